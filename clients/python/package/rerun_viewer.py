@@ -72,12 +72,14 @@ class Log:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._sensors: List[str] = []
-        self._labels: Dict[int, str] = {}
+        self._hello: Optional[hardnessd.Message] = None
+        self._labels: List[str] = []
 
     def begin(self, sensors: Sequence[str], levels: Sequence[Dict[str, Any]], live: bool) -> None:
         """The sensors, and the levels with their labels as `hello` has them."""
         self._sensors = list(sensors)
-        self._labels = {level["level"]: level["label"] for level in levels}
+        self._labels = [level["label"] for level in levels]
+        self._hello = {"model": {"levels": levels}}
         self._stream.send_blueprint(blueprint(sensors, live))
 
     def event(self, event: hardnessd.Event) -> None:
@@ -90,7 +92,8 @@ class Log:
             age_ms = event["age_at_publish_ms"] or 0.0
             self._at(_time_ns(event["time"]) + int(age_ms * 1e6))
             path = f"{event['sensor']}/probability"
-            names = [self._labels.get(level, f"level {level}") for level in range(1, len(event["probabilities"]) + 1)]
+            levels = range(1, len(event["probabilities"]) + 1)
+            names = [self._labels[level - 1] if level <= len(self._labels) else f"level {level}" for level in levels]
             # A verdict is a point, and no line leads from one press to the next.
             colours = COLOURS if len(names) == len(COLOURS) else None
             self._stream.log(path, rr.SeriesPoints(names=names, colors=colours), static=True)
@@ -134,14 +137,16 @@ class Log:
         self._stream.set_time("time", timestamp=np.datetime64(time_ns, "ns"))
 
     def _text(self, sensor: str, name: str, event: hardnessd.Event) -> None:
-        self._stream.log(f"{sensor}/{name}", rr.TextLog(hardnessd._readable(event)))
+        self._stream.log(f"{sensor}/{name}", rr.TextLog(hardnessd._readable(event, self._hello)))
 
 
 def log_recording(take: recording.Recording, log: Log) -> None:
     """Logs a recording."""
     # A recording names the levels only where it has a verdict of each.
     labels = {event["level"]: event["label"] for event in take.events(["hardness"]) if event["type"] == "hardness"}
-    log.begin(list(take.sensors), [{"level": level, "label": label} for level, label in labels.items() if level], live=False)
+    known = range(1, max((level or 0 for level in labels), default=0) + 1)
+    levels = [{"level": level, "label": labels.get(level) or f"level {level}"} for level in known]
+    log.begin(list(take.sensors), levels, live=False)
     frames: Dict[str, Any] = {}
     for sensor, topic, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
         if topic == "frame":
