@@ -15,7 +15,7 @@ use hardnessd_core::event::{Event, Phase};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{self, Decoder, Layout};
 use tract_onnx::prelude::tract_ndarray::Array2;
 
@@ -36,7 +36,7 @@ fn layout() -> Layout {
 }
 
 fn hrn() -> Arc<Hrn> {
-    Arc::new(Hrn::load(BUILT_IN).expect("the model in the binary is one"))
+    Arc::new(Hrn::load(BUILT_IN_HRN).expect("the model in the binary is one"))
 }
 
 fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {

@@ -14,7 +14,7 @@ use hardnessd_core::event::{Event, Hardness, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
 const SEED: u64 = 1;
@@ -24,7 +24,7 @@ const RISEN: f32 = 0.95;
 fn main() {
     let presses = std::env::args().nth(1);
     let presses = presses.map_or(200, |text| text.parse().expect("a number of presses"));
-    let hrn = Arc::new(Hrn::load(BUILT_IN).expect("the model in the binary is one"));
+    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).expect("the model in the binary is one"));
     println!("| material | 5 frames/s | 20 frames/s | 100 frames/s |");
     println!("|---|---|---|---|");
     let mut rising = 0;

@@ -326,7 +326,8 @@ fn start_sensor(
 ) -> SensorHandle {
     let (port, sensor) = (&setup.config.sensors[index], &setup.sensors[index]);
     let (commands, inbox) = mpsc::channel(QUESTIONS);
-    let pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::Arrival);
+    let hrn = setup.hrn_of(sensor.name()).clone();
+    let pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
     let link = Link::new(&port.port, port.baud.get(), serial::Settings::of(sensor));
     let (name, hub) = (port.name.clone(), hub.clone());
     let ended = name.clone();
@@ -402,7 +403,7 @@ fn about(setup: &Setup, hello: &Hello) -> About {
         reason: None,
         labels,
         sensors: sensors
-            .map(|sensor| RecordedSensor::new(sensor, &setup.hrn))
+            .map(|sensor| RecordedSensor::new(sensor, setup.hrn_of(sensor.name())))
             .collect(),
     }
 }

@@ -18,7 +18,8 @@ use hardnessd::tools::fleet;
 #[cfg(feature = "watch")]
 use hardnessd::tools::watch;
 use hardnessd::tools::{
-    self, calibrate, check, control, demo, doctor, record, recover, replay, simulate, sniff, tail,
+    self, calibrate, check, control, demo, doctor, identify, record, recover, replay, simulate,
+    sniff, tail,
 };
 use hardnessd_core::trial;
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -113,6 +114,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         }
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => calibrate(args, signals).await,
+        Command::Identify(args) => identify(args, signals).await,
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
         Command::Sniff(args) => finish(signals, sniff::run(args)).await,
     }
@@ -133,6 +135,23 @@ async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failur
     let mut stopped = None;
     let shutdown = async { stopped = Some(end.await) };
     calibrate::run(args, setup, &path, shutdown).await?;
+    stopped.map_or(Ok(()), |stop| Err(stop.into()))
+}
+
+/// Makes references. At a signal, the daemon inside ends in order, and the command fails.
+async fn identify(args: identify::Args, signals: Signals) -> Result<(), Failure> {
+    let path = args.config.path()?;
+    let mut end = pin!(signals.end());
+    let named = path.clone();
+    let load = tokio::task::spawn_blocking(move || identify::load(&named));
+    let setup = tokio::select! {
+        loaded = load => loaded.expect("a configuration is read without a panic")?,
+        stop = &mut end => return Err(stop.into()),
+    };
+    let _log = Log::start(setup.config.log, "warn")?;
+    let mut stopped = None;
+    let shutdown = async { stopped = Some(end.await) };
+    identify::run(args, setup, &path, shutdown).await?;
     stopped.map_or(Ok(()), |stop| Err(stop.into()))
 }
 

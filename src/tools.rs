@@ -15,6 +15,8 @@ pub mod exit;
 mod faults;
 #[cfg(feature = "zenoh")]
 pub mod fleet;
+pub mod identify;
+pub mod live;
 mod player;
 pub(crate) mod pty;
 pub mod record;
@@ -94,6 +96,16 @@ pub fn print(lines: &[u8]) -> io::Result<bool> {
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
 async fn print_apart(lines: Vec<u8>) -> io::Result<bool> {
     tokio::task::spawn_blocking(move || print(&lines)).await?
+}
+
+/// A path as the configuration may name it: relative, if it lies beside the configuration.
+fn as_in(config: &Path, path: &Path) -> String {
+    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let (config, path) = (absolute(config), absolute(path));
+    let beside = config
+        .parent()
+        .and_then(|directory| path.strip_prefix(directory).ok());
+    beside.unwrap_or(&path).display().to_string()
 }
 
 #[cfg(test)]

@@ -170,6 +170,7 @@ class Hardness(_Numbered):
     levels: Optional[List[int]]
     course: Optional[Literal["positions", "speed", "none"]]
     stiffness_n_per_mm: Optional[float]
+    references: Literal["none", "rigid", "labelled", "both"]
     object: Optional[ObjectVerdict]
 
 

@@ -11,7 +11,7 @@ mod check;
 mod parse;
 mod read;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::env;
 use std::net::SocketAddr;
 use std::num::NonZeroU32;
@@ -30,7 +30,7 @@ use self::read::Until;
 use super::log;
 use super::port::Port;
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{Format, Hrn};
+use hardnessd_core::verdict::{self, Format, Hrn};
 use hardnessd_core::{motion, press, tare, trial, wire};
 
 /// The whole configuration file.
@@ -49,6 +49,9 @@ pub struct Config {
     /// The model that gives verdicts.
     #[serde(default)]
     pub model: Model,
+    /// The hardness levels, in place of the model's own. Without a table, they are the model's.
+    #[serde(default, rename = "level", skip_serializing_if = "Vec::is_empty")]
+    pub levels: Vec<LevelTable>,
     /// All ways to publish events, except HTTP.
     #[serde(default)]
     pub publish: Publish,
@@ -85,6 +88,9 @@ pub struct SensorTable {
     pub calibration: tare::Settings,
     /// The arm that presses with the sensor.
     pub arm: motion::Settings,
+    /// The file with presses of known pieces on this sensor, as `identify` makes it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub references: Option<PathBuf>,
 }
 
 impl Default for SensorTable {
@@ -107,6 +113,7 @@ impl Default for SensorTable {
             frame,
             calibration,
             arm,
+            references: None,
         }
     }
 }
@@ -121,10 +128,43 @@ impl SensorTable {
     }
 }
 
+/// A `[[level]]` table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LevelTable {
+    /// The name of the level, such as `firm`.
+    pub label: String,
+    /// The least and the greatest Shore OO of the level.
+    pub shore: [f32; 2],
+}
+
+/// The models in the binary.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BuiltIn {
+    /// The model of courses and references.
+    #[default]
+    Course,
+    /// The model that judges one frame, that of the largest contact area, as the paper does.
+    Hrn,
+}
+
+impl BuiltIn {
+    /// The bytes of the model.
+    pub fn bytes(self) -> &'static [u8] {
+        match self {
+            Self::Course => verdict::BUILT_IN,
+            Self::Hrn => verdict::BUILT_IN_HRN,
+        }
+    }
+}
+
 /// The `[model]` table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Model {
+    /// The model in the binary that judges, unless a path names another.
+    pub built_in: BuiltIn,
     /// The path of the ONNX file. The default is the built-in model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
@@ -148,6 +188,7 @@ impl Default for Model {
             ..
         } = Description::default();
         Self {
+            built_in: BuiltIn::default(),
             path: None,
             sha256: None,
             min_confidence,
@@ -233,6 +274,7 @@ impl Config {
             sensors,
             press: press::Settings::default(),
             model: Model::default(),
+            levels: Vec::new(),
             publish: Publish::default(),
             http: None,
             record: None,
@@ -292,6 +334,7 @@ impl Config {
         let fixed = |config: &Self, others: &Self| Self {
             press: others.press.clone(),
             model: others.model.clone(),
+            levels: others.levels.clone(),
             log: others.log,
             sensors: Vec::new(),
             ..config.clone()
@@ -300,6 +343,7 @@ impl Config {
             stale_after_ms: others.stale_after_ms,
             calibration: others.calibration.clone(),
             arm: others.arm.clone(),
+            references: others.references.clone(),
             ..sensor.clone()
         };
         let mut of_sensors = self.sensors.iter().filter_map(|ours| {
@@ -364,6 +408,8 @@ pub struct Setup {
     pub sensors: Vec<Sensor>,
     /// The model that the configuration names.
     pub hrn: Arc<Hrn>,
+    /// The model with the references of the sensors that have some.
+    identified: BTreeMap<String, Arc<Hrn>>,
 }
 
 impl Setup {
@@ -371,15 +417,20 @@ impl Setup {
     pub fn model_name(&self) -> String {
         let path = self.config.model.path.as_ref();
         let name = path.map(|path| path.file_name().unwrap_or(path.as_os_str()));
-        name.map_or("built in".to_owned(), |name| {
-            name.to_string_lossy().into_owned()
-        })
+        match (name, self.config.model.built_in) {
+            (Some(name), _) => name.to_string_lossy().into_owned(),
+            (None, BuiltIn::Course) => "built in".to_owned(),
+            (None, BuiltIn::Hrn) => "built in, hrn".to_owned(),
+        }
     }
 
     /// What the model judges, and what it needs beside the sensor.
     pub fn model_needs(&self) -> &'static str {
         match self.hrn.format() {
             Format::Frame => "judges single frames, needs no arm",
+            Format::Course { .. } if self.hrn.most_references() > 0 => {
+                "judges whole presses, best with the arm's positions and with references of each sensor"
+            }
             Format::Course { .. } => {
                 "judges whole presses, needs the arm's positions or sensor.arm.speed_mm_s"
             }
@@ -390,6 +441,10 @@ impl Setup {
     pub fn without_effect(&self) -> Vec<String> {
         let Config { press, model, .. } = &self.config;
         let (press_default, model_default) = (press::Settings::default(), Model::default());
+        let takes_none = self.hrn.most_references() == 0;
+        let sensors = self.config.sensors.iter();
+        let given = sensors.filter(|sensor| takes_none && sensor.references.is_some());
+        let references = given.map(|sensor| format!("sensor.references of {:?}", sensor.name));
         match self.hrn.format() {
             Format::Frame => {
                 let described = |sensor: &&SensorTable| sensor.arm != motion::Settings::default();
@@ -397,19 +452,12 @@ impl Setup {
                 let arms = arms.map(|sensor| format!("sensor.arm of {:?}", sensor.name));
                 let early = model.early_confidence != model_default.early_confidence;
                 let early = early.then(|| "model.early_confidence".to_owned());
-                arms.chain(early).collect()
+                arms.chain(early).chain(references).collect()
             }
             Format::Course { .. } => {
                 let settle = press.early_settle_s != press_default.early_settle_s;
-                let force = press.early_min_force_n != press_default.early_min_force_n;
-                [
-                    settle.then_some("press.early_settle_s"),
-                    force.then_some("press.early_min_force_n"),
-                ]
-                .into_iter()
-                .flatten()
-                .map(str::to_owned)
-                .collect()
+                let settle = settle.then(|| "press.early_settle_s".to_owned());
+                settle.into_iter().chain(references).collect()
             }
         }
     }
@@ -449,12 +497,32 @@ impl Setup {
         let sensors = config.check(path)?;
         let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);
         let most = trial::verdict_most(rates.fold(0.0, f64::max));
-        let hrn = Arc::new(parse::model(&config.model, most, path, until)?);
+        let hrn = Arc::new(parse::model(&config, most, path, until)?);
+        let mut identified = BTreeMap::new();
+        for sensor in &config.sensors {
+            if let Some(file) = &sensor.references {
+                let own = parse::identified(&hrn, file, &sensor.name, path, until)?;
+                identified.insert(sensor.name.clone(), Arc::new(own));
+            }
+        }
         Ok(Self {
             config,
             sensors,
             hrn,
+            identified,
         })
+    }
+
+    /// The sensors that have references, each with its model.
+    pub fn identified(&self) -> impl Iterator<Item = (&str, &Arc<Hrn>)> {
+        self.identified
+            .iter()
+            .map(|(name, hrn)| (name.as_str(), hrn))
+    }
+
+    /// The model for the presses of a sensor.
+    pub fn hrn_of(&self, sensor: &str) -> &Arc<Hrn> {
+        self.identified.get(sensor).unwrap_or(&self.hrn)
     }
 }
 

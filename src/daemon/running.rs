@@ -120,7 +120,7 @@ impl Running {
                 sensors.push(start_sensor(setup, index, recorder, &self.hub, tasks));
                 continue;
             };
-            let hrn = self.setup.hrn.clone();
+            let hrn = self.setup.hrn_of(sensor.name()).clone();
             let command = Command::Reload(Box::new(sensor.clone()), hrn, recorder);
             // The main loop notices a sensor whose task has ended.
             let _ = handle.commands.send(command).await;

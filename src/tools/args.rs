@@ -8,7 +8,8 @@ use super::fleet;
 #[cfg(feature = "watch")]
 use super::watch;
 use super::{
-    calibrate, check, control, demo, doctor, record, recover, replay, simulate, sniff, tail,
+    calibrate, check, control, demo, doctor, identify, record, recover, replay, simulate, sniff,
+    tail,
 };
 
 /// Hardness events from a tactile array on a serial port
@@ -53,6 +54,8 @@ pub enum Command {
     Check(check::Args),
     /// Measure values for the configuration: the arm, newtons, gains of taxels
     Calibrate(calibrate::Args),
+    /// Make a file of presses on known pieces, which tell the model what the sensor reads
+    Identify(identify::Args),
     /// Explain why a port does not work, and what to do
     Doctor(doctor::Args),
     /// Propose a [sensor.frame] for raw bytes, as TOML on stdout

@@ -11,28 +11,22 @@ mod gather;
 mod out;
 mod taxels;
 
-use std::fs::{self, File};
 use std::future::Future;
-use std::io::{self, Seek, SeekFrom};
+use std::io;
 use std::path::{Path, PathBuf};
-use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
 
 use clap::{Args as ClapArgs, ValueEnum};
-use tokio::sync::watch;
 
 use self::gather::{Press, Unreadable};
 use self::out::Out;
 use super::configuration::Configuration;
+use super::live;
 use super::simulate::{OutOfRange, within};
 use crate::daemon::config::Setup;
-use crate::daemon::record::Progress;
-use crate::daemon::{self, Daemon, Sockets};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
-use hardnessd_core::recording::Labels;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::Hrn;
@@ -92,17 +86,9 @@ pub enum Error {
     /// A file was given, but not for `calibrate taxels`.
     #[error("--out is only for `calibrate taxels`: leave it out")]
     NoFile,
-    /// The daemon cannot serve, or has stopped.
+    /// The presses cannot be recorded.
     #[error(transparent)]
-    Daemon(#[from] daemon::Error),
-    /// The temporary file for the recording cannot be used.
-    #[error("{path}: {source}")]
-    Temporary {
-        /// The path of the recording.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+    Live(#[from] live::Error),
     /// A recording that the command line names cannot be opened.
     #[error("{path}: {source}")]
     Missing {
@@ -158,7 +144,7 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Daemon(error) => error.exit_code(),
+            Error::Live(error) => error.exit_code(),
             Error::NoSensor { .. } | Error::Unasked | Error::NoFile => USAGE,
             Error::Missing { .. } => NO_INPUT,
             Error::Recording { source, .. } if source.is_io() => IO,
@@ -167,15 +153,10 @@ impl Coded for Error {
             | Error::Taxels(_)
             | Error::Count { .. }
             | Error::Recording { .. } => FAILED,
-            Error::Temporary { .. } | Error::Taken { .. } | Error::Out { .. } | Error::Print(_) => {
-                IO
-            }
+            Error::Taken { .. } | Error::Out { .. } | Error::Print(_) => IO,
         }
     }
 }
-
-/// How long to wait for positions after the last press.
-const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
 /// Weights that disagree by more than this share get a warning.
 const DOUBTFUL_ERROR: f64 = 0.1;
@@ -268,7 +249,7 @@ pub async fn run(
             let fit = taxels::Fit::of(&plain, array, dead)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
             let out = out.expect("the gains have a file");
-            let path = as_in(config, out.path());
+            let path = super::as_in(config, out.path());
             out.finish(&bytes)?;
             of_taxels(&fit, array, dead, &path)
         }
@@ -279,65 +260,19 @@ pub async fn run(
     Ok(())
 }
 
-/// The presses that the sensor sends from now on; `None` if `shutdown` comes first. The other
-/// sensors of the configuration stay closed: their presses would count, and a missing one would end
-/// the command.
+/// The presses that the sensor sends from now on; `None` if `shutdown` comes first.
 async fn live(
     args: &Args,
-    mut setup: Setup,
+    setup: Setup,
     sensor: &Sensor,
     shutdown: impl Future<Output = ()>,
 ) -> Result<Option<Vec<Press>>, Error> {
     let hrn = setup.hrn.clone();
-    setup.sensors.retain(|one| one.name() == sensor.name());
-    setup.config.sensors.retain(|one| one.name == sensor.name());
-    let path =
-        std::env::temp_dir().join(format!("hardnessd-calibrate-{}.mcap", std::process::id()));
-    let temporary = |source| Error::Temporary {
-        path: path.clone(),
-        source,
-    };
-    let open = File::options()
-        .read(true)
-        .write(true)
-        .create_new(true)
-        .open(&path);
-    let file = open.map_err(temporary)?;
-    // Nobody else needs the file. Without its name, it vanishes when this process ends.
-    fs::remove_file(&path).map_err(temporary)?;
-    let mut recorded = file.try_clone().map_err(temporary)?;
-
-    let (progress, mut counted) = watch::channel(Progress::default());
-    let labels = Labels::new();
-    let sockets = Sockets::Configured;
-    let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
-    let wanted = args.wanted();
-    hardnessd_core::say!("leave the sensor free until its zero is taken");
-    let enough = async {
-        // The presses at the last prompt.
-        let mut said = None;
-        while said < Some(wanted) && counted.changed().await.is_ok() {
-            let Progress { tared, presses, .. } = *counted.borrow_and_update();
-            if tared > 0 && said != Some(presses) {
-                said = Some(presses);
-                say_next(args, presses);
-            }
-        }
-        tokio::time::sleep(LAST_POSITIONS).await;
-    };
-    let mut stopped = false;
-    let end = async {
-        let (enough, shutdown) = (pin!(enough), pin!(shutdown));
-        tokio::select! {
-            () = enough => {}
-            () = shutdown => stopped = true,
-        }
-    };
-    daemon.run(end, None).await?;
-    if stopped {
+    let say_next = |seen| say_next(args, seen);
+    let recorded = live::record(setup, sensor.name(), args.wanted(), say_next, shutdown);
+    let Some(recorded) = recorded.await? else {
         return Ok(None);
-    }
-    recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
+    };
     let read = gather::presses(recorded, sensor, hrn, matches!(args.what, What::Arm));
     read.map(Some).map_err(|source| Error::Recording {
         path: "what was recorded".to_owned(),
@@ -397,16 +332,6 @@ fn plain(press: &Press) -> taxels::Plain {
         }
     }
     taxels::Plain { frames }
-}
-
-/// A path as the configuration may name it: relative, if it lies beside the configuration.
-fn as_in(config: &Path, path: &Path) -> String {
-    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-    let (config, path) = (absolute(config), absolute(path));
-    let beside = config
-        .parent()
-        .and_then(|directory| path.strip_prefix(directory).ok());
-    beside.unwrap_or(&path).display().to_string()
 }
 
 fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {

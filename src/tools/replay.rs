@@ -187,16 +187,21 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         Some(_) if kind == FileKind::Recording => {
             return Err(Error::OwnMotion { path: path.clone() });
         }
-        Some(path) => Some(motion::load(path).map_err(|source| Error::Motion {
-            path: path.clone(),
-            source,
-        })?),
+        Some(path) => Some(positions(path)?),
         None => None,
     };
     match kind {
-        FileKind::Recording => play_recording(path, BufReader::new(recording), setup, pace),
+        FileKind::Recording => play_recording(path, BufReader::new(recording), &setup, pace),
         FileKind::Raw => play_bytes(path, recording, motion, &setup, pace),
     }
+}
+
+/// The arm's positions in a CSV file.
+pub(super) fn positions(path: &Path) -> Result<Vec<Point>, Error> {
+    motion::load(path).map_err(|source| Error::Motion {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// The timing of a replay.
@@ -225,8 +230,11 @@ impl Pace<'_> {
 
 /// Plays a recording. If it is cut off or damaged, its events end like those of bytes that end
 /// there, and the error follows them.
-fn play_recording(path: &Path, file: impl Read, setup: Setup, pace: Pace) -> Result<(), Error> {
-    let mut playback = Playback::new(setup.hrn);
+fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Result<(), Error> {
+    let mut playback = Playback::new(setup.hrn.clone());
+    for (sensor, hrn) in setup.identified() {
+        playback.identify(sensor, hrn.clone());
+    }
     let mut seq = 0;
     let printer = pace.printer;
     let played = play_entries(path, file, pace, &mut playback, &mut seq);
@@ -297,25 +305,54 @@ const AHEAD: Duration = Duration::from_secs(2);
 /// Plays raw bytes, with the arm's positions.
 fn play_bytes(
     path: &Path,
-    mut file: impl Read,
+    file: impl Read,
     motion: Option<Vec<Point>>,
     setup: &Setup,
     mut pace: Pace,
 ) -> Result<(), Error> {
     let sensor = setup.sensors.first();
     let sensor = sensor.expect("a configuration has at least one sensor");
-    let frame_rate_hz = sensor.description().frame_rate_hz;
+    let hrn = setup.hrn_of(sensor.name()).clone();
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
+    let (mut seq, printer) = (0, pace.printer);
+    let is_paced = pace.speed.is_some();
+    let played = feed(
+        path,
+        file,
+        motion,
+        is_paced,
+        &mut pipeline,
+        |events, since| Ok(pace.wait(since) && print(events, &mut seq, printer)?),
+    );
+    let Some(end) = played? else {
+        return Ok(());
+    };
+    let none = no_frame(path, &end);
+    print(end, &mut seq, printer)?;
+    none.map_or(Ok(()), Err)
+}
+
+/// Sends raw bytes through a pipeline, with the arm's positions. `each` takes the events of a part
+/// and the time of its last frame after the first one, and says whether to go on. Returns the events
+/// of the end, or `None` if `each` ended it.
+pub(super) fn feed(
+    path: &Path,
+    mut file: impl Read,
+    motion: Option<Vec<Point>>,
+    is_paced: bool,
+    pipeline: &mut Pipeline,
+    mut each: impl FnMut(Vec<Event>, Duration) -> Result<bool, Error>,
+) -> Result<Option<Vec<Event>>, Error> {
+    let frame_rate_hz = pipeline.sensor().description().frame_rate_hz;
     // No two frames end within this many bytes, so each frame comes at its own moment, between its
     // positions.
-    let chunk_bytes = if pace.speed.is_some() || motion.is_some() {
-        sensor.layout().min_frame_bytes()
+    let chunk_bytes = if is_paced || motion.is_some() {
+        pipeline.sensor().layout().min_frame_bytes()
     } else {
         CHUNK_BYTES
     };
     let mut motion = VecDeque::from(motion.unwrap_or_default());
     let mut chunk = vec![0; chunk_bytes];
-    let mut pipeline = Pipeline::new(sensor.clone(), setup.hrn.clone(), Clock::FrameRate);
-    let mut seq = 0;
     loop {
         let read = match file.read(&mut chunk) {
             Ok(read) => read,
@@ -328,16 +365,7 @@ fn play_bytes(
         if read == 0 {
             let end = pipeline.end_of_recording(None);
             warn(pipeline.unjudged());
-            let none = end.iter().find_map(|event| match event {
-                Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
-                    path: path.to_owned(),
-                    bytes_skipped: status.bytes_skipped,
-                    frames_damaged: status.frames_damaged,
-                }),
-                _ => None,
-            });
-            print(end, &mut seq, pace.printer)?;
-            return none.map_or(Ok(()), Err);
+            return Ok(Some(end));
         }
         let (frames, _) = pipeline.frame_counts();
         let told_until = time_of(frames, frame_rate_hz)
@@ -355,10 +383,22 @@ fn play_bytes(
         warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
         let since = time_of(frames.saturating_sub(1), frame_rate_hz);
-        if !pace.wait(since) || !print(events, &mut seq, pace.printer)? {
-            return Ok(());
+        if !each(events, since)? {
+            return Ok(None);
         }
     }
+}
+
+/// The error of raw bytes that had no whole frame, from the events of their end.
+pub(super) fn no_frame(path: &Path, end: &[Event]) -> Option<Error> {
+    end.iter().find_map(|event| match event {
+        Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
+            path: path.to_owned(),
+            bytes_skipped: status.bytes_skipped,
+            frames_damaged: status.frames_damaged,
+        }),
+        _ => None,
+    })
 }
 
 /// The time of whole frame `number` after the first one, in bytes without times.

@@ -24,7 +24,7 @@ use crate::maybe;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
-use hardnessd_simulator::{Material, REST_S, SensorProfile, Sequence, SequenceSettings};
+use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -45,6 +45,10 @@ pub struct Args {
     /// Material to press; repeat the option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
+    /// Rigid piece to press in place of the materials, for `identify`: flat:MM (so many mm across) or ball:MM (of
+    /// that radius), 1 to 100 mm
+    #[arg(long, value_name = "PIECE", conflicts_with_all = ["materials", "arm"], value_parser = piece)]
+    piece: Option<Reference>,
     /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
     /// random, 5 to 25]
     #[arg(long = "force", value_name = "N", value_parser = force_n)]
@@ -238,7 +242,21 @@ fn sequence(args: &Args) -> SequenceSettings {
         presses: args.presses,
         rest_s: args.rest,
         profile: args.sensor_profile,
+        piece: args.piece,
         ..SequenceSettings::default()
+    }
+}
+
+/// A rigid piece of the command line.
+fn piece(text: &str) -> Result<Reference, String> {
+    let expected = || "expected flat:MM or ball:MM with 1 to 100 mm".to_owned();
+    let (kind, mm) = text.split_once(':').ok_or_else(expected)?;
+    let mm: f32 = mm.parse().map_err(|_| expected())?;
+    match kind {
+        _ if !(1.0..=100.0).contains(&mm) => Err(expected()),
+        "flat" => Ok(Reference::Flat { width_mm: mm }),
+        "ball" => Ok(Reference::Ball { radius_mm: mm }),
+        _ => Err(expected()),
     }
 }
 

@@ -72,13 +72,13 @@ fn whoever_holds_the_port_is_named_and_what_to_do() {
 fn check_warns_of_a_pitch_that_the_model_does_not_know() {
     let bench = Bench::new();
     let config = bench.path("coarse.toml");
-    let small = "[[sensor]]\nport = \"port\"\n[sensor.calibration]\npitch_mm = [3.5, 7.0]\n";
+    let small = "[[sensor]]\nport = \"port\"\n[sensor.calibration]\npitch_mm = [3.5, 9.0]\n";
     fs::write(&config, small).unwrap();
     let Output { status, stderr, .. } = hardnessd(&["check", "--config", config.to_str().unwrap()]);
     let said = text(&stderr);
     assert_eq!(status.code(), Some(0), "{said}");
     assert!(
-        said.contains("found [3.5, 7.0], expected the model's 3.5")
+        said.contains("found [3.5, 9.0], expected the model's 3.5")
             && said.contains("was not trained on such a pitch"),
         "{said}"
     );
@@ -94,7 +94,7 @@ fn check_names_what_the_model_needs_and_what_changes_no_verdict_of_it() {
         ("hrn.onnx", "judges single frames, needs no arm", true),
         (
             "course.onnx",
-            "judges whole presses, needs the arm's",
+            "judges whole presses, best with the arm's positions",
             false,
         ),
     ] {
@@ -243,7 +243,7 @@ fn the_control_socket_has_commands_of_its_own() {
 
 #[test]
 fn a_model_of_the_command_line_judges_in_place_of_the_others() {
-    let course = concat!(env!("CARGO_MANIFEST_DIR"), "/models/course.onnx");
+    let hrn = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
     let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/foam.5hz.bin");
     let verdict = |arguments: &[&str]| {
         let Output { stdout, stderr, .. } = hardnessd(arguments);
@@ -254,13 +254,15 @@ fn a_model_of_the_command_line_judges_in_place_of_the_others() {
         let found = lines.find(|event| event["phase"] == "final");
         found.unwrap_or_else(|| panic!("{}", text(&stderr)))
     };
-    assert_eq!(verdict(&["replay", fixture])["course"], Value::Null);
+    assert_eq!(verdict(&["replay", fixture])["course"], "none");
     assert_eq!(
-        verdict(&["replay", fixture, "--model", course])["course"],
-        "none"
+        verdict(&["replay", fixture, "--model", hrn])["course"],
+        Value::Null
     );
-    let demo = ["demo", "--presses", "1", "--speed", "4", "--model", course];
+    let demo = ["demo", "--presses", "1", "--speed", "4"];
     assert_eq!(verdict(&demo)["course"], "positions");
+    let demo = [&demo[..], &["--model", hrn]].concat();
+    assert_eq!(verdict(&demo)["course"], Value::Null);
     for command in [&["demo"][..], &["replay", fixture], &["run"]] {
         let Output { status, stderr, .. } = hardnessd(&[command, &["--model", "no.onnx"]].concat());
         assert_eq!(status.code(), Some(66), "{}", text(&stderr));

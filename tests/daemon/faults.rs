@@ -16,7 +16,7 @@ use crate::pair::Pair;
 use hardnessd_core::frame::{RawFrame, Stamp};
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use rustix::process::{Resource, Signal, geteuid, getrlimit};
@@ -620,7 +620,7 @@ fn pressed_while_it_tares_a_sensor_says_so_and_tares_when_it_is_released() {
 
 #[test]
 fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
-    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
     let play = |jumps_s: &[(usize, i64)]| {
         let described = Description {
             frame_rate_hz: 100.0,

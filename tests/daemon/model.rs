@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use hardnessd_core::verdict::BUILT_IN;
+use hardnessd_core::verdict::BUILT_IN_HRN;
 use prost::Message as _;
 use rustix::process::Signal;
 use serde_json::json;
@@ -16,7 +16,7 @@ use crate::bench::{Bench, Daemon, hardnessd};
 
 /// Changes the built-in model.
 fn changed(change: impl FnOnce(&mut pb::GraphProto)) -> Vec<u8> {
-    let mut model = pb::ModelProto::decode(BUILT_IN).unwrap();
+    let mut model = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     change(model.graph.as_mut().unwrap());
     model.encode_to_vec()
 }
@@ -215,7 +215,7 @@ fn a_bad_file_is_refused_by_check_and_at_a_start_in_one_line() {
     }
     // The same changes within bounds do not make a file bad.
     let few = changed(|graph| convolutions(graph, 3, 4));
-    for bytes in [BUILT_IN, &few] {
+    for bytes in [BUILT_IN_HRN, &few] {
         fs::write(bench.path("hrn.onnx"), bytes).unwrap();
         let output = with("check");
         assert_eq!(output.status.code(), Some(0), "{output:?}");
@@ -226,7 +226,7 @@ fn a_bad_file_is_refused_by_check_and_at_a_start_in_one_line() {
 fn a_running_daemon_survives_every_bad_file() {
     let bench = Bench::new();
     let config = configure(&bench);
-    fs::write(bench.path("hrn.onnx"), BUILT_IN).unwrap();
+    fs::write(bench.path("hrn.onnx"), BUILT_IN_HRN).unwrap();
     let mut daemon = Daemon::start(&config);
     let old = bench.subscriber().next().unwrap()["model"]["sha256"].clone();
     for (what, bytes, expected) in bad_files() {

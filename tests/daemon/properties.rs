@@ -20,7 +20,7 @@ use hardnessd::tools::replay::motion as table;
 use hardnessd_core::motion::{Point, Track};
 use hardnessd_core::recording::{Playback, Reader, recover};
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, FooterBytes, HexBytes, Layout, LengthField, Order,
     Packets, Preset, Settings,
@@ -315,7 +315,7 @@ pub fn configuration(bytes: &[u8]) {
 
 fn hrn() -> Arc<Hrn> {
     static HRN: OnceLock<Arc<Hrn>> = OnceLock::new();
-    let load = || Arc::new(Hrn::load(BUILT_IN).expect("the model in the binary is one"));
+    let load = || Arc::new(Hrn::load(BUILT_IN_HRN).expect("the model in the binary is one"));
     Arc::clone(HRN.get_or_init(load))
 }
 

@@ -33,6 +33,8 @@ ARRAYS = [
     ("fine", 64, 64, 1.5, 1.5, 100),
 ]
 RADIUS_MM, FORCE_N = 11.0, 20.0
+# The pitches that the built-in model has learnt from.
+TRAINED_MM = (2.0, 7.0)
 
 
 def contact(rows, cols, rows_mm, cols_mm):
@@ -131,7 +133,8 @@ def check_events(hello, events, boards):
             share = verdict["contact_area_mm2"] / (math.pi * RADIUS_MM**2)
             assert 0.7 < share < (1 + max(rows_mm, cols_mm) / RADIUS_MM) ** 2, (name, share)
             assert "resampled" in verdict["notes"], verdict
-            assert ("outside_training" in verdict["notes"]) == (max(rows_mm, cols_mm) > 3.5), verdict
+            is_outside = min(rows_mm, cols_mm) < TRAINED_MM[0] or max(rows_mm, cols_mm) > TRAINED_MM[1]
+            assert ("outside_training" in verdict["notes"]) == is_outside, verdict
         print(f"{name}: {rows}x{cols}, {len(frames)} frames, {len(finals)} verdicts, {finals[-1]['label']}, "
               f"{finals[-1]['contact_area_mm2']:.0f} mm2")
 

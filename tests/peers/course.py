@@ -3,9 +3,9 @@
 
     python tests/peers/course.py target/debug [OBJECTS]
 
-Claims: onnxruntime's probabilities and Shore hardness of 1,000 simulated presses are those of the daemon's own
-code, and a press that a sensor sees at 5, 20 and 100 frames/s gets the same level in most cases. OBJECTS: how many
-of each level; 6 by default.
+Claims: of simulated presses, onnxruntime's bins give the probabilities and Shore hardness that the daemon's own code
+says, without references and with two presses of each rigid piece, and a press that a sensor sees at 5, 20 and 100
+frames/s gets the same level in most cases. OBJECTS: how many of each level; 6 by default.
 """
 
 import csv
@@ -20,22 +20,35 @@ import onnxruntime
 ROOT = pathlib.Path(__file__).parents[2]
 MODEL = ROOT / "models/course.onnx"
 MOST = 48
+# References of a sensor, and numbers that the model keeps of each.
+REFERENCES = (32, 64)
+FLAT, BALL = 1, 2
+# The ends of the levels' parts of the scale, in Shore OO, the hardest first.
+BORDERS = [100, 70, 60, 50]
+
+
+def run(binaries, directory, *command):
+    program = pathlib.Path(binaries).absolute() / "hrn-train"
+    subprocess.run([program, *command], cwd=directory, check=True, capture_output=True, timeout=600)
+
+
+def simulated(binaries, directory, name, *options):
+    """Simulates test presses. Returns the data set's arrays."""
+    run(binaries, directory, "simulate", "--sequences", "--objects", "0", "--out", f"{name}.npz", *options)
+    archive = np.load(pathlib.Path(directory, f"{name}.npz"))
+    return {array: archive[array] for array in archive}
 
 
 def judged(binaries, directory, name, *options):
-    """Simulates test presses, and reads what the daemon's own code says of them."""
-    program = pathlib.Path(binaries).absolute() / "hrn-train"
-    data, verdicts = f"{name}.npz", f"{name}.csv"
-    simulate = [program, "simulate", "--sequences", "--objects", "0", "--out", data, *options]
-    evaluate = [program, "evaluate", "--model", MODEL, "--data", data, "--verdicts", verdicts]
-    for command in [simulate, evaluate]:
-        subprocess.run(command, cwd=directory, check=True, capture_output=True, timeout=600)
+    """What the daemon's own code says of each test press."""
+    verdicts = f"{name}.csv"
+    run(binaries, directory, "evaluate", "--model", MODEL, "--data", f"{name}.npz", "--verdicts", verdicts, *options)
     with open(pathlib.Path(directory, verdicts)) as file:
-        return np.load(pathlib.Path(directory, data)), list(csv.DictReader(file))
+        return list(csv.DictReader(file))
 
 
-def inputs(data, press):
-    """A press as docs/formats.md describes the inputs of format 2."""
+def inputs(data, press, features):
+    """A press as docs/formats.md describes the inputs of format 3, on a sensor without references."""
     rows = np.flatnonzero((data["press"] == press) & (data["time_s"] >= 0))[:MOST]
     count = len(rows)
 
@@ -51,28 +64,69 @@ def inputs(data, press):
         "known": padded(data["known"][rows]),
         "mask": padded(np.ones(count)),
         "arm_n_per_mm": data["arm_n_per_mm"][press].reshape(1, 1).astype(np.float32),
+        "piece": np.zeros((1, 7), np.float32),
+        "references": np.zeros((1, *REFERENCES), np.float32),
+        "given": np.zeros((1, REFERENCES[0]), np.float32),
+        "features": features[press][None],
     }
 
 
+def with_references(session, data, features, sensor):
+    """The inputs `references` and `given` of a sensor, of two presses of each of its rigid pieces."""
+    references, given = np.zeros((1, *REFERENCES), np.float32), np.zeros((1, REFERENCES[0]), np.float32)
+    chosen = []
+    for kind in [FLAT, BALL]:
+        presses = np.flatnonzero((data["sensor"] == sensor) & (data["reference"] == kind))
+        chosen += [presses[number * len(presses) // 2 - 1] for number in [1, 2]]
+    for place, press in enumerate(chosen):
+        told = inputs(data, press, features)
+        size = data["reference_mm"][press]
+        told["piece"][0, :4] = [1, size, 0, 0] if data["reference"][press] == FLAT else [0, 0, 1, size]
+        references[0, place] = session.run(["reference"], told)[0]
+        given[0, place] = 1
+    return {"references": references, "given": given}
+
+
+def said(bins):
+    """Probabilities of the levels, and Shore hardness with its interval, of the logits of the bins."""
+    shares = np.exp(bins.astype(np.float64) - bins.max())
+    ends = np.linspace(0, 100, len(bins) + 1)
+    below = np.concatenate([[0], np.cumsum(shares / shares.sum())])
+    of_levels = np.diff(np.interp([*BORDERS, 0][::-1], ends, below))[::-1]
+    level = of_levels.argmax()
+    middle = np.interp([BORDERS[level], [*BORDERS, 0][level + 1]], ends, below).mean()
+    value, low, high = np.interp([middle, 0.05, 0.95], below, ends)
+    return of_levels, [value, min(low, value), max(high, value)]
+
+
 def onnxruntime_agrees(binaries, directory):
-    broad = "--materials broad --gaps --test-objects 42 --presses 6 --fps 5..60 --unknown 0.3 --seed 77".split()
-    archive, verdicts = judged(binaries, directory, "thousand", *broad)
-    data = {name: archive[name] for name in archive}
-    assert len(verdicts) >= 1000, len(verdicts)
     session = onnxruntime.InferenceSession(MODEL)
-    worst, worst_shore = 0.0, 0.0
-    for press, verdict in enumerate(verdicts):
-        probabilities, shore = session.run(["probabilities", "shore"], inputs(data, press))
-        ours = [float(verdict[f"probability_{level}"]) for level in range(1, 5)]
-        worst = max(worst, np.abs(probabilities[0] - ours).max())
-        ours = [float(verdict[name]) for name in ["shore", "shore_low", "shore_high"]]
-        # The daemon puts the interval's ends in order, and bounds all to 0 to 100.
-        value, low, high = np.clip(shore[0], 0, 100)
-        theirs = [value, min(value, low), max(value, high)]
-        worst_shore = max(worst_shore, np.abs(np.subtract(theirs, ours)).max())
-    assert worst < 1e-4 and worst_shore < 0.01, (worst, worst_shore)
-    print(f"onnxruntime {onnxruntime.__version__}: {len(verdicts)} presses, probabilities off by at most "
-          f"{worst:.1e}, Shore by {worst_shore:.4f}")
+    broad = "--materials broad --gaps --presses 6 --unknown 0.3 --seed 77".split()
+    for name, options, given in [
+        ("thousand", ["--test-objects", "42", "--fps", "5..60"], []),
+        ("sensors", "--sensors broad --test-objects 4 --test-covers 4 --electronics 2".split(), ["--rigid", "2"]),
+    ]:
+        data = simulated(binaries, directory, name, *broad, *options)
+        verdicts = judged(binaries, directory, name, "--features", f"{name}-features.csv", *given)
+        features = np.loadtxt(pathlib.Path(directory, f"{name}-features.csv"), np.float32, delimiter=",")
+        presses = np.flatnonzero(data["level"] > 0)
+        assert len(verdicts) == len(presses), (len(verdicts), len(presses))
+        references = {}
+        if given:
+            for sensor in np.unique(data["sensor"][presses]):
+                references[sensor] = with_references(session, data, features, sensor)
+        worst, worst_shore = 0.0, 0.0
+        for press, verdict in zip(presses, verdicts):
+            told = inputs(data, press, features)
+            told.update(references[data["sensor"][press]] if given else {})
+            of_levels, shore = said(session.run(["bins"], told)[0][0])
+            ours = [float(verdict[f"probability_{level}"]) for level in range(1, 5)]
+            worst = max(worst, np.abs(of_levels - ours).max())
+            ours = [float(verdict[name]) for name in ["shore", "shore_low", "shore_high"]]
+            worst_shore = max(worst_shore, np.abs(np.subtract(shore, ours)).max())
+        print(f"onnxruntime {onnxruntime.__version__}, {name}: {len(verdicts)} presses, probabilities off by at most "
+              f"{worst:.1e}, Shore by {worst_shore:.4f}")
+        assert len(verdicts) >= 100 and worst < 1e-4 and worst_shore < 0.01
 
 
 def rates_agree(binaries, directory, objects):
@@ -81,7 +135,8 @@ def rates_agree(binaries, directory, objects):
         options = [*materials, "--shapes", "wide", "--test-objects", objects, "--presses", "3", "--seed", "78"]
         levels = []
         for rate in ["5", "20", "100"]:
-            data, verdicts = judged(binaries, directory, f"at{rate}", *options, "--fps", f"{rate}..{rate}")
+            data = simulated(binaries, directory, f"at{rate}", *options, "--fps", f"{rate}..{rate}")
+            verdicts = judged(binaries, directory, f"at{rate}")
             levels.append({
                 (verdict["object"], float(force)): verdict["judged"]
                 for verdict, force in zip(verdicts, data["force"])

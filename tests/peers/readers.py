@@ -78,11 +78,9 @@ def data_sets(binaries, directory):
     return len(presses)
 
 
-def a_recording(binary, directory, model=None):
-    """The daemon's own recording, beside what a subscriber read."""
-    more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
-    if model:
-        more += f'[model]\npath = "{model}"\n'
+def a_recording(binary, directory, built_in):
+    """The daemon's own recording, beside what a subscriber read. `built_in` is the name of the model."""
+    more = f'[record]\ndir = "rec"\nkeep_free_mb = 0\n[model]\nbuilt_in = "{built_in}"\n'
     with Bench(str(binary), more=more) as bench:
         daemon = bench.daemon()
         client = hardnessd.Client(bench.path("events.sock"), types=hardnessd.TYPES)
@@ -118,7 +116,7 @@ def a_recording(binary, directory, model=None):
         assert {event["type"] for event in verdicts} == {"hardness"}
         judged = [event for event in verdicts if event["probabilities"]]
         whole = [event for event in judged if event["shore"] and event["levels"] and event["course"] == "none"]
-        assert judged and len(whole) == (len(judged) if model else 0), verdicts
+        assert judged and len(whole) == (len(judged) if built_in == "course" else 0), verdicts
         frames = list(take.frames())
         shown = {event["frame"]: event["newtons"] for event in live if event["type"] == "frame"}
         assert len(shown) > 50 and len(frames) >= len(shown)
@@ -205,9 +203,9 @@ def main(binaries):
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
         print("a data set of", data_sets(binaries, directory), "presses")
-        course = ROOT / "models/course.onnx"
-        print("a recording of %d verdicts and %d frames" % a_recording(binaries / "hardnessd", directory, course))
-        print("a recording of %d verdicts and %d frames" % a_recording(binaries / "hardnessd", directory))
+        for built_in in ["course", "hrn"]:
+            found = a_recording(binaries / "hardnessd", directory, built_in)
+            print("a recording of %d verdicts and %d frames" % found)
         print("damaged recordings, refused:", damaged(directory))
         readme(directory)
         print("type hints of", types(directory), "files")

@@ -10,6 +10,7 @@ mod bench;
 #[allow(dead_code, reason = "nobody here asks where the device is")]
 mod pair;
 
+mod identify;
 mod recording;
 mod replay;
 mod session;

@@ -10,7 +10,7 @@ use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::test_support::of_a_press;
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use serde_json::Value;
 
 fn fixtures() -> PathBuf {
@@ -202,7 +202,7 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
 
 fn pipeline() -> Pipeline {
     let sensor = Sensor::new(Description::default()).unwrap();
-    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
     Pipeline::new(sensor, hrn, Clock::FrameRate)
 }
 
@@ -251,7 +251,7 @@ fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
     let config = recording.with_extension("toml");
     let text = format!(
         "[[sensor]]\nname = \"forearm\"\nport = \"none\"\n\
-         [sensor.calibration]\nauto_tare = {auto_tare}\n"
+         [sensor.calibration]\nauto_tare = {auto_tare}\n[model]\nbuilt_in = \"hrn\"\n"
     );
     std::fs::write(&config, text).unwrap();
     let events = replay(recording, &["--config", config.to_str().unwrap()]);

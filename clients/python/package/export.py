@@ -114,6 +114,7 @@ TABLES: Dict[str, pa.Schema] = {
             ("levels", pa.list_(pa.int32())),
             ("course", pa.string()),
             ("stiffness_n_per_mm", pa.float64()),
+            ("references", pa.string()),
             (
                 "object",
                 pa.struct(

@@ -14,7 +14,7 @@ use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
 use crate::frame::Frame;
-use crate::verdict::Shore;
+use crate::verdict::{ReferenceKinds, Shore};
 
 /// The version of the format, as announced in `hello`.
 pub const PROTOCOL: u32 = 1;
@@ -318,11 +318,14 @@ pub enum Note {
     /// A taxel reads full scale.
     Saturated,
     /// The force or the area is outside the range of the model's training. So is the pitch. With a
-    /// model of format 2, also the duration, the frame rate, the speed, the depth or the arm.
+    /// model of courses, also the duration, the frame rate, the speed, the depth or the arm.
     OutsideTraining,
     /// The sensor's taxels have another pitch than the model's, so their forces were shared out
     /// over the model's.
     Resampled,
+    /// The model takes references, and the sensor has none: what the sensor reads of a known piece is
+    /// unknown.
+    NotIdentified,
 }
 
 /// A verdict.
@@ -339,9 +342,9 @@ pub enum Note {
 /// use hardnessd_core::frame::Stamp;
 /// use hardnessd_core::pipeline::{Clock, Pipeline};
 /// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 ///
-/// let hrn = Arc::new(Hrn::load(BUILT_IN)?);
+/// let hrn = Arc::new(Hrn::load(BUILT_IN_HRN)?);
 /// let mut pipeline = Pipeline::new(Sensor::new(Description::default())?, hrn, Clock::FrameRate);
 /// let at = Stamp {
 ///     mono: Duration::ZERO,
@@ -415,6 +418,8 @@ pub struct Hardness {
     /// The slope of force against indentation at the end of loading; null if unknown.
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,
+    /// The references of the sensor that the model was given.
+    pub references: ReferenceKinds,
     /// The verdict on the object that the context names, over all its presses so far; null if it
     /// names none.
     pub object: Option<ObjectVerdict>,

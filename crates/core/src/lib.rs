@@ -15,6 +15,7 @@ pub mod press;
 pub mod motion;
 pub mod sensor;
 pub mod verdict;
+pub mod references;
 pub mod event;
 pub mod ros;
 pub mod pipeline;

@@ -30,7 +30,7 @@ use crate::motion::{Point, StepBack, Track};
 use crate::press::{Abort, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
-use crate::verdict::{Hrn, ModelError};
+use crate::verdict::{Course, Hrn, ModelError};
 use crate::wire::{Decoded, Decoder};
 
 /// The source of the frames' times.
@@ -78,6 +78,8 @@ pub struct Pipeline {
     arrival: Duration,
     /// The missing verdicts that are not fetched yet.
     unjudged: Vec<Unjudged>,
+    /// The courses of presses that ended and are not fetched yet, if they are kept.
+    courses: Option<Vec<Course>>,
 }
 
 /// The pipeline's own state.
@@ -112,13 +114,13 @@ impl Pipeline {
     /// use hardnessd_core::frame::{RawFrame, Stamp};
     /// use hardnessd_core::pipeline::{Clock, Pipeline};
     /// use hardnessd_core::sensor::{Description, Sensor};
-    /// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+    /// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
     ///
     /// let sensor = Sensor::new(Description::default())?;
     /// let mut bytes = Vec::new();
     /// sensor.layout().encode(&RawFrame::default(), &mut bytes);
     ///
-    /// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN)?), Clock::Arrival);
+    /// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN_HRN)?), Clock::Arrival);
     /// let at = Stamp {
     ///     mono: Duration::from_secs(1),
     ///     wall: jiff::Timestamp::UNIX_EPOCH,
@@ -155,6 +157,7 @@ impl Pipeline {
             clock,
             arrival: Duration::ZERO,
             unjudged: Vec::new(),
+            courses: None,
         }
     }
 
@@ -179,8 +182,10 @@ impl Pipeline {
             .reload(&described.calibration, contact(sensor.thresholds()));
         self.tracker.reload(sensor.thresholds().clone());
         self.sensor = sensor;
-        if hrn.sha256() != self.hrn.sha256() {
-            // Another model errs in other ways.
+        let is_same = hrn.sha256() == self.hrn.sha256()
+            && hrn.known_references() == self.hrn.known_references();
+        if !is_same {
+            // Another model errs in other ways, and so does one that knows the sensor better.
             self.seen.objects = Objects::default();
         }
         self.hrn = hrn;
@@ -248,6 +253,18 @@ impl Pipeline {
     /// Takes out the missing verdicts. Each is returned once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         std::mem::take(&mut self.unjudged)
+    }
+
+    /// Keeps the course of each press that ends from now on, as a model of courses takes it, until
+    /// [`Self::courses`] returns it.
+    pub fn keep_courses(&mut self) {
+        self.courses.get_or_insert_default();
+    }
+
+    /// The kept courses that were not returned yet.
+    pub fn courses(&mut self) -> Vec<Course> {
+        let kept = self.courses.as_mut();
+        kept.map(std::mem::take).unwrap_or_default()
     }
 
     /// The current sensor.

@@ -31,7 +31,7 @@ use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::pipeline::{self, Input, Pipeline};
 use crate::sensor::{Description, Sensor, SensorError};
-use crate::verdict::Hrn;
+use crate::verdict::{Hrn, References};
 
 /// An entry of a recording for one sensor. Entries are in order of time.
 ///
@@ -114,6 +114,9 @@ pub struct RecordedSensor {
     pub description: Description,
     /// The SHA-256 of the model.
     pub model: String,
+    /// The references of the sensor, as the model takes them.
+    #[serde(default, skip_serializing_if = "References::is_none")]
+    pub references: References,
 }
 
 impl RecordedSensor {
@@ -122,6 +125,7 @@ impl RecordedSensor {
         Self {
             description: sensor.for_recording(),
             model: hrn.sha256().to_owned(),
+            references: hrn.known_references().clone(),
         }
     }
 

@@ -18,11 +18,11 @@ use crate::pipeline::{Clock, Input, Pipeline};
 use crate::recording::{About, Entry, Labels, RecordedSensor, State, Writer};
 use crate::sensor::{Description, Sensor};
 use crate::tare::{self, Gains};
-use crate::verdict::{BUILT_IN, Hrn};
+use crate::verdict::{BUILT_IN_HRN, Hrn};
 
 /// The built-in model.
 pub fn hrn() -> Arc<Hrn> {
-    Arc::new(Hrn::load(BUILT_IN).unwrap())
+    Arc::new(Hrn::load(BUILT_IN_HRN).unwrap())
 }
 
 /// A sensor with a gain for each taxel and a baseline that follows drift.

@@ -359,7 +359,7 @@ mod tests {
 
     #[test]
     fn a_file_within_its_limits_is_timed() {
-        let hrn = Hrn::load(verdict::BUILT_IN).unwrap();
+        let hrn = Hrn::load(verdict::BUILT_IN_HRN).unwrap();
         let us = median_us(&hrn).unwrap();
         assert!(us > 0.0 && us < 1e6, "{us}");
     }

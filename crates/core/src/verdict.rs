@@ -1,15 +1,18 @@
 //! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
 //!
 //! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons
-//! (format 1) or the course of a press (format 2). Out: [`Verdict`]s. This module refuses a file
+//! (format 1) or the course of a press (formats 2 and 3). Out: [`Verdict`]s. This module refuses a file
 //! unless all of it follows the format and it reproduces the probabilities that its trainer wrote
 //! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
 //! never prints and never trains.
 
 mod course;
+pub mod features;
 mod file;
 mod grid;
 mod guard;
+mod references;
+mod shore;
 
 use std::time::Duration;
 
@@ -17,18 +20,25 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use tract_onnx::prelude::*;
 
-use self::course::Input;
 pub use self::course::{
-    COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, Shore, course_inputs,
-    extents,
+    COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, course_inputs,
+    extents, identified_inputs,
 };
+use self::course::{Input, Lengths, Query};
 pub use self::file::{check_levels, describe};
 pub use self::grid::{COLS, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS};
 pub use self::guard::NodeProblem;
+pub use self::references::{
+    MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
+};
+pub use self::shore::{Borders, BordersError, Distribution, Shore};
 use crate::frame::Pitch;
 
-/// The default model, built into the binary; `models/README.md` is its card.
-pub const BUILT_IN: &[u8] = include_bytes!("../../../models/hrn.onnx");
+/// The default model, built into the binary; `models/course.md` is its card.
+pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
+
+/// The model of single frames, also built into the binary; `models/README.md` is its card.
+pub const BUILT_IN_HRN: &[u8] = include_bytes!("../../../models/hrn.onnx");
 
 /// The largest accepted model file, in bytes: 64 MB.
 pub const MAX_FILE_BYTES: usize = 64_000_000;
@@ -140,7 +150,7 @@ impl Range {
 /// The description of a model in its file: the `hrn.*` metadata.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Card {
-    /// `hrn.format`: "1" or "2".
+    /// `hrn.format`: "1", "2" or "3".
     pub format: String,
     /// `hrn.levels`: levels 1 to L in order.
     pub levels: Vec<Level>,
@@ -156,7 +166,7 @@ pub struct Card {
     pub validation: String,
     /// `hrn.range`: the forces, areas and presses in training.
     pub range: Range,
-    /// `hrn.conformal`: only a file of format 2 may have it.
+    /// `hrn.conformal`: only a file of format 2 or 3 may have it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub conformal: Option<Conformal>,
 }
@@ -204,7 +214,7 @@ impl Conformal {
 pub enum Checks {
     /// The check frames of format 1.
     Frames(Check),
-    /// The check presses of format 2.
+    /// The check presses of format 2 or 3.
     Courses(CourseCheck),
 }
 
@@ -365,6 +375,32 @@ pub enum ModelError {
     },
 }
 
+/// The reason why a model cannot take other levels.
+#[derive(Debug, thiserror::Error)]
+pub enum LevelsError {
+    /// The model gives no distribution over the scale.
+    #[error(
+        "found levels, expected none: the model has levels of its own, and only a model of format 3 takes others"
+    )]
+    Fixed,
+    /// The levels are no parts of the scale.
+    #[error("found {0}, expected ranges of Shore OO from the hardest to the softest")]
+    Borders(#[from] BordersError),
+}
+
+/// References that another model computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "references: found {count} with {numbers} numbers, expected at most {most} with {features} numbers each, \
+     as this model computes them"
+)]
+pub struct ReferencesError {
+    count: usize,
+    numbers: usize,
+    most: usize,
+    features: usize,
+}
+
 /// The verdict of an HRN on a press.
 ///
 /// # Example
@@ -394,7 +430,7 @@ pub struct Verdict {
     pub probabilities: Vec<f32>,
     /// The largest probability.
     pub confidence: f32,
-    /// The Shore hardness. A model of format 2 always has it; a model of format 1 may.
+    /// The Shore hardness. A model of courses always has it; a model of format 1 may.
     pub shore: Option<Shore>,
     /// The conformal set, if the file has a threshold.
     pub levels: Option<Vec<u8>>,
@@ -405,7 +441,7 @@ pub struct Verdict {
 pub enum Format {
     /// Format 1: the frame of the largest contact area.
     Frame,
-    /// Format 2: the course of a press.
+    /// Formats 2 and 3: the course of a press.
     Course {
         /// The largest number of frames in a course.
         most_frames: usize,
@@ -427,19 +463,86 @@ pub enum Format {
 /// assert_eq!(verdict.confidence, verdict.probabilities[usize::from(verdict.level) - 1]);
 /// # Ok::<(), hardnessd_core::verdict::ModelError>(())
 /// ```
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Hrn {
     plan: Arc<TypedRunnableModel>,
     format: Format,
-    /// The inputs of format 2, in the order of the file.
+    /// The inputs of a model of courses, in the order of the file, and their lengths.
     inputs: Vec<Input>,
-    logits_output: usize,
-    probabilities_output: usize,
-    /// A model of format 2 always has this output; a model of format 1 may.
-    shore_output: Option<usize>,
+    lengths: Lengths,
+    outputs: Outputs,
     card: Card,
-    checks: Checks,
+    checks: Arc<Checks>,
     sha256: String,
+    /// The references of the sensor whose presses are judged.
+    references: References,
+}
+
+/// The places of a model's outputs.
+#[derive(Debug, Clone)]
+enum Outputs {
+    /// Formats 1 and 2.
+    Levels {
+        logits: usize,
+        probabilities: usize,
+        /// A model of format 2 always has this output; a model of format 1 may.
+        shore: Option<usize>,
+    },
+    /// Format 3.
+    Bins {
+        bins: usize,
+        reference: usize,
+        borders: Borders,
+    },
+}
+
+impl Outputs {
+    fn of(graph: &tract_onnx::pb::GraphProto, card: &Card) -> Result<Self, ModelError> {
+        let position = |name: &str| graph.output.iter().position(|output| output.name == name);
+        let missing = || ModelError::Graph("no outputs".into());
+        let place = |name: &str| position(name).ok_or_else(missing);
+        if card.format != "3" {
+            return Ok(Self::Levels {
+                logits: place("logits")?,
+                probabilities: place("probabilities")?,
+                shore: position("shore"),
+            });
+        }
+        Ok(Self::Bins {
+            bins: place("bins")?,
+            reference: place("reference")?,
+            borders: Borders::of(&card.levels).map_err(|_| missing())?,
+        })
+    }
+
+    /// The name, the place and the length of each output.
+    fn shapes(
+        &self,
+        card: &Card,
+        signature: &file::Signature,
+    ) -> Vec<(&'static str, usize, usize)> {
+        let levels = card.levels.len();
+        match *self {
+            Self::Levels {
+                logits,
+                probabilities,
+                shore,
+            } => {
+                let of_levels = [
+                    ("logits", logits, levels),
+                    ("probabilities", probabilities, levels),
+                ];
+                let shore = shore.map(|place| ("shore", place, 3));
+                of_levels.into_iter().chain(shore).collect()
+            }
+            Self::Bins {
+                bins, reference, ..
+            } => vec![
+                ("bins", bins, signature.bins),
+                ("reference", reference, signature.lengths.features),
+            ],
+        }
+    }
 }
 
 impl Hrn {
@@ -478,15 +581,10 @@ impl Hrn {
         file::check_opset(&proto)?;
         file::check_tensors_inside(graph)?;
         let (card, checks) = file::read_metadata(&proto)?;
-        let (format, inputs) = file::check_signature(graph, &card, &checks)?;
+        let signature = file::check_signature(graph, &card, &checks)?;
         guard::check_operators(graph)?;
-        let position = |name: &str| graph.output.iter().position(|output| output.name == name);
-        let shore_output = position("shore");
-        let (Some(logits_output), Some(probabilities_output)) =
-            (position("logits"), position("probabilities"))
-        else {
-            return Err(ModelError::Graph("no outputs".into()));
-        };
+        let outputs = Outputs::of(graph, &card)?;
+        let agreed = outputs.shapes(&card, &signature);
 
         let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
         // The inference library would keep a copy of the metadata.
@@ -494,12 +592,12 @@ impl Hrn {
         let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
         // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
-        let shapes = match format {
+        let shapes = match signature.format {
             Format::Frame => vec![vec![1, 1, ROWS, COLS]],
-            Format::Course { most_frames } => inputs
-                .iter()
-                .map(|input| input.shape(most_frames))
-                .collect(),
+            Format::Course { .. } => {
+                let inputs = signature.inputs.iter();
+                inputs.map(|input| input.shape(signature.lengths)).collect()
+            }
         };
         let inference = shapes
             .iter()
@@ -513,12 +611,6 @@ impl Hrn {
         guard::check_values(&optimized)?;
         optimized.optimize().map_err(graph_error)?;
         // The inference library does not compare a graph with the shapes that it declares.
-        let levels = card.levels.len();
-        let mut agreed = vec![
-            ("logits", logits_output, levels),
-            ("probabilities", probabilities_output, levels),
-        ];
-        agreed.extend(shore_output.map(|output| ("shore", output, 3)));
         for (name, output, length) in agreed {
             let agreed = f32::fact([1, length]);
             let computed = optimized.output_fact(output).map_err(graph_error)?;
@@ -534,14 +626,14 @@ impl Hrn {
 
         Ok(Self {
             plan,
-            format,
-            inputs,
-            logits_output,
-            probabilities_output,
-            shore_output,
+            format: signature.format,
+            inputs: signature.inputs,
+            lengths: signature.lengths,
+            outputs,
             card,
-            checks,
+            checks: Arc::new(checks),
             sha256: sha256_hex(bytes),
+            references: References::NONE,
         })
     }
 
@@ -553,6 +645,22 @@ impl Hrn {
     /// The description of the model in its file.
     pub fn card(&self) -> &Card {
         &self.card
+    }
+
+    /// The same model with other levels: other parts of the scale of its Shore hardness. The promise of
+    /// its sets of levels is of its own levels.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the model gives no distribution over the scale, or the levels are no parts
+    /// of it.
+    pub fn with_levels(mut self, levels: Vec<Level>) -> Result<Self, LevelsError> {
+        let Outputs::Bins { borders, .. } = &mut self.outputs else {
+            return Err(LevelsError::Fixed);
+        };
+        *borders = Borders::of(&levels)?;
+        self.card.levels = levels;
+        Ok(self)
     }
 
     /// The input that the model judges.
@@ -576,7 +684,8 @@ impl Hrn {
         match self.format {
             Format::Frame => {
                 let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons);
-                self.run(tvec!(input.map_err(inference_error)?.into()))
+                let input = input.map_err(inference_error)?;
+                self.verdict(&self.run(tvec!(input.into()))?)
             }
             Format::Course { .. } => self.judge_course(&Course {
                 moments: vec![CourseMoment {
@@ -589,6 +698,71 @@ impl Hrn {
         }
     }
 
+    /// The most references that the model takes. A model of format 1 or 2 takes none.
+    pub fn most_references(&self) -> usize {
+        self.lengths.references
+    }
+
+    /// What the model takes of these presses. A model that takes no references returns
+    /// [`References::NONE`].
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Self::judge`].
+    ///
+    /// # Panics
+    ///
+    /// Panics if a press has no frame or too many, or there are more presses than the model takes.
+    pub fn references(&self, presses: &[ReferencePress]) -> Result<References, ModelError> {
+        let Outputs::Bins { reference, .. } = self.outputs else {
+            return Ok(References::NONE);
+        };
+        let (found, most) = (presses.len(), self.lengths.references);
+        assert!(found <= most, "{found} references of {most}");
+        let mut features = Vec::with_capacity(found * self.lengths.features);
+        for press in presses {
+            let outputs = self.run_course(&Query {
+                course: &press.course,
+                piece: Some(press.piece),
+                references: &References::NONE,
+            })?;
+            features.extend(read(&outputs, reference, "reference")?);
+        }
+        Ok(References::new(presses, features))
+    }
+
+    /// The same model, which knows a sensor by its references.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if another model computed the references.
+    pub fn identified(&self, references: References) -> Result<Self, ReferencesError> {
+        let Lengths {
+            references: most,
+            features,
+            ..
+        } = self.lengths;
+        let found = references.features.len();
+        let is_of_this = references.count <= most && found == references.count * features;
+        if references.count > 0 && !is_of_this {
+            return Err(ReferencesError {
+                count: references.count,
+                numbers: found,
+                most,
+                features,
+            });
+        }
+        Ok(Self {
+            references,
+            ..self.clone()
+        })
+    }
+
+    /// The references of the sensor whose presses this model judges.
+    pub fn known_references(&self) -> &References {
+        &self.references
+    }
+
     /// Judges the course of a press. A model of format 1 judges its last frame.
     ///
     /// # Errors
@@ -597,17 +771,25 @@ impl Hrn {
     ///
     /// # Panics
     ///
-    /// Panics if the course has no frame, or has more frames than a model of format 2 takes.
+    /// Panics if the course has no frame, or has more frames than a model of courses takes.
     pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
+        self.judge_beside(course, &self.references)
+    }
+
+    fn judge_beside(
+        &self,
+        course: &Course,
+        references: &References,
+    ) -> Result<Verdict, ModelError> {
         let last = course.moments.last().expect("a press has a frame");
-        let Format::Course { most_frames } = self.format else {
+        if self.format == Format::Frame {
             return self.judge(&last.frame);
-        };
-        let found = course.moments.len();
-        assert!(found <= most_frames, "{found} frames of {most_frames}");
-        let tensor = |input: &Input| Ok(input.tensor(course, most_frames)?.into());
-        let inputs: TractResult<TVec<TValue>> = self.inputs.iter().map(tensor).collect();
-        self.run(inputs.map_err(inference_error)?)
+        }
+        self.verdict(&self.run_course(&Query {
+            course,
+            piece: None,
+            references,
+        })?)
     }
 
     /// Judges one of [`Self::checks`].
@@ -616,45 +798,72 @@ impl Hrn {
     ///
     /// Returns the errors of [`Self::judge`].
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
-        match &self.checks {
+        match &*self.checks {
             Checks::Frames(check) => {
                 let mut frame = ModelFrame::default();
                 frame.newtons.copy_from_slice(&check.frames[index]);
                 self.judge(&frame)
             }
-            Checks::Courses(check) => self.judge_course(&check.presses[index].course),
+            Checks::Courses(check) => {
+                let press = &check.presses[index];
+                let references = match press.identified {
+                    true => self.references(&check.references)?,
+                    false => References::NONE,
+                };
+                self.judge_beside(&press.course, &references)
+            }
         }
     }
 
-    fn run(&self, inputs: TVec<TValue>) -> Result<Verdict, ModelError> {
-        let outputs = self.plan.run(inputs).map_err(inference_error)?;
-        let read = |index: usize, output: &'static str| {
-            let view = outputs[index].try_as_plain_ram().map_err(inference_error)?;
-            let values = view.as_slice::<f32>().map_err(inference_error)?.to_vec();
-            if values.iter().all(|value| value.is_finite()) {
-                Ok(values)
-            } else {
-                Err(ModelError::NotFinite { output })
+    fn run_course(&self, query: &Query) -> Result<TVec<TValue>, ModelError> {
+        let (found, most) = (query.course.moments.len(), self.lengths.frames);
+        assert!(found <= most, "{found} frames of {most}");
+        let tensor = |input: &Input| Ok(input.tensor(query, self.lengths)?.into());
+        let inputs: TractResult<TVec<TValue>> = self.inputs.iter().map(tensor).collect();
+        self.run(inputs.map_err(inference_error)?)
+    }
+
+    fn run(&self, inputs: TVec<TValue>) -> Result<TVec<TValue>, ModelError> {
+        self.plan.run(inputs).map_err(inference_error)
+    }
+
+    /// What the outputs say.
+    fn verdict(&self, outputs: &[TValue]) -> Result<Verdict, ModelError> {
+        let (logits, probabilities, shore) = match &self.outputs {
+            Outputs::Levels {
+                logits,
+                probabilities,
+                shore,
+            } => {
+                let shore = match shore {
+                    Some(place) => match read(outputs, *place, "shore")?[..] {
+                        // An interval has to contain its value, so widen it if it does not.
+                        [value, low, high] => Some(Shore {
+                            value,
+                            low: low.min(value),
+                            high: high.max(value),
+                        }),
+                        _ => None,
+                    },
+                    None => None,
+                };
+                (
+                    read(outputs, *logits, "logits")?,
+                    read(outputs, *probabilities, "probabilities")?,
+                    shore,
+                )
+            }
+            Outputs::Bins { bins, borders, .. } => {
+                let distribution = Distribution::of(&read(outputs, *bins, "bins")?);
+                let probabilities = distribution.levels(borders);
+                let logits = probabilities.iter();
+                let logits = logits.map(|p| p.max(f32::MIN_POSITIVE).ln()).collect();
+                (logits, probabilities, Some(distribution.shore(borders)))
             }
         };
-        let logits = read(self.logits_output, "logits")?;
-        let probabilities = read(self.probabilities_output, "probabilities")?;
         let (best, confidence) = argmax(&probabilities);
-        let level = self.card.levels[best].level;
-        let shore = match self.shore_output {
-            Some(output) => match read(output, "shore")?[..] {
-                // An interval has to contain its value, so widen it if it does not.
-                [value, low, high] => Some(Shore {
-                    value,
-                    low: low.min(value),
-                    high: high.max(value),
-                }),
-                _ => None,
-            },
-            None => None,
-        };
         Ok(Verdict {
-            level,
+            level: self.card.levels[best].level,
             logits,
             shore,
             levels: self.card.conformal.map(|set| set.set(&probabilities)),
@@ -700,6 +909,16 @@ impl Hrn {
 #[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
 fn inference_error(error: TractError) -> ModelError {
     ModelError::Inference(root_cause(&error))
+}
+
+/// An output's numbers.
+fn read(outputs: &[TValue], place: usize, output: &'static str) -> Result<Vec<f32>, ModelError> {
+    let view = outputs[place].try_as_plain_ram().map_err(inference_error)?;
+    let values = view.as_slice::<f32>().map_err(inference_error)?.to_vec();
+    match values.iter().all(|value| value.is_finite()) {
+        true => Ok(values),
+        false => Err(ModelError::NotFinite { output }),
+    }
 }
 
 /// The index and the value of the largest element. Of equal elements, the first wins.

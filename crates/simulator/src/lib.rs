@@ -48,7 +48,7 @@ pub use sensor::FULL_SCALE_COUNTS;
 pub use sensor::{SensorProfile, UnknownProfile};
 pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials, UnknownMaterials};
-pub use world::{BroadSensors, REFERENCES};
+pub use world::{BroadSensors, REFERENCES, SensorDesigns};
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
 

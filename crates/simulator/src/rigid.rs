@@ -1,6 +1,7 @@
 //! The rigid pieces that a user presses on a sensor: weights, which calibrate it, and references,
 //! which show what it reads of a known form.
 
+use super::courses::Reference;
 use super::object::{Face, Pose};
 use super::press::{Bench, Specimen, Window};
 use super::sensor::{Film, Sensor};
@@ -10,6 +11,8 @@ use crate::random::Stream;
 
 /// Width of the flat piece, mm.
 pub(super) const FLAT_MM: f64 = 20.0;
+/// Standard deviation of the flat piece's tilt under an arm, degrees.
+const TILT_DEG: f64 = 0.1;
 /// Modulus of steel and of hard plastics alike, beside which every cover is soft, MPa.
 const YOUNG_MPA: f64 = 3000.0;
 
@@ -18,6 +21,14 @@ const WEIGHTS_N: [f64; 4] = [2.0, 5.0, 10.0, 20.0];
 const PLACES: u64 = 3;
 /// How long a weight lies before it is read, s.
 const WEIGHT_S: f64 = 2.0;
+
+/// The face of a piece that an arm presses.
+pub(super) fn face(piece: Reference) -> Face {
+    match piece {
+        Reference::Flat { width_mm } => Face::flat(0.5 * f64::from(width_mm), TILT_DEG),
+        Reference::Ball { radius_mm } => Face::ball(radius_mm.into()),
+    }
+}
 
 /// A face of a rigid piece in a pose that is drawn.
 pub(super) fn specimen(face: &Face, stream: &mut Stream) -> Specimen {

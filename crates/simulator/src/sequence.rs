@@ -7,11 +7,13 @@ use std::collections::VecDeque;
 
 use super::body::{Body, draw_patch};
 use super::course::SolvedPress;
+use super::courses::Reference;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
+use super::rigid;
 use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
 use super::tracked::one_press;
 use crate::random::Stream;
@@ -36,6 +38,8 @@ pub struct SequenceSettings {
     pub shapes: Shapes,
     /// Spread of the sensor.
     pub profile: SensorProfile,
+    /// The rigid piece to press in place of the objects.
+    pub piece: Option<Reference>,
 }
 
 impl Default for SequenceSettings {
@@ -50,6 +54,7 @@ impl Default for SequenceSettings {
             rest_s: REST_S,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
+            piece: None,
         }
     }
 }
@@ -193,7 +198,10 @@ impl Sequence {
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
         let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
-        let (_, specimen) = presented(self.settings.shapes, material, &mut draws);
+        let specimen = match self.settings.piece {
+            Some(piece) => rigid::specimen(&rigid::face(piece), &mut draws.child(2)),
+            None => presented(self.settings.shapes, material, &mut draws).1,
+        };
         let rate = self.settings.frame_rate_hz;
         let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
@@ -488,6 +496,7 @@ mod tests {
                         rest_s: REST_S,
                         shapes,
                         profile,
+                        piece: None,
                     });
                 }
             }

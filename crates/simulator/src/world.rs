@@ -12,18 +12,31 @@ use serde::{Deserialize, Serialize};
 use super::course::SolvedPress;
 use super::courses::{CourseSettings, LabelledCourse, Plan, Reading, Reference, read_press};
 use super::material::Split;
-use super::object::Face;
 use super::press::{Bench, Cover};
 use super::rigid::{self, FLAT_MM, Weight};
 use super::sensor::{Design, Sensor};
 use super::settings::DatasetSettings;
 use super::subject::{Subject, Unit, shared_out, units};
 use crate::random::{Stream, log_even};
+use hardnessd_core::frame::Pitch;
 
-/// The sensors of a broad data set.
+/// What the sensors of a data set have in common.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SensorDesigns {
+    /// Nothing: each is of a design of its own, under a cover of its own.
+    #[default]
+    Broad,
+    /// The simulated JX255N under its usual cover. Its users state the right newtons.
+    Jx255n,
+}
+
+/// The sensors of a data set that has many, each with references.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BroadSensors {
+    /// What the sensors have in common.
+    pub designs: SensorDesigns,
     /// The number of covers that training objects are pressed on, at most one for each object of a
     /// material.
     pub covers: u32,
@@ -41,6 +54,7 @@ impl Default for BroadSensors {
     /// 1,600 + 160 sensors.
     fn default() -> Self {
         Self {
+            designs: SensorDesigns::Broad,
             covers: 200,
             test_covers: 20,
             electronics: 8,
@@ -54,8 +68,6 @@ impl Default for BroadSensors {
 pub const REFERENCES: u32 = 5;
 /// Their forces, N: log-uniform, one in each fifth of this range.
 const REFERENCE_N: [f64; 2] = [3.0, 25.0];
-/// Standard deviation of the flat piece's tilt under an arm, degrees.
-const TILT_DEG: f64 = 0.1;
 /// Radius of the rigid ball of a cover, mm.
 const BALL_MM: [f64; 2] = [5.0, 20.0];
 /// The covers: Young's modulus in MPa, and thickness.
@@ -72,6 +84,16 @@ struct Place {
     number: u32,
     /// Number of the cover over both splits.
     index: u32,
+}
+
+impl SensorDesigns {
+    /// The distances between the taxels of the sensors, in mm.
+    pub fn pitches_mm(self) -> [f64; 2] {
+        match self {
+            Self::Broad => Design::BROAD_PITCHES_MM,
+            Self::Jx255n => [Pitch::JX255N.rows_mm; 2],
+        }
+    }
 }
 
 impl BroadSensors {
@@ -176,17 +198,21 @@ struct Electronics {
 impl Electronics {
     fn draw(
         settings: &CourseSettings,
+        designs: SensorDesigns,
         number: u32,
-        cover: Cover,
-        weights: &[Weight],
+        (cover, weights): (Cover, &[Weight]),
         draws: &Stream,
     ) -> Self {
-        let design = Design::broad(cover.thickness_mm, &mut draws.child(0));
+        let is_broad = designs == SensorDesigns::Broad;
+        let design = match designs {
+            SensorDesigns::Broad => Design::broad(cover.thickness_mm, &mut draws.child(0)),
+            SensorDesigns::Jx255n => Design::jx255n(settings.objects.profile),
+        };
         let mut sensor = Sensor::draw(design, &draws.child(1));
         sensor.calibrate(weights);
         let mut own = draws.child(2);
         let wrong = log_even(WRONG, &mut own);
-        if own.uniform() < WRONG_SHARE {
+        if own.uniform() < WRONG_SHARE && is_broad {
             sensor.newtons_per_count *= wrong as f32;
         }
         Self {
@@ -217,9 +243,13 @@ impl Station {
         let seed = of.sensor_seed.unwrap_or(of.seed);
         let draws = Stream::new(seed, name).child(u64::from(place.number));
         let mut own = draws.child(0);
-        let cover = Cover {
+        let drawn = Cover {
             young_mpa: log_even(COVER_MPA, &mut own),
             thickness_mm: log_even(COVER_MM, &mut own),
+        };
+        let cover = match sensors.designs {
+            SensorDesigns::Broad => drawn,
+            SensorDesigns::Jx255n => Cover::of(of.cover_young_mpa),
         };
         let arm_n_per_mm = log_even(settings.arm_n_per_mm, &mut own);
         let mut bench = Bench::under(cover);
@@ -227,7 +257,8 @@ impl Station {
         let electronics = |k: u32| {
             let draws = draws.child(1).child(u64::from(k));
             let number = place.index * sensors.electronics + k;
-            Electronics::draw(settings, number, cover, &weights, &draws)
+            let under = (cover, weights.as_slice());
+            Electronics::draw(settings, sensors.designs, number, under, &draws)
         };
         Self {
             settings: CourseSettings {
@@ -245,16 +276,11 @@ impl Station {
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
     fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
-        let pieces = [
-            (
-                Reference::Flat { width_mm },
-                Face::flat(0.5 * FLAT_MM, TILT_DEG),
-            ),
-            (Reference::Ball { radius_mm }, Face::ball(self.ball_mm)),
-        ];
+        let pieces = [Reference::Flat { width_mm }, Reference::Ball { radius_mm }];
         let material = self.settings.material_names().len() as u8 - 1;
         let mut made = Vec::new();
-        for (piece, (reference, face)) in (0_u32..).zip(pieces) {
+        for (piece, reference) in (0_u32..).zip(pieces) {
+            let face = rigid::face(reference);
             for press in 0..REFERENCES {
                 let draws = self
                     .draws

@@ -2,7 +2,7 @@
 
 pub mod features;
 pub mod baseline;
-pub mod press_features;
+pub mod hertz;
 pub mod likeness;
 pub mod paper;
 pub mod metrics;

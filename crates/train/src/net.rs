@@ -8,6 +8,7 @@ mod builder;
 pub mod frames;
 pub mod standard;
 pub mod shore;
+pub mod bins;
 pub mod start;
 pub mod sensed;
 pub mod hrn;

@@ -100,7 +100,7 @@ pub struct Training {
     pub checkpoint_every_epochs: u32,
     /// How far the weights of levels with few samples are raised, from 0 to 1. With 0 all samples
     /// count the same, with 1 all levels do. `None` is the network's own: 1 for a network that
-    /// judges a frame, 0.5 for one that judges a whole press. The paper's networks ignore it.
+    /// judges a frame, and for one that judges a whole press. The paper's networks ignore it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub level_balance: Option<f64>,
     /// Settings of the optimiser.

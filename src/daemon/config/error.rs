@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use hardnessd_core::exit::{CONFIG, Coded, NO_INPUT};
 use hardnessd_core::npy::NpyError;
+use hardnessd_core::references;
 use hardnessd_core::sensor::SensorError;
-use hardnessd_core::verdict::ModelError;
+use hardnessd_core::verdict::{LevelsError, ModelError, ReferencesError};
 
 /// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
 /// dead.
@@ -118,6 +119,26 @@ pub enum Error {
         /// The reason the file cannot be used.
         source: NpyError,
     },
+    /// A file of references cannot be used.
+    #[error("{path}: sensor.references of {sensor:?}: {file}: {source}")]
+    References {
+        /// The path of the configuration.
+        path: PathBuf,
+        /// The sensor's name.
+        sensor: String,
+        /// The path of the file of references.
+        file: PathBuf,
+        /// The reason the file cannot be used.
+        source: Box<ReferencesProblem>,
+    },
+    /// The model cannot have the levels of the configuration.
+    #[error("{path}: level: {source}")]
+    Levels {
+        /// The path of the configuration.
+        path: PathBuf,
+        /// The reason.
+        source: LevelsError,
+    },
     /// The model file cannot be read.
     #[error("{path}: model.path: cannot read {model}: {source}")]
     ModelUnreadable {
@@ -148,6 +169,31 @@ pub enum Error {
         /// The reason the model is refused.
         source: Box<ModelError>,
     },
+}
+
+/// The reason why a file of references cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ReferencesProblem {
+    /// The file cannot be read.
+    #[error("cannot read: {0}")]
+    Unreadable(#[source] std::io::Error),
+    /// The file holds no references.
+    #[error(transparent)]
+    File(#[from] references::Error),
+    /// There are more than the model takes.
+    #[error("found {found} presses, expected at most {expected}, as many as the model takes")]
+    Many {
+        /// The number of presses in the file.
+        found: usize,
+        /// The most that the model takes.
+        expected: usize,
+    },
+    /// The model fails on one of them.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The model cannot take what it computed.
+    #[error(transparent)]
+    Identified(#[from] ReferencesError),
 }
 
 impl Coded for Error {

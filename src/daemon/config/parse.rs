@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::error::{Error, MAX_BYTES};
+use super::error::{Error, MAX_BYTES, ReferencesProblem};
 use super::read::{Until, read};
-use super::{Config, Model};
+use super::{Config, LevelTable};
 use crate::daemon::port::Port;
 use hardnessd_core::npy::{self, NpyError};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{self, Hrn};
-use hardnessd_core::{trial, wording};
+use hardnessd_core::verdict::{self, Hrn, Level, LevelsError};
+use hardnessd_core::{references, trial, wording};
 
 pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
     let bytes = read(path, MAX_BYTES, until).map_err(|source| Error::Unreadable {
@@ -38,6 +38,10 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
             }
             let key = format!("sensor.port of {:?}", sensor.name);
             resolve(device, directory, key, "the path of a device", path)?;
+        }
+        if let Some(file) = &mut sensor.references {
+            let key = format!("sensor.references of {:?}", sensor.name);
+            resolve(file, directory, key, "the path of an .npz file", path)?;
         }
         if let Some(given) = &mut sensor.calibration.gains {
             *given = gains(given, directory, &sensor.name, path, until)?;
@@ -130,13 +134,14 @@ fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
 pub(super) fn model(
-    model: &Model,
+    config: &Config,
     most: Duration,
     path: &Path,
     until: Until,
 ) -> Result<Hrn, Error> {
+    let model = &config.model;
     let hrn = match &model.path {
-        None => Hrn::load(verdict::BUILT_IN),
+        None => Hrn::load(model.built_in.bytes()),
         Some(file) => {
             let bytes = read(file, verdict::MAX_FILE_BYTES, until);
             let bytes = bytes.map_err(|source| Error::ModelUnreadable {
@@ -155,12 +160,60 @@ pub(super) fn model(
         ),
         source: Box::new(problem),
     })?;
-    match &model.sha256 {
-        Some(expected) if !expected.eq_ignore_ascii_case(hrn.sha256()) => Err(Error::ModelHash {
+    if let Some(expected) = &model.sha256
+        && !expected.eq_ignore_ascii_case(hrn.sha256())
+    {
+        return Err(Error::ModelHash {
             path: path.to_owned(),
             found: hrn.sha256().to_owned(),
             expected: expected.clone(),
-        }),
-        _ => Ok(hrn),
+        });
     }
+    if config.levels.is_empty() {
+        return Ok(hrn);
+    }
+    let level = |(level, table): (u8, &LevelTable)| Level {
+        level,
+        label: table.label.clone(),
+        shore: format!("{}-{}", table.shore[0], table.shore[1]),
+    };
+    let levels: Vec<Level> = (1..=u8::MAX).zip(&config.levels).map(level).collect();
+    let refused = |source: LevelsError| Error::Levels {
+        path: path.to_owned(),
+        source,
+    };
+    hrn.with_levels(levels).map_err(refused)
+}
+
+/// The model with the references in `file`, which are those of `sensor`.
+pub(super) fn identified(
+    hrn: &Hrn,
+    file: &Path,
+    sensor: &str,
+    path: &Path,
+    until: Until,
+) -> Result<Hrn, Error> {
+    let refused = |source: ReferencesProblem| Error::References {
+        path: path.to_owned(),
+        sensor: sensor.to_owned(),
+        file: file.to_owned(),
+        source: Box::new(source),
+    };
+    let bytes = read(file, references::MAX_FILE_BYTES, until);
+    let bytes = bytes.map_err(|source| refused(ReferencesProblem::Unreadable(source)))?;
+    let presses = references::read(&bytes).map_err(|source| refused(source.into()))?;
+    if hrn.most_references() == 0 {
+        return Ok(hrn.clone());
+    }
+    if presses.len() > hrn.most_references() {
+        return Err(refused(ReferencesProblem::Many {
+            found: presses.len(),
+            expected: hrn.most_references(),
+        }));
+    }
+    let references = hrn
+        .references(&presses)
+        .map_err(|source| refused(source.into()))?;
+    hrn.identified(references)
+        .map_err(|source| refused(source.into()))
 }

@@ -409,7 +409,7 @@ fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
         ),
         (
             "model.onnx",
-            hardnessd_core::verdict::BUILT_IN.to_vec(),
+            hardnessd_core::verdict::BUILT_IN_HRN.to_vec(),
             "model.onnx: it did not end in time",
         ),
     ];

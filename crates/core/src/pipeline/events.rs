@@ -6,7 +6,7 @@ use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Reject
 use crate::frame::{Frame, RawFrame};
 use crate::press::{Change, ContactFrame, End, FrameAt, Marks, SoFar};
 use crate::sensor::Description;
-use crate::verdict::{Format, Laying, ModelError, Verdict};
+use crate::verdict::{COURSE_FRAMES, Format, Laying, ModelError, Verdict};
 
 /// The number of frames in contact that an early verdict on the course needs.
 pub const FIRST_LOOK: u64 = 3;
@@ -152,6 +152,11 @@ impl Pipeline {
         let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
         let stiffness_n_per_mm = known.stiffness_n_per_mm(arm_n_per_mm);
         let laying = self.laying(peak);
+        if phase == Phase::Final
+            && let Some(courses) = &mut self.courses
+        {
+            courses.push(known.course(arm_n_per_mm, COURSE_FRAMES.1, &laying));
+        }
         let (verdict, course, is_trained) = match self.hrn.format() {
             Format::Frame => (self.hrn.judge(&laying.lay(&peak.frame)), None, true),
             Format::Course { most_frames } => {
@@ -239,6 +244,7 @@ impl Pipeline {
             label,
             rejected,
             notes: self.notes(peak, beside),
+            references: hrn.known_references().kinds(),
             probabilities: verdict.probabilities,
             confidence: verdict.confidence,
             frame,
@@ -272,6 +278,7 @@ impl Pipeline {
         } else {
             peak.contact_area_taxels
         };
+        let is_unknown = self.hrn.most_references() > 0 && self.hrn.known_references().is_none();
         let [least_n, most_n] = range.force_n.map(f64::from);
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let trained = (least_n..=most_n).contains(&peak.force_n)
@@ -283,6 +290,7 @@ impl Pipeline {
             (Note::Saturated, peak.marks.saturated),
             (Note::OutsideTraining, !trained),
             (Note::Resampled, laying.is_resampled()),
+            (Note::NotIdentified, is_unknown),
         ]
         .into_iter()
         .filter_map(|(note, applies)| applies.then_some(note))

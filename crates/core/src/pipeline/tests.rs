@@ -9,7 +9,7 @@ mod arrays;
 use crate::event::{Note, Rejection};
 use crate::frame::Array;
 use crate::sensor::Description;
-use crate::verdict::BUILT_IN;
+use crate::verdict::BUILT_IN_HRN;
 use crate::wire::Preset;
 
 const PERIOD: Duration = Duration::from_millis(200);
@@ -25,7 +25,7 @@ fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
         ..Description::default()
     };
     change(&mut described);
-    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
 }
 
@@ -522,7 +522,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
             described.frame.rows = array.map(|array| array.rows);
             described.frame.cols = array.map(|array| array.cols);
         });
-        let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
+        let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
         for entry in &mut file.metadata_props {
             if entry.key == "hrn.range" {
                 entry.value = serde_json::json!({
@@ -648,7 +648,7 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
 /// The built-in model, changed so that its logits are NaN if a taxel bears more than 1,000 N. They
 /// are multiplied by x / x, where x is the square root of 1,000 N minus the largest force.
 fn failing_model() -> Hrn {
-    let mut file = pb::ModelProto::decode(BUILT_IN).unwrap();
+    let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     let graph = file.graph.as_mut().unwrap();
     graph.initializer.push(pb::TensorProto {
         name: "limit".to_owned(),

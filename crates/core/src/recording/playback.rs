@@ -1,14 +1,15 @@
 //! Turns the entries of a recording back into events.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::{Entry, Found, Labels};
+use super::{Entry, Found, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
 use crate::motion::Track;
 use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
 use crate::sensor::SensorError;
-use crate::verdict::Hrn;
+use crate::verdict::{Course, Hrn, ReferencesError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -18,9 +19,9 @@ use crate::verdict::Hrn;
 /// use std::sync::Arc;
 ///
 /// use hardnessd_core::recording::{Playback, Reader};
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 ///
-/// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN)?));
+/// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN_HRN)?));
 /// let mut events = Vec::new();
 /// for found in Reader::new(std::fs::File::open("press.mcap")?) {
 ///     events.extend(playback.feed(found?)?);
@@ -32,7 +33,10 @@ use crate::verdict::Hrn;
 #[derive(Debug)]
 pub struct Playback {
     hrn: Arc<Hrn>,
+    /// The models of sensors whose references are not those of the recording.
+    identified: BTreeMap<String, Arc<Hrn>>,
     players: Vec<Player>,
+    keeps_courses: bool,
 }
 
 #[derive(Debug)]
@@ -58,6 +62,9 @@ pub enum PlaybackProblem {
     /// The description of the sensor is not valid.
     #[error(transparent)]
     Sensor(#[from] SensorError),
+    /// The references are not as the model computes them.
+    #[error(transparent)]
+    References(#[from] ReferencesError),
     /// No pipeline can have this state.
     #[error("memory: found what no pipeline can have come to, expected the memory of one")]
     Memory,
@@ -67,12 +74,45 @@ pub enum PlaybackProblem {
 }
 
 impl Playback {
-    /// A playback without any sensor yet. The model is `hrn`.
+    /// A playback without any sensor yet. The model is `hrn`. A sensor keeps the references of the
+    /// recording if the recording is of this model.
     pub fn new(hrn: Arc<Hrn>) -> Self {
         Self {
             hrn,
+            identified: BTreeMap::new(),
             players: Vec::new(),
+            keeps_courses: false,
         }
+    }
+
+    /// Keeps the course of each press that ends, until [`Self::courses`] returns it.
+    pub fn keep_courses(&mut self) {
+        self.keeps_courses = true;
+    }
+
+    /// The kept courses of a sensor that were not returned yet. A state of the sensor forgets them.
+    pub fn courses(&mut self, sensor: &str) -> Vec<Course> {
+        let mut players = self.players.iter_mut();
+        let player = players.find(|player| player.pipeline.sensor().name() == sensor);
+        player
+            .map(|player| player.pipeline.courses())
+            .unwrap_or_default()
+    }
+
+    /// Judges the presses of a sensor with `hrn`, which has references of that sensor.
+    pub fn identify(&mut self, sensor: &str, hrn: Arc<Hrn>) {
+        self.identified.insert(sensor.to_owned(), hrn);
+    }
+
+    /// The model with the references of a recorded sensor.
+    fn hrn_of(&self, recorded: &RecordedSensor) -> Result<Arc<Hrn>, ReferencesError> {
+        if let Some(hrn) = self.identified.get(recorded.name()) {
+            return Ok(hrn.clone());
+        }
+        if recorded.references.is_none() || recorded.model != self.hrn.sha256() {
+            return Ok(self.hrn.clone());
+        }
+        Ok(Arc::new(self.hrn.identified(recorded.references.clone())?))
     }
 
     /// The events of one entry. An entry before its sensor's first state cannot be played and has
@@ -95,6 +135,11 @@ impl Playback {
         at: Stamp,
         entry: Entry,
     ) -> Result<Vec<Event>, PlaybackProblem> {
+        let hrn = match &entry {
+            Entry::State(state) => self.hrn_of(&state.sensor)?,
+            Entry::Settings(described) => self.hrn_of(described)?,
+            Entry::Input(_) => self.hrn.clone(),
+        };
         let mut players = self.players.iter_mut();
         let known = players.find(|player| player.pipeline.sensor().name() == sensor);
         let events = match (entry, known) {
@@ -104,8 +149,11 @@ impl Playback {
                     return Err(PlaybackProblem::Memory);
                 }
                 // If no entry is missing, the pipeline already has this state.
-                let mut pipeline = Pipeline::new(described, self.hrn.clone(), Clock::Arrival);
+                let mut pipeline = Pipeline::new(described, hrn, Clock::Arrival);
                 pipeline.recall(state.memory);
+                if self.keeps_courses {
+                    pipeline.keep_courses();
+                }
                 let player = Player {
                     pipeline,
                     last: at,
@@ -120,7 +168,7 @@ impl Playback {
             }
             (Entry::Settings(described), Some(known)) => {
                 let sensor = described.check()?;
-                known.pipeline.reload(sensor, self.hrn.clone())?;
+                known.pipeline.reload(sensor, hrn)?;
                 known.model = described.model;
                 Vec::new()
             }

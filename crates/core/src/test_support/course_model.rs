@@ -227,10 +227,12 @@ fn check(most: usize) -> CourseCheck {
             course,
             probabilities,
             shore: shore.into(),
+            identified: false,
         }
     };
     CourseCheck {
         presses: (0..8).map(press).collect(),
+        references: Vec::new(),
     }
 }
 

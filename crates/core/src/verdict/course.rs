@@ -1,4 +1,4 @@
-//! The course of a press, as input of a model of format 2.
+//! The course of a press, as input of a model of format 2 or 3.
 //!
 //! In: a press's frames with their times, the approach and the arm's stiffness. Out: the model's
 //! inputs as tensors, and presses as text for `hrn.check`.
@@ -6,10 +6,13 @@
 use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
 
+use super::features::FEATURES;
 use super::grid::{COLS, ModelFrame, ModelFrameError, ROWS, TAXELS};
+use super::references::{PIECE, Piece, ReferencePress, References};
+use super::shore::Shore;
 use crate::frame::sparse::{self, SparseError};
 
-/// The fewest and the most frames that a model of format 2 may take.
+/// The fewest and the most frames that a model of courses may take.
 pub const COURSE_FRAMES: (usize, usize) = (3, 48);
 
 /// One frame of a press.
@@ -27,10 +30,10 @@ pub struct CourseMoment {
 ///
 /// # Example
 ///
-/// A model of format 2 judges a whole press, here one of two frames.
+/// The built-in model judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::verdict::{Course, CourseMoment, Hrn, ModelFrame};
+/// use hardnessd_core::verdict::{BUILT_IN, Course, CourseMoment, Hrn, ModelFrame};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
 ///     let mut frame = ModelFrame::default();
@@ -41,12 +44,13 @@ pub struct CourseMoment {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
 ///     arm_n_per_mm: 10.0,
 /// };
-/// let verdict = Hrn::load(&std::fs::read("../../models/course.onnx")?)?.judge_course(&course)?;
+/// let verdict = Hrn::load(BUILT_IN)?.judge_course(&course)?;
 /// let shore = verdict.shore.unwrap();
 /// assert!(shore.low <= shore.value && shore.value <= shore.high);
-/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// # Ok::<(), hardnessd_core::verdict::ModelError>(())
 /// ```
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(into = "Written", try_from = "Written")]
 pub struct Course {
     /// The frames in contact, from the one that began the press, ascending in time.
     pub moments: Vec<CourseMoment>,
@@ -107,7 +111,7 @@ impl Course {
     }
 }
 
-/// An input of a model of format 2.
+/// An input of a model of courses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Input {
     Frames,
@@ -116,17 +120,46 @@ pub(super) enum Input {
     Known,
     Mask,
     ArmNPerMm,
+    Piece,
+    References,
+    Given,
+    Features,
+}
+
+/// The lengths of the inputs of a model.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Lengths {
+    /// The frames of a press.
+    pub(super) frames: usize,
+    /// The references, and the numbers of each. Both are 0 in a model of format 2.
+    pub(super) references: usize,
+    pub(super) features: usize,
+}
+
+/// What a model of courses judges.
+pub(super) struct Query<'a> {
+    pub(super) course: &'a Course,
+    /// The pressed piece, if the press is to become a reference.
+    pub(super) piece: Option<Piece>,
+    pub(super) references: &'a References,
 }
 
 impl Input {
-    pub(super) const ALL: [Self; 6] = [
+    /// The inputs of format 2, followed by those that format 3 has besides.
+    pub(super) const ALL: [Self; 10] = [
         Self::Frames,
         Self::TimeS,
         Self::ApproachMm,
         Self::Known,
         Self::Mask,
         Self::ArmNPerMm,
+        Self::Piece,
+        Self::References,
+        Self::Given,
+        Self::Features,
     ];
+    /// The number of inputs of format 2.
+    pub(super) const OF_FORMAT_2: usize = 6;
 
     pub(super) fn name(self) -> &'static str {
         match self {
@@ -136,32 +169,39 @@ impl Input {
             Self::Known => "known",
             Self::Mask => "mask",
             Self::ArmNPerMm => "arm_n_per_mm",
+            Self::Piece => "piece",
+            Self::References => "references",
+            Self::Given => "given",
+            Self::Features => "features",
         }
     }
 
-    /// The shape of the input in a model of `most` frames.
-    pub(super) fn shape(self, most: usize) -> Vec<usize> {
+    /// The shape of the input in a model of these lengths.
+    pub(super) fn shape(self, lengths: Lengths) -> Vec<usize> {
         match self {
-            Self::Frames => vec![1, most, ROWS, COLS],
+            Self::Frames => vec![1, lengths.frames, ROWS, COLS],
             Self::ArmNPerMm => vec![1, 1],
-            Self::TimeS | Self::ApproachMm | Self::Known | Self::Mask => vec![1, most],
+            Self::TimeS | Self::ApproachMm | Self::Known | Self::Mask => vec![1, lengths.frames],
+            Self::Piece => vec![1, PIECE],
+            Self::References => vec![1, lengths.references, lengths.features],
+            Self::Given => vec![1, lengths.references],
+            Self::Features => vec![1, FEATURES],
         }
     }
 
-    /// The tensor of this input for `course`. Places after the last frame are 0.
-    pub(super) fn tensor(self, course: &Course, most: usize) -> TractResult<Tensor> {
+    /// The tensor of this input for `query`. Places after the last frame or reference are 0.
+    pub(super) fn tensor(self, query: &Query, lengths: Lengths) -> TractResult<Tensor> {
+        let course = query.course;
         let each = |value: fn(&CourseMoment) -> f32| {
-            let mut values: Vec<f32> = course.moments.iter().map(value).collect();
-            values.resize(most, 0.0);
-            values
+            let values = course.moments.iter().map(value);
+            values.collect::<Vec<f32>>()
         };
-        let values = match self {
+        let mut values = match self {
             Self::Frames => {
-                let mut values = Vec::with_capacity(most * TAXELS);
+                let mut values = Vec::with_capacity(lengths.frames * TAXELS);
                 for moment in &course.moments {
                     values.extend_from_slice(&moment.frame.newtons);
                 }
-                values.resize(most * TAXELS, 0.0);
                 values
             }
             Self::TimeS => each(|moment| moment.time_s),
@@ -169,96 +209,91 @@ impl Input {
             Self::Known => each(|moment| f32::from(u8::from(moment.approach_mm.is_some()))),
             Self::Mask => each(|_| 1.0),
             Self::ArmNPerMm => vec![course.arm_n_per_mm],
+            Self::Piece => Piece::numbers(query.piece).to_vec(),
+            Self::References => query.references.features.clone(),
+            Self::Given => vec![1.0; query.references.count],
+            Self::Features => course.features().to_vec(),
         };
-        Tensor::from_shape(&self.shape(most), &values)
+        let shape = self.shape(lengths);
+        values.resize(shape.iter().product(), 0.0);
+        Tensor::from_shape(&shape, &values)
     }
 }
 
 /// The names and shapes of the inputs of a model of format 2 that takes `most` frames.
-pub fn course_inputs(most: usize) -> [(&'static str, Vec<usize>); 6] {
-    Input::ALL.map(|input| (input.name(), input.shape(most)))
+pub fn course_inputs(most: usize) -> Vec<(&'static str, Vec<usize>)> {
+    let mut inputs = identified_inputs(most, [0, 0]);
+    inputs.truncate(Input::OF_FORMAT_2);
+    inputs
 }
 
-/// The Shore hardness from a model of format 2.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(into = "[f32; 3]", from = "[f32; 3]")]
-pub struct Shore {
-    /// The most likely Shore hardness.
-    pub value: f32,
-    /// The beginning of the 90 % interval.
-    pub low: f32,
-    /// The end of the 90 % interval.
-    pub high: f32,
+/// The names and shapes of the inputs of a model of format 3 that takes `most` frames, and the number
+/// of references and of the features of each.
+pub fn identified_inputs(
+    most: usize,
+    [references, features]: [usize; 2],
+) -> Vec<(&'static str, Vec<usize>)> {
+    let lengths = Lengths {
+        frames: most,
+        references,
+        features,
+    };
+    let input = |input: Input| (input.name(), input.shape(lengths));
+    Input::ALL.map(input).into()
 }
 
-impl From<[f32; 3]> for Shore {
-    fn from([value, low, high]: [f32; 3]) -> Self {
-        Self { value, low, high }
-    }
-}
-
-impl From<Shore> for [f32; 3] {
-    fn from(shore: Shore) -> Self {
-        [shore.value, shore.low, shore.high]
-    }
-}
-
-/// `hrn.check` of format 2: presses, and the outputs of the trainer's own software for them.
+/// `hrn.check` of a model of courses: presses, and the outputs of the trainer's own software for
+/// them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CourseCheck {
     /// The presses: 8, or two of each level.
     pub presses: Vec<CheckedCourse>,
+    /// The references of a model of format 3.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub references: Vec<ReferencePress>,
 }
 
 /// A press of [`CourseCheck`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(into = "Written", try_from = "Written")]
 pub struct CheckedCourse {
     /// The course of the press.
+    #[serde(flatten)]
     pub course: Course,
     /// `[L]`: the trainer's probabilities.
     pub probabilities: Vec<f32>,
     /// The trainer's Shore hardness: value, low and high.
     pub shore: Shore,
+    /// Whether the trainer judged the press with the references.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub identified: bool,
 }
 
 /// A press in the file: a list for each input, and each frame as [`sparse`] text.
 #[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Written {
+pub(super) struct Written {
     time_s: Vec<f32>,
     /// The approach at each frame. Null if it is unknown.
     approach_mm: Vec<Option<f32>>,
     arm_n_per_mm: f32,
     frames: Vec<String>,
-    probabilities: Vec<f32>,
-    shore: Shore,
 }
 
-impl From<CheckedCourse> for Written {
-    fn from(checked: CheckedCourse) -> Self {
-        let Course {
-            moments,
-            arm_n_per_mm,
-        } = &checked.course;
+impl From<Course> for Written {
+    fn from(course: Course) -> Self {
+        let moments = course.moments.iter();
         Self {
-            time_s: moments.iter().map(|moment| moment.time_s).collect(),
-            approach_mm: moments.iter().map(|moment| moment.approach_mm).collect(),
-            arm_n_per_mm: *arm_n_per_mm,
-            frames: moments
-                .iter()
-                .map(|m| sparse::write(&m.frame.newtons))
-                .collect(),
-            probabilities: checked.probabilities,
-            shore: checked.shore,
+            time_s: moments.clone().map(|moment| moment.time_s).collect(),
+            approach_mm: moments.clone().map(|moment| moment.approach_mm).collect(),
+            arm_n_per_mm: course.arm_n_per_mm,
+            frames: moments.map(|m| sparse::write(&m.frame.newtons)).collect(),
         }
     }
 }
 
 /// The reason why lists are not a press.
 #[derive(Debug, thiserror::Error)]
-enum Unwritten {
+pub(super) enum Unwritten {
     #[error(
         "{times} times, {positions} positions and {frames} frames in a press: as many of each, 1 to {}",
         COURSE_FRAMES.1
@@ -274,7 +309,7 @@ enum Unwritten {
     Newtons(#[from] ModelFrameError),
 }
 
-impl TryFrom<Written> for CheckedCourse {
+impl TryFrom<Written> for Course {
     type Error = Unwritten;
 
     fn try_from(written: Written) -> Result<Self, Unwritten> {
@@ -300,12 +335,8 @@ impl TryFrom<Written> for CheckedCourse {
             })
         };
         Ok(Self {
-            course: Course {
-                moments: moments.map(moment).collect::<Result<_, _>>()?,
-                arm_n_per_mm: written.arm_n_per_mm,
-            },
-            probabilities: written.probabilities,
-            shore: written.shore,
+            moments: moments.map(moment).collect::<Result<_, _>>()?,
+            arm_n_per_mm: written.arm_n_per_mm,
         })
     }
 }

@@ -3,14 +3,19 @@
 //! In: the file as ONNX's own messages. Out: the model's description, or the first part that breaks
 //! the format. Nothing here runs the model.
 
+use std::ops::RangeInclusive;
+
 use serde::Deserialize;
 use tract_onnx::pb;
 
-use super::course::Input;
+use super::course::{Input, Lengths};
+use super::features::FEATURES;
 use super::grid::{COLS, ROWS, TAXELS};
+use super::references::{MOST_REFERENCES, PIECE};
+use super::shore::Borders;
 use super::{
-    COURSE_FRAMES, Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Level,
-    MIN_OPSET, ModelError, Range,
+    COURSE_FRAMES, Card, Check, Checks, Conformal, CourseCheck, Format, Level, MIN_OPSET,
+    ModelError, Range,
 };
 use crate::wording::is_plain;
 
@@ -20,6 +25,10 @@ const LONGEST_LABEL_BYTES: usize = 255;
 const NAME_CHARS: usize = 60;
 /// The longest text of another key.
 const LONGEST_LINE_BYTES: usize = 16_384;
+/// The numbers of bins that a model of format 3 may divide the scale into.
+const BINS: RangeInclusive<usize> = 10..=400;
+/// The numbers that such a model may take of a reference.
+const NUMBERS: RangeInclusive<usize> = 1..=1024;
 
 pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
     let found = proto
@@ -45,14 +54,22 @@ pub(super) fn check_tensors_inside(graph: &pb::GraphProto) -> Result<(), ModelEr
     }
 }
 
-/// Refuses inputs and outputs that break the format. Returns the format, and for format 2 the
-/// inputs in their order.
+/// What a model takes and gives.
+pub(super) struct Signature {
+    pub(super) format: Format,
+    /// The inputs of a model of courses, in their order.
+    pub(super) inputs: Vec<Input>,
+    pub(super) lengths: Lengths,
+    /// The number of bins that a model of format 3 divides the scale into.
+    pub(super) bins: usize,
+}
+
+/// Refuses inputs and outputs that break the format.
 pub(super) fn check_signature(
     graph: &pb::GraphProto,
     card: &Card,
     checks: &Checks,
-) -> Result<(Format, Vec<Input>), ModelError> {
-    let levels = card.levels.len();
+) -> Result<Signature, ModelError> {
     // Before ONNX IR 4, every initialiser is also listed among the inputs.
     let inputs: Vec<&pb::ValueInfoProto> = graph
         .input
@@ -64,7 +81,8 @@ pub(super) fn check_signature(
                 .all(|tensor| tensor.name != input.name)
         })
         .collect();
-    let (format, inputs) = match checks {
+    let has_references = card.format == "3";
+    let (format, inputs, lengths) = match checks {
         Checks::Frames(_) => {
             let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
             if found != expected {
@@ -74,24 +92,36 @@ pub(super) fn check_signature(
                     expected,
                 });
             }
-            (Format::Frame, Vec::new())
+            (Format::Frame, Vec::new(), Lengths::default())
         }
         Checks::Courses(check) => {
-            let (most_frames, inputs) = check_course_inputs(&inputs)?;
-            check_lengths(check, most_frames)?;
-            (Format::Course { most_frames }, inputs)
+            let (lengths, inputs) = check_course_inputs(&inputs, has_references)?;
+            check_lengths(check, lengths)?;
+            let most_frames = lengths.frames;
+            (Format::Course { most_frames }, inputs, lengths)
         }
     };
     let mut outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
     outputs.sort_by(|left, right| left.name.cmp(&right.name));
     let found = describe(&outputs);
-    let mut expected = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
-    let with_shore = format!("{expected}, shore f32 [1,3]");
-    let may_lack_shore = format == Format::Frame;
-    let is_agreed = found == with_shore || (may_lack_shore && found == expected);
-    if !may_lack_shore {
-        expected = with_shore;
-    }
+    let bins = outputs.first().and_then(|output| length(output, 1));
+    let bins = bins.filter(|bins| BINS.contains(bins)).unwrap_or_default();
+    let levels = card.levels.len();
+    let of_levels = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
+    let with_shore = format!("{of_levels}, shore f32 [1,3]");
+    let features = lengths.features;
+    let (is_agreed, expected) = match format {
+        _ if has_references => {
+            let of = |bins: &dyn std::fmt::Display| {
+                format!("bins f32 [1,{bins}], reference f32 [1,{features}]")
+            };
+            let (least, most) = (BINS.start(), BINS.end());
+            let expected = format!("{}, B {least} to {most}", of(&"B"));
+            (found == of(&bins), expected)
+        }
+        Format::Frame => (found == of_levels || found == with_shore, of_levels),
+        Format::Course { .. } => (found == with_shore, with_shore),
+    };
     if !is_agreed {
         return Err(ModelError::Signature {
             what: "outputs",
@@ -112,52 +142,122 @@ pub(super) fn check_signature(
             )));
         }
     }
-    Ok((format, inputs))
-}
-
-/// The largest number of frames that a model of format 2 takes, and its inputs in their order.
-fn check_course_inputs(inputs: &[&pb::ValueInfoProto]) -> Result<(usize, Vec<Input>), ModelError> {
-    let (least, most) = COURSE_FRAMES;
-    let agreed = |input: Input, frames: &dyn std::fmt::Display| {
-        let shape = match input {
-            Input::Frames => format!("[1,{frames},{ROWS},{COLS}]"),
-            Input::ArmNPerMm => "[1,1]".to_owned(),
-            _ => format!("[1,{frames}]"),
-        };
-        format!("{} f32 {shape}", input.name())
-    };
-    let found: Vec<String> = inputs.iter().map(|input| describe_value(input)).collect();
-    for frames in least..=most {
-        let of = |described: &String| {
-            let mut all = Input::ALL.into_iter();
-            all.find(|&input| agreed(input, &frames) == *described)
-        };
-        let Some(read) = found.iter().map(of).collect::<Option<Vec<Input>>>() else {
-            continue;
-        };
-        if Input::ALL.iter().all(|input| read.contains(input)) && read.len() == Input::ALL.len() {
-            return Ok((frames, read));
-        }
-    }
-    Err(ModelError::Signature {
-        what: "inputs",
-        found: found.join(", "),
-        expected: format!(
-            "{}, T {least} to {most}",
-            Input::ALL.map(|input| agreed(input, &"T")).join(", ")
-        ),
+    Ok(Signature {
+        format,
+        inputs,
+        lengths,
+        bins,
     })
 }
 
-/// Refuses check presses that have more frames than the model takes.
-fn check_lengths(check: &CourseCheck, most: usize) -> Result<(), ModelError> {
-    let mut lengths = check.presses.iter().map(|press| press.course.moments.len());
-    match lengths.find(|&found| found > most) {
-        Some(found) => Err(ModelError::KeyInvalid {
-            key: "hrn.check",
-            found: format!("a press of {found} frames"),
-            expected: format!("at most {most}, as the input `frames` has"),
+/// The length of a value along an axis, if it is stated.
+fn length(value: &pb::ValueInfoProto, axis: usize) -> Option<usize> {
+    use pb::tensor_shape_proto::dimension::Value as Dimension;
+    let pb::type_proto::Value::TensorType(tensor) = value.r#type.as_ref()?.value.as_ref()?;
+    match tensor.shape.as_ref()?.dim.get(axis)?.value.as_ref()? {
+        &Dimension::DimValue(length) => usize::try_from(length).ok(),
+        Dimension::DimParam(_) => None,
+    }
+}
+
+/// The lengths of the inputs of a model of courses, and the inputs in their order.
+fn check_course_inputs(
+    inputs: &[&pb::ValueInfoProto],
+    has_references: bool,
+) -> Result<(Lengths, Vec<Input>), ModelError> {
+    let wanted = match has_references {
+        true => &Input::ALL[..],
+        false => &Input::ALL[..Input::OF_FORMAT_2],
+    };
+    let along = |name: &str, axis| {
+        let input = inputs.iter().find(|input| input.name == name);
+        input.and_then(|input| length(input, axis)).unwrap_or(0)
+    };
+    let lengths = Lengths {
+        frames: along("frames", 1),
+        references: along("references", 1),
+        features: along("references", 2),
+    };
+    let described: Vec<String> = inputs.iter().map(|input| describe_value(input)).collect();
+    let is_in_range = (COURSE_FRAMES.0..=COURSE_FRAMES.1).contains(&lengths.frames)
+        && (!has_references
+            || ((1..=MOST_REFERENCES).contains(&lengths.references)
+                && NUMBERS.contains(&lengths.features)));
+    let agreed = |input: Input| {
+        let shape = input.shape(lengths);
+        let shape: Vec<String> = shape.iter().map(usize::to_string).collect();
+        format!("{} f32 [{}]", input.name(), shape.join(","))
+    };
+    let read = |described: &String| {
+        let mut wanted = wanted.iter().copied();
+        wanted.find(|&input| agreed(input) == *described)
+    };
+    let read: Option<Vec<Input>> = described.iter().map(read).collect();
+    match read {
+        Some(read)
+            if is_in_range
+                && read.len() == wanted.len()
+                && wanted.iter().all(|input| read.contains(input)) =>
+        {
+            Ok((lengths, read))
+        }
+        _ => Err(ModelError::Signature {
+            what: "inputs",
+            found: match described.is_empty() {
+                true => "none".to_owned(),
+                false => described.join(", "),
+            },
+            expected: expected_inputs(wanted),
         }),
+    }
+}
+
+/// The inputs of a format in words.
+fn expected_inputs(wanted: &[Input]) -> String {
+    let described = |input: &Input| {
+        let shape = match input {
+            Input::Frames => format!("1,T,{ROWS},{COLS}"),
+            Input::ArmNPerMm => "1,1".to_owned(),
+            Input::Piece => format!("1,{PIECE}"),
+            Input::References => "1,R,E".to_owned(),
+            Input::Given => "1,R".to_owned(),
+            Input::Features => format!("1,{FEATURES}"),
+            Input::TimeS | Input::ApproachMm | Input::Known | Input::Mask => "1,T".to_owned(),
+        };
+        format!("{} f32 [{shape}]", input.name())
+    };
+    let described: Vec<String> = wanted.iter().map(described).collect();
+    let (least, most) = COURSE_FRAMES;
+    let mut text = format!("{}, T {least} to {most}", described.join(", "));
+    if wanted.len() > Input::OF_FORMAT_2 {
+        let (few, many) = (NUMBERS.start(), NUMBERS.end());
+        text += &format!(", R 1 to {MOST_REFERENCES}, E {few} to {many}");
+    }
+    text
+}
+
+/// Refuses check presses that have more frames, and references of which there are more, than the
+/// model takes.
+fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError> {
+    let invalid = |found: String, expected: String| ModelError::KeyInvalid {
+        key: "hrn.check",
+        found,
+        expected,
+    };
+    let (most, found) = (lengths.references, check.references.len());
+    if found > most {
+        let expected = format!("at most {most}, as the input `references` has");
+        return Err(invalid(format!("{found} references"), expected));
+    }
+    let presses = check.presses.iter().map(|press| &press.course);
+    let references = check.references.iter().map(|press| &press.course);
+    let mut frames = presses.chain(references).map(|course| course.moments.len());
+    let most = lengths.frames;
+    match frames.find(|&found| found > most) {
+        Some(found) => Err(invalid(
+            format!("a press of {found} frames"),
+            format!("at most {most}, as the input `frames` has"),
+        )),
         None => Ok(()),
     }
 }
@@ -228,8 +328,8 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
     };
 
     let format = text("hrn.format")?.to_owned();
-    if !["1", "2"].contains(&format.as_str()) {
-        let (found, expected) = (format!("{format:?}"), "\"1\" or \"2\"".to_owned());
+    if !["1", "2", "3"].contains(&format.as_str()) {
+        let (found, expected) = (format!("{format:?}"), "\"1\", \"2\" or \"3\"".to_owned());
         return Err(ModelError::KeyInvalid {
             key: "hrn.format",
             found,
@@ -238,6 +338,13 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
     }
     let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
     check_levels(&levels)?;
+    if format == "3" {
+        Borders::of(&levels).map_err(|error| ModelError::KeyInvalid {
+            key: "hrn.levels",
+            found: error.to_string(),
+            expected: "ranges of Shore OO from the hardest to the softest".to_owned(),
+        })?;
+    }
     let pitch = text("hrn.pitch_mm")?;
     let pitch_mm = match pitch.trim().parse::<f32>() {
         Ok(value) if value.is_finite() && value > 0.0 => value,
@@ -308,16 +415,17 @@ fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelErr
     if ![8, 2 * levels].contains(&count) {
         return invalid(format!("{count} presses"), "8, or two a level".to_owned());
     }
-    for CheckedCourse {
-        course,
-        probabilities,
-        ..
-    } in &check.presses
+    if let Some(press) = check
+        .presses
+        .iter()
+        .find(|press| press.probabilities.len() != levels)
     {
-        if probabilities.len() != levels {
-            let found = format!("{} probabilities of a press", probabilities.len());
-            return invalid(found, format!("{levels}"));
-        }
+        let found = format!("{} probabilities of a press", press.probabilities.len());
+        return invalid(found, format!("{levels}"));
+    }
+    let presses = check.presses.iter().map(|press| &press.course);
+    let references = check.references.iter().map(|press| &press.course);
+    for course in presses.chain(references) {
         let numbers = course.moments.iter();
         let mut numbers = numbers.flat_map(|m| [m.time_s, m.approach_mm.unwrap_or(0.0)]);
         if !numbers.all(f32::is_finite) || course.arm_n_per_mm.is_nan() || course.arm_n_per_mm < 0.0

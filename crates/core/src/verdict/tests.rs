@@ -6,7 +6,7 @@ use super::*;
 mod course;
 
 fn proto() -> pb::ModelProto {
-    pb::ModelProto::decode(BUILT_IN).unwrap()
+    pb::ModelProto::decode(BUILT_IN_HRN).unwrap()
 }
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
@@ -30,7 +30,7 @@ fn dims(value: &mut pb::ValueInfoProto) -> &mut Vec<pb::tensor_shape_proto::Dime
 
 #[test]
 fn the_built_in_model_loads_and_judges() {
-    let hrn = Hrn::load(BUILT_IN).unwrap();
+    let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
     let labels: Vec<&str> = hrn.card().levels.iter().map(|l| l.label.as_str()).collect();
     assert_eq!(labels, ["hard", "firm", "soft", "very-soft"]);
     assert_eq!(hrn.sha256().len(), 64);
@@ -156,8 +156,8 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         move |p: &mut pb::ModelProto| *value(p, key) = text.into()
     };
     check(
-        "`hrn.format`: found \"3\", expected \"1\" or \"2\"",
-        set("hrn.format", "3"),
+        "`hrn.format`: found \"4\", expected \"1\", \"2\" or \"3\"",
+        set("hrn.format", "4"),
     );
     check(
         "`hrn.check`: found unknown field `frames`, expected `presses`",
@@ -333,7 +333,11 @@ fn an_oversized_or_foreign_file_is_refused() {
         error.contains("64000001 bytes: at most 64000000"),
         "{error}"
     );
-    for bytes in [&b""[..], b"not a model", &BUILT_IN[..BUILT_IN.len() / 2]] {
+    for bytes in [
+        &b""[..],
+        b"not a model",
+        &BUILT_IN_HRN[..BUILT_IN_HRN.len() / 2],
+    ] {
         let error = Hrn::load(bytes).unwrap_err();
         assert!(matches!(error, ModelError::NotOnnx(_)), "{error}");
     }

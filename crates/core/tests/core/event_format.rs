@@ -7,7 +7,7 @@ use std::time::Duration;
 use hardnessd_core::event::*;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::tare::Offsets;
-use hardnessd_core::verdict::Level;
+use hardnessd_core::verdict::{Level, ReferenceKinds};
 use jiff::Timestamp;
 use serde_json::json;
 
@@ -56,6 +56,7 @@ fn hardness() -> Hardness {
         levels: None,
         course: None,
         stiffness_n_per_mm: None,
+        references: ReferenceKinds::None,
         object: None,
         arrival: Duration::ZERO,
     }
@@ -107,7 +108,7 @@ fn press_is_frozen() {
 fn hardness_is_frozen() {
     check(
         &Event::Hardness(hardness()).to_line(),
-        r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"object":null}"#,
+        r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","object":null}"#,
     );
     let mut rejected = Event::Hardness(Hardness {
         phase: Phase::Early,
@@ -124,7 +125,7 @@ fn hardness_is_frozen() {
     rejected.number(9);
     check(
         &rejected.to_line(),
-        r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"object":null}"#,
+        r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","object":null}"#,
     );
 }
 

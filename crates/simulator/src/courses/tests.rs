@@ -146,7 +146,7 @@ fn errors_are_in_what_is_told_and_nowhere_else() {
 #[test]
 #[ignore = "judges some hundred presses four times, half a minute: run it after a change of laying or models"]
 fn print_levels_by_pitch() {
-    let frame_model = Hrn::load(hardnessd_core::verdict::BUILT_IN).unwrap();
+    let frame_model = Hrn::load(hardnessd_core::verdict::BUILT_IN_HRN).unwrap();
     let course_model = std::fs::read("../../models/course.onnx").unwrap();
     let course_model = Hrn::load(&course_model).unwrap();
     // The second is what another sensor of the same design gives.

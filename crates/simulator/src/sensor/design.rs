@@ -143,6 +143,9 @@ const LEAST_WIDTH_MM: f64 = 50.0;
 const COARSE_COUNT_N: f64 = 0.04;
 
 impl Design {
+    /// The distances between the taxels of broad designs.
+    pub(crate) const BROAD_PITCHES_MM: [f64; 2] = ranges::PITCH_MM;
+
     /// The simulated JX255N.
     pub(crate) fn jx255n(profile: SensorProfile) -> Self {
         Self {

@@ -16,6 +16,7 @@ fn small(shard: u32) -> CourseSettings {
         },
         arm_error: 0.15,
         sensors: Some(BroadSensors {
+            designs: SensorDesigns::Broad,
             covers: 2,
             test_covers: 9,
             electronics: 3,

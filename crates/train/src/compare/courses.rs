@@ -18,14 +18,13 @@ use super::{sets, so_far};
 use crate::data::courses::Courses;
 use crate::data::{dataset, simulated};
 use crate::judge::baseline::Baseline;
+use crate::judge::hertz;
 use crate::judge::metrics::{self, Clusters, Evaluation, Judged};
-use crate::judge::press_features::{self, PressOf};
 use crate::learn::course::{self, Press};
 use crate::model::course as model;
 use crate::model::evaluated;
-use crate::net::course::PressMoment;
-use crate::net::frames::FEATURES;
 use crate::run::disk::{refuse_foreign, write_whole};
+use hardnessd_core::verdict::features::{FRAME, Moment, force_n};
 use hardnessd_core::verdict::{Course, Format, Hrn, argmax};
 use hardnessd_simulator::Split;
 
@@ -59,7 +58,7 @@ impl Control {
 
     fn name(self) -> &'static str {
         match self {
-            Self::Frame => "features of the best frame",
+            Self::Frame => "features of the frame of greatest force",
             Self::Hertz => "Hertz's fit",
             Self::PressAlone => "features of the press, arm unknown",
             Self::Press => "features of the press",
@@ -67,19 +66,11 @@ impl Control {
     }
 
     fn row(self, press: &Press) -> Vec<f32> {
-        let of = PressOf {
-            frames: &press.features,
-            moments: &press.moments,
-            arm_n_per_mm: press.arm_n_per_mm,
-        };
         match self {
-            Self::Frame => press_features::of_press(&of)[..FEATURES].to_vec(),
-            Self::Hertz => press_features::of_hertz(&of),
-            Self::Press => press_features::of_press(&of),
-            Self::PressAlone => press_features::of_press(&PressOf {
-                arm_n_per_mm: 0.0,
-                ..of
-            }),
+            Self::Frame => press.features()[..FRAME].to_vec(),
+            Self::Hertz => hertz::row(press).to_vec(),
+            Self::Press => press.features().to_vec(),
+            Self::PressAlone => press.clone().without_arm().features().to_vec(),
         }
     }
 }
@@ -105,7 +96,7 @@ impl TestSet {
         Ok(Self {
             name: name.to_string_lossy().into_owned(),
             clusters: sets::clusters_of(simulated::settings_of_courses(path)?.as_ref()),
-            presses: course::presses(&courses, 1.0)?,
+            presses: course::presses(&courses),
             courses,
         })
     }
@@ -162,9 +153,9 @@ fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
         if objects.len() == CURVES_A_LEVEL || !objects.insert(press.object) {
             continue;
         }
-        let point = |moment: &PressMoment| {
+        let point = |moment: &Moment| {
             let approach_mm = moment.approach_mm.unwrap_or_default();
-            (f64::from(approach_mm), f64::from(moment.force_n))
+            (f64::from(approach_mm), f64::from(force_n(&moment.frame)))
         };
         curves.push(Curve {
             level: press.level,
@@ -177,7 +168,7 @@ fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
 /// Fits the controls and judges the sets with them.
 fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let courses = read(data)?;
-    let presses = course::presses(&courses, 1.0)?;
+    let presses = course::presses(&courses);
     let learnt: Vec<&Press> = courses
         .labelled(Split::Train)
         .map(|place| &presses[place])
@@ -237,7 +228,8 @@ fn lifted(mut probabilities: Vec<f32>, lifts: &[f32]) -> Vec<f32> {
 fn of_model(name: &str, hrn: &Hrn, sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
     let row = |name: String, change: &dyn Fn(Course) -> Course, is_whole: bool| {
         let on = |set: &TestSet| {
-            let verdicts = model::verdicts(hrn, &set.courses, Split::Test, change)?;
+            let verdicts =
+                model::verdicts(hrn, &set.courses, Split::Test, model::Given::NONE, change)?;
             let levels = hrn.card().levels.len();
             let cases = model::cases(&verdicts);
             let rmse = evaluated::shore(&cases, levels).map(|shore| shore.rmse);

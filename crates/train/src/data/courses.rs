@@ -4,10 +4,14 @@
 //! press. `docs/formats.md` has the arrays.
 
 use std::collections::BTreeSet;
+mod frames;
+
 use std::io::{self, Seek, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+pub use self::frames::Frames;
+use self::frames::NEWTONS;
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
     self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits,
@@ -17,14 +21,11 @@ use super::npz::Writer;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};
 use hardnessd_simulator::{LabelledCourse, Reference, Split};
 
-/// Newtons per unit of [`Courses::frames_mn`].
-const NEWTONS: f32 = 1e-3;
-
 /// Presses over time. Each column is an array of the file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Courses {
-    /// Taxels of the kept frames in millinewtons, `[frames, 784]`.
-    pub frames_mn: Vec<u16>,
+    /// The kept frames.
+    pub frames: Frames,
     /// The number of each frame's press, ascending.
     pub press: Vec<u32>,
     /// Seconds since the frame that began the press. Negative before that frame.
@@ -98,7 +99,7 @@ impl Courses {
         for (number, course) in (0_u32..).zip(courses) {
             let first = all.press.len();
             for moment in &course.moments {
-                all.frames_mn.extend(&moment.millinewtons);
+                all.frames.push(moment.millinewtons.iter().copied());
                 all.press.push(number);
                 all.time_s.push(moment.time_s);
                 all.approach_mm.push(moment.approach_mm);
@@ -131,8 +132,7 @@ impl Courses {
         for (time_s, approach_mm, frame) in moments {
             // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
             let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
-            self.frames_mn
-                .extend(frame.newtons.iter().map(millinewtons));
+            self.frames.push(frame.newtons.iter().map(millinewtons));
             self.press.push(number);
             self.time_s.push(time_s);
             self.approach_mm.push(approach_mm.unwrap_or(0.0));
@@ -192,10 +192,7 @@ impl Courses {
 
     /// A kept frame in newtons.
     pub fn frame(&self, row: usize) -> ModelFrame {
-        let taxels = &self.frames_mn[row * TAXELS..][..TAXELS];
-        ModelFrame {
-            newtons: std::array::from_fn(|k| f32::from(taxels[k]) * NEWTONS),
-        }
+        self.frames.newtons(row)
     }
 
     /// Whether the file has presses over time, and not single frames.
@@ -264,7 +261,7 @@ impl Courses {
     /// Adds the presses of another file. `objects` is added to their numbers of objects.
     pub(super) fn append(&mut self, other: Self, objects: u32) {
         let (rows, presses) = (self.press.len() as u32, self.presses.len() as u32);
-        self.frames_mn.extend(other.frames_mn);
+        self.frames.append(&other.frames);
         self.press
             .extend(other.press.iter().map(|press| press + presses));
         self.time_s.extend(other.time_s);
@@ -383,7 +380,7 @@ impl Courses {
         });
         let courses = Self {
             presses: presses.collect(),
-            frames_mn,
+            frames: Frames::of(&frames_mn),
             press,
             time_s,
             approach_mm,
@@ -419,7 +416,7 @@ impl Courses {
     pub fn write<W: Write + Seek>(&self, out: W, meta: &serde_json::Value) -> io::Result<W> {
         let mut npz = Writer::compressed(out);
         let shape = [self.press.len(), ROWS, COLS];
-        npz.add("frames_mn", &shape, &self.frames_mn)?;
+        npz.add("frames_mn", &shape, &self.frames.dense())?;
         npz.add_list("press", &self.press)?;
         npz.add_list("time_s", &self.time_s)?;
         npz.add_list("approach_mm", &self.approach_mm)?;
@@ -642,10 +639,12 @@ mod tests {
                 // The first two presses become one that is too long.
                 let second = bad.rows(1);
                 let added = 60 - bad.rows(0).len().min(59);
-                let (row, frame) = (bad.rows(0).start, bad.frames_mn[..TAXELS].to_vec());
-                assert!(second.start > row);
+                assert!(second.start > bad.rows(0).start);
+                let first = &bad.frames.dense()[..TAXELS];
+                let mut longer = Frames::of(&first.repeat(added));
+                longer.append(&bad.frames);
+                bad.frames = longer;
                 for _ in 0..added {
-                    bad.frames_mn.splice(0..0, frame.clone());
                     bad.press.insert(0, 0);
                     bad.approach_mm.insert(0, 0.0);
                     bad.known.insert(0, 1);

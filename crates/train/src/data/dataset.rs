@@ -218,6 +218,9 @@ pub struct Source {
     pub generator: Option<String>,
     /// Distance between the sensor's taxels, if the file names one.
     pub pitch_mm: Option<f64>,
+    /// The least and the greatest distance between the taxels of the file's sensors, if they differ.
+    #[serde(skip)]
+    pub pitches_mm: Option<[f64; 2]>,
     /// The levels that the file states, if a model can state them.
     #[serde(skip)]
     pub levels: Option<Vec<Level>>,

@@ -98,6 +98,26 @@ impl Calibration {
         }
     }
 
+    /// The calibration of a distribution with this temperature. `of_truth` has for each press its
+    /// object, whether the object's Shore hardness was measured, and the probability of its level.
+    pub fn of_sets(
+        temperature: f32,
+        of_truth: impl Iterator<Item = ((u32, bool), f32)>,
+        stream: &mut Stream,
+    ) -> Self {
+        let of_truth: Vec<_> = of_truth.collect();
+        let wrong = of_truth.iter().map(|&((object, _), p)| (object, -p));
+        let wrong = by_object(wrong);
+        let measured = of_truth.iter().filter(|((_, is_measured), _)| *is_measured);
+        let measured = by_object(measured.map(|&((object, _), p)| (object, p)));
+        Self {
+            temperature,
+            widths: [0.0; 2],
+            threshold: quantile(&wrong, stream).map_or(0.0, |wrong| -wrong),
+            objects: [wrong.len(), measured.len()],
+        }
+    }
+
     /// What the calibration cannot promise, and why, in one line. `None` if it promises both the
     /// sets of levels and the interval of the Shore hardness.
     pub fn missing(&self) -> Option<String> {

@@ -1,53 +1,54 @@
 //! The training loop of the network that judges the course of a press.
 //!
-//! In: presses over time, with the arm's reported motion. Out: weights, a temperature, and the
-//! calibration of sets of levels and intervals of Shore hardness on held-out objects. Metrics and
-//! checkpoints are written on the way. An interrupted run resumes with bit-identical results.
+//! In: presses over time, with the arm's reported motion, and presses that serve as references of
+//! their sensors. Out: weights, a temperature, and the calibration of sets of levels on held-out
+//! objects. Metrics and checkpoints are written on the way. An interrupted run resumes with
+//! bit-identical results.
 
 use burn::tensor::{Device, Tensor};
 
-use crate::data::courses::Courses;
-use crate::data::dataset;
-use crate::learn::conformal::{Calibration, Judged};
+use self::lots::Lots;
+use crate::data::courses::{self, Courses};
+use crate::learn::conformal::Calibration;
 use crate::learn::epochs::{self, Batch};
-use crate::learn::force::{self, Label};
 use crate::learn::learner::Learner;
-use crate::net::course::{self, COLUMNS, FRAMES, PressMoment};
-use crate::net::frames::{self, FEATURES, Features};
-use crate::net::hrn;
+use crate::learn::temperature;
+use crate::net::bins::{self, BINS};
+use crate::net::course::{self, FRAMES};
 use crate::net::network::{Weights, numbers};
-use crate::net::shore;
 use crate::net::standard::Standard;
 use crate::net::start::ExportedNetwork;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
-use crate::run::progress::ensure_finite_logits;
+use crate::run::progress::ensure_finite;
 use crate::settings::{ArmReports, Training};
-use hardnessd_core::verdict::{ModelFrame, argmax};
+use hardnessd_core::verdict::features::{self, FEATURES, Moment};
+use hardnessd_core::verdict::{Borders, Distribution, Piece, argmax};
+use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
+pub use self::lots::Drawn;
+
+mod lots;
 mod varied;
 
 /// How far the weights of levels with few samples are raised towards equal levels, unless the
-/// settings say otherwise: halfway. Evenly spread Shore hardness gives few samples of the narrow
-/// levels. The course of a press separates these levels well enough that halfway costs no accuracy
-/// over samples, and gains most of what equal weights would gain over levels (`models/course.md`).
-pub const LEVEL_BALANCE: f64 = 0.5;
+/// settings say otherwise: all the way. Evenly spread Shore hardness gives few samples of the narrow
+/// levels, and without weights a doubtful press would never be of one of them.
+pub const LEVEL_BALANCE: f64 = 1.0;
 /// Training that starts from a model's weights ends at this share of the way from them to the
 /// weights it learnt: less of it than for models of one frame ([`epochs::LEARNT_SHARE`]). On four
 /// draws of other sensors and materials, an eighth of the way was better than half by 2 points,
 /// with correct newtons and with wrong ones (`docs/results.md`).
 const LEARNT_SHARE: f32 = 0.125;
-/// Presses per pass without gradients.
-const JUDGED_AT_ONCE: usize = 250;
+/// Groups of presses per pass without gradients.
+const JUDGED_AT_ONCE: usize = 16;
 
 /// A press, prepared for training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Press {
-    /// Features of each frame, `[frames, FEATURES]`.
-    pub features: Vec<f32>,
-    /// Time, approach and force of each frame.
-    pub moments: Vec<PressMoment>,
+    /// Features, time and approach of each frame, from the one that began the press.
+    pub moments: Vec<Moment>,
     /// Stiffness of the arm in N/mm; 0 if unknown.
     pub arm_n_per_mm: f32,
     /// The hardness level, 1..=L, or 0 if unlabelled.
@@ -56,72 +57,93 @@ pub struct Press {
     pub shore: Option<f32>,
     /// The number of the pressed object.
     pub object: u32,
+    /// The number of the sensor.
+    pub sensor: u32,
+    /// The piece, if it is a rigid one.
+    pub piece: Option<Piece>,
 }
 
-/// All presses of the data, each from the frame that began it, with all forces times
-/// `force_factor`.
-///
-/// # Errors
-///
-/// Fails if features cannot be computed.
-pub fn presses(courses: &Courses, force_factor: f32) -> anyhow::Result<Vec<Press>> {
-    let all: Vec<usize> = (0..courses.presses.len()).collect();
-    prepared(courses, &all, force_factor)
-}
-
-/// The presses of these numbers.
-fn prepared(courses: &Courses, numbers: &[usize], force_factor: f32) -> anyhow::Result<Vec<Press>> {
-    let plan = Features::new()?;
-    let prepare = |&number: &usize| {
-        let press = &courses.presses[number];
-        let rows = courses
-            .rows(number)
-            .filter(|&row| courses.time_s[row] >= 0.0);
-        let rows: Vec<usize> = rows.take(FRAMES).collect();
-        let frame = |&row: &usize| courses.frame(row).times(force_factor);
-        let frames: Vec<ModelFrame> = rows.iter().map(frame).collect();
-        let features = plan.of(&frames)?;
-        let moment = |(&row, of_frame): (&usize, &[f32])| PressMoment {
+/// All presses of the data, each from the frame that began it.
+pub fn presses(courses: &Courses) -> Vec<Press> {
+    let prepare = |(number, press): (usize, &courses::Press)| {
+        let rows = courses.rows(number);
+        let rows = rows.filter(|&row| courses.time_s[row] >= 0.0);
+        let moment = |row: usize| Moment {
+            frame: features::of_frame(&courses.frame(row)),
             time_s: courses.time_s[row],
             approach_mm: (courses.known[row] == 1).then_some(courses.approach_mm[row]),
-            force_n: frames::force_n(of_frame),
         };
-        Ok(Press {
-            moments: rows
-                .iter()
-                .zip(features.chunks(FEATURES))
-                .map(moment)
-                .collect(),
-            features,
+        Press {
+            moments: rows.take(FRAMES).map(moment).collect(),
             arm_n_per_mm: press.arm_n_per_mm,
             level: press.level,
             shore: Some(press.shore).filter(|shore| shore.is_finite()),
             object: press.object,
-        })
+            sensor: press.sensor,
+            piece: press.reference.map(piece),
+        }
     };
-    numbers.iter().map(prepare).collect()
+    courses.presses.iter().enumerate().map(prepare).collect()
+}
+
+/// A rigid piece as references name it.
+pub fn piece(reference: Reference) -> Piece {
+    match reference {
+        Reference::Flat { width_mm } => Piece::Flat { width_mm },
+        Reference::Ball { radius_mm } => Piece::Ball { radius_mm },
+    }
+}
+
+impl Drawn {
+    /// The network's inputs.
+    fn group(&self, standard: &Standard) -> course::Group {
+        let references = self.references.iter();
+        let references = references.map(|(press, piece)| (press.inputs(standard), *piece));
+        course::Group {
+            presses: self.presses.iter().map(|p| p.inputs(standard)).collect(),
+            references: references.collect(),
+        }
+    }
+
+    /// The same with the robot's errors, as training presses have them. References are whole presses.
+    fn varied(self, reports: &ArmReports, stream: &mut Stream) -> Self {
+        let whole = ArmReports {
+            early: 0.0,
+            ..*reports
+        };
+        let presses = self.presses.iter();
+        let presses = presses.map(|press| reports.varied(press, stream)).collect();
+        let references = self.references.into_iter();
+        let references = references.map(|(press, piece)| (whole.varied(&press, stream), piece));
+        Self {
+            presses,
+            references: references.collect(),
+        }
+    }
 }
 
 impl Press {
-    /// The columns of each moment, before standardisation.
-    fn columns(&self) -> Vec<f32> {
-        let motion = course::motion(&self.moments, self.arm_n_per_mm);
-        let rows = self.features.chunks(FEATURES).zip(motion);
-        rows.flat_map(|(features, motion)| features.iter().copied().chain(motion))
-            .collect()
+    /// The features of the press.
+    pub fn features(&self) -> [f32; FEATURES] {
+        features::of_press(&self.moments, self.arm_n_per_mm)
+    }
+
+    /// The press as a robot gives it that reports nothing of its arm.
+    #[must_use]
+    pub fn without_arm(mut self) -> Self {
+        self.arm_n_per_mm = 0.0;
+        let moments = self.moments.iter_mut();
+        moments.for_each(|moment| moment.approach_mm = None);
+        self
     }
 
     /// The network's inputs.
     fn inputs(&self, standard: &Standard) -> course::Inputs {
-        let columns = self.columns();
-        let standardised = columns.iter().enumerate();
-        let rows = standardised
-            .map(|(place, &x)| standard.apply(place % COLUMNS, x))
-            .collect();
-        (
-            rows,
-            self.moments.iter().map(|moment| moment.force_n).collect(),
-        )
+        let features = self.features();
+        let standardised = features.iter().enumerate();
+        standardised
+            .map(|(column, &x)| standard.apply(column, x))
+            .collect()
     }
 }
 
@@ -136,6 +158,8 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Indices of labelled presses of held-out objects; may be empty.
     pub held_out: &'a [usize],
+    /// The parts of the scale that the hardness levels have.
+    pub borders: &'a Borders,
     /// The number of hardness levels.
     pub levels: usize,
     /// The errors and gaps in the arm's reports that training presses are given.
@@ -153,63 +177,38 @@ pub struct Task<'a> {
 pub struct Trained {
     /// Weights of all layers.
     pub weights: Weights,
-    /// The factor of the forces, which presses are prepared with, and mean and deviation of the columns.
+    /// Mean and deviation of the features.
     pub standard: Standard,
+    /// What is added to the logits of the bins after temperature ([`bins::lifts`]).
+    pub lifts: Vec<f32>,
     /// The calibration of the verdicts.
     pub calibration: Calibration,
 }
 
 impl Trained {
-    /// Logits, before temperature, and Shore OO (value, low, high) of presses.
-    pub fn judge(
-        &self,
-        presses: &[Press],
-        levels: usize,
-        device: &Device,
-    ) -> Vec<(Vec<f32>, [f32; 3])> {
-        let mut judged = Vec::with_capacity(presses.len());
-        for part in presses.chunks(JUDGED_AT_ONCE) {
-            let inputs: Vec<_> = part
-                .iter()
-                .map(|press| press.inputs(&self.standard))
-                .collect();
-            let outputs = course::outputs(&self.weights, &inputs, device);
-            judged.extend(shore::of_outputs(&outputs, levels, self.calibration.widths));
+    /// The distribution over Shore hardness from the logits of its bins.
+    pub fn distribution(&self, logits: &[f32], temperature: f32) -> Distribution {
+        let lifted = logits.iter().zip(&self.lifts);
+        let lifted: Vec<f32> = lifted.map(|(x, lift)| x / temperature + lift).collect();
+        Distribution::of(&lifted)
+    }
+
+    /// Logits of the bins of Shore hardness, before temperature: of the presses of each group, one
+    /// group after the other.
+    pub fn judge(&self, groups: &[Drawn], device: &Device) -> Vec<Vec<f32>> {
+        let mut judged = Vec::new();
+        for part in groups.chunks(JUDGED_AT_ONCE) {
+            let inputs: Vec<_> = part.iter().map(|g| g.group(&self.standard)).collect();
+            let outputs = course::outputs(&self.weights, &inputs, None, device);
+            judged.extend(numbers(&outputs).chunks(BINS).map(<[f32]>::to_vec));
         }
         judged
     }
 }
 
-/// The start with its factor of the forces corrected by the labels of the presses `train`.
-///
-/// # Errors
-///
-/// Fails if features cannot be computed.
-pub fn with_force_factor(
-    mut start: ExportedNetwork,
-    courses: &Courses,
-    train: &[usize],
-    device: &Device,
-) -> anyhow::Result<ExportedNetwork> {
-    let presses = train.iter().map(|&place| &courses.presses[place]);
-    let labels: Vec<Label> = presses.map(|press| (press.level, press.object)).collect();
-    let trained = Trained {
-        weights: start.weights.clone(),
-        standard: start.standard.clone(),
-        calibration: Calibration::NONE,
-    };
-    let factor = force::factor(&labels, start.temperature, device, |factor| {
-        let presses = prepared(courses, train, start.standard.force_factor * factor)?;
-        let judged = trained.judge(&presses, dataset::levels().len(), device);
-        Ok(judged.into_iter().map(|(logits, _)| logits).collect())
-    })?;
-    start.standard.force_factor *= factor;
-    Ok(start)
-}
-
 /// Trains from random weights or from `start` with its calibration, or continues from the stage's
-/// last checkpoint in `run`. Without held-out objects, the temperature and the interval's widths
-/// stay those of `start`, and there are no sets of levels, because nothing shows whether they hold.
+/// last checkpoint in `run`. Without held-out objects, the temperature stays that of `start`, and
+/// there are no sets of levels, because nothing shows whether they hold.
 ///
 /// # Errors
 ///
@@ -221,17 +220,14 @@ pub fn fit(
     run: &Run,
 ) -> anyhow::Result<Trained> {
     let Some((start, calibration)) = start else {
-        let initial = course::initial(task.levels, task.seed, task.device);
+        let initial = course::initial(task.seed, task.device);
         let (weights, standard) = task.learnt(initial, task.standard(), run)?;
-        let calibration = match task.has_shore() {
-            true => Calibration::NONE,
-            false => Calibration::WITHOUT_SHORE,
-        };
-        return task.calibrated(weights, standard, &calibration);
+        return task.calibrated(weights, standard, task.lifts(), &Calibration::NONE);
     };
     let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
     let weights = weights.between(&start.weights, LEARNT_SHARE);
-    task.calibrated(weights, standard, &calibration)
+    // The levels of a few own objects say nothing of how frequent they are elsewhere.
+    task.calibrated(weights, standard, start.lifts, &calibration)
 }
 
 impl Task<'_> {
@@ -245,11 +241,11 @@ impl Task<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    /// Mean and deviation of the columns of the training presses.
+    /// Mean and deviation of the features of the training presses.
     fn standard(&self) -> Standard {
         let presses = self.train.iter().map(|&place| &self.presses[place]);
-        let rows: Vec<Vec<f32>> = presses.map(Press::columns).collect();
-        Standard::of(COLUMNS, rows.iter().flat_map(|rows| rows.chunks(COLUMNS)))
+        let rows: Vec<_> = presses.map(Press::features).collect();
+        Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice))
     }
 
     /// Runs the epochs from `initial`, or from the last checkpoint.
@@ -259,113 +255,167 @@ impl Task<'_> {
         standard: Standard,
         run: &Run,
     ) -> anyhow::Result<(Weights, Standard)> {
+        let lots = Lots::of(self.presses, self.train);
+        // A sample of an epoch is a group of presses.
+        let settings = Training {
+            batch: (self.settings.batch / lots::GROUP).max(1),
+            ..*self.settings
+        };
         let stage = epochs::Stage {
             name: self.stage,
             origin: self.origin(&initial),
-            train: self.train,
-            settings: self.settings,
+            train: &lots.tickets(),
+            settings: &settings,
             seed: self.seed,
         };
-        let level_of = |&place: &usize| self.presses[place].level;
-        let level_weights = hrn::level_weights(
-            self.train.iter().map(level_of),
-            self.levels,
-            self.settings.level_balance.unwrap_or(LEVEL_BALANCE) as f32,
-            self.device,
-        );
+        let parts = bins::parts(self.borders, self.levels, self.device);
         let weights = epochs::run(&stage, initial, run, self.device, |learner, batch| {
-            Ok(self.step(learner, (&standard, &level_weights), batch))
+            Ok(self.step(learner, &lots, (&standard, &parts), batch))
         })?;
         Ok((weights, standard))
+    }
+
+    /// What makes rare levels as likely as frequent ones.
+    fn lifts(&self) -> Vec<f32> {
+        let mut counts = vec![0; self.levels];
+        for &place in self.train {
+            counts[usize::from(self.presses[place].level) - 1] += 1;
+        }
+        let share = self.settings.level_balance.unwrap_or(LEVEL_BALANCE);
+        bins::lifts(self.borders, &counts, share as f32)
     }
 
     fn origin(&self, initial: &Weights) -> String {
         let mut origin = Origin::new(self.stage, &(self.settings, self.reports), self.seed);
         for &place in self.train.iter().chain(self.held_out) {
             let press = &self.presses[place];
-            let known = press
-                .moments
-                .iter()
-                .flat_map(|moment| [moment.time_s, moment.approach_mm.unwrap_or(f32::NAN)]);
+            let moments = press.moments.iter().flat_map(|moment| {
+                let known = [moment.time_s, moment.approach_mm.unwrap_or(f32::NAN)];
+                moment.frame.into_iter().chain(known)
+            });
             let label = [
                 f32::from(press.level),
                 press.shore.unwrap_or(f32::NAN),
                 press.arm_n_per_mm,
+                press.sensor as f32,
             ];
-            origin = origin.numbers(press.features.iter().copied().chain(known).chain(label));
+            origin = origin.numbers(moments.chain(label));
         }
         origin.weights(initial).finish()
     }
 
-    /// Takes a step on a batch of presses. Returns the batch's mean loss, and how many of the
-    /// presses were judged correctly before the step.
+    /// Takes a step on groups of presses. Returns the mean loss of their presses, and how many of the
+    /// groups' presses were judged correctly before the step, in groups.
     fn step(
         &self,
         learner: &mut Learner,
-        (standard, weights): (&Standard, &Tensor<2>),
+        lots: &Lots,
+        (standard, parts): (&Standard, &Tensor<2>),
         Batch {
-            samples: places,
+            samples: tickets,
             step,
             rate,
         }: Batch,
-    ) -> (f64, usize) {
+    ) -> (f64, f64) {
         let mut stream = self.stream("variation").child(step);
-        let vary = |&place: &usize| self.reports.varied(&self.presses[place], &mut stream);
-        let mut presses: Vec<Press> = places.iter().map(vary).collect();
-        presses.sort_by_key(|press| press.moments.len());
-        let inputs: Vec<_> = presses.iter().map(|press| press.inputs(standard)).collect();
-        let levels_of = presses.iter().map(|press| press.level);
-        let targets = hrn::targets(levels_of, self.levels, self.device).mul(weights.clone());
-        let measured: Vec<Option<f32>> = presses.iter().map(|press| press.shore).collect();
+        let draw = |&ticket: &usize| {
+            let drawn = lots.draw(ticket, self.presses, self.borders, &mut stream);
+            drawn.varied(&self.reports, &mut stream)
+        };
+        let drawn: Vec<Drawn> = tickets.iter().map(draw).collect();
+        let groups: Vec<_> = drawn.iter().map(|drawn| drawn.group(standard)).collect();
+        let presses = drawn.iter().flat_map(|drawn| &drawn.presses);
+        let labels: Vec<bins::Label> = presses.map(|press| (press.level, press.shore)).collect();
 
         let tracked = learner.weights.tracked();
-        let outputs = course::outputs(&tracked, &inputs, self.device);
-        let (loss, judged) = shore::loss(outputs, targets, &measured);
+        let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.device);
+        let (loss, judged) = bins::loss(outputs, &labels, parts);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
-        let right = presses
+        let rows = judged.chunks(self.levels);
+        let right = labels
             .iter()
-            .zip(judged.chunks(self.levels))
-            .filter(|(press, logits)| argmax(logits).0 + 1 == usize::from(press.level))
+            .zip(rows)
+            .filter(|((level, _), row)| argmax(row).0 + 1 == usize::from(*level))
             .count();
-        (f64::from(numbers(&loss)[0]), right)
+        let share = right as f64 / labels.len() as f64;
+        (f64::from(numbers(&loss)[0]), share * tickets.len() as f64)
     }
 
-    /// Calibrates on the presses of held-out objects, varied like the training presses.
+    /// Calibrates on the presses of held-out objects, varied and with references like the training
+    /// presses.
     fn calibrated(
         &self,
         weights: Weights,
         standard: Standard,
+        lifts: Vec<f32>,
         start: &Calibration,
     ) -> anyhow::Result<Trained> {
         let mut trained = Trained {
             weights,
             standard,
+            lifts,
             calibration: Calibration::NONE,
         };
         // Finite weights can still give a logit that is not. One press is enough for this check.
-        let first = self.presses[self.train[0]].clone();
-        let first = trained.judge(&[first], self.levels, self.device);
-        ensure_finite_logits(self.stage, self.settings.epochs, &first)?;
+        let first = Drawn {
+            presses: vec![self.presses[self.train[0]].clone()],
+            references: Vec::new(),
+        };
+        for logit in trained.judge(&[first], self.device).iter().flatten() {
+            ensure_finite(self.stage, self.settings.epochs, "logit", (*logit).into())?;
+        }
         let mut stream = self.stream("calibration");
-        let presses: Vec<Press> = self
-            .held_out
-            .iter()
-            .map(|&place| self.reports.varied(&self.presses[place], &mut stream))
+        let lots = Lots::of(self.presses, self.held_out);
+        let groups = lots
+            .all(self.presses, self.borders, &mut stream)
+            .into_iter();
+        let groups: Vec<Drawn> = groups
+            .map(|group| group.varied(&self.reports, &mut stream))
             .collect();
-        let judged = trained.judge(&presses, self.levels, self.device);
-        let judged: Vec<Judged> = presses
-            .iter()
-            .zip(judged)
-            .map(|(press, (logits, said))| Judged {
-                object: press.object,
-                level: usize::from(press.level) - 1,
-                shore: press.shore,
-                logits,
-                said,
-            })
-            .collect();
-        trained.calibration = Calibration::of(&judged, start, &mut stream, self.device);
+        let judged = trained.judge(&groups, self.device);
+        let presses: Vec<&Press> = groups.iter().flat_map(|group| &group.presses).collect();
+        let judged: Vec<_> = presses.into_iter().zip(judged).collect();
+        trained.calibration = self.calibration(&trained, &judged, start, &mut stream);
         Ok(trained)
+    }
+
+    /// The temperature at which the levels of the held-out presses are most probable, and the sets of
+    /// levels.
+    fn calibration(
+        &self,
+        trained: &Trained,
+        judged: &[(&Press, Vec<f32>)],
+        start: &Calibration,
+        stream: &mut Stream,
+    ) -> Calibration {
+        let of_truth = |(press, logits): &(&Press, Vec<f32>), temperature: f32| {
+            let levels = trained
+                .distribution(logits, temperature)
+                .levels(self.borders);
+            levels[usize::from(press.level) - 1]
+        };
+        // Rare levels count as much as frequent ones.
+        let mut counts = vec![0.0; self.levels + 1];
+        judged
+            .iter()
+            .for_each(|(press, _)| counts[usize::from(press.level)] += 1.0);
+        let loss = |temperature: f64| {
+            let loss = judged.iter().map(|judged| {
+                let p = of_truth(judged, temperature as f32).max(f32::MIN_POSITIVE);
+                -f64::from(p).ln() / counts[usize::from(judged.0.level)]
+            });
+            loss.sum::<f64>()
+        };
+        let temperature = match judged.is_empty() {
+            true => start.temperature,
+            false => temperature::least(loss),
+        };
+        let of_truth = judged.iter().map(|judged| {
+            let press = judged.0;
+            let p = of_truth(judged, temperature);
+            ((press.object, press.shore.is_some()), p)
+        });
+        Calibration::of_sets(temperature, of_truth, stream)
     }
 }

@@ -60,7 +60,7 @@ pub fn run(
     initial: Weights,
     run: &Run,
     device: &Device,
-    mut step: impl FnMut(&mut Learner, Batch) -> anyhow::Result<(f64, usize)>,
+    mut step: impl FnMut(&mut Learner, Batch) -> anyhow::Result<(f64, f64)>,
 ) -> anyhow::Result<Weights> {
     let Training {
         batch,
@@ -91,7 +91,7 @@ pub fn run(
         let mut order = stage.train.to_vec();
         let stream = Stream::new(stage.seed, &format!("{name} order"));
         { stream.child(progress.epoch.into()) }.shuffle(&mut order);
-        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
+        let (mut loss_sum, mut right, mut rate) = (0.0, 0.0, 0.0);
         for samples in order.chunks(batch) {
             rate = optimiser.rate_at(progress.step, steps);
             let batch = Batch {
@@ -110,7 +110,7 @@ pub fn run(
         let loss = loss_sum / count as f64;
         ensure_finite(name, epoch, "loss", loss)?;
         ensure_finite_weights(name, epoch, &learner.weights)?;
-        let accuracy = right as f64 / count as f64;
+        let accuracy = right / count as f64;
         metrics.add(&Row {
             step,
             epoch,

@@ -111,6 +111,7 @@ pub fn fit(task: &Task, start: Option<ExportedNetwork>, run: &Run) -> anyhow::Re
                 standard: Standard::of(FEATURES, rows.chunks(FEATURES)),
                 temperature: 1.0,
                 widths: [0.0; 2],
+                lifts: Vec::new(),
             }
         }
     };
@@ -231,7 +232,7 @@ impl Task<'_> {
         plan: &Features,
         (standard, weights): (&Standard, &Tensor<2>),
         batch: Batch,
-    ) -> anyhow::Result<(f64, usize)> {
+    ) -> anyhow::Result<(f64, f64)> {
         let of = |frames: &[ModelFrame]| frame::Batch::new(frames, plan, standard, self.device);
         let mut stream = self.stream("augmentation").child(batch.step);
         let images = of(&self.varied(batch.samples, &mut stream))?;
@@ -266,7 +267,7 @@ impl Task<'_> {
         let right = batch.samples.iter().zip(judged.chunks(self.levels));
         let right =
             right.filter(|(sample, logits)| argmax(logits).0 + 1 == usize::from(level_of(sample)));
-        Ok((f64::from(numbers(&loss)[0]), right.count()))
+        Ok((f64::from(numbers(&loss)[0]), right.count() as f64))
     }
 
     /// The weak and the strong view of randomly drawn unlabelled samples: `ratio` for each labelled

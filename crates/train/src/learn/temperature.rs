@@ -20,13 +20,18 @@ pub fn mean_loss(judged: &[LevelAndLogits], temperature: f64) -> f64 {
     judged.iter().map(loss).sum::<f64>() / judged.len() as f64
 }
 
-/// The temperature of least loss, between 1/8 and 8. The loss is convex in 1/T, so a shrinking
-/// bracket finds its minimum.
+/// The temperature of least mean cross-entropy, between 1/8 and 8.
 pub fn fit(judged: &[LevelAndLogits]) -> f32 {
+    least(|temperature| mean_loss(judged, temperature))
+}
+
+/// The temperature of least loss, between 1/8 and 8. The loss of logits is convex in 1/T, so a
+/// shrinking bracket finds its minimum.
+pub fn least(loss: impl Fn(f64) -> f64) -> f32 {
     let (mut low, mut high) = (0.125_f64, 8.0_f64);
     for _ in 0..60 {
         let (left, right) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
-        if mean_loss(judged, 1.0 / left) < mean_loss(judged, 1.0 / right) {
+        if loss(1.0 / left) < loss(1.0 / right) {
             high = right;
         } else {
             low = left;

@@ -10,16 +10,15 @@ use super::Request;
 use super::adapt::NoStart;
 use crate::data::courses::Courses;
 use crate::data::dataset::{self, Source};
-use crate::learn::conformal::Calibration;
+use crate::learn::conformal::{Calibration, LEAST_OBJECTS};
 use crate::learn::course::{self, Task};
-use crate::learn::force;
 use crate::model::course::finish;
 use crate::model::evaluated::Evaluated;
 use crate::model::file;
 use crate::net::course as network;
 use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Borders, Hrn};
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
@@ -63,23 +62,17 @@ pub fn train(
     let all: Vec<usize> = courses.labelled(Split::Train).collect();
     let Description { settings, seed, .. } = description;
     let (train, held_out) = hold_out(courses, &all, settings.validation.share, *seed);
-    let corrected = |(start, calibration)| {
-        course::with_force_factor(start, courses, &train, device).map(|start| (start, calibration))
-    };
-    let start = start.map(corrected).transpose()?;
-    let of_start = start.as_ref().map(|(start, _)| start);
-    let force_factor = of_start.map_or(1.0, |start| start.standard.force_factor);
-    if let Some(account) = force::account(force_factor) {
-        hardnessd_core::say!("{account}");
-    }
-    let presses = course::presses(courses, force_factor)?;
+    let levels = dataset::levels_of(&description.data);
+    let borders = Borders::of(&levels)?;
+    let presses = course::presses(courses);
     let is_adapted = start.is_some();
     let task = Task {
         stage: if is_adapted { "adapt" } else { "course" },
         presses: &presses,
         train: &train,
         held_out: &held_out,
-        levels: dataset::levels().len(),
+        borders: &borders,
+        levels: levels.len(),
         reports: settings.reports,
         settings: &settings.training,
         seed: *seed,
@@ -90,14 +83,9 @@ pub fn train(
         hardnessd_core::say!("{missing}");
     }
     if !task.has_shore() {
-        let consequence = match is_adapted {
-            true => "the Shore hardness stays as the start gives it",
-            false => {
-                "the model's Shore hardness says nothing, and its interval is always the whole scale"
-            }
-        };
         hardnessd_core::say!(
-            "no labelled training press has a measured Shore hardness: {consequence}"
+            "no labelled training press has a measured Shore hardness: the model learns only how likely \
+             each level is, and its Shore hardness says no more"
         );
     }
     finish(
@@ -105,7 +93,7 @@ pub fn train(
         description,
         courses,
         (&presses, &train),
-        &trained,
+        (&trained, &borders),
         device,
     )
 }
@@ -122,19 +110,22 @@ pub fn start(
     device: &Device,
 ) -> anyhow::Result<(ExportedNetwork, Calibration)> {
     let constants = file::constants(bytes)?;
-    let start = network::start(|name| constants.get(name), dataset::levels().len(), device);
+    let start = network::start(|name| constants.get(name), device);
     let start = start.ok_or_else(|| NoStart::of(hrn, "presses: course, or adapt of one"))?;
     let calibration = Calibration {
         temperature: start.temperature,
-        widths: start.widths,
         ..Calibration::NONE
     };
     Ok((start, calibration))
 }
 
-/// Splits presses by their objects into presses to learn from and presses to calibrate on. `share`
-/// is the share of each level's objects held out for calibration.
+/// Splits presses into presses to learn from and presses to calibrate on. `share` is the share held
+/// out: of the sensors, with all their objects, where the data has references of many sensors, and
+/// else of each level's objects.
 fn hold_out(courses: &Courses, all: &[usize], share: f64, seed: u64) -> (Vec<usize>, Vec<usize>) {
+    if let Some(split) = hold_out_sensors(courses, all, share, seed) {
+        return split;
+    }
     let mut by_level = BTreeMap::<u8, BTreeSet<u32>>::new();
     for &place in all {
         let press = &courses.presses[place];
@@ -156,6 +147,39 @@ fn hold_out(courses: &Courses, all: &[usize], share: f64, seed: u64) -> (Vec<usi
         held.contains(&(press.level, press.object))
     };
     all.iter().partition(|place| !is_held(place))
+}
+
+/// Holds out sensors. Sensors that objects were pressed on in common stay together. `None` if the data
+/// has too few of them, or no references, so that their numbers say nothing.
+fn hold_out_sensors(
+    courses: &Courses,
+    all: &[usize],
+    share: f64,
+    seed: u64,
+) -> Option<(Vec<usize>, Vec<usize>)> {
+    let references = courses.presses.iter().filter(|p| p.reference.is_some());
+    let known: BTreeSet<u32> = references.map(|press| press.sensor).collect();
+    let presses = || all.iter().map(|&place| &courses.presses[place]);
+    let mut first_of_object = BTreeMap::<u32, u32>::new();
+    for press in presses() {
+        let first = first_of_object.entry(press.object).or_insert(press.sensor);
+        *first = press.sensor.min(*first);
+    }
+    let station = |place: &usize| {
+        let press = &courses.presses[*place];
+        let is_known = known.contains(&press.sensor);
+        is_known.then(|| first_of_object[&press.object])
+    };
+    let stations: BTreeSet<u32> = all.iter().filter_map(station).collect();
+    let mut stations: Vec<u32> = stations.into_iter().collect();
+    Stream::new(seed, "held-out sensors").shuffle(&mut stations);
+    let count = (share * stations.len() as f64).round() as usize;
+    if count < LEAST_OBJECTS {
+        return None;
+    }
+    let held: BTreeSet<u32> = stations[..count].iter().copied().collect();
+    let is_held = |place: &usize| station(place).is_some_and(|station| held.contains(&station));
+    Some(all.iter().partition(|place| !is_held(place)))
 }
 
 #[cfg(test)]

@@ -98,15 +98,21 @@ pub fn adapt(profile: Profile) -> Settings {
 pub fn course(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
     settings.training = Training {
-        batch: 128,
+        batch: 512,
         epochs: match profile {
-            Profile::Paper => 150,
-            Profile::Quick => 60,
+            Profile::Paper => 60,
+            Profile::Quick => 40,
             Profile::Smoke => 1,
         },
-        averaging: averaging(profile),
+        averaging: match profile {
+            Profile::Smoke => 0.0,
+            Profile::Paper | Profile::Quick => 0.99,
+        },
         checkpoint_every_epochs: 10,
-        optimiser: adam(settings.training.optimiser, 2e-3),
+        optimiser: OptimiserSettings {
+            weight_decay: 0.1,
+            ..adam(settings.training.optimiser, 2e-3)
+        },
         ..settings.training
     };
     settings.validation.share = 0.15;

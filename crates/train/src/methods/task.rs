@@ -130,8 +130,9 @@ impl Task {
                 export::cases(model, dataset, &dataset.labelled(Split::Test)?)
             }
             Self::Courses(courses, ..) => {
+                let given = course_model::Given::NONE;
                 let verdicts =
-                    course_model::verdicts(model, courses, Split::Test, |course| course)?;
+                    course_model::verdicts(model, courses, Split::Test, given, |course| course)?;
                 Ok(course_model::cases(&verdicts))
             }
         }

@@ -75,12 +75,8 @@ pub fn finish(
             temperature,
             ..
         } = recogniser.clone();
-        let outputs = file::Outputs {
-            raw_logits,
-            temperature,
-            shore,
-        };
-        file::write(graph, &outputs, card, &checks)
+        let outputs = file::Outputs::Levels { raw_logits, shore };
+        file::write(graph, &outputs, temperature, card, &checks)
     };
     // The metrics are measured on a file without them and then added; the graph does not change.
     let hrn = Hrn::load(&write(&card)?)?;
@@ -223,6 +219,7 @@ pub(super) fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],
+        pitch_mm: None,
         ..Range::ANY
     };
     for frame in frames {
@@ -299,6 +296,7 @@ mod tests {
                     pitch_mm: None,
                     levels: None,
                     recorded: recorded.clone(),
+                    pitches_mm: None,
                 }],
                 paths: Vec::new(),
             };

@@ -76,9 +76,9 @@ pub enum Foreign {
         /// The file's inputs, with type and shape.
         found: String,
     },
-    /// The inputs are those of format 2.
+    /// The inputs are those of format 2 or 3.
     #[error(
-        "inputs: found {found}, those of the course of a press (format 2): adopt takes models of one \
+        "inputs: found {found}, those of the course of a press (format 2 or 3): adopt takes models of one \
          frame; docs/formats.md says how to write the metadata yourself"
     )]
     OfCourse {
@@ -149,6 +149,11 @@ pub fn decode(bytes: &[u8]) -> Result<pb::ModelProto, Foreign> {
 ///
 /// Returns a [`Foreign`] for the first part that is not recognised.
 pub fn mend(proto: &mut pb::ModelProto, levels: &[Level]) -> Result<(Vec<String>, usize), Foreign> {
+    if has_course_inputs(proto) {
+        let graph = proto.graph.get_or_insert_default();
+        let found = found_inputs(graph);
+        return Err(Foreign::OfCourse { found });
+    }
     let mut done = Vec::new();
     let found = mend_outputs(proto, Some(levels), &mut done)?;
     mend_opset(proto, &mut done)?;
@@ -164,11 +169,21 @@ fn inputs(graph: &pb::GraphProto) -> impl Iterator<Item = &pb::ValueInfoProto> {
     inputs.filter(move |input| !is_weight(&input.name))
 }
 
-/// Whether one of several inputs has the name of one of format 2.
+/// The inputs with type and shape, for a message.
+fn found_inputs(graph: &pb::GraphProto) -> String {
+    let inputs: Vec<&pb::ValueInfoProto> = inputs(graph).collect();
+    match inputs.len() {
+        0..=8 => describe(&inputs),
+        many => format!("{many} inputs, {} and others", describe(&inputs[..1])),
+    }
+}
+
+/// Whether one of several inputs has the name of one of format 2 or 3.
 pub(super) fn has_course_inputs(proto: &pb::ModelProto) -> bool {
-    let of_course = course_inputs(COURSE_FRAMES.1).map(|(name, _)| name);
+    let of_course = course_inputs(COURSE_FRAMES.1);
     let inputs: Vec<_> = proto.graph.iter().flat_map(inputs).collect();
-    let is_of_course = |input: &&pb::ValueInfoProto| of_course.contains(&input.name.as_str());
+    let is_of_course =
+        |input: &&pb::ValueInfoProto| of_course.iter().any(|(name, _)| *name == input.name);
     inputs.len() > 1 && inputs.iter().any(is_of_course)
 }
 
@@ -231,16 +246,9 @@ pub(super) fn mend_input(
     proto: &mut pb::ModelProto,
     done: &mut Vec<String>,
 ) -> Result<(), Foreign> {
-    let is_of_course = has_course_inputs(proto);
     let graph = proto.graph.get_or_insert_default();
     let inputs: Vec<&pb::ValueInfoProto> = inputs(graph).collect();
-    let found = match inputs.len() {
-        0..=8 => describe(&inputs),
-        many => format!("{many} inputs, {} and others", describe(&inputs[..1])),
-    };
-    if is_of_course {
-        return Err(Foreign::OfCourse { found });
-    }
+    let found = found_inputs(graph);
     let [input] = inputs[..] else {
         return Err(Foreign::Inputs { found });
     };

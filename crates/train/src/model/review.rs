@@ -40,7 +40,7 @@ const KEYS: [&str; 10] = [
     "hrn.metrics",
     "hrn.validation",
 ];
-/// The key that only a file of format 2 may have.
+/// The key that only a file of format 2 or 3 may have.
 const CONFORMAL: &str = "hrn.conformal";
 /// The problem of a part that the loader did not reach.
 const UNSEEN: &str = "not looked at, because of the other problem";
@@ -54,6 +54,8 @@ pub enum Format {
     Frame,
     /// Format 2: an input of the graph has the name of one of format 2.
     Course,
+    /// Format 3: an input is `references`.
+    Identified,
 }
 
 /// The review of a file.
@@ -104,7 +106,11 @@ pub fn review(bytes: &[u8]) -> Review {
         }
         Ok(mut proto) => {
             if has_course_inputs(&proto) {
-                format = Format::Course;
+                let mut inputs = proto.graph.iter().flat_map(|graph| &graph.input);
+                format = match inputs.any(|input| input.name == "references") {
+                    true => Format::Identified,
+                    false => Format::Course,
+                };
             }
             problems.extend(format.contradicted(&mut proto));
             let mut has_own_check = true;
@@ -198,7 +204,7 @@ impl Mended {
 impl Format {
     /// The metadata keys of the format, in the order in which the loader reads them.
     fn keys(self) -> impl Iterator<Item = &'static str> {
-        let is_of = move |key: &&str| self == Self::Course || *key != CONFORMAL;
+        let is_of = move |key: &&str| self != Self::Frame || *key != CONFORMAL;
         KEYS.into_iter().filter(is_of)
     }
 
@@ -219,6 +225,7 @@ impl Format {
         match self {
             Self::Frame => "1",
             Self::Course => "2",
+            Self::Identified => "3",
         }
     }
 
@@ -228,7 +235,7 @@ impl Format {
         let mut entries = proto.metadata_props.iter_mut();
         let entry = entries.find(|entry| entry.key == key)?;
         let (found, expected) = (entry.value.clone(), self.number());
-        if found == expected || !["1", "2"].contains(&found.as_str()) {
+        if found == expected || !["1", "2", "3"].contains(&found.as_str()) {
             return None;
         }
         expected.clone_into(&mut entry.value);
@@ -271,7 +278,7 @@ impl Format {
             "opset" => {
                 let result = match self {
                     Self::Frame => mend_opset(proto, &mut done).map_err(Some),
-                    Self::Course => Err(None),
+                    Self::Course | Self::Identified => Err(None),
                 };
                 let mut sets = proto.opset_import.iter_mut();
                 let of_onnx = sets.find(|set| ["", "ai.onnx"].contains(&set.domain.as_str()));
@@ -330,7 +337,7 @@ impl Format {
                 frames: vec![vec![1.0; TAXELS]; CHECKS],
                 probabilities: vec![probabilities; CHECKS],
             }),
-            Self::Course => {
+            Self::Course | Self::Identified => {
                 let moment = CourseMoment {
                     time_s: 0.0,
                     approach_mm: None,
@@ -345,9 +352,11 @@ impl Format {
                     },
                     probabilities,
                     shore: [0.0; 3].into(),
+                    identified: false,
                 };
                 Checks::Courses(CourseCheck {
                     presses: vec![press; CHECKS],
+                    references: Vec::new(),
                 })
             }
         }
@@ -359,6 +368,10 @@ impl Format {
             Self::Frame => ("`frame` to `logits` and `probabilities`", "nine hrn.* keys"),
             Self::Course => (
                 "the course of a press to `logits`, `probabilities` and `shore`",
+                "nine hrn.* keys, and a tenth if you like",
+            ),
+            Self::Identified => (
+                "the course of a press and references of its sensor to `bins` and `reference`",
                 "nine hrn.* keys, and a tenth if you like",
             ),
         };
@@ -390,7 +403,7 @@ fn levels(proto: &pb::ModelProto) -> Vec<Level> {
 mod tests {
     use super::*;
     use hardnessd_core::test_support::course_model::{course_model, encoded};
-    use hardnessd_core::verdict::BUILT_IN;
+    use hardnessd_core::verdict::{BUILT_IN, BUILT_IN_HRN};
 
     /// The parts of a file that have a problem, with the problem.
     fn problems(bytes: &[u8]) -> Vec<(&'static str, String)> {
@@ -405,10 +418,11 @@ mod tests {
     }
 
     #[test]
-    fn a_good_file_of_either_format_passes() {
+    fn a_good_file_of_each_format_passes() {
         for (bytes, format, parts) in [
-            (BUILT_IN.to_vec(), Format::Frame, 15),
+            (BUILT_IN_HRN.to_vec(), Format::Frame, 15),
             (course_model(8, &[]), Format::Course, 16),
+            (BUILT_IN.to_vec(), Format::Identified, 16),
         ] {
             assert_eq!(problems(&bytes), []);
             let review = review(&bytes);
@@ -453,7 +467,8 @@ mod tests {
                 "between 0 and 1",
             ),
             ("hrn.format", "1", "found \"1\", expected \"2\""),
-            ("hrn.format", "3", "expected \"1\" or \"2\""),
+            ("hrn.format", "3", "found \"3\", expected \"2\""),
+            ("hrn.format", "4", "expected \"1\", \"2\" or \"3\""),
             ("hrn.pitch_mm", "-1", "millimetres above 0"),
             ("hrn.check", "{}", "missing field"),
         ] {

@@ -48,12 +48,6 @@ impl Builder {
         self.node("Div", &[x, &raised], output)
     }
 
-    /// log(y + `added`), where y is `x` clipped to 0..=`most`.
-    pub(super) fn logarithm(&mut self, x: &str, most: f32, added: f32) -> String {
-        let clipped = self.clipped(x, 0.0, most);
-        self.logarithm_of(&clipped, added)
-    }
-
     pub(super) fn clipped(&mut self, x: &str, least: f32, most: f32) -> String {
         let low = self.scalar(&format!("least {x}"), least);
         let high = self.scalar(&format!("most {x}"), most);

@@ -2,6 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
+use crate::net::bins::{BINS, LIFTS};
 use crate::net::graph::Constant;
 use crate::net::network::Weights;
 use crate::net::shore;
@@ -18,6 +19,8 @@ pub struct ExportedNetwork {
     pub temperature: f32,
     /// The widths by which the interval of Shore hardness is widened below and above, in Shore OO.
     pub widths: [f32; 2],
+    /// What is added to the logits of bins after temperature, if the network has bins.
+    pub lifts: Vec<f32>,
 }
 
 impl ExportedNetwork {
@@ -53,6 +56,7 @@ impl ExportedNetwork {
             temperature: numbers("temperature", 1)?[0],
             widths: numbers("shore middles", shore::OUTPUTS)
                 .map_or([0.0; 2], |middles| shore::widths(&middles)),
+            lifts: numbers(LIFTS, BINS).unwrap_or_default(),
         })
     }
 }

@@ -24,6 +24,7 @@ fn description(name: &str, sha256: &str) -> Description {
             pitch_mm: None,
             levels: None,
             recorded: std::collections::BTreeMap::new(),
+            pitches_mm: None,
         }],
     }
 }

@@ -13,7 +13,6 @@ use hardnessd_simulator::{self, DatasetSettings, Split};
 use hrn_train::data::courses::Courses;
 use hrn_train::data::dataset::{self, Dataset, Kind, Sample, meta};
 use hrn_train::data::simulated;
-use hrn_train::model::course::course_of;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
 
@@ -403,16 +402,11 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
     let train = ["train", "--method", "course", "--config", text(&settings)];
     let whole = ["--out", text(&run), "--data", text(&fine)];
     let output = hrn_train(&[&train[..], &whole].concat());
-    // Nothing says how hard the objects are, so the interval is the whole scale.
     let expected = "no labelled training press has a measured Shore hardness";
     assert!(errors(&output).contains(expected), "{output:?}");
     let model = run.join("hrn.onnx");
     let hrn = Hrn::load(&fs::read(&model).unwrap()).unwrap();
     assert_eq!(hrn.card().pitch_mm, 2.0);
-    let courses = Courses::read(&fine).unwrap();
-    let verdict = hrn.judge_course(&course_of(&courses, 0)).unwrap();
-    let shore = verdict.shore.unwrap();
-    assert_eq!((shore.low, shore.high), (0.0, 100.0));
 
     let warning = "coarse.npz: taxel pitch: found 3.5 mm, expected 2 mm, that of the model\n";
     for (data, expected) in [(&fine, ""), (&coarse, warning)] {

@@ -4,12 +4,12 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use hardnessd_core::verdict::{Course, Format, Hrn};
+use hardnessd_core::verdict::{Checks, Course, Format, Hrn, ReferenceKinds, References};
 use hardnessd_simulator::{
     self, CourseSettings, DatasetSettings, LawName, Materials, Shapes, Split,
 };
 use hrn_train::data::courses::{Courses, single_frames};
-use hrn_train::judge::press_features::{PressOf, of_hertz};
+use hrn_train::judge::hertz;
 use hrn_train::learn::course;
 use hrn_train::model::course::course_of;
 use serde_json::Value;
@@ -139,8 +139,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     adapt(at, &whole);
 }
 
-/// Adapts a model. Without a real step only the factor of the forces is new. An adapted model can be
-/// adapted again.
+/// Adapts a model. Without a real step it stays the same. An adapted model can be adapted again.
 fn adapt(at: &Path, start: &[u8]) {
     let simulate = "simulate --sequences --one-sensor 5 --cover 1 --objects 2 --test-objects 1 --presses 3 \
                     --fps 20 --seed 6 --out own.npz";
@@ -184,26 +183,21 @@ fn adapt(at: &Path, start: &[u8]) {
         "adapt --data own.npz --config still.toml --start whole/hrn.onnx --out still",
     );
     let still = Hrn::load(&std::fs::read(at.join("still/hrn.onnx")).unwrap()).unwrap();
-    let factor = &still.card().metrics["force_factor"];
-    let factor = factor.as_f64().unwrap_or(1.0) as f32;
+    assert!(still.card().metrics.get("force_factor").is_none());
+    // The new data state other borders between the levels.
+    let before = before.with_levels(still.card().levels.clone()).unwrap();
     let courses = Courses::read(&at.join("own.npz")).unwrap();
     for press in 0..courses.presses.len() {
         let course = course_of(&courses, press);
-        let mut scaled = course.clone();
-        for moment in &mut scaled.moments {
-            moment.frame = moment.frame.times(factor);
-        }
-        let [before, after] =
-            [(&before, &scaled), (&still, &course)].map(|(hrn, of)| hrn.judge_course(of).unwrap());
+        let [before, after] = [&before, &still].map(|hrn| hrn.judge_course(&course).unwrap());
         // The running average of unchanged weights has rounding errors.
-        let pairs = before.probabilities.iter().zip(&after.probabilities);
-        assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
+        for (before, after) in before.probabilities.iter().zip(&after.probabilities) {
+            assert!((before - after).abs() < 1e-5, "{before} {after}");
+        }
         let [before, after] = [before, after].map(|verdict| verdict.shore.unwrap());
         assert!((before.value - after.value).abs() < 1e-3 && (before.low - after.low).abs() < 1e-3);
     }
 
-    let output = hrn_train(at, "adapt --data own.npz --out none");
-    assert_eq!(output.status.code(), Some(2), "{output:?}");
     let output = hrn_train(
         at,
         "adapt --data own.npz --start ../../models/hrn.onnx --out none"
@@ -324,7 +318,7 @@ fn levels_weigh_as_the_network_says_unless_the_settings_do() {
         "simulate --sequences --materials broad --shapes matched --objects 5 --test-objects 0 --presses 2 \
          --fps 5..20 --seed 4 --out d.npz",
     );
-    for (method, own) in [("frame", "1.0"), ("course", "0.5")] {
+    for (method, own) in [("frame", "1.0"), ("course", "1.0")] {
         let model = |balance: Option<&str>| {
             let line = balance.map(|balance| format!("level_balance = {balance}"));
             let text = format!("[training]\nepochs = 1\n{}", line.unwrap_or_default());
@@ -357,6 +351,54 @@ fn what_does_not_go_together_is_wrong_usage() {
         errors.contains("has single frames, not whole presses") && errors.lines().count() == 1,
         "{errors}"
     );
+}
+
+#[test]
+fn a_course_model_takes_the_references_of_each_sensor() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = directory.path();
+    std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
+    let simulate = "simulate --sequences --sensors broad --materials broad --objects 6 --test-objects 2 \
+                    --covers 2 --test-covers 1 --electronics 2 --presses 2 --seed 11 --out d.npz";
+    succeed(at, simulate);
+    succeed(
+        at,
+        "train --method course --data d.npz --config settings.toml --out run",
+    );
+    let bytes = std::fs::read(at.join("run/hrn.onnx")).unwrap();
+    let hrn = Hrn::load(&bytes).unwrap();
+    assert_eq!(
+        (hrn.card().format.as_str(), hrn.most_references()),
+        ("3", 32)
+    );
+    assert_eq!(hrn.card().range.pitch_mm, Some([2.0, 7.0]));
+    let Checks::Courses(checks) = hrn.checks() else {
+        panic!("a model of courses has check presses");
+    };
+    // Half of the check presses were judged with two presses on each piece.
+    let identified = checks.presses.iter().filter(|press| press.identified);
+    assert_eq!((checks.references.len(), identified.count()), (4, 4));
+
+    // References change a verdict, and come back from a recording's text as they were.
+    let press = &checks.presses[0].course;
+    let references = hrn.references(&checks.references).unwrap();
+    assert_eq!(references.kinds(), ReferenceKinds::Rigid);
+    let text = serde_json::to_string(&references).unwrap();
+    let read: References = serde_json::from_str(&text).unwrap();
+    assert_eq!(read, references);
+    let identified = hrn.identified(read).unwrap();
+    let [with, without] = [&identified, &hrn].map(|hrn| hrn.judge_course(press).unwrap());
+    assert_ne!(with.probabilities, without.probabilities);
+
+    let accuracy = |given: &str| {
+        let evaluate = format!("evaluate --model run/hrn.onnx --data d.npz --json {given}");
+        let evaluation: Value = serde_json::from_str(&succeed(at, &evaluate)).unwrap();
+        evaluation["n"].as_u64().unwrap()
+    };
+    let all = accuracy("");
+    assert_eq!(accuracy("--rigid 2"), all);
+    // Objects that are references are not judged.
+    assert!(accuracy("--labelled 1") < all);
 }
 
 #[test]
@@ -402,16 +444,12 @@ fn moduli_by_hertz(shapes: Shapes) -> (usize, f64) {
         ..CourseSettings::default()
     };
     let simulated = hardnessd_simulator::courses(&settings, 2, |_| {});
-    let presses = course::presses(&Courses::of(&simulated), 1.0).unwrap();
+    let presses = course::presses(&Courses::of(&simulated));
     let pairs: Vec<(f64, f64)> = presses
         .iter()
         .zip(&simulated)
         .filter_map(|(press, made)| {
-            let fit = of_hertz(&PressOf {
-                frames: &press.features,
-                moments: &press.moments,
-                arm_n_per_mm: press.arm_n_per_mm,
-            });
+            let fit = hertz::row(press);
             (fit[0] == 1.0).then(|| (f64::from(fit[1]), f64::from(made.young_mpa.ln())))
         })
         .collect();

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use burn::tensor::Device;
-use hardnessd_core::verdict::BUILT_IN;
+use hardnessd_core::verdict::BUILT_IN_HRN;
 use hrn_train::data::dataset::{self, Dataset, Sample};
 use hrn_train::data::simulated;
 use hrn_train::run::checkpoint::Checkpoint;
@@ -42,7 +42,7 @@ fn bench() -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     let simulate = "simulate --objects 2 --test-objects 1 --presses 6 --out d.npz";
     succeed(directory.path(), simulate);
-    fs::write(directory.path().join("m.onnx"), BUILT_IN).unwrap();
+    fs::write(directory.path().join("m.onnx"), BUILT_IN_HRN).unwrap();
     directory
 }
 

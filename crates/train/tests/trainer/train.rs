@@ -895,7 +895,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         hrn_train(&["simulate", &force, "--out", &out])
     };
     let (model, heavy) = (path("model.onnx"), path("heavy.npz"));
-    std::fs::write(&model, hardnessd_core::verdict::BUILT_IN).unwrap();
+    std::fs::write(&model, hardnessd_core::verdict::BUILT_IN_HRN).unwrap();
     let mut samples = Dataset::read(Path::new(&data)).unwrap().samples;
     samples[0].frame.newtons[0] = 1e38;
     let file = std::fs::File::create(&heavy).unwrap();

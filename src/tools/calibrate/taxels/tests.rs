@@ -7,7 +7,7 @@ use hardnessd_core::motion::Point;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{ARM_N_PER_MM, Material, SensorProfile, Sequence, SequenceSettings};
 
@@ -219,7 +219,7 @@ fn fitted(played: &Played, hrn: &Arc<Hrn>) -> Fit {
 
 #[test]
 fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
-    let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
     let played = play(7, 300, 0, SensorProfile::Raw);
     let fit = fitted(&played, &hrn);
     let correlation = correlation(&fit, &played.gains);
@@ -236,7 +236,7 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
 #[ignore = "minutes: cargo test --lib worth_of_gains -- --ignored --nocapture"]
 fn print_the_worth_of_gains() {
     let course = std::fs::read("models/course.onnx").unwrap();
-    let models = [BUILT_IN, &course].map(|bytes| Arc::new(Hrn::load(bytes).unwrap()));
+    let models = [BUILT_IN_HRN, &course].map(|bytes| Arc::new(Hrn::load(bytes).unwrap()));
     let rows = |gains: &[f32]| {
         Some(Gains::Taxels(
             gains.chunks(28).map(<[f32]>::to_vec).collect(),

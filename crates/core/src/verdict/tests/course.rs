@@ -50,7 +50,7 @@ fn a_frame_alone_is_a_press_of_which_nothing_else_is_known() {
     let verdict = hrn.judge(&frame).unwrap();
     assert_eq!(<[f32; 3]>::from(verdict.shore.unwrap()), [0.0, -1.0, 0.0]);
     // A model of frames judges the last frame of a course.
-    let hrn = Hrn::load(BUILT_IN).unwrap();
+    let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
     let course = course(4, true);
     let last = hrn.judge(&course.moments[3].frame).unwrap();
     assert_eq!(hrn.judge_course(&course).unwrap(), last);

@@ -7,8 +7,10 @@ use std::path::Path;
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
 use hrn_train::compare::digits::{rounded, thousands};
+use hrn_train::data::courses::Courses;
 use hrn_train::data::dataset;
 use hrn_train::judge::metrics::Evaluation;
+use hrn_train::model::course::course_of;
 use hrn_train::model::evaluated::{Case, Evaluated, NEAR_BORDER};
 
 /// The card of the model read from `path`.
@@ -252,6 +254,16 @@ fn listed(numbers: &[u8]) -> String {
         Some((last, rest)) if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
         _ => texts.concat(),
     }
+}
+
+/// The input `features` of every press, a line each.
+pub(super) fn features_csv(courses: &Courses) -> String {
+    let line = |press: usize| {
+        let features = course_of(courses, press).features();
+        let features: Vec<String> = features.iter().map(f32::to_string).collect();
+        features.join(",") + "\n"
+    };
+    (0..courses.presses.len()).map(line).collect()
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use clap::builder::RangedU64ValueParser;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand, ValueEnum};
-use hardnessd_simulator::{DatasetSettings, LawName, Materials, SensorProfile, Shapes, Split};
+use hardnessd_simulator::{
+    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split,
+};
 use hrn_train::data::dataset::LabelChoice;
 use hrn_train::methods::Method;
 use hrn_train::settings::Profile;
@@ -147,6 +149,17 @@ pub(super) struct Simulate {
 pub(super) enum Sensors {
     /// Many sensors, each of a design of its own, with presses of rigid pieces on each
     Broad,
+    /// Many instances of the JX255N, with presses of rigid pieces on each
+    Jx255n,
+}
+
+impl From<Sensors> for SensorDesigns {
+    fn from(sensors: Sensors) -> Self {
+        match sensors {
+            Sensors::Broad => Self::Broad,
+            Sensors::Jx255n => Self::Jx255n,
+        }
+    }
 }
 
 /// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
@@ -445,9 +458,19 @@ pub(super) struct Evaluate {
     /// Split to evaluate
     #[arg(long, default_value = "test")]
     pub(super) split: SplitName,
+    /// Give the model this many presses of each rigid piece as references of each sensor
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(super) rigid: usize,
+    /// Give the model a press of this many objects of each level as references of each sensor; the
+    /// objects are not judged
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(super) labelled: usize,
     /// Also write every verdict as a line of CSV; an existing file is replaced
     #[arg(long, value_name = "V.csv")]
     pub(super) verdicts: Option<PathBuf>,
+    /// Also write the input `features` of every press of the data, as CSV; an existing file is replaced
+    #[arg(long, value_name = "F.csv")]
+    pub(super) features: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,

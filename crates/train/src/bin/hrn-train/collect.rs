@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use anyhow::bail;
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hrn_train::data::collect::{self, Collection, Labelling, Part, Settings};
 use hrn_train::run::disk::{lock, write_streamed, write_whole};
 
@@ -29,7 +29,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let earlier = is_appended.then(|| Part::of_data_set(out, arguments.sequences));
     let settings = Settings {
         sensor,
-        hrn: Arc::new(Hrn::load(BUILT_IN)?),
+        hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
         labelling: Labelling {
             level: arguments.level,
             object: arguments.object,

@@ -48,11 +48,6 @@ pub(super) struct NoCuda;
 pub(super) enum WrongUsage {
     #[error("--data: found {0} files, expected 1 without --course")]
     ManyFiles(usize),
-    #[error(
-        "--start is missing: the data has whole presses, and the built-in model judges single frames: \
-         name a model of whole presses, such as models/course.onnx"
-    )]
-    NoStart,
     #[error("{0}: works with methods of single frames only")]
     OfFrames(&'static str),
     #[error("{}: {} is another file of this command: name a new one", .0, .1.display())]

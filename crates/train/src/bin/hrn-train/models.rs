@@ -10,7 +10,7 @@ use hardnessd_core::{exit, wording};
 use hrn_train::data::courses::{self, Courses};
 use hrn_train::data::dataset::{self, Dataset};
 use hrn_train::model::adopt::{self, Stated};
-use hrn_train::model::course;
+use hrn_train::model::course::{self, Given};
 use hrn_train::model::evaluated::{Case, Evaluated};
 use hrn_train::model::export;
 use hrn_train::model::review::{self, Format, Review};
@@ -21,9 +21,14 @@ use super::failure::{NoRun, exit_code};
 use super::files::{apart, load, load_with_bytes, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
-    if let Some(verdicts) = &arguments.verdicts {
-        let inputs = [&arguments.model, &arguments.data];
-        apart("--verdicts", verdicts, inputs.map(PathBuf::as_path))?;
+    let inputs = [&arguments.model, &arguments.data];
+    for (option, path) in [
+        ("--verdicts", &arguments.verdicts),
+        ("--features", &arguments.features),
+    ] {
+        if let Some(path) = path {
+            apart(option, path, inputs.map(PathBuf::as_path))?;
+        }
     }
     let hrn = load(&arguments.model)?;
     if Courses::is_at(&arguments.data)? {
@@ -68,12 +73,21 @@ fn warn_of_pitch(data: &Path, pitch_mm: f64, hrn: &Hrn) {
 fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
     let (courses, sources) = Courses::read_all(std::slice::from_ref(&arguments.data))?;
     warn_of_pitch(&arguments.data, dataset::pitch_mm(&sources), hrn);
-    let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), |course| course)?;
+    let given = Given {
+        rigid: arguments.rigid,
+        labelled: arguments.labelled,
+    };
+    let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), given, |course| {
+        course
+    })?;
     anyhow::ensure!(
         !verdicts.is_empty(),
         "{}: no press of this split has a level: choose the other --split, or other data",
         arguments.data.display()
     );
+    if let Some(path) = &arguments.features {
+        write(path, account::features_csv(&courses).as_bytes())?;
+    }
     say(arguments, hrn, &course::cases(&verdicts))
 }
 
@@ -124,7 +138,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
                 "`hrn-train adopt {} --data D.npz --out H.onnx` adds what is missing\n",
                 path.display()
             );
-        } else if format == Format::Course {
+        } else if format != Format::Frame {
             lines += "`hrn-train adopt` takes models of one frame only: add what is missing yourself \
                       (docs/formats.md)\n";
         }

@@ -11,7 +11,7 @@ use hardnessd_simulator::{
 use hrn_train::data::simulated;
 use hrn_train::judge::sheet;
 
-use super::arguments::{Sensors, Simulate};
+use super::arguments::Simulate;
 use super::failure::{NoObjects, OtherMaterials};
 use super::files::{apart, write};
 
@@ -102,12 +102,10 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
 
 fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::Result<String> {
     let (asked, usual) = (&arguments.courses, CourseSettings::default());
-    let is_broad = matches!(asked.sensors, Some(Sensors::Broad));
     let usual = CourseSettings {
-        arm_error: if is_broad {
-            BROAD_ARM_ERROR
-        } else {
-            usual.arm_error
+        arm_error: match asked.sensors {
+            Some(_) => BROAD_ARM_ERROR,
+            None => usual.arm_error,
         },
         ..usual
     };
@@ -123,14 +121,15 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
         unknown_share: asked.unknown.unwrap_or(usual.unknown_share),
         sensors: None,
     };
-    if !is_broad {
+    let Some(designs) = asked.sensors else {
         return write_courses(arguments, &settings, &arguments.out);
-    }
+    };
     let usual = BroadSensors::default();
     let shards = asked.shards.unwrap_or(usual.shards);
     let mut said = String::new();
     for shard in 0..shards {
         let sensors = BroadSensors {
+            designs: designs.into(),
             covers: asked.covers.unwrap_or(usual.covers),
             test_covers: asked.test_covers.unwrap_or(usual.test_covers),
             electronics: asked.electronics.unwrap_or(usual.electronics),
@@ -151,7 +150,7 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
     Ok(said)
 }
 
-/// Error of the stiffness that the robot of a broad sensor reports.
+/// Error of the stiffness that a robot reports, where each sensor has a number.
 const BROAD_ARM_ERROR: f64 = 0.15;
 
 /// `D-3.npz` for part 3 of `D.npz`.

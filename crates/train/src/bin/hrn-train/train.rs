@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
-use hardnessd_core::verdict::{BUILT_IN, Hrn, sha256_hex};
+use hardnessd_core::verdict::{BUILT_IN, BUILT_IN_HRN, Hrn, sha256_hex};
 use hardnessd_core::wording;
 use hrn_train::data::courses::Courses;
 use hrn_train::data::dataset::LabelChoice;
@@ -97,10 +97,10 @@ pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
             let (model, bytes) = load_with_bytes(path)?;
             (model, bytes, path.display().to_string())
         }
-        None if of_courses => return Err(WrongUsage::NoStart.into()),
         None => {
+            let bytes = if of_courses { BUILT_IN } else { BUILT_IN_HRN };
             let name = "the built-in model".to_owned();
-            (Hrn::load(BUILT_IN)?, BUILT_IN.to_vec(), name)
+            (Hrn::load(bytes)?, bytes.to_vec(), name)
         }
     };
     let task = if of_courses {

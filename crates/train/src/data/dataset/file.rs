@@ -13,7 +13,7 @@ use super::{Dataset, DatasetError, Kind, Sample, Source, levels};
 use crate::data::npz::{Element, Writer};
 use hardnessd_core::npy::{Header, NpyError};
 use hardnessd_core::verdict::{COLS, Level, ModelFrame, ROWS, TAXELS, check_levels, sha256_hex};
-use hardnessd_simulator::Split;
+use hardnessd_simulator::{BroadSensors, Split};
 
 /// A force above any sensor's, and low enough that sums of squares stay finite.
 const MOST_NEWTONS: f32 = 1e6;
@@ -157,9 +157,17 @@ pub(in crate::data) fn source(
         sha256: sha256_hex(bytes),
         generator: meta["generator"].as_str().map(str::to_owned),
         pitch_mm,
+        pitches_mm: pitches_mm(meta),
         levels: stated.filter(|of| of.len() == levels().len()),
         recorded: recorded(&meta["captures"]),
     })
+}
+
+/// The distances between the taxels of many simulated sensors.
+fn pitches_mm(meta: &serde_json::Value) -> Option<[f64; 2]> {
+    let sensors = meta.pointer("/settings/sensors")?.clone();
+    let sensors: BroadSensors = serde_json::from_value(sensors).ok()?;
+    Some(sensors.designs.pitches_mm())
 }
 
 /// The objects of recordings, and whether `hardnessd simulate` played them.

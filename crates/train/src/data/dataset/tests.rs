@@ -381,6 +381,7 @@ fn a_model_states_the_levels_of_its_data() {
         pitch_mm: None,
         levels,
         recorded: BTreeMap::new(),
+        pitches_mm: None,
     };
     assert_eq!(levels_of(&[source(None)]), levels());
     let several = [

@@ -2,7 +2,6 @@
 //! trained on exact reports alone would trust every report.
 
 use super::Press;
-use crate::net::frames::FEATURES;
 use crate::settings::ArmReports;
 use hardnessd_core::verdict::{Extents, extents};
 use hardnessd_simulator::random::Stream;
@@ -27,15 +26,9 @@ impl ArmReports {
         if stream.uniform() < self.early && press.moments.len() > LEAST_FRAMES {
             let frames = LEAST_FRAMES + stream.below(press.moments.len() - LEAST_FRAMES);
             press.moments.truncate(frames);
-            press.features.truncate(frames * FEATURES);
         }
         if stream.uniform() < self.unknown {
-            press.arm_n_per_mm = 0.0;
-            press
-                .moments
-                .iter_mut()
-                .for_each(|moment| moment.approach_mm = None);
-            return press;
+            return press.without_arm();
         }
         if stream.uniform() < self.unknown_arm {
             press.arm_n_per_mm = 0.0;
@@ -150,11 +143,6 @@ impl Press {
         let first = stream.below(step);
         let begin = self.moments[first];
         let kept = |of: usize| of >= first && (of - first).is_multiple_of(step);
-        let rows = self.features.chunks(FEATURES).enumerate();
-        self.features = rows
-            .filter(|(of, _)| kept(*of))
-            .flat_map(|(_, row)| row.iter().copied())
-            .collect();
         let mut of = 0..;
         self.moments.retain(|_| of.next().is_some_and(kept));
         for moment in &mut self.moments {
@@ -194,21 +182,22 @@ fn at(reported: &[(f32, f32)], time_s: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::net::course::PressMoment;
+    use hardnessd_core::verdict::features::{Moment, frame_of};
 
     fn press() -> Press {
-        let moment = |n: u8| PressMoment {
+        let moment = |n: u8| Moment {
+            frame: frame_of(9.0, 1.0),
             time_s: 0.1 * f32::from(n),
             approach_mm: Some(0.5 * f32::from(n)),
-            force_n: 1.0,
         };
         Press {
-            features: vec![0.0; 10 * FEATURES],
             moments: (0..10).map(moment).collect(),
             arm_n_per_mm: 10.0,
             level: 1,
             shore: Some(80.0),
             object: 0,
+            sensor: 0,
+            piece: None,
         }
     }
 
@@ -253,7 +242,6 @@ mod tests {
             let step_s = slow.moments[1].time_s;
             steps.insert((10.0 * step_s).round() as u32);
             assert!((3..=5).contains(&slow.moments.len()), "{slow:?}");
-            assert_eq!(slow.features.len(), slow.moments.len() * FEATURES);
             for (place, moment) in (0_u8..).zip(&slow.moments) {
                 let time_s = f32::from(place) * step_s;
                 assert!((moment.time_s - time_s).abs() < 1e-5, "{slow:?}");
@@ -274,11 +262,7 @@ mod tests {
         assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));
         // A quarter of the presses end early. Of the others, three in ten have a slower sensor.
         assert!((410..540).contains(&share(|p| p.moments.len() < 10)));
-        assert!(
-            drawn
-                .iter()
-                .all(|p| p.moments.len() >= 3 && p.features.len() == p.moments.len() * FEATURES)
-        );
+        assert!(drawn.iter().all(|p| p.moments.len() >= 3));
     }
 
     /// A press at `speed_mm_s` of ten frames, with this time between them.

@@ -1,0 +1,358 @@
+//! The file of a sensor's references: presses on pieces whose properties are known, as `.npz`.
+//!
+//! In: the bytes of a file, or presses on the model's grid. Out: the presses, or the bytes.
+//! `docs/formats.md` has the arrays. A daemon gives them to its model, and they replace nothing of the
+//! calibration.
+
+use std::io::{Cursor, Read, Write};
+
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+use crate::npy::{Header, NpyError};
+use crate::verdict::{
+    COLS, COURSE_FRAMES, Course, CourseMoment, MOST_REFERENCES, ModelFrame, Piece, ROWS,
+    ReferencePress, TAXELS,
+};
+
+/// Newtons per unit of `frames_mn`.
+const NEWTONS: f32 = 1e-3;
+/// The lengths of pieces, in mm.
+const MOST_MM: f64 = 1000.0;
+/// The largest file that is read, in bytes.
+pub const MAX_FILE_BYTES: usize = 16_000_000;
+
+/// The reason why bytes are not a file of references.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The bytes are no `.npz` file.
+    #[error("found no .npz file ({0}), expected one of `hardnessd identify`")]
+    Archive(#[from] zip::result::ZipError),
+    /// An array is missing.
+    #[error("{array}: found none, expected {expected}")]
+    Missing {
+        /// The name of the array.
+        array: &'static str,
+        /// Its type and shape.
+        expected: String,
+    },
+    /// An array cannot be read.
+    #[error("{array}: found {source}")]
+    Array {
+        /// The name of the array.
+        array: &'static str,
+        /// What was found in its place.
+        source: NpyError,
+    },
+    /// An array has an unusable content.
+    #[error("{array}: found {found}, expected {expected}")]
+    Content {
+        /// The name of the array.
+        array: &'static str,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+}
+
+/// What the file holds beside the frames, for each press.
+const KINDS: [&str; 3] = ["1 (flat)", "2 (ball)", "3 (known hardness)"];
+
+/// Reads a file.
+///
+/// # Errors
+///
+/// Returns an [`Error`] if the bytes are no such file, or have no press or more than
+/// [`MOST_REFERENCES`].
+pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
+    let mut arrays = Arrays(ZipArchive::new(Cursor::new(bytes))?);
+    let content = |array, found: String, expected: &str| Error::Content {
+        array,
+        found,
+        expected: expected.to_owned(),
+    };
+    let kinds = arrays.read("piece", &[], 0.0..=255.0)?;
+    let count = kinds.len();
+    if !(1..=MOST_REFERENCES).contains(&count) {
+        let expected = format!("1 to {MOST_REFERENCES}");
+        return Err(content("piece", format!("{count} presses"), &expected));
+    }
+    let piece_mm = arrays.of("piece_mm", &[], count, 0.0..=MOST_MM)?;
+    let shore = arrays.of("shore", &[2], count, 0.0..=100.0)?;
+    let arm_n_per_mm = arrays.of("arm_n_per_mm", &[], count, 0.0..=1e6)?;
+    let press = arrays.read("press", &[], 0.0..=f64::from(u32::MAX))?;
+    let frames = press.len();
+    let time_s = arrays.of("time_s", &[], frames, 0.0..=1e5)?;
+    let approach_mm = arrays.of("approach_mm", &[], frames, -1e6..=1e6)?;
+    let known = arrays.of("known", &[], frames, 0.0..=1.0)?;
+    let frames_mn = arrays.of("frames_mn", &[ROWS, COLS], frames, 0.0..=65535.0)?;
+
+    let (mut references, mut first) = (Vec::with_capacity(count), 0);
+    for number in 0..count {
+        let length = press[first..]
+            .iter()
+            .take_while(|&&of| of == number as f64)
+            .count();
+        if !(1..=COURSE_FRAMES.1).contains(&length) {
+            let expected = format!("1 to {} of each press, in order", COURSE_FRAMES.1);
+            let found = format!("{length} frames of press {number}");
+            return Err(content("press", found, &expected));
+        }
+        let moment = |row: usize| CourseMoment {
+            time_s: time_s[row] as f32,
+            approach_mm: (known[row] == 1.0).then_some(approach_mm[row] as f32),
+            frame: ModelFrame {
+                newtons: std::array::from_fn(|k| frames_mn[row * TAXELS + k] as f32 * NEWTONS),
+            },
+        };
+        let mm = piece_mm[number] as f32;
+        let range = [shore[2 * number] as f32, shore[2 * number + 1] as f32];
+        let piece = match kinds[number] {
+            1.0 if mm > 0.0 => Piece::Flat { width_mm: mm },
+            2.0 if mm > 0.0 => Piece::Ball { radius_mm: mm },
+            3.0 if range[0] <= range[1] => Piece::Shore { range },
+            kind => {
+                let found = format!("{kind} of {mm} mm or Shore {range:?}");
+                return Err(content("piece", found, &KINDS.join(", ")));
+            }
+        };
+        references.push(ReferencePress {
+            course: Course {
+                moments: (first..first + length).map(moment).collect(),
+                arm_n_per_mm: arm_n_per_mm[number] as f32,
+            },
+            piece,
+        });
+        first += length;
+    }
+    if first != frames {
+        let found = format!("{frames} frames");
+        return Err(content(
+            "press",
+            found,
+            &format!("{first}, those of {count} presses"),
+        ));
+    }
+    Ok(references)
+}
+
+/// The arrays of a file.
+struct Arrays<'a>(ZipArchive<Cursor<&'a [u8]>>);
+
+impl Arrays<'_> {
+    /// An array with this many rows.
+    fn of(
+        &mut self,
+        array: &'static str,
+        row: &[usize],
+        rows: usize,
+        range: std::ops::RangeInclusive<f64>,
+    ) -> Result<Vec<f64>, Error> {
+        let values = self.read(array, row, range)?;
+        let found = values.len() / row.iter().product::<usize>();
+        if found == rows {
+            return Ok(values);
+        }
+        Err(Error::Content {
+            array,
+            found: format!("{found} rows"),
+            expected: rows.to_string(),
+        })
+    }
+
+    /// An array whose rows have this shape.
+    fn read(
+        &mut self,
+        array: &'static str,
+        row: &[usize],
+        range: std::ops::RangeInclusive<f64>,
+    ) -> Result<Vec<f64>, Error> {
+        let Ok(entry) = self.0.by_name(&format!("{array}.npy")) else {
+            return Err(Error::Missing {
+                array,
+                expected: format!("an array with rows of shape {row:?}"),
+            });
+        };
+        let failed = |source| Error::Array { array, source };
+        let most = MOST_REFERENCES * COURSE_FRAMES.1 * TAXELS * size_of::<f64>() + BLOCK_BYTES;
+        let mut entry = entry.take(most as u64);
+        let header = Header::read(&mut entry).map_err(failed)?;
+        if header.fortran_order || header.shape.is_empty() || header.shape[1..] != *row {
+            return Err(failed(NpyError::Shape(header.shape)));
+        }
+        let values = header.elements(&mut entry, Some).map_err(failed)?;
+        match values.iter().find(|value| !range.contains(*value)) {
+            None => Ok(values),
+            Some(found) => Err(Error::Content {
+                array,
+                found: found.to_string(),
+                expected: format!("{} to {}", range.start(), range.end()),
+            }),
+        }
+    }
+}
+
+/// More than the longest header of an array.
+const BLOCK_BYTES: usize = 1 << 16;
+
+/// The bytes of a file with these presses. The same presses give the same bytes.
+///
+/// # Errors
+///
+/// Returns the errors of packing.
+pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
+    let moments = || {
+        let numbered = (0_u32..).zip(references);
+        numbered.flat_map(|(number, press)| {
+            press
+                .course
+                .moments
+                .iter()
+                .map(move |moment| (number, moment))
+        })
+    };
+    let frames = moments().count();
+    let piece_mm = |press: &ReferencePress| match press.piece {
+        Piece::Flat { width_mm } => width_mm,
+        Piece::Ball { radius_mm } => radius_mm,
+        Piece::Shore { .. } => 0.0,
+    };
+    let shore = |press: &ReferencePress| match press.piece {
+        Piece::Shore { range } => range,
+        Piece::Flat { .. } | Piece::Ball { .. } => [0.0; 2],
+    };
+    let kind = |press: &ReferencePress| match press.piece {
+        Piece::Flat { .. } => 1,
+        Piece::Ball { .. } => 2,
+        Piece::Shore { .. } => 3,
+    };
+    let mut zip = Packed(ZipWriter::new(Cursor::new(Vec::new())));
+    let presses = references.iter();
+    let count = [references.len()];
+    let kinds = presses.clone().map(kind);
+    zip.add("piece", "|u1", &count, kinds.map(u8::to_le_bytes))?;
+    zip.floats("piece_mm", &count, presses.clone().map(piece_mm))?;
+    zip.floats("shore", &[count[0], 2], presses.clone().flat_map(shore))?;
+    let arms = presses.map(|press| press.course.arm_n_per_mm);
+    zip.floats("arm_n_per_mm", &count, arms)?;
+    let numbers = moments().map(|(number, _)| number.to_le_bytes());
+    zip.add("press", "<u4", &[frames], numbers)?;
+    zip.floats("time_s", &[frames], moments().map(|(_, m)| m.time_s))?;
+    let approach_mm = moments().map(|(_, m)| m.approach_mm.unwrap_or(0.0));
+    zip.floats("approach_mm", &[frames], approach_mm)?;
+    let known = moments().map(|(_, m)| [u8::from(m.approach_mm.is_some())]);
+    zip.add("known", "|u1", &[frames], known)?;
+    // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
+    let millinewtons = moments().flat_map(|(_, m)| m.frame.newtons);
+    let millinewtons = millinewtons.map(|n| ((n / NEWTONS).round() as u16).to_le_bytes());
+    zip.add("frames_mn", "<u2", &[frames, ROWS, COLS], millinewtons)?;
+    Ok(zip.0.finish()?.into_inner())
+}
+
+/// A file that is being written. It holds no date.
+struct Packed(ZipWriter<Cursor<Vec<u8>>>);
+
+impl Packed {
+    fn floats(
+        &mut self,
+        name: &str,
+        shape: &[usize],
+        values: impl Iterator<Item = f32>,
+    ) -> std::io::Result<()> {
+        self.add(name, "<f4", shape, values.map(f32::to_le_bytes))
+    }
+
+    fn add<const N: usize>(
+        &mut self,
+        name: &str,
+        descr: &str,
+        shape: &[usize],
+        elements: impl Iterator<Item = [u8; N]>,
+    ) -> std::io::Result<()> {
+        let header = Header {
+            descr: descr.to_owned(),
+            fortran_order: false,
+            shape: shape.to_vec(),
+        };
+        let mut bytes = header.to_bytes();
+        bytes.extend(elements.flatten());
+        let options = SimpleFileOptions::default().compression_method(CompressionMethod::Deflated);
+        self.0.start_file(format!("{name}.npy"), options)?;
+        self.0.write_all(&bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn press(frames: usize, piece: Piece) -> ReferencePress {
+        let moment = |place: usize| {
+            let mut frame = ModelFrame::default();
+            frame.newtons[400..403].fill((250 * (place + 1)) as f32 * NEWTONS);
+            CourseMoment {
+                time_s: 0.05 * place as f32,
+                approach_mm: (place != 2).then_some(0.5 * place as f32),
+                frame,
+            }
+        };
+        ReferencePress {
+            course: Course {
+                moments: (0..frames).map(moment).collect(),
+                arm_n_per_mm: 12.5,
+            },
+            piece,
+        }
+    }
+
+    fn presses() -> Vec<ReferencePress> {
+        vec![
+            press(4, Piece::Flat { width_mm: 20.0 }),
+            press(1, Piece::Ball { radius_mm: 7.5 }),
+            press(
+                48,
+                Piece::Shore {
+                    range: [61.0, 70.0],
+                },
+            ),
+        ]
+    }
+
+    #[test]
+    fn a_file_gives_the_presses_back() {
+        let bytes = write(&presses()).unwrap();
+        assert_eq!(read(&bytes).unwrap(), presses());
+        assert_eq!(write(&presses()).unwrap(), bytes);
+    }
+
+    #[test]
+    fn what_is_no_such_file_is_refused() {
+        let refused = |bytes: &[u8], expected: &str| {
+            let error = read(bytes).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        };
+        refused(b"PK", "found no .npz file");
+        let bytes = write(&presses()).unwrap();
+        refused(&bytes[..bytes.len() / 2], "found no .npz file");
+        refused(
+            &write(&[]).unwrap(),
+            "piece: found 0 presses, expected 1 to 64",
+        );
+        let many = vec![presses()[1].clone(); 65];
+        refused(&write(&many).unwrap(), "65 presses");
+        let long = [press(49, Piece::Flat { width_mm: 1.0 })];
+        refused(&write(&long).unwrap(), "press: found 49 frames of press 0");
+        let none = [press(4, Piece::Ball { radius_mm: 0.0 })];
+        refused(&write(&none).unwrap(), "piece: found 2 of 0 mm");
+        let wrong = [press(
+            4,
+            Piece::Shore {
+                range: [70.0, 61.0],
+            },
+        )];
+        refused(&write(&wrong).unwrap(), "Shore [70.0, 61.0]");
+        let nan = [press(4, Piece::Flat { width_mm: f32::NAN })];
+        refused(&write(&nan).unwrap(), "piece_mm: found NaN");
+    }
+}

@@ -1,0 +1,686 @@
+//! Hand-made features of a press: what its frames, its force over time and the arm's approach say of
+//! what was pressed.
+//!
+//! In: the course of a press. Out: [`FEATURES`] numbers, the input `features` of a model of format 3.
+//! The trainer computes them with this code, so both see the same. Logarithms turn the power laws of
+//! contact into sums. What is not known is 0, beside a number that says whether it is known.
+
+use super::course::{Course, CourseMoment};
+use super::grid::{COLS, ModelFrame, ROWS};
+
+/// The numbers of a frame.
+pub const FRAME: usize = 20;
+/// The numbers of a press.
+pub const FEATURES: usize = FRAME + 103;
+
+/// A taxel of the model's grid is in contact at or above this force.
+const CONTACT_N: f32 = 0.07;
+/// Thresholds above which taxels are counted, in newtons.
+const COUNTED_N: [f32; 5] = [0.2, 0.5, 1.0, 2.0, 4.0];
+/// Shares of the peak above which taxels are counted.
+const COUNTED_SHARES: [f32; 3] = [0.5, 0.25, 0.75];
+/// Added before a logarithm or to a divisor to keep it finite.
+const LITTLE_N: f32 = 0.05;
+const LITTLE_MM: f32 = 0.1;
+const LITTLE_S: f32 = 0.05;
+const TINY: f32 = 1e-4;
+/// The limit of lengths, in mm.
+const MOST_MM: f32 = 60.0;
+/// The least stiffness of an arm, in N/mm.
+const LEAST_ARM: f32 = 0.5;
+/// Shares of the greatest force at which the loading is read off.
+const LOADING: [f32; 4] = [0.1, 0.25, 0.5, 0.75];
+/// Shares of the last force of the hold at which the unloading is compared with the loading.
+const UNLOADING: [f32; 3] = [0.25, 0.5, 0.75];
+/// Approaches at which force and area are read off, in mm.
+const APPROACHES_MM: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
+/// Times of the hold at which it is compared with its beginning, in s.
+const HOLD_S: [f32; 3] = [0.1, 0.3, 1.0];
+/// Loading ends at the first frame of this share of the greatest force, and the hold before the force
+/// falls below this share of it.
+const LOADED: f32 = 0.95;
+const HELD: f32 = 0.8;
+/// Laws are fitted from this share of loading's last force on, and the slope of its end from this one.
+const FITTED: f32 = 0.08;
+const END: f32 = 0.5;
+
+/// Places of a frame's numbers.
+const AREA: usize = 0;
+const HALF: usize = 6;
+const FORCE: usize = 9;
+const PEAK: usize = 10;
+const SPREAD: usize = 11;
+const WIDTH: usize = 12;
+const EFFECTIVE: usize = 13;
+
+/// The numbers of one frame: logarithms of areas, force, peak and second moments, and the contact's
+/// form.
+pub type FrameFeatures = [f32; FRAME];
+
+/// The features of a frame on the model's grid.
+pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
+    let mut sums = Sums::default();
+    let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
+    let mut counts = [0.0_f32; 5];
+    let mut shares = [0.0_f32; 3];
+    let (mut roughness, mut border) = (0.0, 0.0);
+    let taxel = |row: usize, col: usize| {
+        let newtons = frame.newtons[row * COLS + col];
+        if newtons >= CONTACT_N { newtons } else { 0.0 }
+    };
+    for row in 0..ROWS {
+        for col in 0..COLS {
+            let newtons = taxel(row, col);
+            let below = (row + 1 < ROWS).then(|| taxel(row + 1, col));
+            let right = (col + 1 < COLS).then(|| taxel(row, col + 1));
+            for beside in [below, right].into_iter().flatten() {
+                roughness += (newtons - beside).abs();
+                border += f32::from(u8::from((newtons > 0.0) != (beside > 0.0)));
+            }
+            if newtons == 0.0 {
+                continue;
+            }
+            sums.add(row, col, newtons);
+            for (count, threshold_n) in counts.iter_mut().zip(COUNTED_N) {
+                *count += f32::from(u8::from(newtons >= threshold_n));
+            }
+            for (count, share) in shares.iter_mut().zip(COUNTED_SHARES) {
+                *count += f32::from(u8::from(newtons >= share * peak));
+            }
+        }
+    }
+    let (spread, elongation) = sums.of_force.moments();
+    let (width, oblong) = sums.of_contact.moments();
+    let (force, area) = (sums.of_force.total, sums.of_contact.total);
+    let fourth = sums.fourth(frame);
+    let effective = force * force / (sums.squares + TINY);
+    let [c02, c05, c1, c2, c4] = counts.map(f32::ln_1p);
+    let [half, quarter, most] = shares.map(|count| (count + 0.5).ln());
+    [
+        area.ln_1p(),
+        c02,
+        c05,
+        c1,
+        c2,
+        c4,
+        half,
+        quarter,
+        most,
+        (force + LITTLE_N).ln(),
+        (peak + LITTLE_N).ln(),
+        (spread + 0.05).ln(),
+        (width + 0.05).ln(),
+        (effective + 0.5).ln(),
+        elongation,
+        oblong,
+        roughness / (force + LITTLE_N),
+        border / (area + 0.5),
+        ((fourth + 0.1) / (spread * spread + 0.1)).ln(),
+        (peak * area / (force + 0.01) + 0.5).ln(),
+    ]
+}
+
+/// The number of a frame's taxels in contact, from its features.
+pub fn area(frame: &FrameFeatures) -> f32 {
+    frame[AREA].exp_m1()
+}
+
+/// The features of a frame of which only the area in taxels and the force are known. For tests.
+pub fn frame_of(area: f32, force_n: f32) -> FrameFeatures {
+    let mut frame = [0.0; FRAME];
+    frame[AREA] = area.ln_1p();
+    frame[FORCE] = (force_n + LITTLE_N).ln();
+    frame
+}
+
+/// The total force of a frame's taxels in contact, from its features.
+pub fn force_n(frame: &FrameFeatures) -> f32 {
+    (frame[FORCE].exp() - LITTLE_N).max(0.0)
+}
+
+/// Sums over the taxels in contact, weighted by force, and all alike.
+#[derive(Default)]
+struct Sums {
+    of_force: Moments,
+    of_contact: Moments,
+    squares: f32,
+}
+
+impl Sums {
+    fn add(&mut self, row: usize, col: usize, newtons: f32) {
+        self.of_force.add(row, col, newtons);
+        self.of_contact.add(row, col, 1.0);
+        self.squares += newtons * newtons;
+    }
+
+    /// The fourth moment of the force about its centre.
+    fn fourth(&self, frame: &ModelFrame) -> f32 {
+        let [centre_row, centre_col] = self.of_force.centre();
+        let mut sum = 0.0;
+        for (place, &newtons) in frame.newtons.iter().enumerate() {
+            if newtons >= CONTACT_N {
+                let (row, col) = centred(place / COLS, place % COLS);
+                let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
+                sum += newtons * square * square;
+            }
+        }
+        sum / (self.of_force.total + TINY)
+    }
+}
+
+/// A taxel's place from the middle of the grid.
+fn centred(row: usize, col: usize) -> (f32, f32) {
+    let middle = |length: usize| (length as f32 - 1.0) / 2.0;
+    (row as f32 - middle(ROWS), col as f32 - middle(COLS))
+}
+
+/// The moments of a weight over the grid.
+#[derive(Default)]
+struct Moments {
+    total: f32,
+    first: [f32; 2],
+    second: [f32; 3],
+}
+
+impl Moments {
+    fn add(&mut self, row: usize, col: usize, weight: f32) {
+        let (row, col) = centred(row, col);
+        self.total += weight;
+        self.first[0] += weight * row;
+        self.first[1] += weight * col;
+        self.second[0] += weight * row * row;
+        self.second[1] += weight * col * col;
+        self.second[2] += weight * row * col;
+    }
+
+    fn centre(&self) -> [f32; 2] {
+        self.first.map(|sum| sum / (self.total + TINY))
+    }
+
+    /// The trace of the second central moments, and their anisotropy from 0 (round) to 1 (a line).
+    fn moments(&self) -> (f32, f32) {
+        let [row, col] = self.centre();
+        let [rows, cols, both] = self.second.map(|sum| sum / (self.total + TINY));
+        let (rows, cols, both) = (rows - row * row, cols - col * col, both - row * col);
+        let trace = (rows + cols).max(0.0);
+        let difference = ((rows - cols).powi(2) + 4.0 * both * both).sqrt();
+        (trace, difference / (trace + 0.05))
+    }
+}
+
+/// A frame of a press as features take it: its own features, seconds since the press began, and the
+/// approach where it is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    /// The features of the frame.
+    pub frame: FrameFeatures,
+    /// Seconds since the frame that began the press.
+    pub time_s: f32,
+    /// The approach of the arm since that frame.
+    pub approach_mm: Option<f32>,
+}
+
+impl From<&CourseMoment> for Moment {
+    fn from(moment: &CourseMoment) -> Self {
+        Self {
+            frame: of_frame(&moment.frame),
+            time_s: moment.time_s,
+            approach_mm: moment.approach_mm,
+        }
+    }
+}
+
+impl Course {
+    /// The features of the press.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the course has no frame.
+    pub fn features(&self) -> [f32; FEATURES] {
+        let moments: Vec<Moment> = self.moments.iter().map(Moment::from).collect();
+        of_press(&moments, self.arm_n_per_mm)
+    }
+}
+
+/// The features of a press of at least one frame. `arm_n_per_mm` is 0 if the stiffness is unknown.
+///
+/// # Panics
+///
+/// Panics if there is no frame.
+pub fn of_press(moments: &[Moment], arm_n_per_mm: f32) -> [f32; FEATURES] {
+    let press = Press::new(moments, arm_n_per_mm);
+    let mut row = Vec::with_capacity(FEATURES);
+    row.extend(press.moments[press.top].frame);
+    press.times(&mut row);
+    press.depths(&mut row);
+    press.loading(&mut row);
+    press.laws(&mut row);
+    press.ratios(&mut row);
+    press.hold(&mut row);
+    press.unloading(&mut row);
+    row.try_into().expect("a press has its number of features")
+}
+
+/// The logarithm of a length.
+fn length(mm: f32) -> f32 {
+    (mm.clamp(0.0, MOST_MM) + LITTLE_MM).ln()
+}
+
+/// A press with what all features need.
+struct Press<'a> {
+    moments: &'a [Moment],
+    forces_n: Vec<f32>,
+    /// The frame of the largest area, and that of the greatest force.
+    best: usize,
+    top: usize,
+    /// The last frame of loading, and of the hold.
+    loaded: usize,
+    held: usize,
+    /// 0 if unknown.
+    arm_n_per_mm: f32,
+}
+
+impl<'a> Press<'a> {
+    fn new(moments: &'a [Moment], arm_n_per_mm: f32) -> Self {
+        let forces_n: Vec<f32> = moments
+            .iter()
+            .map(|moment| force_n(&moment.frame).max(1e-3))
+            .collect();
+        let before = |a: &usize, b: &usize| {
+            let area = |place: usize| moments[place].frame[AREA];
+            let areas = area(*a).total_cmp(&area(*b));
+            areas.then(forces_n[*a].total_cmp(&forces_n[*b]))
+        };
+        let best = (0..moments.len())
+            .max_by(before)
+            .expect("a press has a frame");
+        let greatest = forces_n.iter().copied().fold(0.0, f32::max);
+        let first = |share: f32| {
+            let mut forces = forces_n.iter();
+            forces.position(|&n| n >= share * greatest).unwrap_or(0)
+        };
+        let (top, loaded) = (first(1.0), first(LOADED));
+        let fallen = (top..forces_n.len()).find(|&place| forces_n[place] < HELD * greatest);
+        let held = fallen.unwrap_or(forces_n.len()) - 1;
+        Self {
+            moments,
+            best,
+            top,
+            loaded,
+            held,
+            arm_n_per_mm,
+            forces_n,
+        }
+    }
+
+    fn approach_mm(&self, place: usize) -> Option<f32> {
+        self.moments[place].approach_mm
+    }
+
+    /// How far object and cover gave way together: the approach without that of the arm itself.
+    fn indentation_mm(&self, place: usize) -> Option<f32> {
+        let approach_mm = self.approach_mm(place)?;
+        let arm = self.arm_n_per_mm.max(LEAST_ARM);
+        (self.arm_n_per_mm > 0.0).then(|| approach_mm - self.forces_n[place] / arm)
+    }
+
+    fn of_frame(&self, number: usize) -> impl Fn(usize) -> Option<f32> {
+        move |place| Some(self.moments[place].frame[number])
+    }
+
+    fn times(&self, row: &mut Vec<f32>) {
+        let time_s = |place: usize| self.moments[place].time_s;
+        let mut periods: Vec<f32> = self
+            .moments
+            .windows(2)
+            .map(|pair| pair[1].time_s - pair[0].time_s)
+            .collect();
+        periods.sort_unstable_by(f32::total_cmp);
+        let period = periods.get(periods.len() / 2);
+        row.extend([
+            period.map_or(0.0, |period_s| (period_s.max(0.0) + 0.005).ln()),
+            (self.moments.len() as f32).ln(),
+            (time_s(self.top) + LITTLE_S).ln(),
+            (time_s(self.held) - time_s(self.loaded) + LITTLE_S).ln(),
+            (time_s(self.moments.len() - 1) - time_s(self.held) + LITTLE_S).ln(),
+        ]);
+    }
+
+    fn depths(&self, row: &mut Vec<f32>) {
+        let furthest = self.moments.iter().filter_map(|moment| moment.approach_mm);
+        let furthest = furthest.reduce(f32::max);
+        let is_known = |known: bool| f32::from(u8::from(known));
+        let of_top = self.indentation_mm(self.top);
+        row.extend([
+            is_known(self.approach_mm(self.top).is_some()),
+            is_known(of_top.is_some()),
+            match self.arm_n_per_mm > 0.0 {
+                true => self.arm_n_per_mm.max(LEAST_ARM).ln(),
+                false => 0.0,
+            },
+            furthest.map_or(0.0, length),
+            of_top.map_or(0.0, length),
+            self.indentation_mm(self.best).map_or(0.0, length),
+            of_top.map_or(0.0, |mm| mm.clamp(-3.0, 20.0)),
+        ]);
+    }
+
+    /// The value when the rising force passed `force_n`, interpolated between two frames.
+    fn while_loading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
+        let after = (0..=self.top).find(|&place| self.forces_n[place] >= force_n)?;
+        let Some(before) = after.checked_sub(1) else {
+            return value(after);
+        };
+        let (low, high) = (self.forces_n[before], self.forces_n[after]);
+        let part = (force_n - low) / (high - low + TINY);
+        let (low, high) = (value(before)?, value(after)?);
+        Some(low + part * (high - low))
+    }
+
+    /// The value when the rising approach passed `mm`.
+    fn at_approach(&self, mm: f32, value: &dyn Fn(usize) -> f32) -> Option<f32> {
+        let at = |place: usize| self.approach_mm(place);
+        let after = (0..=self.top).find(|&place| at(place).is_some_and(|own| own >= mm))?;
+        let before = after.checked_sub(1)?;
+        let (low, high) = (at(before)?, at(after)?);
+        let part = (mm - low) / (high - low + TINY);
+        Some(value(before) + part * (value(after) - value(before)))
+    }
+
+    fn loading(&self, row: &mut Vec<f32>) {
+        for share in LOADING {
+            let force_n = share * self.forces_n[self.top];
+            let at = |value: &dyn Fn(usize) -> Option<f32>| self.while_loading(force_n, value);
+            row.push(at(&|place| self.approach_mm(place)).map_or(0.0, length));
+            row.push(at(&|place| self.indentation_mm(place)).map_or(0.0, length));
+            for number in [AREA, SPREAD, WIDTH, EFFECTIVE, PEAK, HALF] {
+                row.push(at(&self.of_frame(number)).unwrap_or(0.0));
+            }
+        }
+        for mm in APPROACHES_MM {
+            let force = self.at_approach(mm, &|place| self.forces_n[place]);
+            let area = self.at_approach(mm, &|place| self.moments[place].frame[AREA]);
+            row.push(force.map_or(0.0, |force_n| (force_n + LITTLE_N).ln()));
+            row.push(area.unwrap_or(0.0));
+            row.push(f32::from(u8::from(force.is_some())));
+        }
+    }
+
+    /// The points of a law of loading.
+    fn points(
+        &self,
+        share: f32,
+        x: impl Fn(usize) -> Option<f32>,
+        y: impl Fn(usize) -> f32,
+    ) -> Vec<(f32, f32)> {
+        let least = share * self.forces_n[self.top];
+        let places = (0..=self.top).filter(|&place| self.forces_n[place] >= least);
+        let point = |place: usize| Some((x(place)?, y(place)));
+        places.filter_map(point).collect()
+    }
+
+    /// Exponents of the laws of loading, the compliance at its end, and Hertz's law.
+    fn laws(&self, row: &mut Vec<f32>) {
+        let force = |place: usize| (self.forces_n[place] + LITTLE_N).ln();
+        let depth = |mm: f32| (mm.clamp(0.0, MOST_MM) + 0.15).ln();
+        let by_indentation = |place: usize| self.indentation_mm(place).map(depth);
+        let by_approach = |place: usize| self.approach_mm(place).map(depth);
+        row.push(slope(&self.points(FITTED, by_indentation, force)));
+        row.push(slope(&self.points(FITTED, by_approach, force)));
+        for number in [AREA, SPREAD, PEAK, EFFECTIVE] {
+            let of = |place: usize| self.moments[place].frame[number];
+            row.push(slope(&self.points(FITTED, |place| Some(force(place)), of)));
+        }
+
+        let end = self.points(END, |place| self.approach_mm(place), |p| self.forces_n[p]);
+        let end: Vec<(f32, f32)> = end.into_iter().map(|(mm, n)| (n, mm)).collect();
+        let known = f32::from(u8::from(end.len() > 1));
+        let compliance = slope(&end);
+        let own = match self.arm_n_per_mm > 0.0 {
+            true => compliance - 1.0 / self.arm_n_per_mm.max(LEAST_ARM),
+            false => compliance,
+        };
+        row.extend([compliance, own].map(|mm_per_n| known * mm_per_n.clamp(3e-3, 5.0).ln()));
+
+        let hertz = |place: usize| self.forces_n[place].powf(2.0 / 3.0);
+        let points = self.points(FITTED, |place| self.indentation_mm(place), hertz);
+        let known = f32::from(u8::from(points.len() > 1));
+        let rise = known * slope(&points).clamp(0.02, 50.0).ln();
+        let width = self.moments[self.top].frame[WIDTH];
+        row.extend([rise, known * (1.5 * rise - 0.25 * width)]);
+    }
+
+    /// Quotients that are the same for contacts of one form and other sizes.
+    fn ratios(&self, row: &mut Vec<f32>) {
+        let top = &self.moments[self.top].frame;
+        let depth = self.indentation_mm(self.top).map(length);
+        let against = |number: usize, power: f32| depth.map_or(0.0, |mm| mm - power * top[number]);
+        row.extend([
+            top[FORCE] - top[AREA],
+            top[FORCE] - 1.5 * top[AREA],
+            top[FORCE] - 1.5 * top[WIDTH],
+            against(AREA, 0.5),
+            against(WIDTH, 1.0),
+            against(SPREAD, 1.0),
+            against(WIDTH, 0.5),
+            top[PEAK] - top[FORCE],
+            top[EFFECTIVE] - top[AREA],
+            top[SPREAD] - top[WIDTH],
+            top[HALF] - top[AREA],
+        ]);
+    }
+
+    /// How force, area and peak change while the arm holds its position.
+    fn hold(&self, row: &mut Vec<f32>) {
+        let begin = &self.moments[self.loaded];
+        let after = |seconds: f32, number: usize| {
+            let wanted = begin.time_s + seconds;
+            let late = (self.loaded..=self.held).find(|&p| self.moments[p].time_s >= wanted);
+            let late = late.unwrap_or(self.held);
+            self.moments[late].frame[number] - begin.frame[number]
+        };
+        for seconds in HOLD_S {
+            row.extend([FORCE, AREA, PEAK].map(|number| after(seconds, number)));
+        }
+        row.extend([FORCE, SPREAD, EFFECTIVE].map(|number| after(f32::INFINITY, number)));
+    }
+
+    /// The value when the falling force passed `force_n`.
+    fn while_unloading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
+        let places = self.held..self.moments.len();
+        let after = places
+            .into_iter()
+            .find(|&place| self.forces_n[place] <= force_n)?;
+        let before = after.checked_sub(1)?;
+        let (high, low) = (self.forces_n[before], self.forces_n[after]);
+        let part = (high - force_n) / (high - low + TINY);
+        let (high, low) = (value(before)?, value(after)?);
+        Some(high + part * (low - high))
+    }
+
+    /// How the unloading differs from the loading.
+    fn unloading(&self, row: &mut Vec<f32>) {
+        let last = self.moments.len() - 1;
+        let furthest_mm = self.approach_mm(self.held).unwrap_or(0.0).max(0.0);
+        row.push(f32::from(u8::from(last > self.held + 1)));
+        for share in UNLOADING {
+            let force_n = share * self.forces_n[self.held];
+            let difference = |value: &dyn Fn(usize) -> Option<f32>| {
+                let up = self.while_loading(force_n, value)?;
+                Some(self.while_unloading(force_n, value)? - up)
+            };
+            let way = difference(&|place| self.approach_mm(place));
+            row.push(way.map_or(0.0, |mm| mm / (furthest_mm + LITTLE_MM)));
+            row.push(difference(&self.of_frame(AREA)).unwrap_or(0.0));
+            row.push(difference(&self.of_frame(SPREAD)).unwrap_or(0.0));
+        }
+        let left = self.approach_mm(last).filter(|_| last > self.held);
+        row.push(left.map_or(0.0, length));
+        row.push(left.map_or(0.0, |mm| mm / (furthest_mm + LITTLE_MM)));
+        let (up, down) = (self.work(0, self.loaded), -self.work(self.held, last));
+        let known = f32::from(u8::from(left.is_some() && up > 0.0));
+        row.push(known * ((down.max(0.0) + 0.05) / (up.max(0.0) + 0.05)).ln());
+        let of_box = self.forces_n[self.loaded] * furthest_mm;
+        let known = f32::from(u8::from(self.approach_mm(self.loaded).is_some()));
+        row.push(known * ((up.max(0.0) + 0.05) / (of_box + 0.05)).ln());
+    }
+
+    /// The work of the force between two frames, in mJ. 0 where the approach is unknown.
+    fn work(&self, first: usize, last: usize) -> f32 {
+        let step = |place: usize| {
+            let way = self.approach_mm(place + 1)? - self.approach_mm(place)?;
+            Some(0.5 * (self.forces_n[place] + self.forces_n[place + 1]) * way)
+        };
+        (first..last).filter_map(step).sum()
+    }
+}
+
+/// The slope of a line through points by least squares. Points that hardly differ in x give a slope
+/// near 0.
+fn slope(points: &[(f32, f32)]) -> f32 {
+    let count = points.len().max(1) as f32;
+    let mean_x = points.iter().map(|point| point.0).sum::<f32>() / count;
+    let mean_y = points.iter().map(|point| point.1).sum::<f32>() / count;
+    let spread: f32 = points.iter().map(|(x, _)| (x - mean_x).powi(2)).sum();
+    let both: f32 = points
+        .iter()
+        .map(|(x, y)| (x - mean_x) * (y - mean_y))
+        .sum();
+    both / (spread + 0.02 * count)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Places of a press's numbers.
+    const TIMES: usize = FRAME;
+    const DEPTHS: usize = TIMES + 5;
+    const LAWS: usize = DEPTHS + 7 + 8 * LOADING.len() + 3 * APPROACHES_MM.len();
+    const RELAXATION: usize = LAWS + 10 + 11;
+
+    #[test]
+    fn features_are_those_of_a_frame_by_hand() {
+        let mut frame = ModelFrame::default();
+        // Two taxels of one row with a taxel between them, and one that is too light to count.
+        frame.newtons[10 * COLS + 4] = 1.0;
+        frame.newtons[10 * COLS + 6] = 3.0;
+        frame.newtons[20 * COLS + 20] = 0.01;
+        let found = of_frame(&frame);
+        let ln = f32::ln;
+        // The columns' variance is 0.75 with the forces as weights, and 1 with all taxels alike. Each
+        // taxel differs from its four neighbours. From the force's centre at column 5.5 the taxels are
+        // 1.5 and 0.5 away. The small numbers in divisors are left out, so the tolerance is wide.
+        let fourth = (1.5_f32.powi(4) + 3.0 * 0.5_f32.powi(4)) / 4.0;
+        let expected = [
+            ln(3.0),
+            ln(3.0),
+            ln(3.0),
+            ln(3.0),
+            ln(2.0),
+            ln(1.0),
+            ln(1.5),
+            ln(2.5),
+            ln(1.5),
+            ln(4.05),
+            ln(3.05),
+            ln(0.75 + 0.05),
+            ln(1.0 + 0.05),
+            ln(16.0 / 10.0 + 0.5),
+            0.75 / 0.8,
+            1.0 / 1.05,
+            16.0 / 4.05,
+            8.0 / 2.5,
+            ln((fourth + 0.1) / (0.75 * 0.75 + 0.1)),
+            ln(3.0 * 2.0 / 4.01 + 0.5),
+        ];
+        for (place, (found, expected)) in found.iter().zip(expected).enumerate() {
+            assert!(
+                (found - expected).abs() < 5e-3,
+                "{place}: {found} {expected}"
+            );
+        }
+        assert!((force_n(&found) - 4.0).abs() < 1e-4 && (area(&found) - 2.0).abs() < 1e-4);
+        let nothing = of_frame(&ModelFrame::default());
+        assert!(nothing.iter().all(|x| x.is_finite()));
+    }
+
+    /// A ball on an elastic half space, on an arm of 10 N/mm: loaded in 20 steps, held for 10 while the
+    /// force falls by a tenth, and unloaded.
+    fn ball() -> Vec<Moment> {
+        let moment = |step: u8, depth_mm: f32, share: f32| {
+            let force_n = 5.0 * depth_mm.powf(1.5);
+            Moment {
+                frame: frame_of(20.0 * depth_mm, share * force_n),
+                time_s: 0.05 * f32::from(step),
+                approach_mm: Some(depth_mm + force_n / 10.0),
+            }
+        };
+        let up = (1..=20).map(|step| moment(step, 0.1 * f32::from(step), 1.0));
+        let hold = (21..=30).map(|step| moment(step, 2.0, 1.0 - 0.01 * f32::from(step - 20)));
+        let down = (31..50).map(|step| moment(step, 0.1 * f32::from(50 - step), 0.8));
+        up.chain(hold).chain(down).collect()
+    }
+
+    #[test]
+    fn a_press_on_a_ball_follows_hertz() {
+        let found = of_press(&ball(), 10.0);
+        let near = |place: usize, expected: f32, slack: f32| {
+            let found = found[place];
+            assert!(
+                (found - expected).abs() < slack,
+                "{place}: {found} {expected}"
+            );
+        };
+        // Force and area grow with the indentation to the power of 3/2 and 1. What is added to
+        // lengths and forces takes something off the exponents.
+        near(LAWS, 1.5, 0.15);
+        near(LAWS + 2, 0.66, 0.05);
+        // The slope of F^(2/3) is 5^(2/3).
+        near(LAWS + 8, f32::ln(5.0_f32.powf(2.0 / 3.0)), 0.1);
+        // The indentation at the greatest force, as a logarithm and as it is.
+        near(DEPTHS + 4, f32::ln(2.1), 0.01);
+        near(DEPTHS + 6, 2.0, 0.01);
+        // At the end of the hold the force is a tenth lower.
+        near(RELAXATION + 9, f32::ln(0.9), 0.08);
+        assert_eq!(found[DEPTHS..DEPTHS + 2], [1.0, 1.0]);
+    }
+
+    #[test]
+    fn without_the_arm_only_depths_are_missing() {
+        let mut moments = ball();
+        let with = of_press(&moments, 10.0);
+        for moment in &mut moments {
+            moment.approach_mm = None;
+        }
+        let without = of_press(&moments, 0.0);
+        assert_eq!(without[DEPTHS..DEPTHS + 7], [0.0; 7]);
+        assert_eq!(without[..DEPTHS], with[..DEPTHS]);
+        assert_eq!(without[LAWS + 2..LAWS + 6], with[LAWS + 2..LAWS + 6]);
+        assert_eq!(
+            without[RELAXATION..RELAXATION + 12],
+            with[RELAXATION..RELAXATION + 12]
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn every_press_has_finite_features(
+            rows in proptest::collection::vec(
+                (0.0..400.0_f32, 0.0..300.0_f32, proptest::option::of(-50.0..500.0_f32)), 1..48),
+            period_s in 0.0..2.0_f32,
+            arm_n_per_mm in 0.0..100.0_f32,
+        ) {
+            let moment = |(place, &(area, force_n, approach_mm)): (usize, &(f32, f32, _))| Moment {
+                frame: frame_of(area, force_n),
+                time_s: period_s * place as f32,
+                approach_mm,
+            };
+            let moments: Vec<Moment> = rows.iter().enumerate().map(moment).collect();
+            let features = of_press(&moments, arm_n_per_mm);
+            prop_assert!(features.iter().all(|x| x.is_finite()), "{features:?}");
+        }
+    }
+}

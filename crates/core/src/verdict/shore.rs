@@ -1,0 +1,272 @@
+//! A distribution over Shore hardness, and what a verdict says of it.
+//!
+//! In: the outputs of a model of format 3, one for each of a number of equal bins from 0 to 100 Shore
+//! OO. Out: probabilities of the levels, a value and an interval. All are of the same distribution,
+//! so none contradicts another.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Level, argmax, softmax};
+
+/// The end of the scale.
+const MOST: f32 = 100.0;
+/// The shares of the distribution below the ends of the interval.
+const ENDS: [f32; 2] = [0.05, 0.95];
+
+/// A Shore hardness with its interval.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(into = "[f32; 3]", from = "[f32; 3]")]
+pub struct Shore {
+    /// The Shore hardness. Of a distribution, its median within the named level.
+    pub value: f32,
+    /// The beginning of the 90 % interval.
+    pub low: f32,
+    /// The end of the 90 % interval.
+    pub high: f32,
+}
+
+impl From<[f32; 3]> for Shore {
+    fn from([value, low, high]: [f32; 3]) -> Self {
+        Self { value, low, high }
+    }
+}
+
+impl From<Shore> for [f32; 3] {
+    fn from(shore: Shore) -> Self {
+        [shore.value, shore.low, shore.high]
+    }
+}
+
+/// The levels' parts of the scale.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Borders {
+    /// The borders between the levels with the ends of the scale, descending: a level lies between
+    /// its border and the next one.
+    shore: Vec<f32>,
+}
+
+/// The reason why levels are no parts of the scale. The message follows the word "found".
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum BordersError {
+    /// A level's range is no range.
+    #[error("`shore` {0:?}, which is no range such as \"60-70\", \">70\" or \"<=50\"")]
+    Range(String),
+    /// A level is not softer than the one before.
+    #[error("level {level} ({softer}), which is not softer than the level before it ({harder})")]
+    Order {
+        /// The number of the softer level.
+        level: u8,
+        /// Its range.
+        softer: String,
+        /// The range of the level before.
+        harder: String,
+    },
+}
+
+impl Borders {
+    /// The borders of levels in their order, the hardest first. A border lies in the middle of a gap
+    /// between two levels. The first and the last level go to the ends of the scale.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if a range cannot be read, or two levels overlap.
+    pub fn of(levels: &[Level]) -> Result<Self, BordersError> {
+        let range = |level: &Level| {
+            range(&level.shore).ok_or_else(|| BordersError::Range(level.shore.clone()))
+        };
+        let ranges = levels.iter().map(range).collect::<Result<Vec<_>, _>>()?;
+        let mut shore = vec![MOST];
+        for (place, pair) in ranges.windows(2).enumerate() {
+            let ([low, _], [_, high]) = (pair[0], pair[1]);
+            if high > low || low >= shore[place] {
+                return Err(BordersError::Order {
+                    level: levels[place + 1].level,
+                    softer: levels[place + 1].shore.clone(),
+                    harder: levels[place].shore.clone(),
+                });
+            }
+            shore.push(0.5 * (low + high));
+        }
+        shore.push(0.0);
+        Ok(Self { shore })
+    }
+
+    /// The part of the scale of the level at this place, from 0.
+    pub fn part(&self, place: usize) -> [f32; 2] {
+        [self.shore[place + 1], self.shore[place]]
+    }
+
+    fn count(&self) -> usize {
+        self.shore.len() - 1
+    }
+}
+
+/// A range of Shore OO as levels state it.
+fn range(text: &str) -> Option<[f32; 2]> {
+    let text = text.trim();
+    let number = |text: &str| {
+        let number: f32 = text.trim().parse().ok()?;
+        (0.0..=MOST).contains(&number).then_some(number)
+    };
+    let after = |signs: [&str; 2]| signs.iter().find_map(|sign| text.strip_prefix(sign));
+    if let Some(low) = after([">=", ">"]) {
+        return Some([number(low)?, MOST]);
+    }
+    if let Some(high) = after(["<=", "<"]) {
+        return Some([0.0, number(high)?]);
+    }
+    let (low, high) = text.split_once('-')?;
+    let (low, high) = (number(low)?, number(high)?);
+    (low < high).then_some([low, high])
+}
+
+/// A distribution over the scale: a probability for each of a number of equal bins from 0 to 100.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Distribution {
+    /// The probability below the end of each bin.
+    below: Vec<f32>,
+}
+
+impl Distribution {
+    /// The softmax of `logits`, one for each bin.
+    pub fn of(logits: &[f32]) -> Self {
+        let mut sum = 0.0;
+        let mut below = softmax(logits);
+        for share in &mut below {
+            sum += *share;
+            *share = sum;
+        }
+        for share in &mut below {
+            *share /= sum;
+        }
+        Self { below }
+    }
+
+    fn width(&self) -> f32 {
+        MOST / self.below.len() as f32
+    }
+
+    fn below_bin(&self, bin: usize) -> f32 {
+        if bin == 0 { 0.0 } else { self.below[bin - 1] }
+    }
+
+    /// The probability below `shore`. It is even within a bin.
+    fn below(&self, shore: f32) -> f32 {
+        let place = (shore / self.width()).clamp(0.0, self.below.len() as f32);
+        let bin = (place as usize).min(self.below.len() - 1);
+        let before = self.below_bin(bin);
+        before + (place - bin as f32) * (self.below[bin] - before)
+    }
+
+    /// The Shore hardness that has this share below it.
+    fn quantile(&self, share: f32) -> f32 {
+        let bin = self.below.partition_point(|&below| below < share);
+        let bin = bin.min(self.below.len() - 1);
+        let before = self.below_bin(bin);
+        let within = (share - before) / (self.below[bin] - before).max(f32::MIN_POSITIVE);
+        (bin as f32 + within.clamp(0.0, 1.0)) * self.width()
+    }
+
+    /// The probability of each level.
+    pub fn levels(&self, borders: &Borders) -> Vec<f32> {
+        let part = |place| {
+            let [low, high] = borders.part(place);
+            (self.below(high) - self.below(low)).max(0.0)
+        };
+        (0..borders.count()).map(part).collect()
+    }
+
+    /// The median within the most probable level, and the interval of the whole distribution.
+    pub fn shore(&self, borders: &Borders) -> Shore {
+        let (best, _) = argmax(&self.levels(borders));
+        let [low, high] = borders.part(best);
+        let middle = 0.5 * (self.below(low) + self.below(high));
+        let value = self.quantile(middle).clamp(low, high);
+        let [low, high] = ENDS.map(|share| self.quantile(share));
+        // With many levels, the most probable one may lie at an end.
+        Shore {
+            value,
+            low: low.min(value),
+            high: high.max(value),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn levels(ranges: &[&str]) -> Vec<Level> {
+        let level = |(level, shore): (u8, &&str)| Level {
+            level,
+            label: format!("l{level}"),
+            shore: (*shore).to_owned(),
+        };
+        (1..).zip(ranges).map(level).collect()
+    }
+
+    fn borders(ranges: &[&str]) -> Borders {
+        Borders::of(&levels(ranges)).unwrap()
+    }
+
+    #[test]
+    fn borders_lie_between_the_levels() {
+        let touching = borders(&[">70", "60-70", "50-60", "<=50"]);
+        assert_eq!(touching.shore, [100.0, 70.0, 60.0, 50.0, 0.0]);
+        let with_gaps = borders(&["70-90", "40-60", "10-39"]);
+        assert_eq!(with_gaps.shore, [100.0, 65.0, 39.5, 0.0]);
+        for (ranges, text) in [
+            (
+                &["60-70", "50-65"][..],
+                "level 2 (50-65), which is not softer",
+            ),
+            (&["<=50", ">50"], "level 2 (>50)"),
+            (&["hard", "<=50"], "`shore` \"hard\", which is no range"),
+            (&["70-60", "<=50"], "no range"),
+            (&[">170", "<=50"], "no range"),
+        ] {
+            let error = Borders::of(&levels(ranges)).unwrap_err().to_string();
+            assert!(error.contains(text), "{error}");
+        }
+    }
+
+    #[test]
+    fn an_even_distribution_has_the_parts_of_the_scale() {
+        let even = Distribution::of(&[0.0; 50]);
+        let borders = borders(&[">70", "61-70", "50-60", "<=50"]);
+        let found = even.levels(&borders);
+        for (found, expected) in found.iter().zip([0.3, 0.095, 0.105, 0.5]) {
+            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
+        }
+        let shore = even.shore(&borders);
+        for (found, expected) in <[f32; 3]>::from(shore).iter().zip([25.0, 5.0, 95.0]) {
+            assert!((found - expected).abs() < 1e-3, "{found} {expected}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_contradicts(
+            logits in proptest::collection::vec(-30.0..30.0_f32, 2..80),
+            mut cuts in proptest::collection::btree_set(1..100_u8, 1..12),
+        ) {
+            cuts.insert(50);
+            let cuts: Vec<u8> = cuts.into_iter().rev().collect();
+            let mut ranges = vec![format!(">{}", cuts[0])];
+            ranges.extend(cuts.windows(2).map(|pair| format!("{}-{}", pair[1], pair[0])));
+            ranges.push(format!("<={}", cuts[cuts.len() - 1]));
+            let ranges: Vec<&str> = ranges.iter().map(String::as_str).collect();
+            let borders = borders(&ranges);
+            let distribution = Distribution::of(&logits);
+            let levels = distribution.levels(&borders);
+            prop_assert!((levels.iter().sum::<f32>() - 1.0).abs() < 1e-4);
+            let shore = distribution.shore(&borders);
+            let [low, high] = borders.part(argmax(&levels).0);
+            prop_assert!((low..=high).contains(&shore.value));
+            prop_assert!((shore.low..=shore.high).contains(&shore.value));
+            prop_assert!(0.0 <= shore.low && shore.high <= 100.001);
+        }
+    }
+}

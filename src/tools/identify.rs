@@ -1,0 +1,549 @@
+//! `hardnessd identify`: presses on pieces whose properties are known become a sensor's references.
+//!
+//! In: a configuration, and recordings or presses that are made now. Out: an `.npz` file, which
+//! `references` of the configuration names. The presses are those that the daemon's pipeline sees, as
+//! it would give them to a model of courses.
+
+use std::fs::{self, File};
+use std::future::Future;
+use std::io::{self, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::Arc;
+
+use clap::Args as ClapArgs;
+
+use super::configuration::Configuration;
+use super::replay::{self, feed, no_frame};
+use super::{live, open, print_apart};
+use crate::daemon::config::{self, Config, Setup};
+use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use hardnessd_core::motion::Point;
+use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::recording::{self, FileKind, Labels, Playback, PlaybackError, Reader};
+use hardnessd_core::references;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::verdict::{
+    Borders, BordersError, Course, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress,
+};
+
+/// Arguments of `identify`.
+#[derive(Debug, Clone, ClapArgs)]
+pub struct Args {
+    #[expect(missing_docs, reason = "a comment would be taken for help")]
+    #[command(flatten)]
+    pub config: Configuration,
+    /// File for the references, which `references` of the configuration names
+    #[arg(long, value_name = "R.npz")]
+    out: PathBuf,
+    /// Add to the file
+    #[arg(long)]
+    append: bool,
+    /// What is pressed: flat:MM (a rigid flat piece so many mm across), ball:MM (a rigid ball of that radius),
+    /// shore:OO or level:N [default: the recording's labels `reference`, `shore` or `level`]
+    #[arg(long = "as", value_name = "WHAT")]
+    what: Option<What>,
+    /// Positions of the arm for raw bytes: CSV with the columns time_s, counted from the first whole
+    /// frame, and approach_mm [default: none]
+    #[arg(long, value_name = "M.csv", requires = "what")]
+    motion: Option<PathBuf>,
+    /// Sensor that was pressed [default: the first]
+    #[arg(long, value_name = "NAME")]
+    sensor: Option<String>,
+    /// Presses to make, 1 to 64
+    #[arg(long, value_name = "N", default_value_t = 5, conflicts_with = "files",
+        value_parser = clap::value_parser!(u64).range(1..=MOST_REFERENCES as u64))]
+    presses: u64,
+    /// Recordings, or raw bytes back to back [default: record presses now]
+    #[arg(value_name = "FILE")]
+    files: Vec<PathBuf>,
+}
+
+/// What a user knows of a piece.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum What {
+    Piece(Piece),
+    Level(u8),
+}
+
+/// A text that names no piece.
+#[derive(Debug, PartialEq, thiserror::Error)]
+#[error("expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, or level:N")]
+pub struct NoPiece;
+
+impl FromStr for What {
+    type Err = NoPiece;
+
+    fn from_str(text: &str) -> Result<Self, NoPiece> {
+        let (kind, value) = text.split_once(':').ok_or(NoPiece)?;
+        let within = |least: f32, most: f32| {
+            let number: f32 = value.trim().parse().map_err(|_| NoPiece)?;
+            (least..=most)
+                .contains(&number)
+                .then_some(number)
+                .ok_or(NoPiece)
+        };
+        Ok(match kind.trim() {
+            "flat" => Self::Piece(Piece::Flat {
+                width_mm: within(0.1, 1000.0)?,
+            }),
+            "ball" => Self::Piece(Piece::Ball {
+                radius_mm: within(0.1, 1000.0)?,
+            }),
+            "shore" => Self::Piece(Piece::Shore {
+                range: [within(0.0, 100.0)?; 2],
+            }),
+            "level" => Self::Level(value.trim().parse().map_err(|_| NoPiece)?),
+            _ => return Err(NoPiece),
+        })
+    }
+}
+
+/// The reason why there are no references.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The configuration or its model cannot be used.
+    #[error(transparent)]
+    Config(#[from] config::Error),
+    /// The configuration has no sensor of this name.
+    #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
+    NoSensor {
+        /// The name on the command line.
+        found: String,
+        /// The names of the configured sensors.
+        names: Vec<String>,
+    },
+    /// Nothing says what is pressed now.
+    #[error("--as: found nothing, expected what will be pressed, such as flat:20 or ball:10")]
+    Unnamed,
+    /// Nothing says what was pressed in a recording.
+    #[error(
+        "{path}: found no label `reference`, `shore` or `level`: say what was pressed with --as"
+    )]
+    Unlabelled {
+        /// The path of the recording.
+        path: PathBuf,
+    },
+    /// A label says nothing of a piece.
+    #[error("{path}: label {key}: found {found:?}, {source}")]
+    Label {
+        /// The path of the recording.
+        path: PathBuf,
+        /// The label.
+        key: &'static str,
+        /// Its text.
+        found: String,
+        /// What was expected.
+        source: NoPiece,
+    },
+    /// The model has no such level.
+    #[error("level: found {found}, expected 1 to {most}, those of the model")]
+    Level {
+        /// The level.
+        found: u8,
+        /// The model's last level.
+        most: usize,
+    },
+    /// The model's levels are no parts of the scale.
+    #[error("the model's levels: found {0}")]
+    Borders(#[from] BordersError),
+    /// There are no presses.
+    #[error("{path}: found no press of sensor {sensor:?}, expected at least one")]
+    NoPress {
+        /// The path of the recording, or words for the recording that was made just now.
+        path: String,
+        /// The sensor.
+        sensor: String,
+    },
+    /// There are more presses than a file may have.
+    #[error("found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out")]
+    Many {
+        /// The number of presses, with those of the file.
+        found: usize,
+    },
+    /// The presses cannot be recorded.
+    #[error(transparent)]
+    Live(#[from] live::Error),
+    /// A file cannot be opened.
+    #[error("{path}: cannot read: {source}")]
+    Unreadable {
+        /// The path on the command line.
+        path: PathBuf,
+        /// The system's error.
+        source: io::Error,
+    },
+    /// Raw bytes or positions cannot be used.
+    #[error(transparent)]
+    Raw(#[from] replay::Error),
+    /// A recording cannot be read.
+    #[error("{path}: {source}")]
+    Recording {
+        /// The path of the recording.
+        path: String,
+        /// The error of the recording.
+        source: recording::Error,
+    },
+    /// A recording describes an impossible sensor.
+    #[error("{path}: {source}")]
+    Playback {
+        /// The path of the recording.
+        path: String,
+        /// The error of the description.
+        source: PlaybackError,
+    },
+    /// The file to add to is none of references.
+    #[error("{path}: {source}")]
+    References {
+        /// The path of the file.
+        path: PathBuf,
+        /// The reason.
+        source: references::Error,
+    },
+    /// The file exists.
+    #[error("{path} exists already: add to it with --append, or name another file")]
+    Taken {
+        /// The path of the file.
+        path: PathBuf,
+    },
+    /// The file cannot be written.
+    #[error("{path}: {source}")]
+    Out {
+        /// The path of the file.
+        path: PathBuf,
+        /// The system's error.
+        source: io::Error,
+    },
+    /// Stdout cannot be written to.
+    #[error("stdout: {0}")]
+    Print(#[source] io::Error),
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Self::Config(error) => error.exit_code(),
+            Self::Live(error) => error.exit_code(),
+            Self::Raw(error) => error.exit_code(),
+            Self::NoSensor { .. } | Self::Unnamed => USAGE,
+            Self::Unreadable { .. } => NO_INPUT,
+            Self::Recording {
+                source: recording::Error::Io(_),
+                ..
+            }
+            | Self::Taken { .. }
+            | Self::Out { .. }
+            | Self::Print(_) => IO,
+            _ => FAILED,
+        }
+    }
+}
+
+/// Reads the configuration at `path`. Its references need not exist yet, and do not count.
+///
+/// # Errors
+///
+/// Returns the errors of [`Config::load`] and [`Setup::of`].
+pub fn load(path: &Path) -> Result<Setup, config::Error> {
+    let mut config = Config::load(path)?;
+    for sensor in &mut config.sensors {
+        sensor.references = None;
+    }
+    Setup::of(config, path)
+}
+
+/// Makes the file from recordings, or from presses that are made now. Ends early, without a file, when
+/// `shutdown` comes. `config` is the path of the configuration.
+///
+/// # Errors
+///
+/// Returns [`Error`] if there are no presses, nothing says what was pressed, or a file cannot be used.
+pub async fn run(
+    args: Args,
+    setup: Setup,
+    config: &Path,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let sensor = chosen(&args, &setup)?;
+    let known = known(&args)?;
+    let levels = setup.hrn.card().levels.clone();
+    let file = if args.files.is_empty() {
+        let Some(what) = args.what else {
+            return Err(Error::Unnamed);
+        };
+        let wanted = args.presses;
+        let say_next = |seen: u64| match seen {
+            0 => hardnessd_core::say!("press it {wanted} times, harder each time"),
+            _ => hardnessd_core::say!("press {seen} of {wanted}"),
+        };
+        let hrn = setup.hrn.clone();
+        let made = live::record(setup, sensor.name(), wanted, say_next, shutdown).await?;
+        let Some(file) = made else {
+            return Ok(());
+        };
+        let path = "what was recorded".to_owned();
+        let (courses, _) = of_recording(file, &path, sensor.name(), hrn)?;
+        made_of(courses, piece(what, &levels)?, &path, &sensor)?
+    } else {
+        let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());
+        let read = tokio::task::spawn_blocking(move || of_files(&args, &sensor, &hrn, &levels));
+        tokio::select! {
+            read = read => read.expect("recordings are read without a panic")?,
+            () = shutdown => return Ok(()),
+        }
+    };
+    let all: Vec<ReferencePress> = known.into_iter().chain(file).collect();
+    if all.len() > MOST_REFERENCES {
+        return Err(Error::Many { found: all.len() });
+    }
+    write(&args, &all)?;
+    let text = account(&super::as_in(config, &args.out), &all);
+    print_apart(text.into_bytes()).await.map_err(Error::Print)?;
+    Ok(())
+}
+
+fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
+    let Some(found) = &args.sensor else {
+        return Ok(setup.sensors[0].clone());
+    };
+    let mut sensors = setup.sensors.iter();
+    let chosen = sensors.find(|sensor| sensor.name() == found);
+    chosen.cloned().ok_or_else(|| Error::NoSensor {
+        found: found.clone(),
+        names: setup.sensors.iter().map(|s| s.name().to_owned()).collect(),
+    })
+}
+
+/// The presses that the file has already. Fails if there is a file that nothing is to be added to.
+fn known(args: &Args) -> Result<Vec<ReferencePress>, Error> {
+    let path = || args.out.clone();
+    match fs::read(&args.out) {
+        Ok(_) if !args.append => Err(Error::Taken { path: path() }),
+        Ok(bytes) => references::read(&bytes).map_err(|source| Error::References {
+            path: path(),
+            source,
+        }),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Vec::new()),
+        Err(source) => Err(Error::Unreadable {
+            path: path(),
+            source,
+        }),
+    }
+}
+
+/// What is known of a piece, with the model's levels.
+fn piece(what: What, levels: &[Level]) -> Result<Piece, Error> {
+    let level = match what {
+        What::Piece(piece) => return Ok(piece),
+        What::Level(level) => level,
+    };
+    if !(1..=levels.len()).contains(&usize::from(level)) {
+        return Err(Error::Level {
+            found: level,
+            most: levels.len(),
+        });
+    }
+    let range = Borders::of(levels)?.part(usize::from(level) - 1);
+    Ok(Piece::Shore { range })
+}
+
+/// The references of all files of the command line.
+fn of_files(
+    args: &Args,
+    sensor: &Sensor,
+    hrn: &Arc<Hrn>,
+    levels: &[Level],
+) -> Result<Vec<ReferencePress>, Error> {
+    let motion = match &args.motion {
+        None => None,
+        Some(path) => Some(replay::positions(path)?),
+    };
+    let mut all = Vec::new();
+    for path in &args.files {
+        let unreadable = |source| Error::Unreadable {
+            path: path.clone(),
+            source,
+        };
+        let file = open(path).map_err(unreadable)?;
+        let (kind, file) = FileKind::read(file).map_err(unreadable)?;
+        let shown = path.display().to_string();
+        let (courses, labels) = match kind {
+            FileKind::Recording if motion.is_some() => {
+                return Err(replay::Error::OwnMotion { path: path.clone() }.into());
+            }
+            FileKind::Recording => {
+                of_recording(BufReader::new(file), &shown, sensor.name(), hrn.clone())?
+            }
+            FileKind::Raw => {
+                let courses = of_bytes(file, path, sensor, hrn.clone(), motion.clone())?;
+                (courses, Labels::new())
+            }
+        };
+        let what = match args.what {
+            Some(what) => what,
+            None => labelled(&labels, path)?,
+        };
+        all.extend(made_of(courses, piece(what, levels)?, &shown, sensor)?);
+    }
+    Ok(all)
+}
+
+/// What the labels of a recording say was pressed.
+fn labelled(labels: &Labels, path: &Path) -> Result<What, Error> {
+    let kinds = [("reference", ""), ("shore", "shore:"), ("level", "level:")];
+    let known = kinds
+        .into_iter()
+        .find_map(|(key, kind)| Some((key, kind, labels.get(key)?)));
+    let Some((key, kind, found)) = known else {
+        return Err(Error::Unlabelled {
+            path: path.to_owned(),
+        });
+    };
+    let what = format!("{kind}{found}").parse();
+    what.map_err(|source| Error::Label {
+        path: path.to_owned(),
+        key,
+        found: found.clone(),
+        source,
+    })
+}
+
+fn made_of(
+    courses: Vec<Course>,
+    piece: Piece,
+    path: &str,
+    sensor: &Sensor,
+) -> Result<Vec<ReferencePress>, Error> {
+    if courses.is_empty() {
+        return Err(Error::NoPress {
+            path: path.to_owned(),
+            sensor: sensor.name().to_owned(),
+        });
+    }
+    let press = |course| ReferencePress { course, piece };
+    Ok(courses.into_iter().map(press).collect())
+}
+
+/// The courses of the presses in a recording, and its labels.
+fn of_recording(
+    file: impl Read,
+    path: &str,
+    sensor: &str,
+    hrn: Arc<Hrn>,
+) -> Result<(Vec<Course>, Labels), Error> {
+    let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
+    playback.keep_courses();
+    for found in Reader::new(file) {
+        let found = found.map_err(|source| Error::Recording {
+            path: path.to_owned(),
+            source,
+        })?;
+        let fed = playback.feed(found);
+        fed.map_err(|source| Error::Playback {
+            path: path.to_owned(),
+            source,
+        })?;
+        courses.extend(playback.courses(sensor));
+    }
+    playback.end();
+    courses.extend(playback.courses(sensor));
+    Ok((courses, playback.labels()))
+}
+
+/// The courses of the presses in raw bytes.
+fn of_bytes(
+    file: impl Read,
+    path: &Path,
+    sensor: &Sensor,
+    hrn: Arc<Hrn>,
+    motion: Option<Vec<Point>>,
+) -> Result<Vec<Course>, Error> {
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
+    pipeline.keep_courses();
+    let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
+    match end.as_deref().and_then(|end| no_frame(path, end)) {
+        Some(error) => Err(error.into()),
+        None => Ok(pipeline.courses()),
+    }
+}
+
+/// Writes the file beside its place first, so that it is whole or not there.
+fn write(args: &Args, references: &[ReferencePress]) -> Result<(), Error> {
+    let failed = |source| Error::Out {
+        path: args.out.clone(),
+        source,
+    };
+    let bytes = references::write(references).map_err(failed)?;
+    let directory = args
+        .out
+        .parent()
+        .filter(|parent| !parent.as_os_str().is_empty());
+    let part = tempfile::Builder::new()
+        .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))
+        .tempfile_in(directory.unwrap_or(Path::new(".")));
+    let mut part = part.map_err(failed)?;
+    part.write_all(&bytes).map_err(failed)?;
+    part.as_file().sync_all().map_err(failed)?;
+    let persisted = match args.append {
+        true => part.persist(&args.out),
+        false => part.persist_noclobber(&args.out),
+    };
+    persisted
+        .map(|_: File| ())
+        .map_err(|error| failed(error.error))
+}
+
+/// What the file holds, what is missing, and the lines of the configuration. `out` is the file's path as
+/// the configuration may name it.
+fn account(out: &str, references: &[ReferencePress]) -> String {
+    let count = |is: fn(&Piece) -> bool| references.iter().filter(|p| is(&p.piece)).count();
+    let flat = count(|piece| matches!(piece, Piece::Flat { .. }));
+    let ball = count(|piece| matches!(piece, Piece::Ball { .. }));
+    let mut text = format!(
+        "presses on  rigid flat piece {flat}, rigid ball {ball}, known hardness {}\n",
+        references.len() - flat - ball
+    );
+    let without = references.iter().filter(|press| {
+        let mut moments = press.course.moments.iter();
+        moments.all(|moment| moment.approach_mm.is_none())
+    });
+    match without.count() {
+        0 => {}
+        without => {
+            text += &format!(
+                "without the arm's approach {without}: such a press does not show how deep the sensor gives way\n"
+            );
+        }
+    }
+    if flat < 2 || ball < 2 {
+        text += "a light and a hard press on a rigid flat piece and on a rigid ball tell most\n";
+    }
+    text + &format!("\n[[sensor]]\nreferences = {out:?}\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_names_a_piece() {
+        let parse = |text: &str| text.parse::<What>();
+        let flat = Piece::Flat { width_mm: 20.0 };
+        assert_eq!(parse("flat:20"), Ok(What::Piece(flat)));
+        let ball = Piece::Ball { radius_mm: 7.5 };
+        assert_eq!(parse("ball: 7.5"), Ok(What::Piece(ball)));
+        let shore = Piece::Shore { range: [63.0; 2] };
+        assert_eq!(parse("shore:63"), Ok(What::Piece(shore)));
+        assert_eq!(parse("level:2"), Ok(What::Level(2)));
+        for text in [
+            "flat",
+            "flat:",
+            "flat:0",
+            "ball:nan",
+            "shore:101",
+            "level:x",
+            "egg:3",
+        ] {
+            assert_eq!(parse(text), Err(NoPiece), "{text}");
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! Records presses of one sensor for a command that measures something with them.
+//!
+//! A daemon with sockets serves the sensor meanwhile, so the robot's controller runs as it always
+//! does. The recording has no name: it vanishes with the command.
+
+use std::fs::{self, File};
+use std::future::Future;
+use std::io::{self, Seek, SeekFrom};
+use std::path::PathBuf;
+use std::pin::pin;
+use std::time::Duration;
+
+use tokio::sync::watch;
+
+use crate::daemon::config::Setup;
+use crate::daemon::record::Progress;
+use crate::daemon::{self, Daemon, Sockets};
+use hardnessd_core::exit::{Coded, IO};
+use hardnessd_core::recording::Labels;
+
+/// The reason why there is no recording.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The daemon cannot serve, or has stopped.
+    #[error(transparent)]
+    Daemon(#[from] daemon::Error),
+    /// The temporary file for the recording cannot be used.
+    #[error("{path}: {source}")]
+    Temporary {
+        /// The path of the recording.
+        path: PathBuf,
+        /// The system's error.
+        source: io::Error,
+    },
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Self::Daemon(error) => error.exit_code(),
+            Self::Temporary { .. } => IO,
+        }
+    }
+}
+
+/// How long to wait for positions after the last press.
+const LAST_POSITIONS: Duration = Duration::from_secs(1);
+
+/// Records `wanted` presses of `sensor`; `None` if `shutdown` comes first. `say_next` is called with
+/// the number of presses so far, when the zero is taken and after each press. The other sensors of
+/// the configuration stay closed: their presses would count, and a missing one would end the
+/// command.
+pub(super) async fn record(
+    mut setup: Setup,
+    sensor: &str,
+    wanted: u64,
+    say_next: impl Fn(u64),
+    shutdown: impl Future<Output = ()>,
+) -> Result<Option<File>, Error> {
+    setup.sensors.retain(|one| one.name() == sensor);
+    setup.config.sensors.retain(|one| one.name == sensor);
+    let path = std::env::temp_dir().join(format!("hardnessd-presses-{}.mcap", std::process::id()));
+    let temporary = |source| Error::Temporary {
+        path: path.clone(),
+        source,
+    };
+    let open = File::options()
+        .read(true)
+        .write(true)
+        .create_new(true)
+        .open(&path);
+    let file = open.map_err(temporary)?;
+    // Nobody else needs the file. Without its name, it vanishes when this process ends.
+    fs::remove_file(&path).map_err(temporary)?;
+    let mut recorded = file.try_clone().map_err(temporary)?;
+
+    let (progress, mut counted) = watch::channel(Progress::default());
+    let labels = Labels::new();
+    let sockets = Sockets::Configured;
+    let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
+    hardnessd_core::say!("leave the sensor free until its zero is taken");
+    let enough = async {
+        // The presses at the last prompt.
+        let mut said = None;
+        while said < Some(wanted) && counted.changed().await.is_ok() {
+            let Progress { tared, presses, .. } = *counted.borrow_and_update();
+            if tared > 0 && said != Some(presses) {
+                said = Some(presses);
+                say_next(presses);
+            }
+        }
+        tokio::time::sleep(LAST_POSITIONS).await;
+    };
+    let mut stopped = false;
+    let end = async {
+        let (enough, shutdown) = (pin!(enough), pin!(shutdown));
+        tokio::select! {
+            () = enough => {}
+            () = shutdown => stopped = true,
+        }
+    };
+    daemon.run(end, None).await?;
+    if stopped {
+        return Ok(None);
+    }
+    recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
+    Ok(Some(recorded))
+}
