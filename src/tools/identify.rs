@@ -50,8 +50,8 @@ pub struct Args {
     /// Sensor that was pressed [default: the first]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Presses to make, 1 to 64
-    #[arg(long, value_name = "N", default_value_t = 5, conflicts_with = "files",
+    /// Presses to make, or to take of each file, from light to hard: 1 to 64
+    #[arg(long, value_name = "N", default_value_t = 5,
         value_parser = clap::value_parser!(u64).range(1..=MOST_REFERENCES as u64))]
     presses: u64,
     /// Recordings, or raw bytes back to back [default: record presses now]
@@ -382,9 +382,22 @@ fn of_files(
             Some(what) => what,
             None => labelled(&labels, path)?,
         };
+        let courses = spread(courses, args.presses as usize);
         all.extend(made_of(courses, piece(what, levels)?, &shown, sensor)?);
     }
     Ok(all)
+}
+
+/// At most `most` of the presses, evenly up to the hardest: presses of unlike force tell most.
+fn spread(mut courses: Vec<Course>, most: usize) -> Vec<Course> {
+    let greatest = |course: &Course| {
+        let forces = course.moments.iter().map(|moment| moment.frame.force_n());
+        forces.fold(0.0, f64::max)
+    };
+    courses.sort_by(|a, b| greatest(a).total_cmp(&greatest(b)));
+    let (found, wanted) = (courses.len(), most.min(courses.len()));
+    let places = (1..=wanted).map(|number| number * found / wanted - 1);
+    places.map(|place| courses[place].clone()).collect()
 }
 
 /// What the labels of a recording say was pressed.
@@ -523,6 +536,33 @@ fn account(out: &str, references: &[ReferencePress]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hardnessd_core::verdict::{CourseMoment, ModelFrame, TAXELS};
+
+    #[test]
+    fn the_presses_that_are_taken_differ_in_force() {
+        let press = |newtons: f32| Course {
+            moments: vec![CourseMoment {
+                time_s: 0.0,
+                approach_mm: None,
+                frame: ModelFrame {
+                    newtons: [newtons; TAXELS],
+                },
+            }],
+            arm_n_per_mm: 0.0,
+        };
+        let taken = |most| {
+            let courses = [5.0, 1.0, 4.0, 2.0, 3.0].map(press).to_vec();
+            let taken = spread(courses, most);
+            let newtons = taken
+                .iter()
+                .map(|course| course.moments[0].frame.newtons[0]);
+            newtons.collect::<Vec<_>>()
+        };
+        assert_eq!(taken(1), [5.0]);
+        assert_eq!(taken(2), [2.0, 5.0]);
+        assert_eq!(taken(64), [1.0, 2.0, 3.0, 4.0, 5.0]);
+        assert_eq!(spread(Vec::new(), 5), []);
+    }
 
     #[test]
     fn a_text_names_a_piece() {
