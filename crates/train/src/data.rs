@@ -5,5 +5,4 @@ pub mod dataset;
 pub mod courses;
 pub mod simulated;
 pub mod collect;
-pub mod disturb;
 pub mod augment;

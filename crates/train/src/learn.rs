@@ -3,12 +3,9 @@
 pub mod optimiser;
 pub mod learner;
 pub mod temperature;
-pub mod consistency;
 pub mod fit;
 pub mod epochs;
 pub mod conformal;
-pub mod force;
-pub mod adapt;
 pub mod frame;
 pub mod course;
 pub mod gan;

@@ -1,6 +1,5 @@
-//! The methods of the table, each a sequence of the same stages; `adapt`; and whole presses.
+//! The methods of the table, each a sequence of the same stages; and whole presses.
 
-pub mod adapt;
 pub mod course;
 pub mod features;
 pub mod frame;
@@ -187,8 +186,6 @@ pub struct Request {
     pub labels: Option<usize>,
     /// How the labels are chosen.
     pub label_choice: LabelChoice,
-    /// SHA-256 of the model file that the run starts from, if it is one.
-    pub start: Option<String>,
     /// The settings with all overrides applied.
     pub settings: Settings,
 }
@@ -230,7 +227,6 @@ impl Request {
             seed: self.seed,
             labels,
             label_choice: self.label_choice,
-            start: self.start.clone(),
             settings: self.settings,
             data,
         }
@@ -243,16 +239,12 @@ impl Request {
 ///
 /// Fails if the data has no labelled training samples, if no unlabelled ones remain for a method
 /// that needs them, if an STGAN has none of its level, or if objects are to be held out without
-/// effect. Without a method, the run adapts a model.
-fn check(
-    method: Option<Method>,
-    dataset: &Dataset,
-    description: &Description,
-) -> anyhow::Result<()> {
+/// effect.
+fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow::Result<()> {
     let labelled = chosen(dataset, description)?;
     let needs_unlabelled = matches!(
         method,
-        Some(Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan)
+        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
     );
     let Validation { share, .. } = description.settings.validation;
     let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
@@ -263,7 +255,7 @@ fn check(
         description.method,
         description.labels
     );
-    let has_stgans = matches!(method, Some(Method::Ours | Method::Nihrn));
+    let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
     for level in crate::data::dataset::levels() {
         let of_level = |&index: &usize| dataset.samples[index].level == level.level;
         ensure!(
@@ -280,16 +272,16 @@ fn check(
 /// Checks that the method uses held-out objects. Prints a warning where the share rounds to no
 /// object.
 fn check_validation(
-    method: Option<Method>,
+    method: Method,
     dataset: &Dataset,
     description: &Description,
     labelled: &[usize],
 ) -> anyhow::Result<()> {
     let Validation { share, keep, .. } = description.settings.validation;
-    if method == Some(Method::Frame) {
+    if method == Method::Frame {
         description.settings.validation.check_last()?;
     }
-    if share == 0.0 || method == Some(Method::Features) {
+    if share == 0.0 || method == Method::Features {
         return Ok(());
     }
     let refused = |expected| SettingsError::Range {
@@ -297,7 +289,7 @@ fn check_validation(
         found: share,
         expected,
     };
-    if matches!(method, Some(Method::Sgan | Method::Igan)) {
+    if matches!(method, Method::Sgan | Method::Igan) {
         return Err(refused("0: sgan and igan have no use for held-out objects").into());
     }
     let (_, held_out) = dataset.hold_out(labelled, share, description.seed);
@@ -356,9 +348,8 @@ fn train(
                 dataset,
                 train: &train,
                 held_out: &validation,
-                unlabelled: &[],
             };
-            return frame::train("frame", &samples, None, description, run, device);
+            return frame::train(&samples, description, run, device);
         }
         Method::Ours => {
             let ustgan = stages.ustgan()?;
@@ -384,7 +375,7 @@ fn train(
         | Method::Hrn15Tuned
         | Method::Hrn15Strong => stages.trained("hrn", stages.random())?,
     };
-    stages.finish(&trained, 1.0)
+    stages.finish(&trained)
 }
 
 /// The training samples whose level is not used: all except `labelled` and the other presses of the
@@ -484,8 +475,7 @@ mod tests {
     fn all_settings_are_within_their_ranges() {
         for &method in Method::all() {
             for profile in [Profile::Paper, Profile::Quick, Profile::Smoke] {
-                let settings = [adapt::settings(profile), course::settings(profile)];
-                for settings in settings.into_iter().chain([method.settings(profile)]) {
+                for settings in [course::settings(profile), method.settings(profile)] {
                     assert!(settings.checked().is_ok(), "{}", method.name());
                 }
             }

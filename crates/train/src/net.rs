@@ -9,7 +9,6 @@ pub mod frames;
 pub mod standard;
 pub mod shore;
 pub mod bins;
-pub mod start;
 pub mod sensed;
 pub mod hrn;
 pub mod frame;

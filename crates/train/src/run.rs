@@ -40,9 +40,6 @@ pub struct Description {
     pub labels: usize,
     /// How the labelled samples are chosen.
     pub label_choice: LabelChoice,
-    /// SHA-256 of the model file that the run started from, if it was one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<String>,
     /// Settings of the method.
     pub settings: Settings,
     /// The files from which the run learns.

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 pub mod augmentation;
 mod bounds;
-pub mod consistency;
 pub mod gan;
 pub mod network;
 pub mod optimiser;
@@ -17,7 +16,6 @@ use hardnessd_core::wording;
 
 pub use augmentation::AugmentationSettings;
 pub use bounds::SettingsError;
-pub use consistency::ConsistencySettings;
 pub use gan::GanSettings;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
@@ -161,8 +159,6 @@ pub struct Settings {
     /// The training of HRN on the labelled samples, from random weights or as the fine-tuning of
     /// other weights.
     pub training: Training,
-    /// Learning from unlabelled samples beside the labelled ones, without a GAN.
-    pub consistency: ConsistencySettings,
     /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
     pub reports: ArmReports,
     /// The labelled objects that are held out.
@@ -184,7 +180,6 @@ impl Default for Settings {
             generation: Generation::default(),
             pretraining: Training::default(),
             training: Training::default(),
-            consistency: ConsistencySettings::default(),
             reports: ArmReports::default(),
             validation: Validation::default(),
         }
@@ -263,7 +258,6 @@ impl Settings {
         check("generation.", key, generated, fits, "1 to 10000")?;
         self.pretraining.check("pretraining.")?;
         self.training.check("training.")?;
-        self.consistency.check()?;
         self.reports.check()?;
         let Validation {
             share,
@@ -367,10 +361,6 @@ mod tests {
             (
                 "[ustgan]\nsamples_a_component = 9223372036854775807",
                 "expected 1 to 10000",
-            ),
-            (
-                "[consistency]\nratio = 4611686018427387904",
-                "expected 1 to 1000",
             ),
             (
                 "[training]\nbatch = 4611686018427387904",

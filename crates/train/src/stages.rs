@@ -9,14 +9,13 @@ use burn::tensor::Device;
 
 use crate::data::dataset::{Dataset, Sample};
 use crate::judge::sheet::{self, Strip};
-use crate::learn::adapt;
 use crate::learn::fit::{self, Trained};
 use crate::learn::gan::{self, Gan};
 use crate::learn::temperature;
 use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Recogniser};
 use crate::net::generator;
-use crate::net::hrn::{self, ExportedHrn};
+use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::losses::Game;
 use crate::net::network::Weights;
@@ -219,7 +218,6 @@ impl Stages<'_> {
             dataset: self.dataset,
             train: self.train,
             validation: (self.validation, self.settings().validation),
-            unlabelled: None,
             scale: self.scale(),
             settings: &self.settings().training,
             seed: self.description.seed,
@@ -234,34 +232,6 @@ impl Stages<'_> {
     /// Fails if the run's directory cannot be read or written, or the training diverges.
     pub fn trained(&self, stage: &'static str, initial: Weights) -> anyhow::Result<Trained> {
         fit::fit(&self.fit_task(stage), initial, self.run)
-    }
-
-    fn consistent_task(&self, stage: &'static str) -> fit::Task<'_> {
-        let has_unlabelled = !self.unlabelled.is_empty();
-        let consistency = self.settings().consistency;
-        fit::Task {
-            unlabelled: has_unlabelled.then_some((self.unlabelled, consistency)),
-            ..self.fit_task(stage)
-        }
-    }
-
-    /// The factor by which the forces of the labelled samples must be multiplied for the start.
-    ///
-    /// # Errors
-    ///
-    /// Fails as [`adapt::force_factor`] does.
-    pub fn force_factor(&self, start: &ExportedHrn) -> anyhow::Result<f32> {
-        adapt::force_factor(start, &self.fit_task("adapt"))
-    }
-
-    /// Continues to train an exported HRN on the labelled samples and, by consistency, on the
-    /// unlabelled ones, if there are any.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the run's directory cannot be read or written, or the training diverges.
-    pub fn adapted(&self, stage: &'static str, start: &ExportedHrn) -> anyhow::Result<Trained> {
-        adapt::fit(&self.consistent_task(stage), start, self.run)
     }
 
     /// Trains a GAN whose discriminator also learns the levels and becomes the recogniser.
@@ -294,17 +264,12 @@ impl Stages<'_> {
         task.finished(weights, self.settings().ustgan.epochs)
     }
 
-    /// Writes the model, its evaluation and a picture of its mistakes. `force_factor` is the factor
-    /// of the forces that the scale of the image includes.
+    /// Writes the model, its evaluation and a picture of its mistakes.
     ///
     /// # Errors
     ///
     /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
-    pub fn finish(
-        &self,
-        trained: &Trained,
-        force_factor: f32,
-    ) -> anyhow::Result<Option<Evaluated>> {
+    pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluated>> {
         let scale = self.scale();
         self.draw_mistakes(trained)?;
         let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, scale);
@@ -313,7 +278,6 @@ impl Stages<'_> {
             raw_logits,
             shore: None,
             temperature: trained.temperature,
-            force_factor,
         };
         let probabilities = |frames: &[&ModelFrame]| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);

@@ -95,13 +95,6 @@ impl ModelFrame {
         frame::contact_area_taxels(&self.newtons, threshold_n)
     }
 
-    /// The frame with all forces times `factor`, which is finite and not negative.
-    pub fn times(&self, factor: f32) -> Self {
-        Self {
-            newtons: self.newtons.map(|newtons| newtons * factor),
-        }
-    }
-
     /// The total force in newtons. It is summed in f64, so the order of taxels makes no difference.
     pub fn force_n(&self) -> f64 {
         frame::force_n(&self.newtons)

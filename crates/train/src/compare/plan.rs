@@ -199,7 +199,6 @@ impl Recipe {
             seed,
             labels: self.labels,
             label_choice: self.choice,
-            start: None,
             settings: self.method.settings(profile),
         };
         request.of_method(self.method, dataset)

@@ -54,23 +54,12 @@ impl Calibration {
         objects: [0; 2],
     };
 
-    /// The calibration of a network that learnt no Shore hardness: its interval is the whole scale.
-    pub const WITHOUT_SHORE: Self = Self {
-        // An untrained output may lie outside the scale.
-        widths: [1000.0; 2],
-        ..Self::NONE
-    };
-
     /// Calibrates on held-out presses. `stream` draws presses of the objects. With fewer than
     /// [`LEAST_OBJECTS`] objects there are no sets. With fewer than that many measured objects, the
-    /// widths stay those of `start`. Without held-out presses, the temperature does too.
-    pub fn of(presses: &[Judged], start: &Self, stream: &mut Stream, device: &Device) -> Self {
+    /// interval is not widened.
+    pub fn of(presses: &[Judged], stream: &mut Stream, device: &Device) -> Self {
         if presses.is_empty() {
-            return Self {
-                threshold: 0.0,
-                objects: [0; 2],
-                ..*start
-            };
+            return Self::NONE;
         }
         let level_and_logits = |press: &Judged| (press.level, press.logits.clone());
         let judged: Vec<_> = presses.iter().map(level_and_logits).collect();
@@ -92,7 +81,7 @@ impl Calibration {
         let width = quantile(&outside, stream);
         Self {
             temperature,
-            widths: width.map_or(start.widths, |width| [width; 2]),
+            widths: width.map_or([0.0; 2], |width| [width; 2]),
             threshold,
             objects: [wrong.len(), outside.len()],
         }
@@ -205,18 +194,10 @@ mod tests {
 
     #[test]
     fn few_objects_give_no_sets_and_promise_nothing() {
-        let (device, start) = (
-            Device::flex(),
-            Calibration {
-                temperature: 1.5,
-                widths: [2.0; 2],
-                threshold: 0.2,
-                objects: [40; 2],
-            },
-        );
+        let device = Device::flex();
         let of = |objects, measured| {
             let stream = &mut Stream::new(1, "calibration");
-            Calibration::of(&judged(objects, measured), &start, stream, &device)
+            Calibration::of(&judged(objects, measured), stream, &device)
         };
         let enough = of(9, 9);
         assert!((enough.threshold - 0.5).abs() < 1e-3, "{enough:?}");
@@ -224,7 +205,7 @@ mod tests {
         assert_eq!(enough.missing(), None);
 
         let few = of(8, 8);
-        assert_eq!((few.threshold, few.widths), (0.0, start.widths));
+        assert_eq!((few.threshold, few.widths), (0.0, [0.0; 2]));
         let missing = few.missing().unwrap();
         assert!(
             missing.contains("found 8, expected at least 9"),
@@ -232,14 +213,12 @@ mod tests {
         );
 
         let unmeasured = of(9, 2);
-        assert!(unmeasured.threshold > 0.0 && unmeasured.widths == start.widths);
+        assert!(unmeasured.threshold > 0.0 && unmeasured.widths == [0.0; 2]);
         let missing = unmeasured.missing().unwrap();
         assert!(missing.contains("Shore hardness: found 2"), "{missing}");
 
-        // What was not calibrated on the new data keeps no threshold of the start.
         let none = of(0, 0);
-        assert_eq!((none.temperature, none.widths), (1.5, start.widths));
-        assert_eq!((none.threshold, none.objects), (0.0, [0; 2]));
+        assert_eq!(none, Calibration::NONE);
         assert!(none.missing().unwrap().contains("found 0"));
     }
 }

@@ -17,7 +17,6 @@ use crate::net::bins::{self, BINS};
 use crate::net::course::{self, FRAMES};
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
-use crate::net::start::ExportedNetwork;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite;
@@ -36,11 +35,6 @@ mod varied;
 /// settings say otherwise: all the way. Evenly spread Shore hardness gives few samples of the narrow
 /// levels, and without weights a doubtful press would never be of one of them.
 pub const LEVEL_BALANCE: f64 = 1.0;
-/// Training that starts from a model's weights ends at this share of the way from them to the
-/// weights it learnt: less of it than for models of one frame ([`epochs::LEARNT_SHARE`]). On four
-/// draws of other sensors and materials, an eighth of the way was better than half by 2 points,
-/// with correct newtons and with wrong ones (`docs/results.md`).
-const LEARNT_SHARE: f32 = 0.125;
 /// Groups of presses per pass without gradients.
 const JUDGED_AT_ONCE: usize = 16;
 
@@ -206,28 +200,17 @@ impl Trained {
     }
 }
 
-/// Trains from random weights or from `start` with its calibration, or continues from the stage's
-/// last checkpoint in `run`. Without held-out objects, the temperature stays that of `start`, and
-/// there are no sets of levels, because nothing shows whether they hold.
+/// Trains from random weights, or continues from the stage's last checkpoint in `run`. Without held-out
+/// objects there are no sets of levels, because nothing shows whether they hold.
 ///
 /// # Errors
 ///
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
 /// this, or the loss or a weight is no longer finite.
-pub fn fit(
-    task: &Task,
-    start: Option<(ExportedNetwork, Calibration)>,
-    run: &Run,
-) -> anyhow::Result<Trained> {
-    let Some((start, calibration)) = start else {
-        let initial = course::initial(task.seed, task.device);
-        let (weights, standard) = task.learnt(initial, task.standard(), run)?;
-        return task.calibrated(weights, standard, task.lifts(), &Calibration::NONE);
-    };
-    let (weights, standard) = task.learnt(start.weights.clone(), start.standard, run)?;
-    let weights = weights.between(&start.weights, LEARNT_SHARE);
-    // The levels of a few own objects say nothing of how frequent they are elsewhere.
-    task.calibrated(weights, standard, start.lifts, &calibration)
+pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
+    let initial = course::initial(task.seed, task.device);
+    let (weights, standard) = task.learnt(initial, task.standard(), run)?;
+    task.calibrated(weights, standard, task.lifts())
 }
 
 impl Task<'_> {
@@ -349,7 +332,6 @@ impl Task<'_> {
         weights: Weights,
         standard: Standard,
         lifts: Vec<f32>,
-        start: &Calibration,
     ) -> anyhow::Result<Trained> {
         let mut trained = Trained {
             weights,
@@ -376,7 +358,7 @@ impl Task<'_> {
         let judged = trained.judge(&groups, self.device);
         let presses: Vec<&Press> = groups.iter().flat_map(|group| &group.presses).collect();
         let judged: Vec<_> = presses.into_iter().zip(judged).collect();
-        trained.calibration = self.calibration(&trained, &judged, start, &mut stream);
+        trained.calibration = self.calibration(&trained, &judged, &mut stream);
         Ok(trained)
     }
 
@@ -386,7 +368,6 @@ impl Task<'_> {
         &self,
         trained: &Trained,
         judged: &[(&Press, Vec<f32>)],
-        start: &Calibration,
         stream: &mut Stream,
     ) -> Calibration {
         let of_truth = |(press, logits): &(&Press, Vec<f32>), temperature: f32| {
@@ -408,7 +389,7 @@ impl Task<'_> {
             loss.sum::<f64>()
         };
         let temperature = match judged.is_empty() {
-            true => start.temperature,
+            true => 1.0,
             false => temperature::least(loss),
         };
         let of_truth = judged.iter().map(|judged| {

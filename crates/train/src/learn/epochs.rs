@@ -15,12 +15,6 @@ use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, r
 use crate::settings::Training;
 use hardnessd_simulator::random::Stream;
 
-/// Training that starts from the weights of a model of one frame ends at this share of the way from
-/// them to the weights it learnt. A few objects show what the sensor is like, but say little of
-/// other materials, which the start knows (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
-/// models").
-pub const LEARNT_SHARE: f32 = 0.5;
-
 /// The description of a training stage.
 #[derive(Debug)]
 pub struct Stage<'a> {

@@ -11,8 +11,6 @@ use burn::tensor::{Device, Tensor};
 
 use crate::data::augment;
 use crate::data::dataset::{self, Dataset};
-use crate::data::disturb;
-use crate::learn::consistency::{self, Views};
 use crate::learn::learner::Learner;
 use crate::learn::temperature::{self, LevelAndLogits};
 use crate::net::hrn;
@@ -22,16 +20,12 @@ use crate::run::Run;
 use crate::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::run::history::Row;
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
-use crate::settings::{ConsistencySettings, Keep, Training, Validation};
+use crate::settings::{Keep, Training, Validation};
 use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
 /// Samples per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
-
-/// A bit of the step number: when set, the number selects the sub-stream of the step's unlabelled
-/// samples.
-const UNLABELLED: u64 = 1 << 62;
 
 /// The inputs of a training.
 #[derive(Debug)]
@@ -44,8 +38,6 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Samples of held-out training objects, and how they are used; may be empty.
     pub validation: (&'a [usize], Validation),
-    /// Unlabelled samples to learn from by consistency, and its settings; `None` for most methods.
-    pub unlabelled: Option<(&'a [usize], ConsistencySettings)>,
     /// The scale from newtons to images.
     pub scale: PixelScale,
     /// Settings of the training.
@@ -63,8 +55,7 @@ pub struct Trained {
     pub weights: Weights,
     /// Mean and variance of each normalised layer over the training samples.
     pub statistics: Statistics,
-    /// The divisor of the logits. Without validation objects it is 1, or the start's in
-    /// [`super::adapt`].
+    /// The divisor of the logits. Without validation objects it is 1.
     pub temperature: f32,
 }
 
@@ -251,18 +242,7 @@ impl State {
     fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
         let number = self.progress.step;
         let (images, targets) = (task.images(indices, number), task.targets(indices));
-        let (loss, judged) = match task.unlabelled_views(indices.len(), number) {
-            None => step(&mut self.learner, images, targets, rate),
-            Some((weak, strong, settings)) => {
-                let views = Views {
-                    labelled: images,
-                    targets,
-                    weak,
-                    strong,
-                };
-                consistency::step(&mut self.learner, views, &settings, rate)
-            }
-        };
+        let (loss, judged) = step(&mut self.learner, images, targets, rate);
         self.progress.step += 1;
         let right = indices
             .iter()
@@ -294,11 +274,9 @@ impl State {
 
 impl Task<'_> {
     fn origin(&self, initial: &Weights) -> String {
-        let (unlabelled, consistency) = self.unlabelled.unzip();
-        let settings = (self.settings, self.validation.1, self.scale, consistency);
+        let settings = (self.settings, self.validation.1, self.scale);
         Origin::new(self.stage, &settings, self.seed)
             .samples(self.dataset, self.train)
-            .samples(self.dataset, unlabelled.unwrap_or_default())
             .samples(self.dataset, self.validation.0)
             .weights(initial)
             .finish()
@@ -326,39 +304,6 @@ impl Task<'_> {
             })
             .collect();
         self.scale.images(frames.iter(), self.device)
-    }
-
-    /// The weak and the strong view of the unlabelled samples of step `step`: `ratio` samples for
-    /// each of the `labelled` ones. The unlabelled samples have passes and an order of their own.
-    fn unlabelled_views(
-        &self,
-        labelled: usize,
-        step: u64,
-    ) -> Option<(Tensor<4>, Tensor<4>, ConsistencySettings)> {
-        let (samples, settings) = self.unlabelled?;
-        // The last batch of an epoch may be smaller, but it advances by a whole batch too, so that
-        // the places follow from the step's number alone.
-        let batch = (self.settings.batch.min(self.train.len()) * settings.ratio).min(samples.len());
-        let wanted = (labelled * settings.ratio).clamp(1, batch);
-        let batches = (samples.len() / batch) as u64;
-        let mut order = samples.to_vec();
-        let pass = self.stream("unlabelled order").child(step / batches);
-        { pass }.shuffle(&mut order);
-        let first = (step % batches) as usize * batch;
-        let indices = &order[first..first + wanted];
-
-        let weak = self.images(indices, step | UNLABELLED);
-        let mut stream = self.stream("disturbance").child(step);
-        let frames: Vec<ModelFrame> = indices
-            .iter()
-            .map(|&index| {
-                let frame = &self.dataset.samples[index].frame;
-                let turned = augment::vary(frame, self.settings.augmentation, &mut stream);
-                disturb::disturbed(&turned, &mut stream)
-            })
-            .collect();
-        let strong = self.scale.images(frames.iter(), self.device);
-        Some((weak, strong, settings))
     }
 
     fn targets(&self, indices: &[usize]) -> Tensor<2> {
@@ -392,7 +337,7 @@ impl Task<'_> {
     }
 
     /// The temperature of least loss on the validation samples; `None` without any.
-    pub(super) fn fitted_temperature(&self, trained: &Trained) -> Option<f32> {
+    fn fitted_temperature(&self, trained: &Trained) -> Option<f32> {
         let (samples, _) = self.validation;
         (!samples.is_empty()).then(|| temperature::fit(&self.judge(trained, samples)))
     }

@@ -1,18 +1,14 @@
 //! The training loop of the network that judges a frame, with Shore hardness.
 //!
-//! In: labelled frames, labelled frames of held-out objects, and unlabelled frames if there are
-//! any. Out: weights, and the calibration of the verdicts. Training begins from random weights or
-//! from those of an exported file.
+//! In: labelled frames, and labelled frames of held-out objects. Out: weights, and the calibration of
+//! the verdicts.
 
 use burn::tensor::{Device, Tensor};
 
 use crate::data::augment;
 use crate::data::dataset::Dataset;
-use crate::data::disturb;
 use crate::learn::conformal::{Calibration, Judged};
-use crate::learn::consistency;
 use crate::learn::epochs::{self, Batch};
-use crate::learn::force::{self, Label};
 use crate::learn::learner::Learner;
 use crate::net::frame;
 use crate::net::frames::{FEATURES, Features};
@@ -20,11 +16,10 @@ use crate::net::hrn;
 use crate::net::network::{Weights, numbers};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::ExportedNetwork;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
 use crate::run::progress::ensure_finite_logits;
-use crate::settings::{ConsistencySettings, Training};
+use crate::settings::Training;
 use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
@@ -46,8 +41,6 @@ pub struct Task<'a> {
     pub train: &'a [usize],
     /// Labelled samples of held-out objects; may be empty.
     pub held_out: &'a [usize],
-    /// Unlabelled samples to learn from by consistency, and its settings; may be empty.
-    pub unlabelled: (&'a [usize], ConsistencySettings),
     /// The number of hardness levels.
     pub levels: usize,
     /// Settings of the training.
@@ -63,7 +56,7 @@ pub struct Task<'a> {
 pub struct Trained {
     /// Weights of all layers.
     pub weights: Weights,
-    /// The factor of the forces, and mean and deviation of the features.
+    /// Mean and deviation of the features.
     pub standard: Standard,
     /// The calibration of the verdicts.
     pub calibration: Calibration,
@@ -92,46 +85,22 @@ impl Trained {
     }
 }
 
-/// Trains from random weights or from `start`, or continues from the stage's last checkpoint in
-/// `run`.
+/// Trains from random weights, or continues from the stage's last checkpoint in `run`.
 ///
 /// # Errors
 ///
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
 /// this, features cannot be computed, or the loss or a weight is no longer finite.
-pub fn fit(task: &Task, start: Option<ExportedNetwork>, run: &Run) -> anyhow::Result<Trained> {
+pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
     let plan = Features::new()?;
-    let kept = start.as_ref().map(|start| start.weights.clone());
-    let start = match start {
-        Some(start) => start,
-        None => {
-            let rows = plan.of(&task.frames(task.train))?;
-            ExportedNetwork {
-                weights: frame::initial(task.levels, task.seed, task.device),
-                standard: Standard::of(FEATURES, rows.chunks(FEATURES)),
-                temperature: 1.0,
-                widths: [0.0; 2],
-                lifts: Vec::new(),
-            }
-        }
-    };
-    let calibration = Calibration {
-        temperature: start.temperature,
-        widths: start.widths,
-        ..Calibration::NONE
-    };
-    let ExportedNetwork {
-        weights: initial,
-        standard,
-        ..
-    } = start;
-    let (unlabelled, consistency) = task.unlabelled;
+    let rows = plan.of(&task.frames(task.train))?;
+    let standard = Standard::of(FEATURES, rows.chunks(FEATURES));
+    let initial = frame::initial(task.levels, task.seed, task.device);
     let stage = epochs::Stage {
         name: task.stage,
-        origin: Origin::new(task.stage, &(task.settings, consistency), task.seed)
+        origin: Origin::new(task.stage, task.settings, task.seed)
             .samples(task.dataset, task.train)
             .samples(task.dataset, task.held_out)
-            .samples(task.dataset, unlabelled)
             .numbers(task.shore())
             .numbers(standard.numbers())
             .weights(&initial)
@@ -150,12 +119,8 @@ pub fn fit(task: &Task, start: Option<ExportedNetwork>, run: &Run) -> anyhow::Re
     let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
         task.step(learner, &plan, (&standard, &level_weights), batch)
     })?;
-    let weights = match &kept {
-        Some(start) => weights.between(start, epochs::LEARNT_SHARE),
-        None => weights,
-    };
     let trained = Trained {
-        calibration: task.calibration(&weights, &standard, &plan, &calibration)?,
+        calibration: task.calibration(&weights, &standard, &plan)?,
         weights,
         standard,
     };
@@ -171,35 +136,6 @@ pub fn fit(task: &Task, start: Option<ExportedNetwork>, run: &Run) -> anyhow::Re
 }
 
 impl Task<'_> {
-    /// The start with its factor of the forces corrected by the labels of the training samples.
-    ///
-    /// # Errors
-    ///
-    /// Fails if features cannot be computed.
-    pub fn with_force_factor(&self, mut start: ExportedNetwork) -> anyhow::Result<ExportedNetwork> {
-        let plan = Features::new()?;
-        let levels = self
-            .train
-            .iter()
-            .map(|&sample| self.dataset.samples[sample].level);
-        let labels: Vec<Label> = levels
-            .zip(self.dataset.object_numbers(self.train))
-            .collect();
-        let frames = self.frames(self.train);
-        let mut trained = Trained {
-            weights: start.weights.clone(),
-            standard: start.standard.clone(),
-            calibration: Calibration::NONE,
-        };
-        let factor = force::factor(&labels, start.temperature, self.device, |factor| {
-            trained.standard.force_factor = start.standard.force_factor * factor;
-            let judged = trained.judge(&frames, &plan, self.levels, self.device)?;
-            Ok(judged.into_iter().map(|(logits, _)| logits).collect())
-        })?;
-        start.standard.force_factor *= factor;
-        Ok(start)
-    }
-
     /// The measured Shore hardness of the training samples; NaN where there is none.
     fn shore(&self) -> impl Iterator<Item = f32> {
         let samples = self
@@ -236,17 +172,6 @@ impl Task<'_> {
         let of = |frames: &[ModelFrame]| frame::Batch::new(frames, plan, standard, self.device);
         let mut stream = self.stream("augmentation").child(batch.step);
         let images = of(&self.varied(batch.samples, &mut stream))?;
-        let pseudo = self.unlabelled_views(batch, &mut stream);
-        let pseudo = match pseudo {
-            Some((weak, strong)) => {
-                let outputs = frame::outputs(&learner.evaluated(), &of(&weak)?);
-                let logits = outputs.slice([0..weak.len(), 0..self.levels]);
-                let targets = consistency::pseudo_targets(logits, self.unlabelled.1.confidence);
-                Some((targets, of(&strong)?))
-            }
-            None => None,
-        };
-
         let level_of = |&sample: &usize| self.dataset.samples[sample].level;
         let targets = hrn::targets(batch.samples.iter().map(level_of), self.levels, self.device)
             .mul(weights.clone());
@@ -255,13 +180,7 @@ impl Task<'_> {
 
         let tracked = learner.weights.tracked();
         let outputs = frame::outputs(&tracked, &images);
-        let (mut loss, judged) = shore::loss(outputs, targets, &measured);
-        if let Some((targets, strong)) = pseudo {
-            let outputs = frame::outputs(&tracked, &strong);
-            let logits = outputs.slice([0..targets.dims()[0], 0..self.levels]);
-            let weight = self.unlabelled.1.weight;
-            loss = loss.add(hrn::cross_entropy(logits, targets).mul_scalar(weight));
-        }
+        let (loss, judged) = shore::loss(outputs, targets, &measured);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, batch.rate);
         let right = batch.samples.iter().zip(judged.chunks(self.levels));
@@ -270,33 +189,12 @@ impl Task<'_> {
         Ok((f64::from(numbers(&loss)[0]), right.count() as f64))
     }
 
-    /// The weak and the strong view of randomly drawn unlabelled samples: `ratio` for each labelled
-    /// sample of the batch. `None` at step 0 or without unlabelled samples.
-    fn unlabelled_views(
-        &self,
-        batch: Batch,
-        stream: &mut Stream,
-    ) -> Option<(Vec<ModelFrame>, Vec<ModelFrame>)> {
-        let (all, settings) = self.unlabelled;
-        if all.is_empty() || batch.step == 0 {
-            return None;
-        }
-        let count = batch.samples.len() * settings.ratio;
-        let drawn: Vec<usize> = (0..count).map(|_| all[stream.below(all.len())]).collect();
-        let weak = self.varied(&drawn, stream);
-        let strong = self.varied(&drawn, stream);
-        let strong = strong.iter().map(|frame| disturb::disturbed(frame, stream));
-        Some((weak, strong.collect()))
-    }
-
-    /// Calibrates on the frames of held-out objects, augmented like the training frames. Without
-    /// any, gives `start`.
+    /// Calibrates on the frames of held-out objects, augmented like the training frames.
     fn calibration(
         &self,
         weights: &Weights,
         standard: &Standard,
         plan: &Features,
-        start: &Calibration,
     ) -> anyhow::Result<Calibration> {
         let trained = Trained {
             weights: weights.clone(),
@@ -321,6 +219,6 @@ impl Task<'_> {
                 said,
             })
             .collect();
-        Ok(Calibration::of(&judged, start, &mut stream, self.device))
+        Ok(Calibration::of(&judged, &mut stream, self.device))
     }
 }

@@ -1,5 +1,4 @@
-//! The method `course`, and `adapt` on presses: the network that judges whole presses, from random
-//! weights or from those of a model file.
+//! The method `course`: the network that judges whole presses.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,30 +6,25 @@ use anyhow::ensure;
 use burn::tensor::Device;
 
 use super::Request;
-use super::adapt::NoStart;
 use crate::data::courses::Courses;
 use crate::data::dataset::{self, Source};
-use crate::learn::conformal::{Calibration, LEAST_OBJECTS};
+use crate::learn::conformal::LEAST_OBJECTS;
 use crate::learn::course::{self, Task};
 use crate::model::course::finish;
 use crate::model::evaluated::Evaluated;
-use crate::model::file;
-use crate::net::course as network;
-use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
-use hardnessd_core::verdict::{Borders, Hrn};
+use hardnessd_core::verdict::Borders;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
 pub use super::settings::course as settings;
 
-/// The description of a run called `method`, which uses all labels.
+/// The description of a run, which uses all labels.
 ///
 /// # Errors
 ///
 /// Fails if the data has no labelled training presses, or if `validation.keep` is not `last`.
 pub fn description(
-    method: &str,
     courses: &Courses,
     sources: Vec<Source>,
     request: &Request,
@@ -43,18 +37,17 @@ pub fn description(
         "{}: no press of the train split has a level: collect some with `--sequences --level L`",
         sources.first().map_or("", |source| &source.name)
     );
-    Ok(request.of(method, labels, sources))
+    Ok(request.of("course", labels, sources))
 }
 
-/// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
-/// directory. A resumed run continues from the files there.
+/// Trains, and writes the model and its evaluation to the run's directory. A resumed run continues from
+/// the files there.
 ///
 /// # Errors
 ///
 /// Fails if the training diverges, or the directory cannot be read or written.
 pub fn train(
     courses: &Courses,
-    start: Option<(ExportedNetwork, Calibration)>,
     description: &Description,
     run: &Run,
     device: &Device,
@@ -65,9 +58,8 @@ pub fn train(
     let levels = dataset::levels_of(&description.data);
     let borders = Borders::of(&levels)?;
     let presses = course::presses(courses);
-    let is_adapted = start.is_some();
     let task = Task {
-        stage: if is_adapted { "adapt" } else { "course" },
+        stage: "course",
         presses: &presses,
         train: &train,
         held_out: &held_out,
@@ -78,7 +70,7 @@ pub fn train(
         seed: *seed,
         device,
     };
-    let trained = course::fit(&task, start, run)?;
+    let trained = course::fit(&task, run)?;
     if let Some(missing) = trained.calibration.missing() {
         hardnessd_core::say!("{missing}");
     }
@@ -96,27 +88,6 @@ pub fn train(
         (&trained, &borders),
         device,
     )
-}
-
-/// The start of `adapt`: the weights and calibration of a model file that the daemon's loader has
-/// accepted.
-///
-/// # Errors
-///
-/// Returns [`NoStart`] if the file holds another network.
-pub fn start(
-    hrn: &Hrn,
-    bytes: &[u8],
-    device: &Device,
-) -> anyhow::Result<(ExportedNetwork, Calibration)> {
-    let constants = file::constants(bytes)?;
-    let start = network::start(|name| constants.get(name), device);
-    let start = start.ok_or_else(|| NoStart::of(hrn, "presses: course, or adapt of one"))?;
-    let calibration = Calibration {
-        temperature: start.temperature,
-        ..Calibration::NONE
-    };
-    Ok((start, calibration))
 }
 
 /// Splits presses into presses to learn from and presses to calibrate on. `share` is the share held

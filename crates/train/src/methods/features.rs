@@ -51,7 +51,6 @@ pub fn train(
         raw_logits,
         shore: None,
         temperature: 1.0,
-        force_factor: 1.0,
     };
     let probabilities = |frames: &[&ModelFrame]| {
         let rows = features::features(frames.iter().copied())?;

@@ -1,17 +1,15 @@
-//! The network that judges a frame and gives its Shore hardness, from random weights (`frame`) or
-//! from those of a model file (`adapt`).
+//! The method `frame`: the network that judges a frame and gives its Shore hardness.
 
 use anyhow::Context as _;
 use burn::tensor::Device;
 
 use crate::data::dataset::{self, Dataset};
 use crate::learn::frame::{self, Task, Trained};
-use crate::learn::{force, temperature};
+use crate::learn::temperature;
 use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Recogniser};
 use crate::net::frame as network;
 use crate::net::frames::Features;
-use crate::net::start::ExportedNetwork;
 use crate::run::{Description, Run};
 use crate::stages;
 use hardnessd_core::verdict::ModelFrame;
@@ -25,8 +23,6 @@ pub struct Samples<'a> {
     pub train: &'a [usize],
     /// Labelled samples of held-out objects; may be empty.
     pub held_out: &'a [usize],
-    /// Samples to learn from without their labels; may be empty.
-    pub unlabelled: &'a [usize],
 }
 
 impl Samples<'_> {
@@ -37,16 +33,14 @@ impl Samples<'_> {
     }
 }
 
-/// Trains from random weights or from `start`, and writes the model and its evaluation to the run's
-/// directory. A resumed run continues from the files there.
+/// Trains, and writes the model and its evaluation to the run's directory. A resumed run continues from
+/// the files there.
 ///
 /// # Errors
 ///
 /// Fails if the training diverges, or the directory cannot be read or written.
 pub fn train(
-    stage: &'static str,
     samples: &Samples,
-    start: Option<ExportedNetwork>,
     description: &Description,
     run: &Run,
     device: &Device,
@@ -54,24 +48,16 @@ pub fn train(
     let levels = dataset::levels().len();
     let settings = &description.settings;
     let task = Task {
-        stage,
+        stage: "frame",
         dataset: samples.dataset,
         train: samples.train,
         held_out: samples.held_out,
-        unlabelled: (samples.unlabelled, settings.consistency),
         levels,
         settings: &settings.training,
         seed: description.seed,
         device,
     };
-    let start = start
-        .map(|start| task.with_force_factor(start))
-        .transpose()?;
-    let force_factor = start.as_ref().map_or(1.0, |s| s.standard.force_factor);
-    if let Some(account) = force::account(force_factor) {
-        hardnessd_core::say!("{account}");
-    }
-    let trained = frame::fit(&task, start, run)?;
+    let trained = frame::fit(&task, run)?;
     let missing = trained.calibration.missing_interval();
     if !samples.has_shore() {
         hardnessd_core::say!(
@@ -121,14 +107,13 @@ fn finish(
         levels,
         calibration.widths,
     );
-    // Leave the Shore output out if no training sample has a measured hardness: the second head
-    // then learnt nothing, or lost what the start knew.
+    // Leave the Shore output out if no training sample has a measured hardness: the second head then
+    // learnt nothing.
     let recogniser = Recogniser {
         graph,
         raw_logits,
         shore: samples.has_shore().then_some(shore),
         temperature: calibration.temperature,
-        force_factor: trained.standard.force_factor,
     };
     export::finish(
         run,

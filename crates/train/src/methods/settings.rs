@@ -78,22 +78,6 @@ pub(super) fn frame(profile: Profile) -> Settings {
     settings
 }
 
-/// The settings of `adapt`.
-pub fn adapt(profile: Profile) -> Settings {
-    let mut settings = Settings::of(profile);
-    settings.training = Training {
-        batch: 50,
-        epochs: 60,
-        averaging: 0.99,
-        checkpoint_every_epochs: 10,
-        optimiser: adam(settings.training.optimiser, 5e-4),
-        augmentation: SYMMETRIES_AND_SHIFTS,
-        ..settings.training
-    };
-    settings.consistency.ratio = 1;
-    settings
-}
-
 /// The settings of `course`.
 pub fn course(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);

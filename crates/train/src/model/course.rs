@@ -66,7 +66,7 @@ pub fn finish(
         threshold,
         ..
     } = trained.calibration;
-    let mut metrics = metrics(description, temperature, trained.standard.force_factor);
+    let mut metrics = metrics(temperature);
     if let Some(missing) = trained.calibration.missing() {
         metrics["not_promised"] = json!(missing);
     }

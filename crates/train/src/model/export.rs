@@ -33,8 +33,6 @@ pub struct Recogniser {
     pub shore: Option<String>,
     /// The divisor of the logits.
     pub temperature: f32,
-    /// The factor by which the graph multiplies forces first; 1 if it does not.
-    pub force_factor: f32,
 }
 
 /// Writes the model and its evaluation on the test split to the run's directory. `train` are the
@@ -62,7 +60,7 @@ pub fn finish(
         pitch_mm: dataset.pitch_mm() as f32,
         method: description.method.clone(),
         data: data(&description.data)?,
-        metrics: metrics(description, recogniser.temperature, recogniser.force_factor),
+        metrics: metrics(recogniser.temperature),
         validation: validation(&dataset.validated()).to_owned(),
         range: range(train.iter().map(|&index| dataset.samples[index].frame)),
         conformal: None,
@@ -97,19 +95,8 @@ pub fn finish(
 }
 
 /// What a file says of itself before it is measured.
-pub fn metrics(
-    description: &Description,
-    temperature: f32,
-    force_factor: f32,
-) -> serde_json::Value {
-    let mut metrics = json!({ "temperature": temperature });
-    if let Some(start) = &description.start {
-        metrics["start"] = json!(start);
-    }
-    if force_factor != 1.0 {
-        metrics["force_factor"] = json!(force_factor);
-    }
-    metrics
+pub fn metrics(temperature: f32) -> serde_json::Value {
+    json!({ "temperature": temperature })
 }
 
 /// Judges samples with a model and evaluates its verdicts.

@@ -4,16 +4,13 @@
 //! with the trainer's probabilities. Out: the bytes of the file, already read back through
 //! [`verdict::Hrn`](hardnessd_core::verdict::Hrn), which refuses a file that does not reproduce its checks.
 
-use std::collections::BTreeMap;
-
 use anyhow::{Context as _, ensure};
 use prost::Message as _;
 use tract_onnx::pb;
-use tract_onnx::prelude::Framework as _;
 
 use crate::net::bins::{BINS, LIFTS};
 use crate::net::course::{EMBEDDING, REFERENCES};
-use crate::net::graph::{self, Constant, Graph, frame_input, integer, model, value_info};
+use crate::net::graph::{Graph, frame_input, integer, model, value_info};
 use hardnessd_core::verdict::{COURSE_FRAMES, Card, Checks, Hrn, course_inputs, identified_inputs};
 
 /// The outputs of a graph.
@@ -137,16 +134,4 @@ pub(super) fn metadata(
         value,
     };
     Ok(entries.into_iter().map(entry).collect())
-}
-
-/// The f32 constants of a file that [`write()`] wrote, by name.
-///
-/// # Errors
-///
-/// Fails if the bytes are not an ONNX model.
-pub fn constants(bytes: &[u8]) -> anyhow::Result<BTreeMap<String, Constant>> {
-    let mut reader = bytes;
-    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader)?;
-    let graph = proto.graph.unwrap_or_default();
-    Ok(graph::floats(&graph.initializer))
 }

@@ -8,9 +8,7 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::bins::BINS;
-use crate::net::graph::Constant;
 use crate::net::network::{Weights, dense};
-use crate::net::start::ExportedNetwork;
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::{COURSE_FRAMES, Piece};
 use hardnessd_simulator::random::Stream;
@@ -59,16 +57,6 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
         weights.add(&bias, &[outputs], vec![0.0; outputs], device);
     }
     weights
-}
-
-/// The start of further training, from an exported graph's constants. `None` if they are of another
-/// network.
-pub fn start<'a>(
-    constant: impl Fn(&str) -> Option<&'a Constant>,
-    device: &Device,
-) -> Option<ExportedNetwork> {
-    let weight = |name: &str| constant(name).cloned();
-    ExportedNetwork::of_constants(initial(0, device), FEATURES, weight, device)
 }
 
 /// Presses of one sensor, with its references.

@@ -9,14 +9,13 @@ use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::builder::Builder;
 use crate::net::frames::{self, FEATURES, Features};
-use crate::net::graph::{Constant, Graph, INPUT, integer};
+use crate::net::graph::{Graph, INPUT, integer};
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::layers::leaky_relu;
 use crate::net::network::{self, LEAKY_SLOPE, TRUNK, Weights, as_images, dense, pooled, sums};
 use crate::net::shore;
 use crate::net::standard::Standard;
-use crate::net::start::ExportedNetwork;
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
@@ -82,9 +81,7 @@ impl Batch {
         standard: &Standard,
         device: &Device,
     ) -> anyhow::Result<Self> {
-        let times = |frame: &ModelFrame| frame.times(standard.force_factor);
-        let frames: Vec<ModelFrame> = frames.iter().map(times).collect();
-        let rows = plan.of(&frames)?;
+        let rows = plan.of(frames)?;
         let rows = rows.iter().enumerate();
         let rows: Vec<f32> = rows
             .map(|(at, &x)| standard.apply(at % FEATURES, x))
@@ -110,17 +107,6 @@ pub fn outputs(weights: &Weights, batch: &Batch) -> Tensor<2> {
     dense(weights, "head", joint)
 }
 
-/// The start of further training, from an exported graph's constants. `None` if they are of another
-/// network.
-pub fn start<'a>(
-    constant: impl Fn(&str) -> Option<&'a Constant>,
-    levels: usize,
-    device: &Device,
-) -> Option<ExportedNetwork> {
-    let constant = |name: &str| constant(name).cloned();
-    ExportedNetwork::of_constants(initial(levels, 0, device), FEATURES, constant, device)
-}
-
 /// The graph from newtons to raw logits `[1, levels]` and Shore OO `[1, 3]`, and the names of both.
 /// `widths` widen the interval below and above.
 pub fn graph(
@@ -130,9 +116,8 @@ pub fn graph(
     widths: [f32; 2],
 ) -> (Graph, String, String) {
     let mut b = Builder(Graph::default());
-    let newtons = standard.forces_node(&mut b, INPUT);
-    let pooled = hrn::trunk_nodes(&mut b.0, &newtons, (weights, None), SCALE, true);
-    let (columns, _) = frames::nodes(&mut b, &newtons, 1);
+    let pooled = hrn::trunk_nodes(&mut b.0, INPUT, (weights, None), SCALE, true);
+    let (columns, _) = frames::nodes(&mut b, INPUT, 1);
     let columns = standard.nodes(&mut b, &columns);
     let columns = b.reshaped(&columns, &[1, FEATURES], "columns");
     let along = vec![integer("axis", 1)];
@@ -198,19 +183,16 @@ mod tests {
     fn the_graph_computes_what_training_does() {
         let device = Device::flex();
         let frames = frames();
-        let (_, mut standard) = prepared(&frames, &device);
+        let (_, standard) = prepared(&frames, &device);
         let weights = initial(4, 2, &device);
         let features = Features::new().unwrap();
-        for force_factor in [1.0, 0.65] {
-            standard.force_factor = force_factor;
-            let (graph, raw_logits, _) = graph(&weights, &standard, 4, [0.0; 2]);
-            let plan = Plan::new(graph, &raw_logits, &[1, 4]).unwrap();
-            let batch = Batch::new(&frames, &features, &standard, &device).unwrap();
-            let trained = numbers(&outputs(&weights, &batch));
-            for (frame, expected) in frames.iter().zip(trained.chunks(4 + shore::OUTPUTS)) {
-                for (found, expected) in plan.run(frame).unwrap().iter().zip(expected) {
-                    assert!((found - expected).abs() < 1e-4, "{found} {expected}");
-                }
+        let (graph, raw_logits, _) = graph(&weights, &standard, 4, [0.0; 2]);
+        let plan = Plan::new(graph, &raw_logits, &[1, 4]).unwrap();
+        let batch = Batch::new(&frames, &features, &standard, &device).unwrap();
+        let trained = numbers(&outputs(&weights, &batch));
+        for (frame, expected) in frames.iter().zip(trained.chunks(4 + shore::OUTPUTS)) {
+            for (found, expected) in plan.run(frame).unwrap().iter().zip(expected) {
+                assert!((found - expected).abs() < 1e-4, "{found} {expected}");
             }
         }
     }

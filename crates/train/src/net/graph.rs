@@ -4,15 +4,10 @@
 //! exported file and the daemon's reader share one schema, or a plan that computes it in this
 //! process.
 
-use std::collections::BTreeMap;
-
 use tract_onnx::pb;
 use tract_onnx::prelude::*;
 
 use hardnessd_core::verdict::{COLS, MIN_OPSET, ModelFrame, ROWS};
-
-/// Shape and numbers of a constant of a graph.
-pub type Constant = (Vec<usize>, Vec<f32>);
 
 /// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
@@ -33,11 +28,6 @@ impl Graph {
         self.raw(name, dims, pb::tensor_proto::DataType::Float, |raw| {
             raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
         })
-    }
-
-    /// The f32 constants by name: the shape and the numbers of each.
-    pub fn floats(&self) -> BTreeMap<String, Constant> {
-        floats(&self.constants)
     }
 
     /// Adds an i64 vector, the form of shapes and axes, and returns its name.
@@ -100,20 +90,6 @@ impl Graph {
         });
         output.to_owned()
     }
-}
-
-/// The f32 tensors among `tensors` by name: the shape and the numbers of each.
-pub(crate) fn floats(tensors: &[pb::TensorProto]) -> BTreeMap<String, Constant> {
-    let floats = tensors
-        .iter()
-        .filter(|tensor| tensor.data_type == pb::tensor_proto::DataType::Float as i32);
-    let constant = |tensor: &pb::TensorProto| {
-        let dims = tensor.dims.iter().map(|&length| length as usize).collect();
-        let (numbers, _) = tensor.raw_data.as_chunks();
-        let numbers = numbers.iter().map(|&bytes| f32::from_le_bytes(bytes));
-        (tensor.name.clone(), (dims, numbers.collect()))
-    };
-    floats.map(constant).collect()
 }
 
 /// An integer attribute.

@@ -5,64 +5,13 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::net::graph::{self, Constant, Graph};
+use crate::net::graph::{self, Graph};
 use crate::net::image::PixelScale;
 use crate::net::layers::STRIDE;
 use crate::net::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
 use crate::settings::network::Pooling;
 use hardnessd_core::verdict::ROWS;
 use hardnessd_simulator::random::Stream;
-
-/// An exported HRN to continue training from.
-#[derive(Debug, Clone)]
-pub struct ExportedHrn {
-    /// Weights of all layers.
-    pub weights: Weights,
-    /// Mean and variance of each normalised layer over the samples that it learnt from.
-    pub statistics: Statistics,
-    /// The pooling before the head.
-    pub pooling: Pooling,
-    /// The scale of the image.
-    pub scale: PixelScale,
-    /// The temperature by which the logits are divided.
-    pub temperature: f32,
-}
-
-/// The start of further training, from an exported graph's constants. `None` if they are of another
-/// network.
-pub fn start<'a>(
-    constant: impl Fn(&str) -> Option<&'a Constant>,
-    levels: usize,
-    device: &Device,
-) -> Option<ExportedHrn> {
-    let number = |name: &str| constant(name)?.1.first().copied();
-    let pooling = match *constant("head.matrix")?.0.first()? {
-        FEATURES => Pooling::Max,
-        features if features == 2 * FEATURES => Pooling::MaxMean,
-        _ => return None,
-    };
-    let values = |name: &str, dims: &[usize]| {
-        let (found, values) = constant(name)?;
-        let tensor = || Tensor::from_data(TensorData::new(values.clone(), [values.len()]), device);
-        (found == dims).then(tensor)
-    };
-    let mut weights = initial(levels, pooling, 0, device);
-    for weight in &mut weights.entries {
-        weight.values = values(&weight.name, &weight.dims)?;
-    }
-    let normalised = TRUNK.iter().filter(|layer| layer.normalised);
-    let statistics = normalised.map(|layer| {
-        let part = |part: &str| values(&format!("{}.{part}", layer.name), &[layer.outputs]);
-        Some((part("mean")?, part("variance")?))
-    });
-    Some(ExportedHrn {
-        statistics: Statistics::of(statistics.collect::<Option<_>>()?),
-        weights,
-        pooling,
-        scale: PixelScale::of_constants(number("scale")?, number("log factor"))?,
-        temperature: number("temperature")?,
-    })
-}
 
 /// The number of features that a pooling makes.
 fn features(pooling: Pooling) -> usize {
@@ -402,38 +351,11 @@ mod tests {
         );
         let fixed = logits(&weights, x, &mut Normalisation::Fixed(&statistics));
         let (graph, name) = graph(&weights, &statistics, scale);
-        let mut constants = graph.floats();
-        constants.insert("temperature".to_owned(), (vec![], vec![1.5]));
         let plan = graph::Plan::new(graph, &name, &[1, 4]).unwrap();
         let computed = frames.iter().flat_map(|frame| plan.run(frame).unwrap());
         let (computed, fixed) = (computed.collect::<Vec<_>>(), network::numbers(&fixed));
         let largest = largest_difference(&computed, &fixed);
         assert!(largest < 1e-4, "{largest}: {computed:?} {fixed:?}");
-
-        let found = start(|name| constants.get(name), 4, &device()).unwrap();
-        assert_eq!((found.pooling, found.temperature), (pooling, 1.5));
-        let near = |found: f64, expected: f64| (found - expected).abs() <= 1e-6 * expected;
-        assert!(
-            near(found.scale.full_scale_n, scale.full_scale_n),
-            "{found:?}"
-        );
-        assert!(
-            near(found.scale.log_above_n, scale.log_above_n),
-            "{found:?}"
-        );
-        for entry in &weights.entries {
-            let values = found.weights.numbers(&entry.name);
-            assert_eq!(values, network::numbers(&entry.values), "{}", entry.name);
-        }
-        for index in 0..2 {
-            let (was, is) = (statistics.layer(index), found.statistics.layer(index));
-            assert_eq!(network::numbers(&was.0), network::numbers(&is.0));
-            assert_eq!(network::numbers(&was.1), network::numbers(&is.1));
-        }
-        for missing in ["conv2.gamma", "conv3.variance", "head.bias", "scale"] {
-            let without = |name: &str| constants.get(name).filter(|_| name != missing);
-            assert!(start(without, 4, &device()).is_none(), "{missing}");
-        }
     }
 
     #[test]

@@ -42,16 +42,6 @@ impl PixelScale {
         ((pixel + 1.0) / self.log_factor()).exp_m1() * log_above_n as f32
     }
 
-    /// The scale under which newtons look as their product with `factor` does under this one.
-    #[must_use]
-    pub fn of_newtons_times(self, factor: f32) -> Self {
-        let factor = f64::from(factor);
-        Self {
-            full_scale_n: self.full_scale_n / factor,
-            log_above_n: self.log_above_n / factor,
-        }
-    }
-
     /// The factor that makes log(1 + full scale / `log_above_n`) equal to 2.
     fn log_factor(self) -> f32 {
         (2.0 / (self.full_scale_n / self.log_above_n).ln_1p()) as f32
@@ -69,25 +59,6 @@ impl PixelScale {
             values.extend(frame.newtons.map(|newtons| self.pixel(newtons)));
         }
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
-    }
-
-    /// The scale whose [`Self::nodes`] have these constants: `scale`, and of a logarithmic one its
-    /// `log factor`. `None` if no scale has them.
-    pub fn of_constants(scale: f32, log_factor: Option<f32>) -> Option<Self> {
-        let found = match (f64::from(scale), log_factor) {
-            (scale, None) => Self {
-                full_scale_n: 2.0 / scale,
-                log_above_n: 0.0,
-            },
-            (scale, Some(factor)) => Self {
-                full_scale_n: (2.0 / f64::from(factor)).exp_m1() / scale,
-                log_above_n: 1.0 / scale,
-            },
-        };
-        let is_sound = [found.full_scale_n, found.log_above_n + 1.0]
-            .iter()
-            .all(|number| number.is_finite() && *number > 0.0);
-        is_sound.then_some(found)
     }
 
     /// Adds the nodes from `newtons` to the image raised by 1, so that the background is 0. Returns
@@ -123,8 +94,6 @@ mod tests {
             for newtons in [0.04_f32, 0.2, 0.7, 5.0] {
                 let back = scale.newtons(scale.pixel(newtons));
                 assert!((back - newtons).abs() < 1e-5 * newtons.max(1.0), "{back}");
-                let doubled = scale.of_newtons_times(2.0).pixel(newtons);
-                assert!((doubled - scale.pixel(2.0 * newtons)).abs() < 1e-6);
             }
         }
     }

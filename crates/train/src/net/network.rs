@@ -172,22 +172,6 @@ impl Weights {
         }
     }
 
-    /// The weights that lie `share` of the way from `start` to these. Both are of one network.
-    #[must_use]
-    pub fn between(&self, start: &Self, share: f32) -> Self {
-        let between = |(weight, start): (&Weight, &Weight)| {
-            let way = weight.values.clone().sub(start.values.clone());
-            Weight {
-                values: start.values.clone().add(way.mul_scalar(share)),
-                ..weight.clone()
-            }
-        };
-        let pairs = self.entries.iter().zip(&start.entries);
-        Self {
-            entries: pairs.map(between).collect(),
-        }
-    }
-
     /// The weights with every gamma, beta and bias moved. In an untrained network they are 1 and 0,
     /// which hides an omission.
     #[cfg(test)]

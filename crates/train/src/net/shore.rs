@@ -102,14 +102,6 @@ pub(super) fn nodes(
     (raw_logits, shore)
 }
 
-/// The widths in the constant `shore middles` of an exported graph.
-pub(super) fn widths(middles: &[f32]) -> [f32; 2] {
-    let &[_, low, high] = middles else {
-        return [0.0; 2];
-    };
-    [MIDDLE - low, high - MIDDLE]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

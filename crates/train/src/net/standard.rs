@@ -1,18 +1,14 @@
-//! Forces and columns of numbers brought to one scale before a network sees them.
+//! Columns of numbers brought to one scale before a network sees them.
 
 use crate::net::builder::Builder;
 
 /// The number of standard deviations from the mean at which a column is clipped, because a network
 /// extrapolates beyond its training data.
 const CLIP: f32 = 4.0;
-/// The graph's constant with the factor of the forces.
-pub(super) const FORCE_FACTOR: &str = "force factor";
 
-/// The factor of the forces, and mean and standard deviation of each column over the training data.
+/// Mean and standard deviation of each column over the training data.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standard {
-    /// The factor by which newtons are multiplied before anything else: 1 unless `adapt` found another.
-    pub force_factor: f32,
     /// Mean of each column.
     pub mean: Vec<f32>,
     /// Standard deviation of each column.
@@ -36,7 +32,6 @@ impl Standard {
             }
         }
         Self {
-            force_factor: 1.0,
             mean: mean.iter().map(|&mean| mean as f32).collect(),
             // The lower limit avoids a division by 0 for a column that never varies.
             deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
@@ -45,18 +40,7 @@ impl Standard {
 
     /// All numbers that an interrupted training must find unchanged.
     pub fn numbers(&self) -> impl Iterator<Item = f32> {
-        let columns = self.mean.iter().chain(&self.deviation);
-        std::iter::once(self.force_factor).chain(columns.copied())
-    }
-
-    /// Adds the node that multiplies the forces of `input` by the factor, unless it is 1. Returns
-    /// its output's name.
-    pub(super) fn forces_node(&self, b: &mut Builder, input: &str) -> String {
-        if self.force_factor == 1.0 {
-            return input.to_owned();
-        }
-        let factor = b.0.constant(FORCE_FACTOR, &[], &[self.force_factor]);
-        b.node("Mul", &[input, &factor], "forces")
+        self.mean.iter().chain(&self.deviation).copied()
     }
 
     /// A column's number on the scale that the network takes.

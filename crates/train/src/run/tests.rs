@@ -14,7 +14,6 @@ fn description(name: &str, sha256: &str) -> Description {
         seed: 1,
         labels: 4,
         label_choice: LabelChoice::Object,
-        start: None,
         settings: Settings::of(Profile::Smoke),
         data: vec![Source {
             name: name.to_owned(),

@@ -4,7 +4,6 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
-mod adapt;
 mod adopt;
 mod collect;
 mod compare;

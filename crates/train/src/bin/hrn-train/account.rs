@@ -114,17 +114,6 @@ pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
     text
 }
 
-/// The figures of an adapted model, and the accuracy of the model that it started from on the same
-/// presses.
-pub(super) fn of_adapted(evaluation: &Evaluated, start: &Hrn, of_start: &[Case]) -> String {
-    let of_start = Evaluated::of(of_start, start.card().levels.len());
-    format!(
-        "{}accuracy of its start  {:.1} %\n",
-        of_evaluated(evaluation),
-        of_start.levels.accuracy * 100.0
-    )
-}
-
 /// The figures of the levels, and the confusion matrix with a row for each true level.
 fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;

@@ -32,8 +32,6 @@ pub(super) enum Command {
     Collect(Collect),
     /// Train one method
     Train(Train),
-    /// Continue to train a model on a few presses of your own sensor, labelled or not
-    Adapt(Adapt),
     /// Train every method under several seeds and make the paper's tables; run it again to continue
     Compare(Compare),
     /// Run an exported model on a data set
@@ -311,32 +309,6 @@ pub(super) struct Train {
     /// End when this process ends, the one that started this one
     #[arg(long, hide = true, value_name = "PID")]
     pub(super) parent: Option<i32>,
-}
-
-#[derive(Debug, clap::Args)]
-pub(super) struct Adapt {
-    /// Presses of your sensor, those of level 0 unlabelled; several files may be named
-    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
-    pub(super) data: Vec<PathBuf>,
-    /// Directory of the run
-    #[arg(long, value_name = "RUN")]
-    pub(super) out: PathBuf,
-    /// Model to start from, which `train` or `adapt` made by any method but `features` [default: the
-    /// built-in one]. For presses over time, one of `train --method course`
-    #[arg(long, value_name = "M.onnx")]
-    pub(super) start: Option<PathBuf>,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 1, value_parser = seed())]
-    pub(super) seed: u64,
-    /// Settings that override the default ones (see config/hrn-train.toml)
-    #[arg(long, value_name = "F.toml")]
-    pub(super) config: Option<PathBuf>,
-    /// Continue a run that was stopped
-    #[arg(long)]
-    pub(super) resume: bool,
-    /// Where to compute
-    #[arg(long, default_value = "cpu")]
-    pub(super) device: DeviceName,
 }
 
 #[derive(Debug, clap::Args)]

@@ -6,7 +6,6 @@ use hardnessd_core::exit;
 use hrn_train::data::collect::{CollectError, Problem};
 use hrn_train::data::dataset::DatasetError;
 use hrn_train::methods::LabelsError;
-use hrn_train::methods::adapt::NoStart;
 use hrn_train::model::foreign::Foreign;
 use hrn_train::settings::SettingsError;
 
@@ -103,7 +102,6 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
         exit::UNAVAILABLE
     } else if has(|e| {
         e.is::<ModelError>()
-            || e.is::<NoStart>()
             || e.is::<Foreign>()
             || e.is::<SettingsError>()
             || e.is::<ConfigurationError>()

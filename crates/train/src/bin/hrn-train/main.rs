@@ -38,7 +38,7 @@ fn main() -> ExitCode {
     };
     let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
     let how_to_continue = match arguments.command {
-        Command::Train(_) | Command::Adapt(_) => Some(signals::resuming(words)),
+        Command::Train(_) => Some(signals::resuming(words)),
         Command::Compare(_) => Some(signals::again(words)),
         _ => None,
     };
@@ -52,7 +52,6 @@ fn main() -> ExitCode {
         // Training runs on a thread of the pool. From outside, every operation on several threads
         // would first have to wake one of them.
         Command::Train(arguments) => rayon::scope(|_| train::train(&arguments)),
-        Command::Adapt(arguments) => rayon::scope(|_| train::adapt(&arguments)),
         Command::Compare(arguments) => compare::compare(arguments),
         Command::Evaluate(arguments) => models::evaluate(&arguments),
         Command::Report { directory, out } => compare::report_of(&directory, &out),

@@ -1,24 +1,21 @@
-//! `hrn-train train` and `hrn-train adapt`.
+//! `hrn-train train`.
 
 use std::path::Path;
 use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
-use hardnessd_core::verdict::{BUILT_IN, BUILT_IN_HRN, Hrn, sha256_hex};
 use hardnessd_core::wording;
-use hrn_train::data::courses::Courses;
 use hrn_train::data::dataset::LabelChoice;
-use hrn_train::methods::task::{Frames, Task};
+use hrn_train::methods::task::Task;
 use hrn_train::methods::{self, Request};
-use hrn_train::model::evaluated::Evaluated;
 use hrn_train::run::Run;
 use hrn_train::settings::{Profile, Settings};
 
 use super::account;
-use super::arguments::{Adapt, DeviceName, Train, Trained};
+use super::arguments::{DeviceName, Train, Trained};
 use super::failure::{NoCuda, Unreadable, WrongUsage};
-use super::files::{load_with_bytes, read};
+use super::files::read;
 
 pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
@@ -31,10 +28,10 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     };
     let settings = overridden(defaults, arguments.config.as_deref())?;
     let task = match arguments.method {
-        Trained::Frames(method) => Task::frames(&arguments.data, Frames::Method(method))?,
+        Trained::Frames(method) => Task::frames(&arguments.data, method)?,
         Trained::Courses => {
             check_options_of_courses(arguments)?;
-            Task::courses(&arguments.data, None)?
+            Task::courses(&arguments.data)?
         }
     };
     for other in &arguments.from {
@@ -49,7 +46,6 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
         seed: arguments.seed,
         labels: arguments.labels,
         label_choice: arguments.label_choice,
-        start: None,
         settings,
     };
     let description = task.description(&request)?;
@@ -84,52 +80,6 @@ fn check_options_of_courses(arguments: &Train) -> Result<(), WrongUsage> {
         Some((option, _)) => Err(WrongUsage::OfFrames(option)),
         None => Ok(()),
     }
-}
-
-pub(super) fn adapt(arguments: &Adapt) -> anyhow::Result<String> {
-    let of_courses = Courses::is_at(&arguments.data[0])?;
-    let profile = Profile::Paper;
-    let defaults = methods::adapt::settings(profile);
-    let settings = overridden(defaults, arguments.config.as_deref())?;
-    let device = device(arguments.device)?;
-    let (model, bytes, name) = match &arguments.start {
-        Some(path) => {
-            let (model, bytes) = load_with_bytes(path)?;
-            (model, bytes, path.display().to_string())
-        }
-        None => {
-            let bytes = if of_courses { BUILT_IN } else { BUILT_IN_HRN };
-            let name = "the built-in model".to_owned();
-            (Hrn::load(bytes)?, bytes.to_vec(), name)
-        }
-    };
-    let task = if of_courses {
-        let start = methods::course::start(&model, &bytes, &device).context(name)?;
-        Task::courses(&arguments.data, Some(start))?
-    } else {
-        let start = methods::adapt::AdaptBase::read(&model, &bytes, &device).context(name)?;
-        Task::frames(&arguments.data, Frames::Adapt(start))?
-    };
-    let request = Request {
-        profile,
-        seed: arguments.seed,
-        labels: None,
-        label_choice: LabelChoice::Object,
-        start: Some(sha256_hex(&bytes)),
-        settings,
-    };
-    let description = task.description(&request)?;
-    let run = Run::open(&arguments.out, &description, arguments.resume)?;
-    let presses = task.presses();
-    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&presses)));
-    let begun = Instant::now();
-    let evaluation = task.train(&description, &run, &device)?;
-    let beside_start = |evaluation: &Evaluated| {
-        let cases = task.test_cases(&model)?;
-        Ok(account::of_adapted(evaluation, &model, &cases))
-    };
-    let figures: anyhow::Result<Option<String>> = evaluation.as_ref().map(beside_start).transpose();
-    Ok(account_of_run(begun, &run, figures?))
 }
 
 /// The duration of the training, the path of the model, and its figures on the data's test presses,
