@@ -247,8 +247,16 @@ pub struct Subscriber {
 }
 
 impl Subscriber {
+    /// Connects to a socket of a daemon that may still be starting.
     pub fn connect(socket: &Path) -> Self {
-        let stream = UnixStream::connect(socket).unwrap();
+        let mut stream = UnixStream::connect(socket);
+        wait_for("the socket", || {
+            if stream.is_err() {
+                stream = UnixStream::connect(socket);
+            }
+            stream.is_ok()
+        });
+        let stream = stream.unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         Self {
             lines: BufReader::new(Box::new(stream)),
