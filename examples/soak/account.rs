@@ -8,10 +8,11 @@ use std::time::Duration;
 use crate::Failure;
 use crate::player::Player;
 
-/// The time until the black boxes are full: they hold a minute, and up to a stretch of ten seconds
-/// more. The events that are held for `since` take minutes more to fill, so a longer run leaves out
-/// its first quarter.
-const WARM: Duration = Duration::from_secs(75);
+/// The time until memory grows no more: the black boxes hold a minute, and up to a stretch of ten
+/// seconds more of each sensor that was there all the time, and the first reloads need room for a
+/// second model. The events that are held for `since` take minutes more to fill, so a longer run
+/// leaves out its first quarter.
+const WARM: Duration = Duration::from_secs(120);
 
 /// The daemon's memory in kB, descriptors and threads.
 pub(crate) fn usage(daemon: &Child) -> Result<[u64; 3], Failure> {

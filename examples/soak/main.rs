@@ -49,7 +49,7 @@ const KEPT: usize = 16;
 
 #[derive(Parser)]
 struct Args {
-    /// Minutes to play, at least 2
+    /// Minutes to play, at least 3
     #[arg(long, default_value_t = 120.0)]
     minutes: f64,
     /// Sensors
@@ -141,8 +141,8 @@ fn recordings(directory: &Path) -> io::Result<Vec<PathBuf>> {
 }
 
 fn soak(args: &Args) -> Result<Vec<String>, Failure> {
-    if !(2.0..=100_000.0).contains(&args.minutes) || !(1..=100).contains(&args.sensors) {
-        return Err("expected at least 2 minutes and 1 to 100 sensors".into());
+    if !(3.0..=100_000.0).contains(&args.minutes) || !(1..=100).contains(&args.sensors) {
+        return Err("expected at least 3 minutes and 1 to 100 sensors".into());
     }
     let directory = tempfile::tempdir()?;
     let at = |name: &str| directory.path().join(name);
