@@ -3,12 +3,14 @@
 //!     cargo run --release --example soak -- --minutes 120
 //!
 //! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated
-//! presses over a pty of its own, with a fault in every second press. There are subscribers of all
+//! presses over a pty or a TCP connection of its own, with a fault in every second press. Arrays
+//! are 28x28 to 64x64. There are subscribers of all
 //! kinds, recordings, and a reload every ten seconds. At the end, every press must have its
 //! verdict, or must be lost with the link, by its number. Memory, descriptors and threads must not
 //! have grown. Otherwise the exit code is 1.
 
 mod account;
+mod line;
 mod listener;
 #[path = "../../src/tools/pty/pair.rs"]
 mod pair;
@@ -33,8 +35,9 @@ use hardnessd::daemon::{Daemon, Reload};
 use hardnessd_core::recording::Reader;
 use hardnessd_core::trial;
 use hardnessd_simulator::random::Stream;
+use line::Line;
 use listener::{Heard, Link, come_and_go, hear};
-use player::{FAULTS, Player, library, plug};
+use player::{FAULTS, Player, library};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -55,6 +58,9 @@ struct Args {
     /// Sensors
     #[arg(long, default_value_t = 8)]
     sensors: usize,
+    /// References of the second half of the sensors
+    #[arg(long)]
+    references: Option<PathBuf>,
     /// Seed of the faults
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -110,18 +116,40 @@ fn serve(config: &Path) -> Result<(), Failure> {
     })
 }
 
-fn configure(path: &Path, sensors: usize, min_confidence: f64) -> io::Result<()> {
-    let mut text = String::from("robot = \"soak\"\n");
-    for sensor in 0..sensors {
+/// The sides of the arrays, in taxels, which the sensors have in turn. Every second one is on TCP.
+const SIDES: [usize; 4] = [28, 28, 48, 64];
+
+/// The `[[sensor]]` tables of the configuration.
+fn tables(players: &[Player], references: Option<&Path>) -> String {
+    let mut text = String::new();
+    for (index, player) in players.iter().enumerate() {
+        let side = SIDES[index % SIDES.len()];
+        let share = 28.0 / side as f64;
         let _ = write!(
             text,
-            "[[sensor]]\nname = \"s{sensor}\"\nport = \"s{sensor}\"\nbaud = 1000000\n\
-             frame_rate_hz = {FRAMES_PER_S:.1}\n"
+            "[[sensor]]\nname = \"{}\"\nport = \"{}\"\nbaud = 3000000\n\
+             frame_rate_hz = {FRAMES_PER_S:.1}\n",
+            player.name,
+            player.line.port()
+        );
+        if let Some(path) = references.filter(|_| index >= players.len() / 2) {
+            let _ = writeln!(text, "references = \"{}\"", path.display());
+        }
+        let _ = write!(
+            text,
+            "[sensor.frame]\nrows = {side}\ncols = {side}\n[sensor.calibration]\n\
+             newtons_per_count = {}\npitch_mm = {}\n",
+            0.04 * share * share,
+            3.5 * share
         );
     }
-    let _ = write!(
-        text,
-        "[publish.unix]\npath = \"events.sock\"\n[model]\nmin_confidence = {min_confidence}\n\
+    text
+}
+
+fn configure(path: &Path, tables: &str, min_confidence: f64) -> io::Result<()> {
+    let text = format!(
+        "robot = \"soak\"\n{tables}[publish.unix]\npath = \"events.sock\"\n\
+         [model]\nmin_confidence = {min_confidence}\n\
          [record]\ndir = \"rec\"\nrotate_s = 20\nkeep_free_mb = 0\n"
     );
     let born = path.with_extension("new");
@@ -146,18 +174,21 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
     }
     let directory = tempfile::tempdir()?;
     let at = |name: &str| directory.path().join(name);
-    let (presses, rest) = library()?;
-    let (presses, rest) = (Arc::new(presses), Arc::new(rest));
+    let libraries = SIDES.map(|side| library(side).map(Arc::new));
     let root = Stream::new(args.seed, "soak");
     let links: Vec<Arc<Link>> = (0..args.sensors).map(|_| Arc::default()).collect();
     let mut players = Vec::new();
     for (index, link) in links.iter().enumerate() {
-        let port = at(&format!("s{index}"));
+        let name = format!("s{index}");
+        let library = libraries[index % SIDES.len()].as_ref();
         players.push(Player {
-            pair: plug(&port)?,
-            port,
-            presses: Arc::clone(&presses),
-            rest: Arc::clone(&rest),
+            line: if index % 2 == 0 {
+                Line::pty(at(&name))?
+            } else {
+                Line::tcp()?
+            },
+            name,
+            library: Arc::clone(library.map_err(ToString::to_string)?),
             stream: root.child(index as u64),
             link: Arc::clone(link),
             sent: Vec::new(),
@@ -165,15 +196,28 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
             due: Instant::now(),
         });
     }
+    let references = args
+        .references
+        .as_deref()
+        .map(fs::canonicalize)
+        .transpose()?;
+    let tables = tables(&players, references.as_deref());
     let (config, socket) = (at("soak.toml"), at("events.sock"));
-    configure(&config, args.sensors, 0.0)?;
+    configure(&config, &tables, 0.0)?;
     let mut daemon = Command::new(std::env::current_exe()?)
         .arg("--daemon")
         .arg(&config)
         .stderr(File::create(at("log"))?)
         .stdin(Stdio::null())
         .spawn()?;
-    let played = attend(args, &mut daemon, players, &links, &socket, &config);
+    let played = attend(
+        args,
+        &mut daemon,
+        players,
+        &links,
+        &socket,
+        (&config, &tables),
+    );
     // The daemon has already ended, unless something failed.
     let _ = daemon.kill();
     let _ = daemon.wait();
@@ -202,7 +246,7 @@ fn attend(
     players: Vec<Player>,
     links: &[Arc<Link>],
     socket: &Path,
-    config: &Path,
+    config: (&Path, &str),
 ) -> Result<Vec<String>, Failure> {
     let pid = Pid::from_raw(i32::try_from(daemon.id())?).ok_or("no process")?;
     await_start(daemon, socket)?;
@@ -317,7 +361,7 @@ impl Played {
         daemon: &mut Child,
         pid: Pid,
         players: Vec<Player>,
-        config: &Path,
+        (config, tables): (&Path, &str),
     ) -> Result<Self, Failure> {
         let start = Instant::now();
         let length = Duration::from_secs_f64(60.0 * args.minutes);
@@ -333,7 +377,7 @@ impl Played {
             let second = start.elapsed().as_secs();
             if second / 10 > reloads {
                 reloads += 1;
-                configure(config, args.sensors, 0.001 * (reloads % 2) as f64)?;
+                configure(config, tables, 0.001 * (reloads % 2) as f64)?;
                 kill_process(pid, Signal::HUP)?;
                 removed += remove_old(&config.with_file_name("rec"))?;
             }

@@ -1,20 +1,17 @@
-//! A simulated sensor on a pty, with faults.
+//! A simulated sensor, with faults.
 
-use std::fs;
-use std::io;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
-use rustix::termios::OptionalActions;
 
+use crate::line::Line;
 use crate::listener::Link;
-use crate::pair::Pair;
 use crate::{FRAMES_PER_S, Failure, PATIENCE, PERIOD};
 
 /// One simulated press as frames on the wire, with the rest after it.
@@ -24,9 +21,23 @@ pub(crate) struct Press {
     middle: usize,
 }
 
-/// A press of each material, and a frame without load.
-pub(crate) fn library() -> Result<(Vec<Press>, Vec<u8>), Failure> {
-    let layout = Layout::new(&Settings::default())?;
+/// What a sensor with `side` rows and columns sends.
+pub(crate) struct Library {
+    /// A press of each material.
+    presses: Vec<Press>,
+    /// A frame without load.
+    rest: Vec<u8>,
+}
+
+/// The simulated frames, as an array of `side` rows and columns over the same area has them.
+pub(crate) fn library(side: usize) -> Result<Library, Failure> {
+    let layout = Layout::new(&Settings {
+        rows: Some(side),
+        cols: Some(side),
+        ..Settings::default()
+    })?;
+    let (rows, cols) = (side, side);
+    let array = Array { rows, cols };
     let materials = Material::ALL.to_vec();
     let sequence = Sequence::new(SequenceSettings {
         frame_rate_hz: FRAMES_PER_S,
@@ -36,8 +47,14 @@ pub(crate) fn library() -> Result<(Vec<Press>, Vec<u8>), Failure> {
     });
     let (mut presses, mut rest): (Vec<Press>, _) = (Vec::new(), Vec::new());
     for frame in sequence {
+        let counts = (0..array.taxels()).map(|place| {
+            let (row, col) = array.position(place);
+            let from = frame.raw.array;
+            frame.raw.counts[from.place(row * from.rows / rows, col * from.cols / cols)]
+        });
+        let counts = counts.collect();
         let mut bytes = Vec::new();
-        layout.encode(&frame.raw, &mut bytes);
+        layout.encode(&RawFrame { array, counts }, &mut bytes);
         if frame.press == 0 {
             rest = bytes;
             continue;
@@ -55,7 +72,7 @@ pub(crate) fn library() -> Result<(Vec<Press>, Vec<u8>), Failure> {
             }
         }
     }
-    Ok((presses, rest))
+    Ok(Library { presses, rest })
 }
 
 pub(crate) const FAULTS: [&str; 7] = [
@@ -64,10 +81,9 @@ pub(crate) const FAULTS: [&str; 7] = [
 
 /// A sensor, its cable, and the expected end of each press sent: whether it has a verdict.
 pub(crate) struct Player {
-    pub(crate) port: PathBuf,
-    pub(crate) pair: Pair,
-    pub(crate) presses: Arc<Vec<Press>>,
-    pub(crate) rest: Arc<Vec<u8>>,
+    pub(crate) name: String,
+    pub(crate) line: Line,
+    pub(crate) library: Arc<Library>,
     pub(crate) stream: Stream,
     pub(crate) link: Arc<Link>,
     pub(crate) sent: Vec<bool>,
@@ -75,22 +91,13 @@ pub(crate) struct Player {
     pub(crate) due: Instant,
 }
 
-pub(crate) fn plug(port: &Path) -> io::Result<Pair> {
-    let pair = Pair::open()?;
-    let mut settings = rustix::termios::tcgetattr(&pair.device)?;
-    settings.make_raw();
-    rustix::termios::tcsetattr(&pair.device, OptionalActions::Now, &settings)?;
-    std::os::unix::fs::symlink(&pair.path, port)?;
-    Ok(pair)
-}
-
 impl Player {
     /// Plays until `end`, and then to the end of the press under way.
     pub(crate) fn play(mut self, end: Instant) -> Result<Self, Failure> {
         self.wake(0)?;
         while Instant::now() < end {
-            let presses = Arc::clone(&self.presses);
-            let press = &presses[self.stream.below(presses.len())];
+            let library = Arc::clone(&self.library);
+            let press = &library.presses[self.stream.below(library.presses.len())];
             let fault = self.stream.below(2 * FAULTS.len());
             if fault < FAULTS.len() {
                 self.faults[fault] += 1;
@@ -143,14 +150,11 @@ impl Player {
         self.write(&frame[..part])?;
         self.drain()?;
         let losses = self.link.losses.load(Relaxed);
-        fs::remove_file(&self.port)?;
-        // Open the new pty before the old one is closed, so that its name is a different one.
-        let next = self.port.with_extension("next");
-        self.pair = plug(&next)?;
+        self.line.unplug()?;
         self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
         let lives = self.link.lives.load(Relaxed);
         sleep(Duration::from_secs_f64(self.stream.range(0.0, 1.5)));
-        fs::rename(next, &self.port)?;
+        self.line.plug()?;
         self.wake(lives)
     }
 
@@ -162,7 +166,7 @@ impl Player {
         let start = Instant::now();
         while !is_there()? {
             if start.elapsed() > PATIENCE {
-                return Err(format!("{}: is not {what}", self.port.display()).into());
+                return Err(format!("{}: is not {what}", self.name).into());
             }
             sleep(Duration::from_millis(2));
         }
@@ -172,26 +176,22 @@ impl Player {
     /// Sends frames without load until the sensor is live once more, and then enough frames for a
     /// tare.
     fn wake(&mut self, lives: u64) -> Result<(), Failure> {
-        let (start, rest) = (Instant::now(), Arc::clone(&self.rest));
+        let (start, library) = (Instant::now(), Arc::clone(&self.library));
         self.due = start;
         while self.link.lives.load(Relaxed) == lives {
             if start.elapsed() > PATIENCE {
-                return Err(format!("{}: is not live", self.port.display()).into());
+                return Err(format!("{}: is not live", self.name).into());
             }
-            self.write(&rest)?;
+            self.write(&library.rest)?;
         }
-        (0..30).try_for_each(|_| self.write(&rest))
+        (0..30).try_for_each(|_| self.write(&library.rest))
     }
 
     /// Writes when the next frame is due.
-    fn write(&mut self, mut bytes: &[u8]) -> Result<(), Failure> {
+    fn write(&mut self, bytes: &[u8]) -> Result<(), Failure> {
         sleep(self.due.saturating_duration_since(Instant::now()));
         self.due += PERIOD;
-        while !bytes.is_empty() {
-            // Until the other end is opened, there is room for 4 kB.
-            bytes = &bytes[rustix::io::write(&self.pair.master, bytes)?..];
-        }
-        Ok(())
+        Ok(self.line.write(bytes)?)
     }
 
     /// Waits until everything is read.
@@ -199,8 +199,7 @@ impl Player {
         let mut empty = 0;
         self.wait("read", || {
             // Written bytes reach the device a moment later.
-            let is_empty = rustix::io::ioctl_fionread(&self.pair.device)? == 0;
-            empty = if is_empty { empty + 1 } else { 0 };
+            empty = if self.line.is_read()? { empty + 1 } else { 0 };
             Ok(empty > 3)
         })
     }
