@@ -238,8 +238,8 @@ def loss_shows_at_once(page, bench, sensors):
     time.sleep(0.5)
     nothing_stands_as_current(page)
     assert (page.tab("forearm"), page.tab("wrist")) == ("stale", "live")
-    # A press may have made it larger since.
-    assert float(page.text("most").split()[0]) >= float(scale.split()[0])
+    # The map keeps a scale. Presses may come into its span since, and leave it.
+    assert float(page.text("most").split()[0]) > 0, (scale, page.text("most"))
     page.picture("stale-dark")
     forearm.send_signal(signal.SIGCONT)
     wait_for("live again", lambda: page.text("state") == "live")
