@@ -161,10 +161,11 @@ fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 
     let rules = gan::Rules {
         game: GAME,
         sigma_penalty: GanSettings::default().sigma_penalty,
+        gradient_penalty: None,
         rate: RATE,
         sensing: None,
     };
     let [generator, discriminator] = gan;
-    let losses = gan::step(generator, discriminator, &batch, eta.clone(), rules);
+    let losses = gan::step(generator, discriminator, &batch, eta.clone(), &rules);
     losses.0 + losses.1
 }

@@ -42,6 +42,9 @@ pub enum Method {
     Nahrn,
     /// The paper's method without USTGAN's start: random weights, pretraining, fine-tuning.
     Nihrn,
+    /// Control: ours with a GAN that does not break: gradient penalty R1, averaged weights of the generator,
+    /// and the epoch whose generated samples lie nearest to the real ones.
+    OursSteady,
     /// Control: hrn15 with as many steps as the paper's whole method.
     Hrn15Long,
     /// Control: hrn15 with Adam and five times as many epochs. It holds a quarter of its labelled
@@ -84,6 +87,7 @@ impl Method {
             Self::Igan => "igan",
             Self::Nahrn => "nahrn",
             Self::Nihrn => "nihrn",
+            Self::OursSteady => "ours-steady",
             Self::Hrn15Long => "hrn15-long",
             Self::Hrn15Tuned => "hrn15-tuned",
             Self::Hrn15Strong => "hrn15-strong",
@@ -96,6 +100,7 @@ impl Method {
     pub fn settings(self, profile: Profile) -> Settings {
         match self {
             Self::Igan => settings::igan(profile),
+            Self::OursSteady => settings::ours_steady(profile),
             Self::Hrn15Tuned => settings::hrn15_tuned(profile),
             Self::Frame => settings::frame(profile),
             Self::Hrn15Strong => settings::strong(profile),
@@ -244,7 +249,12 @@ fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow
     let labelled = chosen(dataset, description)?;
     let needs_unlabelled = matches!(
         method,
-        Method::Ours | Method::Nahrn | Method::Nihrn | Method::Sgan | Method::Igan
+        Method::Ours
+            | Method::OursSteady
+            | Method::Nahrn
+            | Method::Nihrn
+            | Method::Sgan
+            | Method::Igan
     );
     let Validation { share, .. } = description.settings.validation;
     let (_, held_out) = dataset.hold_out(&labelled, share, description.seed);
@@ -255,7 +265,7 @@ fn check(method: Method, dataset: &Dataset, description: &Description) -> anyhow
         description.method,
         description.labels
     );
-    let has_stgans = matches!(method, Method::Ours | Method::Nihrn);
+    let has_stgans = matches!(method, Method::Ours | Method::OursSteady | Method::Nihrn);
     for level in crate::data::dataset::levels() {
         let of_level = |&index: &usize| dataset.samples[index].level == level.level;
         ensure!(
@@ -351,7 +361,7 @@ fn train(
             };
             return frame::train(&samples, description, run, device);
         }
-        Method::Ours => {
+        Method::Ours | Method::OursSteady => {
             let ustgan = stages.ustgan()?;
             let generated = stages.generated(&ustgan)?;
             let pretrained = stages.pretrained(&generated, stages.inherited(&ustgan))?;

@@ -209,6 +209,8 @@ impl Recipe {
     /// nothing. Other profiles have the same proportions.
     fn effort(&self) -> f64 {
         match self.method {
+            // The gradient penalty is another pass through the discriminator.
+            Method::OursSteady => 480.0,
             Method::Ours => 396.0,
             Method::Sgan | Method::Igan => 255.0,
             Method::Hrn15Long | Method::Nihrn => 93.0,

@@ -7,7 +7,7 @@
 
 use std::time::Instant;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::data::dataset::Dataset;
 use crate::learn::learner::Learner;
@@ -21,7 +21,7 @@ use crate::run::Run;
 use crate::run::checkpoint::{Checkpoint, Origin, Progress};
 use crate::run::history::{Adversarial, Row};
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
-use crate::settings::GanSettings;
+use crate::settings::{GanSettings, Keep};
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
@@ -30,7 +30,7 @@ mod step;
 #[cfg(test)]
 mod tests;
 
-pub use step::{Batch, Rules, step};
+pub use step::{Batch, GradientPenalty, Rules, step};
 
 /// The weights of generator and discriminator.
 #[derive(Debug, Clone)]
@@ -123,15 +123,18 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         for side in [&state.generator, &state.discriminator] {
             ensure_finite_weights(task.stage, epoch, &side.weights)?;
         }
-        let sigma = sigma_range(&state.generator.weights);
+        let generator = state.generator.evaluated();
+        let sigma = sigma_range(&generator);
         let mut likeness = None;
         if due(task.settings.picture_every_epochs) {
             if reference.is_none() {
                 reference = Some(task.reference()?);
             }
             let real = reference.as_ref().expect("set just now");
-            likeness = Some(task.likeness(real, &state.generator.weights)?);
-            task.picture(&state.generator.weights, epoch, run)?;
+            let measured = task.likeness(real, &generator)?;
+            state.keep(measured.feature_distance, generator, task.settings.keep);
+            likeness = Some(measured);
+            task.picture(&state.generator.evaluated(), epoch, run)?;
         }
         metrics.add(&Row {
             step,
@@ -162,10 +165,7 @@ pub fn fit(task: &Task, initial: Gan, run: &Run) -> anyhow::Result<Gan> {
         }
     }
     bar.finish_and_clear();
-    Ok(Gan {
-        discriminator: state.discriminator.evaluated(),
-        generator: state.generator.weights,
-    })
+    Ok(state.kept())
 }
 
 /// Everything that changes from step to step, and the sensor.
@@ -175,23 +175,29 @@ struct State {
     sensor: Sensor,
     generator: Learner,
     discriminator: Learner,
+    /// With [`Keep::Best`], the weights of the epoch with the least distance so far.
+    best: Option<Gan>,
 }
 
 /// Prefixes of the generator's and the discriminator's lists in a checkpoint.
 const SIDES: [&str; 2] = ["generator ", "discriminator "];
+/// The name of a side's best weights in a checkpoint, after the prefix.
+const BEST: &str = "best";
 
 impl State {
     fn fresh(initial: Gan, settings: &GanSettings, sensor: Sensor) -> Self {
         let GanSettings {
             optimiser,
             averaging,
+            generator_averaging,
             ..
         } = *settings;
         Self {
             progress: Progress::default(),
             sensor,
-            generator: Learner::fresh(initial.generator, optimiser, 0.0),
+            generator: Learner::fresh(initial.generator, optimiser, generator_averaging),
             discriminator: Learner::fresh(initial.discriminator, optimiser, averaging),
+            best: None,
         }
     }
 
@@ -204,22 +210,57 @@ impl State {
         let resumed = |prefix: &str, averaging| {
             Learner::resumed(checkpoint, prefix, steps, settings.optimiser, averaging)
         };
+        let best = |prefix: &str| checkpoint.list(&format!("{prefix}{BEST}")).ok().cloned();
+        let best = match (best(SIDES[0]), best(SIDES[1])) {
+            (Some(generator), Some(discriminator)) => Some(Gan {
+                generator,
+                discriminator,
+            }),
+            _ => None,
+        };
         Ok(Self {
             progress: checkpoint.progress,
             sensor,
-            generator: resumed(SIDES[0], 0.0)?,
+            generator: resumed(SIDES[0], settings.generator_averaging)?,
             discriminator: resumed(SIDES[1], settings.averaging)?,
+            best,
         })
     }
 
     fn checkpoint(&self, origin: &str) -> Checkpoint {
         let mut lists = self.generator.lists(SIDES[0]);
         lists.extend(self.discriminator.lists(SIDES[1]));
+        if let Some(best) = &self.best {
+            for (side, weights) in SIDES.iter().zip([&best.generator, &best.discriminator]) {
+                lists.push((format!("{side}{BEST}"), weights.clone()));
+            }
+        }
         Checkpoint {
             origin: origin.to_owned(),
             progress: self.progress,
             lists,
         }
+    }
+
+    /// Keeps the present weights, if these are to be kept and no generator was nearer to the real
+    /// samples before. `generator` is the evaluated one.
+    fn keep(&mut self, distance: f64, generator: Weights, keep: Keep) {
+        let nearer = self.progress.best_loss.is_none_or(|best| distance < best);
+        if keep == Keep::Best && nearer {
+            self.progress.best_loss = Some(distance);
+            self.best = Some(Gan {
+                generator,
+                discriminator: self.discriminator.evaluated(),
+            });
+        }
+    }
+
+    /// The weights to keep: the best ones, if any were chosen, or the last ones.
+    fn kept(self) -> Gan {
+        self.best.unwrap_or_else(|| Gan {
+            generator: self.generator.evaluated(),
+            discriminator: self.discriminator.evaluated(),
+        })
     }
 
     /// Takes a step of both sides on the real samples `indices`. Returns the losses of
@@ -232,6 +273,7 @@ impl State {
         let rules = Rules {
             game: task.game,
             sigma_penalty: settings.sigma_penalty,
+            gradient_penalty: task.gradient_penalty(&batch, number),
             rate,
             sensing: Some((self.sensor, task.scale)),
         };
@@ -242,7 +284,7 @@ impl State {
             &mut self.discriminator,
             &batch,
             eta,
-            rules,
+            &rules,
         )
     }
 }
@@ -286,6 +328,21 @@ impl Task<'_> {
         let mut order = samples.to_vec();
         self.stream(name).child(pass).shuffle(&mut order);
         order
+    }
+
+    /// The gradient penalty of step `step`.
+    fn gradient_penalty(&self, batch: &Batch, step: u64) -> Option<GradientPenalty> {
+        let gamma = self.settings.gradient_penalty;
+        (gamma > 0.0).then(|| {
+            let dims = batch.real.dims();
+            let mut stream = self.stream("gradient penalty").child(step);
+            let normal = (0..dims.iter().product()).map(|_| stream.normal() as f32);
+            let directions = TensorData::new(normal.collect::<Vec<_>>(), dims);
+            GradientPenalty {
+                gamma,
+                directions: Tensor::from_data(directions, self.device),
+            }
+        })
     }
 
     fn frames(&self, indices: &[usize]) -> Vec<&ModelFrame> {

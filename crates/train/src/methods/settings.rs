@@ -25,6 +25,18 @@ pub(super) fn igan(profile: Profile) -> Settings {
     settings
 }
 
+/// The settings of `ours-steady`. The average covers about 500 steps, six epochs of USTGAN.
+pub(super) fn ours_steady(profile: Profile) -> Settings {
+    let mut settings = Settings::of(profile);
+    for (gan, measured) in [(&mut settings.ustgan, 5), (&mut settings.stgan, 20)] {
+        gan.gradient_penalty = 1.0;
+        gan.generator_averaging = averaging(profile);
+        gan.keep = Keep::Best;
+        gan.picture_every_epochs = gan.picture_every_epochs.min(measured);
+    }
+    settings
+}
+
 /// The settings of `hrn15-tuned`, which holds out two of a level's eight objects.
 pub(super) fn hrn15_tuned(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
@@ -103,7 +115,7 @@ pub fn course(profile: Profile) -> Settings {
     settings
 }
 
-/// The averaging of `frame` and `course`. The steps of a smoke test are too few for an average.
+/// The averaging of `frame` and of the generators of `ours-steady`. The steps of a smoke test are too few for an average.
 fn averaging(profile: Profile) -> f64 {
     match profile {
         Profile::Smoke => 0.0,

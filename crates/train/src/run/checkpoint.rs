@@ -37,7 +37,7 @@ pub struct Progress {
     pub epoch: u32,
     /// Steps done.
     pub step: u64,
-    /// Least validation loss so far.
+    /// Least validation loss so far, or a GAN's least distance.
     pub best_loss: Option<f64>,
 }
 

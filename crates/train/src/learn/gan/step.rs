@@ -13,17 +13,50 @@ use crate::net::network::{self, Normalisation, Weights, numbers};
 use crate::net::sensed::Sensor;
 
 /// The settings of a step.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Rules {
     /// The classes that the discriminator distinguishes, and the losses.
     pub game: Game,
     /// Lambda of Eq. (7).
     pub sigma_penalty: f64,
+    /// The gradient penalty on real images, if there is one.
+    pub gradient_penalty: Option<GradientPenalty>,
     /// Learning rate.
     pub rate: f64,
     /// The sensor applied to generated images before the discriminator judges them. `None` applies
     /// no sensor.
     pub sensing: Option<(Sensor, PixelScale)>,
+}
+
+/// The penalty R1: gamma / 2 times the mean square of the gradient of the discriminator's logits
+/// with respect to a real image (Mescheder et al. 2018, Eq. (9)).
+///
+/// The logits' slope along a standard normal direction has this square as its mean. A difference
+/// over a small step along such a direction stands for the slope, because a gradient of gradients
+/// would be needed otherwise (Lin et al. 2025, "Diffusion adversarial post-training", Eq. (5)).
+#[derive(Debug, Clone)]
+pub struct GradientPenalty {
+    /// The factor gamma.
+    pub gamma: f64,
+    /// A standard normal direction for each real image, `[batch, 1, 28, 28]`.
+    pub directions: Tensor<4>,
+}
+
+/// The step along a direction of [`GradientPenalty`], in an image's units: -1 is no force.
+const SLOPE_STEP: f64 = 0.01;
+
+impl GradientPenalty {
+    pub(super) fn loss(
+        &self,
+        discriminator: &Weights,
+        real: &Tensor<4>,
+        logits: Tensor<2>,
+    ) -> Tensor<1> {
+        let moved = real.clone() + self.directions.clone().mul_scalar(SLOPE_STEP);
+        let slopes = (judge(discriminator, moved).logits - logits).div_scalar(SLOPE_STEP);
+        let squares = slopes.powi_scalar(2).sum_dim(1).mean();
+        squares.mul_scalar(self.gamma / 2.0)
+    }
 }
 
 /// The discriminator's inputs in a step, besides generated images.
@@ -41,13 +74,13 @@ pub fn step(
     discriminator: &mut Learner,
     batch: &Batch,
     eta: Tensor<2>,
-    rules: Rules,
+    rules: &Rules,
 ) -> (f64, f64) {
     // The generator does not change while the discriminator takes its step, so both steps use the
     // same images.
     let generated = Generated::of(generator, eta, rules.sensing);
 
-    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules.game);
+    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules);
     let mut gradients = loss.backward();
     discriminator.step(&tracked, &mut gradients, rules.rate);
 
@@ -79,16 +112,17 @@ fn told_apart(
     discriminator: &Learner,
     batch: &Batch,
     generated: &Generated,
-    game: Game,
+    rules: &Rules,
 ) -> (Weights, Tensor<1>) {
     let tracked = discriminator.weights.tracked();
     let images = generated.images.clone().inner();
-    let loss = discriminator_loss(game, &tracked, batch, images);
+    let penalty = rules.gradient_penalty.as_ref();
+    let loss = discriminator_loss(rules.game, &tracked, batch, images, penalty);
     (tracked, loss)
 }
 
 /// Takes the generator's step on its loss plus the penalty on sigma, and returns this sum.
-fn learn(generator: &mut Learner, tracked: &Weights, fooled: Tensor<1>, rules: Rules) -> f64 {
+fn learn(generator: &mut Learner, tracked: &Weights, fooled: Tensor<1>, rules: &Rules) -> f64 {
     let loss = fooled.add(penalty(tracked, rules.sigma_penalty));
     let mut gradients = loss.backward();
     generator.step(tracked, &mut gradients, rules.rate);
@@ -101,7 +135,7 @@ fn number(loss: &Tensor<1>) -> f64 {
 
 /// Judges one batch. Each batch passes through the discriminator alone and is normalised by its own
 /// statistics: in a mixed batch, the statistics would reveal the share of real frames.
-fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
+pub(super) fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
     let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
     Judged {
         logits: network::head(discriminator, features.clone()),
@@ -114,6 +148,7 @@ pub(super) fn discriminator_loss(
     discriminator: &Weights,
     batch: &Batch,
     generated: Tensor<4>,
+    penalty: Option<&GradientPenalty>,
 ) -> Tensor<1> {
     let labelled = batch.labelled.as_ref().map(|(images, targets)| {
         let judged = judge(discriminator, images.clone());
@@ -121,7 +156,13 @@ pub(super) fn discriminator_loss(
     });
     let real = judge(discriminator, batch.real.clone());
     let generated = judge(discriminator, generated);
-    losses::discriminator(game, real, generated, labelled)
+    let penalty =
+        penalty.map(|penalty| penalty.loss(discriminator, &batch.real, real.logits.clone()));
+    let loss = losses::discriminator(game, real, generated, labelled);
+    match penalty {
+        Some(penalty) => loss + penalty,
+        None => loss,
+    }
 }
 
 /// The generator's loss without [`penalty`].

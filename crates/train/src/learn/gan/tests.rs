@@ -1,6 +1,6 @@
 //! Compares gradients of a whole step with finite differences, and checks how a stage starts.
 
-use super::step::{discriminator_loss, generator_loss, penalty};
+use super::step::{discriminator_loss, generator_loss, judge, penalty};
 use super::*;
 use crate::net::network::{Normalisation, numbers};
 use burn::tensor::{DType, FloatDType, Tensor, TensorData};
@@ -98,7 +98,7 @@ impl Case {
             self.eta.clone(),
             &mut Normalisation::Batch,
         );
-        discriminator_loss(game, discriminator, &self.batch, images)
+        discriminator_loss(game, discriminator, &self.batch, images, None)
     }
 
     fn generator_loss(&self, game: Game, generator: &Weights) -> Tensor<1> {
@@ -197,4 +197,59 @@ fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
             }
         }
     }
+}
+
+#[test]
+fn the_gradient_penalty_is_half_gamma_times_the_square_of_the_gradient() {
+    let case = case(Game::RealOrFake);
+    let (weights, real) = (&case.gan.discriminator, case.batch.real.clone());
+    let samples = real.dims()[0];
+    // The batch is normalised together, so a logit has a gradient with respect to all images.
+    let squares = (0..samples).map(|sample| {
+        let images = real.clone().autodiff().require_grad();
+        let logits = judge(&weights.tracked(), images.clone()).logits;
+        let gradients = logits.narrow(0, sample, 1).sum().backward();
+        numbers(&images.grad(&gradients).unwrap().powi_scalar(2).sum())[0]
+    });
+    let exact = squares.sum::<f32>() / samples as f32;
+
+    let mut stream = Stream::new(4, "directions");
+    let mut penalty = || {
+        let normal: Vec<f32> = (0..real.dims().iter().product())
+            .map(|_| stream.normal() as f32)
+            .collect();
+        let penalty = GradientPenalty {
+            gamma: 3.0,
+            directions: Tensor::from_data(TensorData::new(normal, real.dims()), &device()),
+        };
+        numbers(&penalty.loss(weights, &real, judge(weights, real.clone()).logits))[0]
+    };
+    let mean = (0..400).map(|_| penalty()).sum::<f32>() / 400.0;
+    let expected = 1.5 * exact;
+    assert!(
+        (mean - expected).abs() < 0.15 * expected,
+        "{mean}, not {expected}"
+    );
+}
+
+#[test]
+fn the_nearest_generator_is_kept_through_a_checkpoint() {
+    let settings = GanSettings {
+        keep: Keep::Best,
+        ..GanSettings::default()
+    };
+    let near = initial(Game::RealOrFake, LEVELS, 1, &device());
+    let far = initial(Game::RealOrFake, LEVELS, 2, &device());
+    let first = numbers(&near.generator.entries[0].values);
+    let sensor = Sensor::of(&[]);
+    let mut state = State::fresh(near, &settings, sensor);
+    let keep = |state: &mut State, distance| {
+        let generator = state.generator.evaluated();
+        state.keep(distance, generator, settings.keep);
+    };
+    keep(&mut state, 0.5);
+    state.generator.weights = far.generator;
+    keep(&mut state, 0.7);
+    let resumed = State::resumed(&state.checkpoint(""), &settings, sensor).unwrap();
+    assert_eq!(numbers(&resumed.kept().generator.entries[0].values), first);
 }
