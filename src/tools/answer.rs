@@ -6,8 +6,7 @@
 use serde_json::Value;
 
 /// A level with less confidence is marked as weak. Of simulated presses with at least this
-/// confidence, 87 to 98 % got the right level (`models/README.md`, "A confident verdict is mostly
-/// right").
+/// confidence, 87 to 98 % got the right level (`models/README.md`, "Accuracy").
 const CONFIDENT: f64 = 0.7;
 
 /// What a verdict says.
