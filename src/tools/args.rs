@@ -44,13 +44,13 @@ pub enum Command {
     /// Show the sensors of every robot behind a zenoh router
     #[cfg(feature = "zenoh")]
     Fleet(fleet::Args),
-    /// Take another tare of a sensor of a running daemon
+    /// Take another tare of a sensor of a running daemon, and print the offsets before and after
     Tare(control::Target),
-    /// Set what presses and verdicts of a sensor repeat, or remove it
+    /// Set what presses and verdicts of a sensor of a running daemon repeat
     Context(control::Context),
-    /// Write the last minutes of a sensor to a file
+    /// Write the last minute of a sensor of a running daemon to a file, and print its path
     Blackbox(control::Target),
-    /// Check a configuration and print what would run
+    /// Check a configuration and its model, and print what would run; opens and creates nothing
     Check(check::Args),
     /// Measure values for the configuration: the arm, newtons, gains of taxels
     Calibrate(calibrate::Args),

@@ -31,11 +31,20 @@ use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::Hrn;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    Without --from the command opens the sensor and the sockets of [publish.unix] as `run` does, \
+    so stop the daemon first. It prints the values, their spread and the lines for the \
+    configuration. With four weights, one at least twice another, `force` also finds `exponent`. \
+    Exit code 1: the presses do not determine the values; stderr says what to do differently.";
+
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
     /// arm: press something rigid a few times, while the robot sends the positions of its arm. force: put
-    /// known weights on the sensor. taxels: press something wide and soft at many places, or the whole array evenly
+    /// known weights on the sensor, on a foot of at least three taxels. taxels: press something wide and soft at
+    /// many places, or the whole array evenly
     what: What,
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]

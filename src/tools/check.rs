@@ -17,8 +17,16 @@ use hardnessd_core::tare::{self, Gains};
 use hardnessd_core::verdict::Card;
 use hardnessd_core::wire::Layout;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    It refuses what `run` would refuse, as far as no port has to be opened for it: also a frame \
+    rate that the baud rate cannot carry, and a `dir` of [record] that cannot be written to. It \
+    warns of taxels of another pitch than the model's, and of keys that change no verdict of \
+    this model.";
+
 /// Arguments of `check`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
     #[command(flatten)]
     config: Configuration,

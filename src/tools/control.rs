@@ -28,8 +28,8 @@ pub struct Context {
     /// Sensor and socket.
     #[command(flatten)]
     target: Target,
-    /// What presses and verdicts repeat from now on, such as tag=pick-17 or speed_mm_s=5; without
-    /// any, the context is removed
+    /// What presses and verdicts repeat from now on, such as tag=pick-17 or speed_mm_s=5. A value that is JSON
+    /// is sent as JSON, any other as text. Without any, the context is removed
     #[arg(value_name = "KEY=VALUE", value_parser = pair)]
     pairs: Vec<(String, Value)>,
 }

@@ -39,8 +39,15 @@ use hardnessd_core::motion;
 use hardnessd_core::wire::{Layout, LayoutError};
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    The presses are of four materials in turn, with 5 to 25 N. On a terminal, stdout has one \
+    line per press; elsewhere it has the events as JSON lines. stderr has the address of the \
+    live page and the socket, which `tail` and `watch` find by themselves.";
+
 /// Arguments of `demo`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
     /// End after the final verdicts of N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
@@ -48,7 +55,7 @@ pub struct Args {
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
-    /// Address of the live page
+    /// Address of the live page; port 0 takes a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
     /// Play X times as fast, 0.01 to 100

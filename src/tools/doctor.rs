@@ -18,10 +18,19 @@ use crate::daemon::port::Port;
 use hardnessd_core::exit::{Coded, FAILED, IO};
 use hardnessd_core::wording::escaped;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    It opens no device but one that the daemon has open already. It looks for a missing port, \
+    missing rights (of this user, and of the service), other processes that have the port open \
+    (all of them only as root), settings of the line that another program changed, addresses \
+    that do not answer, brltty, ModemManager and a slow FTDI timer. Exit code 1: it found a \
+    fault.";
+
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
-    /// Port to examine [default: every USB serial port]
+    /// Port to examine: a device, tcp://HOST:PORT or udp://ADDRESS:PORT [default: every USB serial port]
     #[arg(long, value_name = "P")]
     port: Option<Port>,
 }

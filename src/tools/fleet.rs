@@ -30,7 +30,7 @@ pub struct Args {
     /// A zenoh router or a daemon, tcp/HOST:PORT; of several, the first that answers
     #[arg(long, value_name = "ENDPOINT", required = true, value_parser = endpoint)]
     connect: Vec<Endpoint>,
-    /// Print JSON lines: one for each sensor, once a second if something of it is new
+    /// Print JSON lines: one for each sensor, once a second if something of it is new [default: a table]
     #[arg(long)]
     json: bool,
     /// End after S seconds. A table is then printed once, at the end [default: no limit]

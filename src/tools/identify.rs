@@ -33,10 +33,10 @@ pub struct Args {
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
     pub config: Configuration,
-    /// File for the references, which `references` of the configuration names
+    /// New file for the references, which `references` of the configuration names
     #[arg(long, value_name = "R.npz")]
     out: PathBuf,
-    /// Add to the file
+    /// Add to the file, which may exist
     #[arg(long)]
     append: bool,
     /// What is pressed: flat:MM (a rigid flat piece so many mm across), ball:MM (a rigid ball of that radius),

@@ -33,8 +33,16 @@ use hardnessd_core::recording::{LabelError, Labels, check_label};
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    --session asks for the name of each object, and for its level or the reading of a durometer, \
+    then counts its presses. Meanwhile Enter starts the next object, r records this one again, q \
+    or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap and a line of session.csv. A \
+    second session in the same directory continues the numbers.";
+
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
@@ -46,10 +54,10 @@ pub struct Args {
     /// labelled for `hrn-train collect`
     #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "seconds"])]
     session: Option<PathBuf>,
-    /// Label to store in the recording, such as level=2 or object=7; may be repeated
+    /// Label to store in the recording, such as level=2, object=7 or shore=64; may be repeated
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
     labels: Vec<(String, String)>,
-    /// Open the sockets of [publish.unix] too, so that a robot can tell where its arm is
+    /// Open the sockets of [publish.unix] too, so that a robot can send the positions of its arm
     #[arg(long)]
     sockets: bool,
     /// End after S seconds [default: at SIGINT or SIGTERM, or when no sensor is left]

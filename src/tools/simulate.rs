@@ -30,19 +30,20 @@ use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, 
 #[derive(Debug, Clone, ClapArgs)]
 #[command(after_long_help = faults::FORMAT)]
 pub struct Args {
-    /// Symbolic link to make to the pty; a link that leads nowhere is replaced
+    /// Symbolic link to make to the pty, until the end; a link that leads nowhere is replaced
     #[arg(long, value_name = "PATH")]
     link: Option<PathBuf>,
-    /// Write the sensor's raw bytes to this new file instead, as fast as possible
+    /// Write the sensor's raw bytes to this new file (or a device or a pipe) instead, as fast as possible
     #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
-    /// Layout of a frame
+    /// Layout of a frame: a preset of the configuration
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
     preset: Preset,
     /// Frames per second, 0.1 to 1000
     #[arg(long, value_name = "F", default_value_t = DEFAULT_FRAME_RATE_HZ, value_parser = frame_rate_hz)]
     fps: f64,
-    /// Material to press; repeat the option for several in turn [default: all eight]
+    /// Material to press: wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat; repeat the
+    /// option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M")]
     materials: Vec<Material>,
     /// Rigid piece to press in place of the materials, for `identify`: flat:MM (so many mm across) or ball:MM (of
@@ -62,7 +63,7 @@ pub struct Args {
     /// End after N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
-    /// Least rest before the first press and after each, in seconds, 1 to 3600
+    /// Least rest before the first press (at least 2) and after each, in seconds, 1 to 3600
     #[arg(long, value_name = "S", default_value_t = REST_S, value_parser = rest_s)]
     rest: f64,
     /// Play X times as fast, 0.000001 to 1000000000
@@ -71,7 +72,7 @@ pub struct Args {
     /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// Control socket of a daemon, to tell it where the arm is, as a robot would
+    /// Control socket of a daemon, to which a simulated robot sends the positions of its arm, 100 a second
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<PathBuf>,
     /// The daemon's sensor on the arm [default: its first]
@@ -80,7 +81,7 @@ pub struct Args {
     /// Play no presses: move the arm as a controller says on this new Unix socket
     #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]
     arm: Option<PathBuf>,
-    /// Script of faults; --help shows its format
+    /// Script of faults; `--help` shows its format
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
 }

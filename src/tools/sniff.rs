@@ -44,13 +44,23 @@ use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::escaped;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    Press the sensor meanwhile, with one finger at several places and at the edges: only presses \
+    show the shape of the array. It finds frames of one length with a constant mark, and \
+    ff-tail, zero-run, ascii, csv and jq-glove, of up to 64x64 taxels. If two arrays are likely, \
+    it shows a picture of each with the options that choose it. `order`, `mask` and `invert` \
+    leave no trace in the bytes, and without a checksum a header and a tail look the same. Exit \
+    code 1: no layout was found, or it is not sure.";
+
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 #[command(group(ArgGroup::new("source").args(["file", "port"]).required(true)))]
 pub struct Args {
-    /// Recording of `record`, or raw bytes back to back; best with presses in it
+    /// Recording of `record`, or raw bytes back to back, with presses in it
     file: Option<PathBuf>,
-    /// Listen to this port instead; press the sensor meanwhile
+    /// Listen to this port instead: a device, tcp://HOST:PORT or udp://ADDRESS:PORT
     #[arg(long, value_name = "P")]
     port: Option<Port>,
     /// Speed of the port in bits per second

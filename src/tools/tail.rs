@@ -20,18 +20,25 @@ use hardnessd_core::event::{Kind, PROTOCOL};
 use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::wording;
 
+/// What `--help` says below the options.
+const MORE: &str = "\
+    Times are UTC. The line of a verdict begins with the time of its publication; the frame that \
+    it judges follows, with its own time. Exit code 69: no daemon answers within 5 s, it has too \
+    many subscribers, or it has ended.";
+
 /// Arguments of `tail`.
 #[derive(Debug, Clone, ClapArgs)]
+#[command(after_help = MORE)]
 pub struct Args {
     #[command(flatten)]
     source: Source,
     /// Print the JSON lines as they are
     #[arg(long)]
     json: bool,
-    /// End after N events [default: no limit]
+    /// End after N events of these types, the first statuses included [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
-    /// Give up after S seconds, with exit code 1 [default: no limit]
+    /// End with exit code 1 if not done after S seconds in all [default: no limit]
     #[arg(long, value_name = "S", value_parser = positive)]
     timeout: Option<f64>,
     /// Types of events: hardness, press, status, frame

@@ -31,7 +31,10 @@ use hardnessd_core::exit::{Coded, IO, USAGE};
 #[derive(Debug, Clone, ClapArgs)]
 #[command(
     after_help = "Keys: q or Ctrl-C quits; Tab, arrows or 1 to 9 choose a sensor; Ctrl-L draws \
-                        again. Without colours where NO_COLOR is set or TERM has none."
+                        again. DAEMON SILENT: no answer for 3 s. NO DAEMON: nobody answers, or the \
+                        protocol is another one; `watch` connects again. A map that is not live is \
+                        grey. Without colours where NO_COLOR is set or TERM has none, and in ASCII \
+                        unless LC_ALL, LC_CTYPE or LANG says UTF-8."
 )]
 pub struct Args {
     #[command(flatten)]

@@ -1,5 +1,6 @@
 //! The shipped files: the real binary accepts them, and they agree with the code.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -29,42 +30,66 @@ fn the_shipped_configuration_passes_check_and_equals_the_defaults() {
 }
 
 #[test]
-fn the_shipped_configuration_names_every_key() {
+fn the_shipped_configuration_shows_every_key_and_its_default_also_in_lines_that_are_off() {
     let text = fs::read_to_string(shipped("config/hardnessd.toml")).unwrap();
-    let named: Vec<&str> = text
-        .lines()
-        .filter_map(|line| line.trim_start_matches("# ").split_once(" = "))
-        .map(|(key, _)| key)
-        .collect();
-    let mut keys = Vec::new();
-    let defaults = Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))]);
-    collect(&toml::Value::try_from(defaults).unwrap(), &mut keys);
-    // Keys without a default value are not in the defaults.
-    let silent = "gains stale_after_ms sync tail length cell mask invert checksum rows cols order request request_ms start path sha256 control_path listen connect site domain_id namespace networks dir continuous rotate_mb rotate_s keep_free_mb";
-    keys.extend(silent.split(' ').map(str::to_owned));
-    for key in keys {
-        assert!(
-            named.contains(&key.as_str()),
-            "{key} is not in config/hardnessd.toml"
-        );
+    let is_key = |line: &str| {
+        line.split_once(" = ").is_some_and(|(key, _)| {
+            key.chars()
+                .all(|c| c.is_ascii_lowercase() || "0123456789_".contains(c))
+        })
+    };
+    let on = text.lines().map(|line| match line.strip_prefix("# ") {
+        Some(off) if off.starts_with('[') || is_key(off) => off,
+        _ => line,
+    });
+    let on = on.collect::<Vec<_>>().join("\n");
+    // It has no key that the daemon does not know.
+    toml::from_str::<Config>(&on).unwrap();
+    let mut shown = BTreeMap::new();
+    leaves(&toml::from_str(&on).unwrap(), "", &mut shown);
+    // Tables that are off by default have default values too.
+    let off =
+        "[http]\n[record]\n[publish.tcp]\n[publish.foxglove]\n[publish.zenoh]\n[publish.ros2]";
+    let defaults: Config = toml::from_str(&format!("[[sensor]]\nport = \"p\"\n{off}")).unwrap();
+    let mut expected = BTreeMap::new();
+    // Written and read again, an f32 has its own digits.
+    let defaults = toml::from_str(&toml::to_string(&defaults).unwrap()).unwrap();
+    leaves(&defaults, "", &mut expected);
+    expected.remove("robot");
+    expected.remove("sensor.port");
+    for (path, default) in &expected {
+        assert_eq!(shown.get(path), Some(default), "{path}");
+    }
+    // These have no default, or one that depends on others.
+    let others = "stale_after_ms references sync tail length header_bytes cell footer_bytes mask invert checksum \
+        checksum_over rows cols order request request_ms start count number_at first gains stiffness_n_per_mm \
+        speed_mm_s contact_threshold_n begin_area_taxels end_area_taxels sha256 label shore control_path site motion \
+        domain_id dir robot";
+    for key in others.split_whitespace() {
+        let is_shown = |path: &String| path.rsplit('.').next() == Some(key);
+        assert!(shown.keys().any(is_shown), "{key}");
     }
 }
 
-/// The keys of all values that are not tables.
-fn collect(value: &toml::Value, keys: &mut Vec<String>) {
+/// The values that are not tables, as TOML writes them, by the path of their keys.
+fn leaves(value: &toml::Value, path: &str, found: &mut BTreeMap<String, String>) {
     match value {
         toml::Value::Table(table) => {
             for (key, value) in table {
-                match value {
-                    toml::Value::Table(_) => {}
-                    toml::Value::Array(items) if items.iter().any(toml::Value::is_table) => {}
-                    _ => keys.push(key.clone()),
-                }
-                collect(value, keys);
+                let below = if path.is_empty() {
+                    key.clone()
+                } else {
+                    format!("{path}.{key}")
+                };
+                leaves(value, &below, found);
             }
         }
-        toml::Value::Array(items) => items.iter().for_each(|item| collect(item, keys)),
-        _ => {}
+        toml::Value::Array(items) if items.iter().any(toml::Value::is_table) => {
+            items.iter().for_each(|item| leaves(item, path, found));
+        }
+        _ => {
+            found.insert(path.to_owned(), value.to_string());
+        }
     }
 }
 

@@ -14,6 +14,7 @@ use std::process::{Command, Stdio};
 
 use crate::bench::BINARY;
 use crate::commands::{Call, blocks, calls, calls_of, names_of};
+use crate::docs::has_command;
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use hardnessd::tools::args::Args;
@@ -150,13 +151,9 @@ fn the_page_on_recordings_says_what_happens() {
     follow("recordings.md");
 }
 
-/// Whether this build has the command: some come with a feature.
+/// Whether this build has the command of a call.
 fn is_built(call: &Call) -> bool {
-    match call.words.get(1).map(String::as_str) {
-        Some("watch") => cfg!(feature = "watch"),
-        Some("fleet") => cfg!(feature = "zenoh"),
-        _ => true,
-    }
+    call.words.get(1).is_none_or(|name| has_command(name))
 }
 
 #[test]

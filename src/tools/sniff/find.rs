@@ -40,7 +40,7 @@ pub(super) struct Shown {
 pub enum Failure {
     /// There are no bytes.
     #[error(
-        "nothing arrives: check the wiring, or the sensor sends only on a request ([sensor] `request` and `start`)"
+        "nothing arrives: check the wiring, or the sensor sends only on a request (`request` and `start` of [sensor.frame])"
     )]
     Nothing,
     /// Lines of text, but not as many numbers on each.

@@ -24,11 +24,32 @@ const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usag
     here is missing or unreadable; 69 no CUDA device; 74 I/O error; 78 bad settings, model or \
     configuration; 130 and 143 after SIGINT and SIGTERM.";
 
+/// What `collect --help` says below the options.
+const COLLECTED: &str = "\
+    Of a directory it takes all recordings below it, sorted by path. The first bytes of a file, \
+    not its name, decide what it is. Presses of a data set keep their level, object and split; \
+    only objects that `collect` itself numbered get new numbers. With --skip-unusable, the most \
+    frequent combination of pitch, material and shore decides, or the data set of --append.";
+
+/// What `compare --help` says below the options.
+const COMPARED: &str = "\
+    The tables contain all finished runs of DIR with the same data and profile. `settings.toml`, \
+    `revision`, `metrics.csv` and `compared.json` of a run are enough to keep. The controls of \
+    --course are logistic regressions: on features of the best frame, on modulus and radius by \
+    Hertz's law, and on features of the whole press without and with the arm's motion.";
+
+/// What `check-model --help` says below the options.
+const CHECKED: &str = "\
+    Each line begins with ok; adopt: wrong or absent, and `adopt` corrects it; missing: wrong or \
+    absent, and you must change the file; or unseen: another part is wrong, so this cannot be \
+    checked. It also tries the memory and time of a verdict for a sensor of 5 frames/s. Exit \
+    code 78: a line is not ok.";
+
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
     /// Simulate a labelled data set (default: the paper's 10,000 + 1,000 samples)
     Simulate(Simulate),
-    /// Make a data set from recordings of known objects, with the daemon's own decoding
+    /// Make a data set from recordings of known objects, with the daemon's own decoding and press selection
     Collect(Collect),
     /// Train one method
     Train(Train),
@@ -53,6 +74,7 @@ pub(super) enum Command {
         out: PathBuf,
     },
     /// Check an ONNX file that was made elsewhere against the model format, line by line
+    #[command(after_help = CHECKED)]
     CheckModel {
         /// The model file
         model: PathBuf,
@@ -78,22 +100,21 @@ pub(super) struct Simulate {
     /// Seed of everything random
     #[arg(long, default_value_t = DatasetSettings::default().seed, value_parser = seed())]
     pub(super) seed: u64,
-    /// Materials: named (the paper's eight) or broad (each object has a random one, and its level is
-    /// what a simulated durometer reads)
+    /// Materials: named (the paper's eight) or broad (each object has a random one)
     #[arg(long, default_value = "named")]
     pub(super) materials: Materials,
     /// Laws that broad materials are drawn from: solid, plastic, foam, layered [default: all]
-    #[arg(long, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
+    #[arg(long, hide_short_help = true, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
     pub(super) laws: Vec<LawName>,
     /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
     /// hardness of 50 to 51, 60 to 61 or 70 to 71
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     pub(super) gaps: bool,
     /// Objects of each training material; with broad materials, four times as many in all
     #[arg(long, default_value_t = DatasetSettings::default().objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) objects: u32,
-    /// Objects of each test material; with broad materials, four times as many in all
+    /// The same of each test material
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
@@ -101,8 +122,8 @@ pub(super) struct Simulate {
     /// forces each; a smaller number takes some of these
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) presses: Option<u32>,
-    /// The least nominal force, in newtons; the greatest is 25
-    #[arg(long, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
+    /// Least nominal force in newtons; the greatest is 25
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
           value_parser = lowest_force_n)]
     pub(super) lowest_force: f32,
     /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
@@ -113,21 +134,20 @@ pub(super) struct Simulate {
     #[arg(long, default_value = "clean")]
     pub(super) sensor_profile: SensorProfile,
     /// Press all objects on the same sensor, which is drawn with this seed
-    #[arg(long, value_name = "SEED", value_parser = seed())]
+    #[arg(long, hide_short_help = true, value_name = "SEED", value_parser = seed())]
     pub(super) one_sensor: Option<u64>,
     /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
-    #[arg(long, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
+    #[arg(long, hide_short_help = true, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
           value_parser = cover_mpa)]
     pub(super) cover: f64,
-    /// Calibrate each sensor with weights: the mean sum of its taxels is then the force of the press,
-    /// and not a tenth more
-    #[arg(long)]
+    /// Calibrate each sensor with weights, so that the mean sum of its taxels is the force of the press
+    #[arg(long, hide_short_help = true)]
     pub(super) calibrated: bool,
-    /// Levels whose two materials change roles, such as 24: the paper's test material trains
-    #[arg(long, value_name = "LEVELS", value_parser = swapped_levels)]
+    /// Levels whose two materials change roles, such as 24
+    #[arg(long, hide_short_help = true, value_name = "LEVELS", value_parser = swapped_levels)]
     pub(super) swapped_levels: Option<[bool; 4]>,
     /// Put all eight named materials into the test split
-    #[arg(long, conflicts_with = "swapped_levels")]
+    #[arg(long, hide_short_help = true, conflicts_with = "swapped_levels")]
     pub(super) all_test: bool,
     /// Also draw samples of every material and a press of every level
     #[arg(long, value_name = "S.png")]
@@ -164,7 +184,7 @@ impl From<Sensors> for SensorDesigns {
 #[derive(Debug, clap::Args)]
 #[group(requires = "sequences")]
 pub(super) struct Courses {
-    /// Frames a second, 1 to 200 [default: 5..100]
+    /// With --sequences, drawn for each press: frames a second, 1 to 200 [default: 5..100]
     #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
     pub(super) fps: Option<[f64; 2]>,
     /// Speed of the arm in mm/s, 1 to 100 [default: 2..20]
@@ -174,45 +194,47 @@ pub(super) struct Courses {
     #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
     pub(super) arm: Option<[f64; 2]>,
     /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
-    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
+    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
     pub(super) hold: Option<[f64; 2]>,
     /// Reported positions are off by up to this share, 0 to 0.5, constant within a press [default: 0]
-    #[arg(long, value_name = "SHARE", value_parser = part::<50>)]
+    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<50>)]
     pub(super) position_error: Option<f64>,
-    /// The reported stiffness of the arm is off by up to this share, 0 to 0.9 [default: 0]
-    #[arg(long, value_name = "SHARE", value_parser = part::<90>)]
+    /// The reported stiffness of the arm is off by up to this share, 0 to 0.9 [default: 0; 0.15 with
+    /// --sensors]
+    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<90>)]
     pub(super) arm_error: Option<f64>,
     /// Times of positions are off by up to this many frames, 0 to 5, constant within a press [default: 0]
-    #[arg(long, value_name = "FRAMES", value_parser = part::<500>)]
+    #[arg(long, hide_short_help = true, value_name = "FRAMES", value_parser = part::<500>)]
     pub(super) clock_error: Option<f64>,
     /// Share of the presses in which the arm reports nothing, 0 to 1 [default: 0]
-    #[arg(long, value_name = "SHARE", value_parser = part::<100>)]
+    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<100>)]
     pub(super) unknown: Option<f64>,
-    /// Sensors: broad (each has a design of its own, and presses of rigid pieces that show what it
-    /// reads) [default: eight instances of one design in each split]
+    /// Sensors: broad (each has a design of its own) or jx255n (many of the JX255N), with presses of rigid pieces
+    /// too [default: eight of one design in each split]
     #[arg(long, value_enum, hide_possible_values = true,
           conflicts_with_all = ["sensor_profile", "one_sensor", "cover", "calibrated"])]
     pub(super) sensors: Option<Sensors>,
-    /// Covers of broad sensors that training objects are pressed on, each with an arm of its own; at most
-    /// one for each object of a material [default: 200]
-    #[arg(long, value_name = "N", requires = "sensors",
+    /// With --sensors: covers that training objects are pressed on, at most one for each object of a material
+    /// [default: 200]
+    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
           value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) covers: Option<u32>,
     /// The same for test objects [default: 20]
-    #[arg(long, value_name = "N", requires = "sensors",
+    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
           value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) test_covers: Option<u32>,
     /// Sensors under each of these covers. All of them read each press on it [default: 8]
-    #[arg(long, value_name = "N", requires = "sensors",
+    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
           value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(super) electronics: Option<u32>,
     /// Write this many files in place of one, each with other covers: D-0.npz, D-1.npz, ... [default: 1]
-    #[arg(long, value_name = "N", requires = "sensors",
+    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
           value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(super) shards: Option<u32>,
 }
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = COLLECTED)]
 pub(super) struct Collect {
     /// Data set to write; an existing file is replaced
     #[arg(long, value_name = "D.npz")]
@@ -241,8 +263,8 @@ pub(super) struct Collect {
     #[arg(long)]
     pub(super) skip_unusable: bool,
     /// Recordings of `record`, directories with recordings, raw bytes back to back, or data sets of
-    /// `collect` to put together, which keep their labels. If all have a label "material" or "shore", the
-    /// data set has that array; all or none must have it
+    /// `collect` to put together. If all have a label "material" or "shore", the data set has that array; all
+    /// or none must have it
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
 }
@@ -275,8 +297,7 @@ pub(super) struct Train {
     /// What to train
     #[arg(long, value_parser = trained())]
     pub(super) method: Trained,
-    /// Data to learn from; several files may be named. The files are joined, and objects of different files stay
-    /// different: all presses of an object must be in one file
+    /// Data to learn from; several files may be named. All presses of an object must be in one file
     #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the run
@@ -288,20 +309,20 @@ pub(super) struct Train {
     /// Length of the training
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
-    /// Settings that override the profile's (see config/hrn-train.toml)
+    /// Settings that override the profile's; config/hrn-train.toml has every key
     #[arg(long, value_name = "F.toml")]
     pub(super) config: Option<PathBuf>,
     /// Continue a run that was stopped
     #[arg(long)]
     pub(super) resume: bool,
     /// Reuse finished stages of another run where they are identical; may be repeated
-    #[arg(long, value_name = "RUN")]
+    #[arg(long, hide_short_help = true, value_name = "RUN")]
     pub(super) from: Vec<PathBuf>,
     /// Number of labels to use [default: the method's share]
     #[arg(long, value_name = "N")]
     pub(super) labels: Option<usize>,
     /// Which samples get their labels
-    #[arg(long, default_value = "object")]
+    #[arg(long, hide_short_help = true, default_value = "object")]
     pub(super) label_choice: LabelChoice,
     /// Where to compute
     #[arg(long, default_value = "cpu")]
@@ -312,18 +333,21 @@ pub(super) struct Train {
 }
 
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = COMPARED)]
 pub(super) struct Compare {
-    /// The data set to learn from. With --course, several may be named
+    /// The data set to learn from
+    ///
+    /// With --course, several may be named.
     #[arg(long, value_name = "D.npz", num_args = 1.., required = true)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the comparison
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Methods to run [default: all]. The tables also contain what was finished in DIR before
-    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1..)]
+    /// Methods to run: those of `train` but course [default: all]
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1.., hide_possible_values = true)]
     pub(super) methods: Vec<Method>,
     /// Also run every method with each of these numbers of labels, for a curve of accuracy against labels
-    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
+    #[arg(long, hide_short_help = true, value_name = "N", value_delimiter = ',', num_args = 1..)]
     pub(super) labels: Vec<usize>,
     /// Train with the seeds 1 to N
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST as u64))]
@@ -339,18 +363,18 @@ pub(super) struct Compare {
     pub(super) jobs: Option<std::num::NonZeroUsize>,
     /// Also swap the two materials of each level: 16 times features, hrn15-strong and hrn15-tuned, 4 times
     /// ours
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     pub(super) swaps: bool,
-    /// Compare models of whole presses instead, with simpler controls that are fitted on --data. Nothing else is
-    /// trained. All data must have whole presses (`simulate --sequences`)
-    #[arg(long, requires = "test", requires = "model",
+    /// Compare models of whole presses instead, with simpler controls that are fitted on --data. All data must
+    /// have whole presses (`simulate --sequences`)
+    #[arg(long, hide_short_help = true, requires = "test", requires = "model",
         conflicts_with_all = ["methods", "labels", "seeds", "profile", "plan", "jobs", "swaps"])]
     pub(super) course: bool,
     /// Test presses; may be given several times
-    #[arg(long, value_name = "T.npz", num_args = 1.., requires = "course")]
+    #[arg(long, hide_short_help = true, value_name = "T.npz", num_args = 1.., requires = "course")]
     pub(super) test: Vec<PathBuf>,
     /// Model files, of either format. The others are compared with the first
-    #[arg(long, value_name = "M.onnx", num_args = 1.., requires = "course")]
+    #[arg(long, hide_short_help = true, value_name = "M.onnx", num_args = 1.., requires = "course")]
     pub(super) model: Vec<PathBuf>,
 }
 
@@ -431,17 +455,18 @@ pub(super) struct Evaluate {
     #[arg(long, default_value = "test")]
     pub(super) split: SplitName,
     /// Give the model this many presses of each rigid piece as references of each sensor
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) rigid: usize,
     /// Give the model a press of this many objects of each level as references of each sensor; the
     /// objects are not judged
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) labelled: usize,
-    /// Also write every verdict as a line of CSV; an existing file is replaced
+    /// Also write every verdict as a line of CSV: object, level, the verdict's level, probabilities and Shore
+    /// hardness with its interval, true Shore hardness; an existing file is replaced
     #[arg(long, value_name = "V.csv")]
     pub(super) verdicts: Option<PathBuf>,
     /// Also write the input `features` of every press of the data, as CSV; an existing file is replaced
-    #[arg(long, value_name = "F.csv")]
+    #[arg(long, hide_short_help = true, value_name = "F.csv")]
     pub(super) features: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
@@ -458,7 +483,7 @@ pub(super) struct Adopt {
     /// Model file to write; an existing file is replaced
     #[arg(long, value_name = "H.onnx")]
     pub(super) out: PathBuf,
-    /// How it was made, in a few words [default: "adopted from" and the file's name]
+    /// How it was made, in a few words [default: adopted from MODEL]
     #[arg(long, value_name = "TEXT")]
     pub(super) method: Option<String>,
     /// What it was tried on, in a few words [default: by the origin of the data]
