@@ -231,7 +231,7 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
     assert!(are_dead, "{:?}", fit.dead);
 }
 
-/// Prints how much the calibration improves the verdicts. docs/your-array.md has the figures.
+/// Prints how much the calibration improves the verdicts. docs/your-array.md names the gain.
 #[test]
 #[ignore = "minutes: cargo test --lib worth_of_gains -- --ignored --nocapture"]
 fn print_the_worth_of_gains() {
