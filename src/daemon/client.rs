@@ -34,7 +34,7 @@ use hardnessd_core::event::{Reply, Tared};
 use hardnessd_core::motion::StepBack;
 use hardnessd_core::tare::RetareError;
 
-/// The longest line that a subscriber may send (`docs/controller.md`).
+/// The longest line that a subscriber may send (`docs/protocol.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
 /// The first and the longest pause between checks of a connection whose other end has stopped
