@@ -36,5 +36,5 @@ impl Body {
 /// Draws the roughness of one posture's face.
 pub(super) fn draw_patch(texture: &Texture, roughness: f64, stream: &mut Stream) -> Patch {
     let factor = roughness * (0.35 * stream.normal()).exp();
-    Patch::new(texture, factor, super::sensor::CELL_MM, stream)
+    Patch::new(texture, factor, super::press::CELL_MM, stream)
 }

@@ -4,10 +4,13 @@
 //! frame rate, hold and the robot's errors are drawn anew for each press. Test presses of the same
 //! number are made alike in every material, as for single frames.
 
+mod world;
+
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
+pub use self::world::{BroadSensors, REFERENCES, SensorDesigns};
 use super::body::{Body, draw_patch};
 use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
@@ -15,11 +18,11 @@ use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
 use super::press::{Bench, Cover, Specimen};
+use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
 use super::subject::{Subject, shared_out, units, weights};
 use super::tracked::{Seen, begins_press, one_press};
-use super::world::{self, BroadSensors};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
@@ -93,7 +96,7 @@ pub struct LabelledCourse {
     pub level: u8,
     /// Number of the object, unique in the data set.
     pub object: u32,
-    /// Index of the material among [`super::material_names`].
+    /// Index of the material among [`crate::material_names`].
     pub material: u8,
     /// Greatest force on the sensor.
     pub force_n: f32,
@@ -111,21 +114,6 @@ pub struct LabelledCourse {
     pub frame_rate_hz: f32,
     /// The arm's true speed.
     pub speed_mm_s: f32,
-}
-
-/// A rigid piece whose form is known.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Reference {
-    /// A flat round face of this width across.
-    Flat {
-        /// The width.
-        width_mm: f32,
-    },
-    /// A ball of this radius.
-    Ball {
-        /// The radius.
-        radius_mm: f32,
-    },
 }
 
 /// One frame of a press.

@@ -10,10 +10,13 @@ use super::contact::{self, Contact, Fields, Local, Problem, TOLERANCE};
 use super::fourier::Convolver;
 use super::kernel::{self, Base, Layer};
 use super::object::{Face, Pose};
-use super::sensor::{CELL_MM, CELLS};
 use super::substance::{Law, Substance};
 use super::texture::Patch;
 
+/// Width of a cell, mm: a quarter of a taxel of the JX255N.
+pub(super) const CELL_MM: f64 = 0.875;
+/// Width of the sensor in cells.
+pub(super) const CELLS: usize = 112;
 /// Window widths in cells. FFTs of twice these sizes are fast.
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 

@@ -1,9 +1,8 @@
 //! The rigid pieces that a user presses on a sensor: weights, which calibrate it, and references,
 //! which show what it reads of a known form.
 
-use super::courses::Reference;
 use super::object::{Face, Pose};
-use super::press::{Bench, Specimen, Window};
+use super::press::{Bench, CELL_MM, Specimen, Window};
 use super::sensor::{Film, Sensor};
 use super::substance::{Creep, Law, Substance, Texture};
 use super::texture::Patch;
@@ -21,6 +20,21 @@ const WEIGHTS_N: [f64; 4] = [2.0, 5.0, 10.0, 20.0];
 const PLACES: u64 = 3;
 /// How long a weight lies before it is read, s.
 const WEIGHT_S: f64 = 2.0;
+
+/// A rigid piece whose form is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Reference {
+    /// A flat round face of this width across.
+    Flat {
+        /// The width.
+        width_mm: f32,
+    },
+    /// A ball of this radius.
+    Ball {
+        /// The radius.
+        radius_mm: f32,
+    },
+}
 
 /// The face of a piece that an arm presses.
 pub(super) fn face(piece: Reference) -> Face {
@@ -46,7 +60,7 @@ pub(super) fn specimen(face: &Face, stream: &mut Stream) -> Specimen {
         texture,
     };
     let pose = Pose::draw(face, stream);
-    let patch = Patch::new(&texture, 1.0, super::sensor::CELL_MM, stream);
+    let patch = Patch::new(&texture, 1.0, CELL_MM, stream);
     Specimen::new(substance, YOUNG_MPA, face, &pose, &patch)
 }
 

@@ -21,10 +21,6 @@ use hardnessd_core::press::{Settings, Thresholds};
 
 /// The array of a sequence.
 pub(super) const ARRAY: Array = Array::JX255N;
-/// Width of a cell, mm: a quarter of a taxel of the JX255N.
-pub(super) const CELL_MM: f64 = 0.875;
-/// Width of the sensor in cells.
-pub(super) const CELLS: usize = 112;
 /// The largest count of the simulated JX255N, which has 8 bits.
 pub const FULL_SCALE_COUNTS: u16 = 255;
 /// A force on a taxel that is no longer felt, N. The film's delay alone would never end a press.

@@ -8,6 +8,7 @@
 //! repeated.
 
 mod children;
+pub mod hertz;
 pub mod course_results;
 pub mod courses;
 pub mod digits;

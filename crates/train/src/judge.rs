@@ -2,7 +2,6 @@
 
 pub mod features;
 pub mod baseline;
-pub mod hertz;
 pub mod likeness;
 pub mod paper;
 pub mod metrics;

@@ -2,7 +2,7 @@ use std::f64::consts::PI;
 
 use super::*;
 use crate::kernel::{self, Base, Layer};
-use crate::sensor::CELL_MM;
+use crate::press::CELL_MM;
 
 /// Solves gaps that are given by radius, on a half-space of modulus E* or on a layer.
 struct Bed {

@@ -3,6 +3,7 @@
 //! [`Design::jx255n`] is the array of the paper. [`Design::broad`] draws one of many.
 
 use super::SensorProfile;
+use crate::press::{CELL_MM, CELLS};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Array, MOST_SIDE, Pitch};
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
@@ -205,7 +206,7 @@ impl Design {
         let even = |[low, high]: [f64; 2], stream: &mut Stream| stream.range(low, high);
         let pitch_mm = log_even(PITCH_MM, stream);
         let area = (pitch_mm / Pitch::JX255N.rows_mm).powi(2);
-        let whole = crate::sensor::CELLS as f64 * crate::sensor::CELL_MM;
+        let whole = CELLS as f64 * CELL_MM;
         let is_small = stream.uniform() < SMALL_SHARE;
         let width_mm = stream.range(LEAST_WIDTH_MM, whole);
         let side = (if is_small { width_mm } else { whole } / pitch_mm).round() as usize;

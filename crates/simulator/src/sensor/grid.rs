@@ -4,8 +4,7 @@
 use std::sync::{Arc, OnceLock};
 
 use super::design::Design;
-use super::{CELL_MM, CELLS};
-use crate::press::Window;
+use crate::press::{CELL_MM, CELLS, Window};
 use hardnessd_core::frame::{Array, Pitch};
 
 /// The film's taxels lie this deep, in depths, before what they feel of a load is left out. At this

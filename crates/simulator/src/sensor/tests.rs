@@ -1,6 +1,6 @@
 use super::design::{FOIL_MM, Response, ranges};
 use super::*;
-use crate::press::Window;
+use crate::press::{CELL_MM, Window};
 
 const TAXELS: usize = ARRAY.taxels();
 

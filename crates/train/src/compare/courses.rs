@@ -12,13 +12,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, ensure};
 
 use super::course_results::{self, CourseRow, Difference, OnSet};
+use super::hertz;
 use super::report::{self, Curve};
 use super::table::Table;
 use super::{sets, so_far};
 use crate::data::courses::Courses;
 use crate::data::{dataset, simulated};
 use crate::judge::baseline::Baseline;
-use crate::judge::hertz;
 use crate::judge::metrics::{self, Clusters, Evaluation, Judged};
 use crate::learn::course::{self, Press};
 use crate::model::course as model;

@@ -8,8 +8,8 @@ use hardnessd_core::verdict::{Checks, Course, Format, Hrn, ReferenceKinds, Refer
 use hardnessd_simulator::{
     self, CourseSettings, DatasetSettings, LawName, Materials, Shapes, Split,
 };
+use hrn_train::compare::hertz;
 use hrn_train::data::courses::{Courses, single_frames};
-use hrn_train::judge::hertz;
 use hrn_train::learn::course;
 use hrn_train::model::course::course_of;
 use serde_json::Value;

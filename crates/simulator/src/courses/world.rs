@@ -9,15 +9,15 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-use super::course::SolvedPress;
-use super::courses::{CourseSettings, LabelledCourse, Plan, Reading, Reference, read_press};
-use super::material::Split;
-use super::press::{Bench, Cover};
-use super::rigid::{self, FLAT_MM, Weight};
-use super::sensor::{Design, Sensor};
-use super::settings::DatasetSettings;
-use super::subject::{Subject, Unit, shared_out, units};
+use super::{CourseSettings, LabelledCourse, Plan, Reading, read_press};
+use crate::course::SolvedPress;
+use crate::material::Split;
+use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
+use crate::rigid::{self, FLAT_MM, Reference, Weight};
+use crate::sensor::{Design, Sensor};
+use crate::settings::DatasetSettings;
+use crate::subject::{Subject, Unit, shared_out, units};
 use hardnessd_core::frame::Pitch;
 
 /// What the sensors of a data set have in common.
@@ -143,7 +143,7 @@ impl CourseSettings {
 
     /// The names that a press's `material` indexes.
     pub fn material_names(&self) -> Vec<&'static str> {
-        let mut names = super::material_names(self.objects.materials);
+        let mut names = crate::material_names(self.objects.materials);
         names.extend(self.sensors.map(|_| "rigid"));
         names
     }

@@ -1,8 +1,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::super::courses::courses;
-use super::super::settings::Materials;
+use super::super::courses;
 use super::*;
+use crate::settings::Materials;
 
 fn small(shard: u32) -> CourseSettings {
     CourseSettings {
