@@ -410,20 +410,4 @@ mod tests {
         // Rubber and foam are pressed alike.
         assert_eq!(forces[2..4], forces[10..12]);
     }
-
-    #[test]
-    #[ignore = "measures speed: cargo test --release"]
-    fn print_rate() {
-        let began = std::time::Instant::now();
-        let settings = DatasetSettings {
-            objects: 10,
-            test_objects: 1,
-            ..Default::default()
-        };
-        let count = dataset(&settings, 2, |_| ()).len();
-        println!(
-            "{:.0} samples a second on 2 threads",
-            count as f64 / began.elapsed().as_secs_f64()
-        );
-    }
 }

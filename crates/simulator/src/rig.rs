@@ -226,22 +226,4 @@ mod tests {
         rig.place(1);
         assert_eq!(greatest(&mut rig), first, "the same object, as new");
     }
-
-    #[test]
-    #[ignore = "measures speed: cargo test --release"]
-    fn print_speed() {
-        for material in Material::ALL {
-            let mut rig = rig(material);
-            let begun = std::time::Instant::now();
-            for step in 0..200_u32 {
-                rig.move_to(f64::from(step.min(200 - step)) * 0.06, 0.01);
-            }
-            let cost = begun.elapsed().as_secs_f64() / 200.0;
-            println!(
-                "{material}: {:.1} ms a step to {:.0} N",
-                1e3 * cost,
-                rig.touched().greatest_n
-            );
-        }
-    }
 }

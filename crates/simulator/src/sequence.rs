@@ -501,23 +501,4 @@ mod tests {
             }
         }
     }
-
-    #[test]
-    #[ignore = "measures speed: cargo test --release"]
-    fn print_speed() {
-        for material in Material::ALL {
-            let began = std::time::Instant::now();
-            let settings = SequenceSettings {
-                frame_rate_hz: 100.0,
-                materials: vec![material],
-                presses: Some(8),
-                ..SequenceSettings::default()
-            };
-            let seconds = Sequence::new(settings).count() as f64 / 100.0;
-            println!(
-                "{material}: {:.0} times real time",
-                seconds / began.elapsed().as_secs_f64()
-            );
-        }
-    }
 }

@@ -115,34 +115,3 @@ fn objects_and_sensors_of_a_split_are_its_own() {
         assert!(!train.is_empty() && !test.is_empty() && train.is_disjoint(&test));
     }
 }
-
-#[test]
-#[ignore = "measures speed: cargo test --release"]
-fn print_costs() {
-    let cost = |electronics| {
-        let mut settings = small(0);
-        settings.objects.objects = 8;
-        settings.objects.presses = 6;
-        settings.sensors = Some(BroadSensors {
-            covers: 8,
-            electronics,
-            ..BroadSensors::default()
-        });
-        let begun = std::time::Instant::now();
-        let made = courses(&settings, 1, |_| ());
-        let frames: usize = made.iter().map(|course| course.moments.len()).sum();
-        let presses = settings.presses() as f64;
-        (begun.elapsed().as_secs_f64(), presses, frames, made.len())
-    };
-    let (one, many) = (cost(1), cost(9));
-    let reading = (many.0 - one.0) / (many.1 - one.1);
-    let contact = one.0 / one.1 - reading;
-    println!(
-        "{:.1} ms a contact, {:.1} ms a reading, sensors included; {} presses of {}, {} frames",
-        1e3 * contact,
-        1e3 * reading,
-        many.3,
-        many.1,
-        many.2
-    );
-}
