@@ -26,20 +26,6 @@ pub struct Contact {
 /// press, below 0.07 N on a taxel, takes four minutes to disappear.
 pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
 
-/// The effect of a frame on the tare.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
-    /// No tare is under way.
-    Ready,
-    /// The frame is averaged into the tare under way.
-    Taking,
-    /// The frame was the last of the tare. The new baseline holds from the next frame on.
-    Taken,
-    /// Something touches the sensor, and the frames of the tare were discarded. A first tare begins
-    /// again, with this frame if it differs from those before it. A tare on request has ended.
-    Contact,
-}
-
 /// A summary of a baseline over the array's live taxels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offsets {
@@ -99,14 +85,15 @@ pub enum Aim {
 ///
 /// ```
 /// use hardnessd_core::frame::{Array, RawFrame};
-/// use hardnessd_core::tare::{Contact, Progress, Settings, Tare};
+/// use hardnessd_core::tare::{Contact, Settings, Tare};
 ///
 /// let contact = Contact { threshold_n: 0.07, area_taxels: 3 };
 /// let settings = Settings { tare_frames: 1, ..Settings::default() };
 /// let mut tare = Tare::new(&settings, Array::JX255N, contact);
 /// let mut raw = RawFrame::zero(Array::JX255N);
 /// raw.counts.fill(2);
-/// assert_eq!(tare.observe(&raw), Progress::Taken);
+/// tare.observe(&raw);
+/// assert_eq!(tare.aim(), None, "the tare is taken");
 ///
 /// raw.counts[0] = 27;
 /// let frame = tare.apply(&raw);
@@ -420,10 +407,12 @@ impl Tare {
         })
     }
 
-    /// Takes in a frame for the tare under way.
-    pub fn observe(&mut self, raw: &RawFrame) -> Progress {
+    /// Takes in a frame for the tare under way, if there is one. A new baseline holds from the next
+    /// frame on. If something touches the sensor, the frames so far are discarded: a first tare begins
+    /// again, with this frame if it differs from those before it, and a tare on request ends.
+    pub fn observe(&mut self, raw: &RawFrame) {
         let Stage::Taking { aim, sums } = &mut self.stage else {
-            return Progress::Ready;
+            return;
         };
         sums.add(raw);
         let (aim, sums) = (*aim, sums.clone());
@@ -437,10 +426,10 @@ impl Tare {
                 Aim::First { .. } => Stage::again(sums.wanted, self.array, moves.then_some(raw)),
                 Aim::Request => Stage::Ended(Err(RetareError::Touched)),
             };
-            return Progress::Contact;
+            return;
         }
         if !is_whole {
-            return Progress::Taking;
+            return;
         }
         let old = self.offsets();
         self.baseline = mean;
@@ -451,7 +440,6 @@ impl Tare {
                 new: self.offsets(),
             })),
         };
-        Progress::Taken
     }
 
     /// Whether the frames of a tare differ as under a touch that moves.

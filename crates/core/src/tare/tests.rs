@@ -158,40 +158,35 @@ fn a_baseline_follows_by_its_bound_while_no_live_taxel_is_in_contact() {
 fn baseline_is_the_mean_and_frames_before_it_are_untared() {
     let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
     for count in [2, 3, 2, 3] {
-        assert_eq!(tare.observe(&raw(&[(0, count)])), Progress::Taking);
+        tare.observe(&raw(&[(0, count)]));
     }
     assert_eq!(tare.apply(&raw(&[])).newtons[5], 2.0 * 0.04);
-    assert_eq!(tare.observe(&raw(&[(0, 3)])), Progress::Taken);
+    tare.observe(&raw(&[(0, 3)]));
     let frame = tare.apply(&raw(&[(0, 12), (1, 1)]));
     assert_eq!(frame.newtons[0], (12.0 - 13.0 / 5.0) * 0.04);
     assert_eq!(frame.newtons[1], 0.0, "below the baseline is zero");
-    assert_eq!(tare.observe(&raw(&[])), Progress::Ready);
+    assert_eq!(tare.aim(), None);
 }
 
 #[test]
 fn a_moving_or_a_resting_load_is_contact() {
     let moving = [[2, 4], [2, 4], [2, 4]];
+    let again = Some(Aim::First { met_contact: true });
     let check = |touch: &dyn Fn(usize) -> Vec<(usize, u16)>, expected| {
         let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
-        let last = (0..5).map(|frame| tare.observe(&raw(&touch(frame)))).last();
-        assert_eq!(last, Some(expected));
-        let again = Aim::First { met_contact: true };
-        let expected = (expected == Progress::Contact).then_some(again);
+        (0..5).for_each(|frame| tare.observe(&raw(&touch(frame))));
         assert_eq!(tare.aim(), expected);
     };
     check(
         &|frame| (0..3).map(|i| (i, moving[i][frame % 2])).collect(),
-        Progress::Contact,
+        again,
     );
     check(
         &|frame| (0..2).map(|i| (i, moving[i][frame % 2])).collect(),
-        Progress::Taken,
+        None,
     );
-    check(
-        &|_| (0..3).map(|i| (i, 2 + 13)).collect(),
-        Progress::Contact,
-    );
-    check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), Progress::Taken);
+    check(&|_| (0..3).map(|i| (i, 2 + 13)).collect(), again);
+    check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), None);
 }
 
 /// The counts of 40 taxels in each frame of a robot that presses again and again. `unloaded` of `cycle`
@@ -217,7 +212,10 @@ fn the_first_tare_takes_the_first_quiet_frames_wherever_a_robot_begins() {
         for begin in 0..cycle {
             let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
             let mut frames = frames.iter().cycle().skip(begin).take(2 * cycle);
-            let taken = frames.position(|raw| tare.observe(raw) == Progress::Taken);
+            let taken = frames.position(|raw| {
+                tare.observe(raw);
+                tare.aim().is_none()
+            });
             // The next five quiet frames in a row.
             let wait = if begin + 5 <= unloaded {
                 0
@@ -233,9 +231,11 @@ fn the_first_tare_takes_the_first_quiet_frames_wherever_a_robot_begins() {
 
 #[test]
 fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
+    let touched = Some(Aim::First { met_contact: true });
     let check = |settings: &Settings, array: Array, contact, frames: [RawFrame; 2]| {
         let mut tare = Tare::new(settings, array, contact);
-        frames.map(|raw| tare.observe(&raw))[1]
+        frames.iter().for_each(|raw| tare.observe(raw));
+        tare.aim()
     };
     let settings = |dead: &[[usize; 2]]| Settings {
         tare_frames: 2,
@@ -243,11 +243,7 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
     };
     let flicker = [[(0, 2), (1, 2), (2, 2)], [(0, 9), (1, 9), (2, 9)]].map(|c| raw(&c));
     let row = [[0, 0], [0, 1], [0, 2]];
-    for (dead, expected) in [
-        (&row[..], Progress::Taken),
-        (&row[..2], Progress::Taken),
-        (&[], Progress::Contact),
-    ] {
+    for (dead, expected) in [(&row[..], None), (&row[..2], None), (&[], touched)] {
         let found = check(&settings(dead), Array::JX255N, CONTACT, flicker.clone());
         assert_eq!(found, expected, "{dead:?}");
     }
@@ -256,11 +252,11 @@ fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
     high.counts[..4].fill(0);
     assert_eq!(
         check(&settings(&[]), Array::JX255N, CONTACT, [high.clone(), high]),
-        Progress::Taken
+        None
     );
     // A variation equal to the threshold counts: two counts are 0.08 N.
     let two = [[(0, 2), (1, 2), (2, 2)], [(0, 4), (1, 4), (2, 4)]].map(|c| raw(&c));
-    for (threshold_n, expected) in [(0.08, Progress::Contact), (0.081, Progress::Taken)] {
+    for (threshold_n, expected) in [(0.08, touched), (0.081, None)] {
         let contact = Contact {
             threshold_n,
             ..CONTACT
@@ -283,9 +279,9 @@ fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
     let mut settings = settings(&[[0, 1]]);
     settings.tare_frames = 2;
     let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
-    let frames = |tare: &mut Tare, count| -> Vec<Progress> {
+    let frames = |tare: &mut Tare, count| {
         let drifted = raw(&[(0, count), (1, 900)]);
-        (0..2).map(|_| tare.observe(&drifted)).collect()
+        (0..2).for_each(|_| tare.observe(&drifted));
     };
     frames(&mut tare, 2);
     let old = tare.offsets();
@@ -293,23 +289,24 @@ fn another_tare_leaves_the_baseline_until_it_is_taken_or_given_up() {
     assert_eq!(tare.ended(), None, "nobody asked for the first");
     assert_eq!(tare.retake(), Ok(()));
     assert_eq!(tare.retake(), Err(RetareError::UnderWay));
-    assert_eq!(tare.observe(&raw(&[(0, 9)])), Progress::Taking);
+    tare.observe(&raw(&[(0, 9)]));
     assert_eq!(tare.offsets(), old);
     tare.give_up(RetareError::Pressed);
     assert_eq!((tare.aim(), tare.offsets()), (None, old));
     assert_eq!(tare.ended(), Some(Err(RetareError::Pressed)));
     assert_eq!(tare.ended(), None, "said once");
     assert_eq!(tare.retake(), Ok(()));
-    assert_eq!(frames(&mut tare, 9), [Progress::Taking, Progress::Taken]);
+    frames(&mut tare, 9);
     let new = tare.offsets();
     assert_eq!(tare.ended(), Some(Ok(Retaken { old, new })));
     assert_eq!((new.least_counts, new.most_counts), (2.0, 9.0));
     assert!((new.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
     // A reload with the same number of frames keeps the frames already taken.
     assert_eq!(tare.retake(), Ok(()));
-    assert_eq!(tare.observe(&raw(&[])), Progress::Taking);
+    tare.observe(&raw(&[]));
     tare.reload(&settings, CONTACT);
-    assert_eq!(tare.observe(&raw(&[])), Progress::Taken);
+    tare.observe(&raw(&[]));
+    assert_eq!(tare.aim(), None);
     settings.tare_frames = 0;
     tare.reload(&settings, CONTACT);
     assert_eq!(tare.retake(), Err(RetareError::NoFrames));
