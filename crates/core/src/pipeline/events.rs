@@ -1,10 +1,11 @@
 //! The press and hardness events of a pipeline.
 
+use super::course::PressWithApproach;
 use super::objects::object_of;
 use super::{Clock, Pipeline, Unjudged};
 use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Rejection};
 use crate::frame::{Frame, RawFrame};
-use crate::press::{Change, ContactFrame, End, FrameAt, Marks, SoFar};
+use crate::press::{Change, ContactFrame, End, FrameAt, Marks};
 use crate::sensor::Description;
 use crate::verdict::{COURSE_FRAMES, Format, Laying, ModelError, Verdict};
 
@@ -67,7 +68,8 @@ impl Pipeline {
                 };
                 let number = press.press();
                 events.push(self.press(number, PressState::End, last, frames, reason));
-                events.extend(self.judge(Phase::Final, &press, press.peak()));
+                let known = self.known(&press, Phase::Final);
+                events.extend(self.judge(number, Phase::Final, &known, press.peak()));
                 let delay_ms = self.sensor.description().arm.delay_ms;
                 self.track.judged(last.stamp.mono, delay_ms);
             }
@@ -122,11 +124,12 @@ impl Pipeline {
         if (known.frames.len() as u64) < FIRST_LOOK {
             return;
         }
-        let peak = known.frames[known.best].clone();
+        let peak = known.frames[known.best];
         if peak.force_n < self.sensor.description().press.early_min_force_n {
             return;
         }
-        let Some(Event::Hardness(verdict)) = self.judge(Phase::Early, &so_far, &peak) else {
+        let Some(Event::Hardness(verdict)) = self.judge(so_far.press(), Phase::Early, &known, peak)
+        else {
             return;
         };
         // A press has one early verdict at most, so none is spent on a rejection. A later look may
@@ -147,8 +150,13 @@ impl Pipeline {
     }
 
     /// The verdict on a press up to now. `peak` is its best frame.
-    fn judge(&mut self, phase: Phase, so_far: &SoFar, peak: &ContactFrame) -> Option<Event> {
-        let known = self.known(so_far, phase);
+    fn judge(
+        &mut self,
+        press: u64,
+        phase: Phase,
+        known: &PressWithApproach<'_>,
+        peak: &ContactFrame,
+    ) -> Option<Event> {
         let arm_n_per_mm = self.sensor.description().arm.stiffness_n_per_mm;
         let stiffness_n_per_mm = known.stiffness_n_per_mm(arm_n_per_mm);
         let laying = self.laying(peak);
@@ -175,7 +183,7 @@ impl Pipeline {
             stiffness_n_per_mm,
             is_trained,
         };
-        self.judged(so_far.press(), phase, peak, verdict, &beside)
+        self.judged(press, phase, peak, verdict, &beside)
     }
 
     /// The event of a verdict. A model that fails on its own check frames was already refused at
