@@ -125,7 +125,8 @@ pub fn area(frame: &FrameFeatures) -> f32 {
     frame[AREA].exp_m1()
 }
 
-/// The features of a frame of which only the area in taxels and the force are known. For tests.
+/// The features of a frame of which only the area in taxels and the force are known.
+#[cfg(any(test, feature = "test-support"))]
 pub fn frame_of(area: f32, force_n: f32) -> FrameFeatures {
     let mut frame = [0.0; FRAME];
     frame[AREA] = area.ln_1p();
