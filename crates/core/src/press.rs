@@ -339,18 +339,19 @@ impl PressTracker {
     pub fn push(&mut self, frame: &Frame, marks: Marks, at: FrameAt) -> Vec<Change> {
         let area = frame.contact_area_taxels(self.thresholds.contact_threshold_n);
         let touched = area >= self.thresholds.end_area_taxels;
+        let contact = || ContactFrame {
+            moment: at,
+            frame: Arc::new(frame.clone()),
+            marks,
+            contact_area_taxels: area,
+            force_n: frame.force_n(),
+        };
         let mut changes = Vec::new();
         match &mut self.state {
             State::Idle if area < self.thresholds.begin_area_taxels => return changes,
             State::Idle => {
                 self.presses += 1;
-                let peak = ContactFrame {
-                    moment: at,
-                    frame: Arc::new(frame.clone()),
-                    marks,
-                    contact_area_taxels: area,
-                    force_n: frame.force_n(),
-                };
+                let peak = contact();
                 changes.push(Change::Begin {
                     press: self.presses,
                     at,
@@ -368,7 +369,7 @@ impl PressTracker {
                     course,
                 }));
             }
-            State::Pressed(pressed) if touched => pressed.touch(frame, marks, at, area),
+            State::Pressed(pressed) if touched => pressed.touch(contact()),
             State::Pressed(pressed) => pressed.released_frames += 1,
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if touched { 0 } else { *released_frames + 1 };
@@ -443,17 +444,10 @@ impl PressTracker {
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
 impl Pressed {
-    fn touch(&mut self, frame: &Frame, marks: Marks, at: FrameAt, area: u32) {
-        self.last = at;
+    fn touch(&mut self, touched: ContactFrame) {
+        self.last = touched.moment;
         self.frames += 1;
         self.released_frames = 0;
-        let touched = ContactFrame {
-            moment: at,
-            frame: Arc::new(frame.clone()),
-            marks,
-            contact_area_taxels: area,
-            force_n: frame.force_n(),
-        };
         if is_greater(&touched, &self.peak) {
             self.peak = touched.clone();
         }
