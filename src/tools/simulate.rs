@@ -24,7 +24,9 @@ use crate::maybe;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
-use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings};
+use hardnessd_simulator::{
+    Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings, named,
+};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -44,7 +46,7 @@ pub struct Args {
     fps: f64,
     /// Material to press: wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat; repeat the
     /// option for several in turn [default: all eight]
-    #[arg(long = "material", value_name = "M")]
+    #[arg(long = "material", value_name = "M", value_parser = named::<Material>)]
     materials: Vec<Material>,
     /// Rigid piece to press in place of the materials, for `identify`: flat:MM (so many mm across) or ball:MM (of
     /// that radius), 1 to 100 mm
@@ -55,7 +57,7 @@ pub struct Args {
     #[arg(long = "force", value_name = "N", value_parser = force_n)]
     forces: Vec<f64>,
     /// How alike the taxels are: clean, as after a calibration, or raw, with a gain of their own each
-    #[arg(long, value_name = "PROFILE", default_value = "clean")]
+    #[arg(long, value_name = "PROFILE", default_value = "clean", value_parser = named::<SensorProfile>)]
     sensor_profile: SensorProfile,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]

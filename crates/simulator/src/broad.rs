@@ -57,20 +57,6 @@ impl LawName {
     }
 }
 
-impl std::str::FromStr for LawName {
-    type Err = UnknownLaw;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        let law = Self::ALL.into_iter().find(|law| law.name() == name);
-        law.ok_or_else(|| UnknownLaw(name.to_owned()))
-    }
-}
-
-/// A name that is not a law's.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no law \"{0}\"; there are solid, plastic, foam, layered")]
-pub struct UnknownLaw(pub String);
-
 /// The laws that materials are drawn from, by their index in [`LawName::ALL`]; at least one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<LawName>", into = "Vec<LawName>")]

@@ -36,24 +36,33 @@ mod courses;
 mod sequence;
 mod rig;
 
-pub use broad::{LawName, Laws, NoLaw, UnknownLaw};
+pub use broad::{LawName, Laws, NoLaw};
 pub use courses::{
     BroadSensors, CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, REFERENCES,
     SensorDesigns, courses,
 };
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
-pub use material::{Material, Split, UnknownMaterial};
+pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
-pub use object::{Shapes, UnknownShapes};
+pub use object::Shapes;
 pub use rig::{Rig, Touched};
 pub use rigid::Reference;
-pub use sensor::FULL_SCALE_COUNTS;
-pub use sensor::{SensorProfile, UnknownProfile};
+pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};
 pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
-pub use settings::{DatasetSettings, Materials, UnknownMaterials};
+pub use settings::{DatasetSettings, Materials};
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
+use serde::de::{DeserializeOwned, IntoDeserializer as _, value};
+
+/// The material, law, shapes or profile of this name, as commands and files write it.
+///
+/// # Errors
+///
+/// Returns an error that lists the names if there is no such one.
+pub fn named<T: DeserializeOwned>(name: &str) -> Result<T, value::Error> {
+    T::deserialize(name.into_deserializer())
+}
 
 /// The names that a sample's `material` indexes: the eight named materials, then, for broad
 /// materials, their laws.

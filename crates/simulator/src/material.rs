@@ -4,13 +4,14 @@
 //! durometer with the same laws ([`super::durometer`]). This file holds the resulting moduli, and a
 //! test repeats the simulation.
 
-use std::str::FromStr;
+use serde::Deserialize;
 
 use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::Stream;
 
 /// A reference material (paper, Table 1).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Material {
     /// Level 1, training.
     Wood,
@@ -49,13 +50,6 @@ impl Split {
         }
     }
 }
-
-/// A name that is not a material's.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "no material \"{0}\"; there are wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat"
-)]
-pub struct UnknownMaterial(pub String);
 
 impl Material {
     /// All eight materials, in the order of their indices.
@@ -105,17 +99,6 @@ impl Material {
 
     pub(super) fn properties(self) -> &'static Properties {
         &PROPERTIES[usize::from(self.index())]
-    }
-}
-
-impl FromStr for Material {
-    type Err = UnknownMaterial;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        Self::ALL
-            .into_iter()
-            .find(|material| material.name() == name)
-            .ok_or_else(|| UnknownMaterial(name.to_owned()))
     }
 }
 
@@ -311,14 +294,15 @@ const PROPERTIES: [Properties; 8] = [
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::named;
 
     #[test]
     fn names_round_trip_and_a_wrong_one_lists_them() {
         for (index, material) in Material::ALL.into_iter().enumerate() {
-            assert_eq!(material.name().parse(), Ok(material));
+            assert_eq!(named(material.name()), Ok(material));
             assert_eq!(usize::from(material.index()), index);
         }
-        let error = "steel".parse::<Material>().unwrap_err().to_string();
+        let error = named::<Material>("steel").unwrap_err().to_string();
         assert!(
             Material::ALL
                 .iter()

@@ -23,24 +23,6 @@ pub enum Shapes {
     Paper,
 }
 
-impl std::str::FromStr for Shapes {
-    type Err = UnknownShapes;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "matched" => Ok(Shapes::Matched),
-            "wide" => Ok(Shapes::Wide),
-            "paper" => Ok(Shapes::Paper),
-            _ => Err(UnknownShapes(name.to_owned())),
-        }
-    }
-}
-
-/// A name that is not a set of shapes.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no shapes \"{0}\"; there are matched, wide, paper")]
-pub struct UnknownShapes(pub String);
-
 /// The number of postures that an object is pressed in (paper: "at least six").
 pub(super) const POSTURES: usize = 6;
 /// The depth beside the object, which no press reaches.

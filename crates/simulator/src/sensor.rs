@@ -36,23 +36,6 @@ pub enum SensorProfile {
     Raw,
 }
 
-impl std::str::FromStr for SensorProfile {
-    type Err = UnknownProfile;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "clean" => Ok(SensorProfile::Clean),
-            "raw" => Ok(SensorProfile::Raw),
-            _ => Err(UnknownProfile(name.to_owned())),
-        }
-    }
-}
-
-/// A name that is not a sensor profile.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no sensor profile \"{0}\"; there are clean, raw")]
-pub struct UnknownProfile(pub String);
-
 /// One instance of a sensor.
 #[derive(Debug, Clone)]
 pub(super) struct Sensor {

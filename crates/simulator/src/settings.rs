@@ -21,23 +21,6 @@ pub enum Materials {
     Broad,
 }
 
-impl std::str::FromStr for Materials {
-    type Err = UnknownMaterials;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "named" => Ok(Materials::Named),
-            "broad" => Ok(Materials::Broad),
-            _ => Err(UnknownMaterials(name.to_owned())),
-        }
-    }
-}
-
-/// A name that is not a set of materials.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no materials \"{0}\"; there are named, broad")]
-pub struct UnknownMaterials(pub String);
-
 /// The settings of a simulated data set.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -976,12 +976,12 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (
             simulate(&["--materials", "broad", "--laws", "liquid"]),
             2,
-            "no law \"liquid\"; there are solid, plastic, foam, layered",
+            "unknown variant `liquid`, expected one of `solid`, `plastic`, `foam`, `layered`",
         ),
         (
             simulate(&["--shapes", "round"]),
             2,
-            "there are matched, wide, paper",
+            "expected one of `matched`, `wide`, `paper`",
         ),
         (
             simulate(&["--objects", "0", "--test-objects", "0"]),

@@ -6,7 +6,7 @@ use clap::builder::RangedU64ValueParser;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd_simulator::{
-    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split,
+    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split, named,
 };
 use hrn_train::data::dataset::LabelChoice;
 use hrn_train::methods::Method;
@@ -101,10 +101,10 @@ pub(super) struct Simulate {
     #[arg(long, default_value_t = DatasetSettings::default().seed, value_parser = seed())]
     pub(super) seed: u64,
     /// Materials: named (the paper's eight) or broad (each object has a random one)
-    #[arg(long, default_value = "named")]
+    #[arg(long, default_value = "named", value_parser = named::<Materials>)]
     pub(super) materials: Materials,
     /// Laws that broad materials are drawn from: solid, plastic, foam, layered [default: all]
-    #[arg(long, hide_short_help = true, value_name = "LAW", value_delimiter = ',', num_args = 1..)]
+    #[arg(long, hide_short_help = true, value_name = "LAW", value_delimiter = ',', num_args = 1.., value_parser = named::<LawName>)]
     pub(super) laws: Vec<LawName>,
     /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
     /// hardness of 50 to 51, 60 to 61 or 70 to 71
@@ -128,10 +128,10 @@ pub(super) struct Simulate {
     pub(super) lowest_force: f32,
     /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
     /// 8 to 60 mm, edges and points) or paper (rigid objects flat, soft ones round)
-    #[arg(long, default_value = "matched")]
+    #[arg(long, default_value = "matched", value_parser = named::<Shapes>)]
     pub(super) shapes: Shapes,
     /// Spread of the sensor's taxels: clean or raw
-    #[arg(long, default_value = "clean")]
+    #[arg(long, default_value = "clean", value_parser = named::<SensorProfile>)]
     pub(super) sensor_profile: SensorProfile,
     /// Press all objects on the same sensor, which is drawn with this seed
     #[arg(long, hide_short_help = true, value_name = "SEED", value_parser = seed())]
