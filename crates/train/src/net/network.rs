@@ -423,10 +423,7 @@ pub(super) fn batch_norm(
 
 /// The linear layer after the trunk: features `[batch, features]` to `[batch, outputs]`.
 pub fn head(weights: &Weights, features: Tensor<2>) -> Tensor<2> {
-    let matrix = weights.tensor::<2>("head.matrix");
-    let bias = weights.tensor::<1>("head.bias");
-    let outputs = bias.dims()[0];
-    features.matmul(matrix).add(bias.reshape([1, outputs]))
+    dense(weights, "head", features)
 }
 
 /// Passes `x` `[rows, inputs]` through the layer `name`.
