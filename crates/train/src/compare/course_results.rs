@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::so_far::{self, SoFar};
 use super::table::Table;
 use super::tables;
-use crate::judge::metrics::{self, Bin, Evaluation, ObjectCount};
+use crate::judge::metrics::{Bin, Estimate, Evaluation, ObjectCount};
 
 /// A row of the tables: a control or model, and its results on each set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -36,18 +36,9 @@ pub struct OnSet {
     pub objects: Vec<ObjectCount>,
     /// Accuracy minus that of the first model on the same presses, with its 95 % interval of the same
     /// kind; null for the first model.
-    pub less_first: Option<Difference>,
+    pub less_first: Option<Estimate>,
     /// The evaluation of verdicts before the end of presses; null except for models of format 2.
     pub so_far: Option<SoFar>,
-}
-
-/// A difference of two accuracies.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Difference {
-    /// The difference, as a share of the presses.
-    pub mean: f64,
-    /// The 95 % interval.
-    pub interval: Option<[f64; 2]>,
 }
 
 /// What the intervals are drawn over.
@@ -93,12 +84,8 @@ pub(super) fn tables(rows: &[CourseRow]) -> Vec<Table> {
                  {CLUSTERS}."
             ),
             &|on| {
-                on.less_first.map_or("-".to_owned(), |difference| {
-                    tables::difference_text(metrics::Estimate {
-                        mean: difference.mean,
-                        interval: difference.interval,
-                    })
-                })
+                on.less_first
+                    .map_or("-".to_owned(), tables::difference_text)
             },
         ),
         of(

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
 
-use super::course_results::{self, CourseRow, Difference, OnSet};
+use super::course_results::{self, CourseRow, OnSet};
 use super::hertz;
 use super::report::{self, Curve};
 use super::table::Table;
@@ -293,11 +293,7 @@ fn compare_with_first(rows: &mut [CourseRow], first: &str, sets: &[TestSet]) {
     for row in rows.iter_mut().filter(|row| row.name != first) {
         for ((own, others), set) in row.sets.iter_mut().zip(&reference.sets).zip(sets) {
             let pair = (own.objects.as_slice(), others.objects.as_slice());
-            let difference = metrics::difference_by_object(&[pair], set.clusters);
-            own.less_first = difference.map(|estimate| Difference {
-                mean: estimate.mean,
-                interval: estimate.interval,
-            });
+            own.less_first = metrics::difference_by_object(&[pair], set.clusters);
         }
     }
 }

@@ -96,16 +96,8 @@ impl Courses {
     /// The columns of simulated presses.
     pub fn of(courses: &[LabelledCourse]) -> Self {
         let mut all = Self::default();
-        for (number, course) in (0_u32..).zip(courses) {
-            let first = all.press.len();
-            for moment in &course.moments {
-                all.frames.push(moment.millinewtons.iter().copied());
-                all.press.push(number);
-                all.time_s.push(moment.time_s);
-                all.approach_mm.push(moment.approach_mm);
-                all.known.push(moment.known.into());
-            }
-            all.presses.push(Press {
+        for course in courses {
+            let press = Press {
                 level: course.level,
                 object: course.object,
                 material: course.material,
@@ -115,8 +107,17 @@ impl Courses {
                 arm_n_per_mm: course.arm_n_per_mm,
                 sensor: course.sensor,
                 reference: course.reference,
-                best: (first + course.best) as u32,
+                best: course.best as u32,
+            };
+            let moments = course.moments.iter().map(|moment| {
+                let approach_mm = moment.known.then_some(moment.approach_mm);
+                (
+                    moment.time_s,
+                    approach_mm,
+                    moment.millinewtons.iter().copied(),
+                )
             });
+            all.add(press, moments);
         }
         all
     }
@@ -128,11 +129,22 @@ impl Courses {
         press: Press,
         moments: impl Iterator<Item = (f32, Option<f32>, &'a ModelFrame)>,
     ) {
+        // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
+        let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
+        let moments = moments.map(|(time_s, approach_mm, frame)| {
+            (time_s, approach_mm, frame.newtons.iter().map(millinewtons))
+        });
+        self.add(press, moments);
+    }
+
+    fn add<F: Iterator<Item = u16>>(
+        &mut self,
+        press: Press,
+        moments: impl Iterator<Item = (f32, Option<f32>, F)>,
+    ) {
         let (first, number) = (self.press.len() as u32, self.presses.len() as u32);
-        for (time_s, approach_mm, frame) in moments {
-            // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
-            let millinewtons = |newtons: &f32| (newtons / NEWTONS).round() as u16;
-            self.frames.push(frame.newtons.iter().map(millinewtons));
+        for (time_s, approach_mm, millinewtons) in moments {
+            self.frames.push(millinewtons);
             self.press.push(number);
             self.time_s.push(time_s);
             self.approach_mm.push(approach_mm.unwrap_or(0.0));

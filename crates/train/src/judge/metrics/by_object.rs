@@ -71,7 +71,7 @@ impl Clusters {
 /// With several seeds, the variance is that of the bootstrap plus that of the mean over the seeds.
 /// The interval is Student's, with the degrees of freedom of Welch and Satterthwaite. If the seeds
 /// vary most, this is nearly the t interval over the seeds.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// The value over all samples, and over the seeds if there are several.
     pub mean: f64,
