@@ -1,16 +1,10 @@
-//! Recorded bytes give exactly the expected events, at any pace and in any chunks.
+//! Recorded bytes give exactly the expected events, at any pace.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use hardnessd_core::event::Event;
-use hardnessd_core::frame::Stamp;
-use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::test_support::of_a_press;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use serde_json::Value;
 
 fn fixtures() -> PathBuf {
@@ -197,43 +191,6 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
         // The replay runs ten times as fast as 5 frames/s.
         let least = Duration::from_secs_f64((frames - 1.0) / 50.0);
         assert!(took >= least, "{preset}: {took:?} for {frames} frames");
-    }
-}
-
-fn pipeline() -> Pipeline {
-    let sensor = Sensor::new(Description::default()).unwrap();
-    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
-    Pipeline::new(sensor, hrn, Clock::FrameRate)
-}
-
-fn events<'a>(chunks: impl Iterator<Item = &'a [u8]>) -> Vec<Event> {
-    let at = Stamp {
-        mono: Duration::ZERO,
-        wall: jiff::Timestamp::UNIX_EPOCH,
-    };
-    let mut pipeline = pipeline();
-    let mut events = Vec::new();
-    for chunk in chunks {
-        events.extend(pipeline.push(chunk, at));
-    }
-    events.extend(pipeline.end_of_recording(None));
-    events
-}
-
-#[test]
-fn bytes_one_at_a_time_or_split_anywhere_give_the_same_events() {
-    let bytes = std::fs::read(fixtures().join("drop-bytes.5hz.bin")).unwrap();
-    let expected = events(std::iter::once(bytes.as_slice()));
-    assert!(
-        expected
-            .iter()
-            .any(|event| matches!(event, Event::Hardness(_)))
-    );
-    assert_eq!(events(bytes.chunks(1)), expected);
-    // Split at every byte of the damaged frame and a bit around it.
-    for at in 790 * 17..790 * 18 + 20 {
-        let (head, tail) = bytes.split_at(at);
-        assert_eq!(events([head, tail].into_iter()), expected, "split at {at}");
     }
 }
 

@@ -166,29 +166,6 @@ fn jx255n_is_790_bytes_and_its_bytes_are_frozen() {
 }
 
 #[test]
-fn bytes_split_at_every_position_or_one_by_one_give_the_same_frames() {
-    for (preset, layout) in layouts() {
-        let mut bytes = noise(3, 40);
-        bytes.extend(encode(&layout, &frames(&layout, 2, 3)));
-        bytes.remove(bytes.len() / 2);
-        let expected = decode(&layout, [bytes.as_slice()]);
-        assert_eq!(
-            decode(&layout, bytes.chunks(1)),
-            expected,
-            "{preset:?} one by one"
-        );
-        for at in 0..bytes.len() {
-            let (head, tail) = bytes.split_at(at);
-            assert_eq!(
-                decode(&layout, [head, tail]),
-                expected,
-                "{preset:?} split at {at}"
-            );
-        }
-    }
-}
-
-#[test]
 fn ten_megabytes_of_noise_around_100_frames_lose_none() {
     let layout = layout("preset = 'jx255n'");
     let sent = frames(&layout, 4, 100);
