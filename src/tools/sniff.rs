@@ -4,15 +4,17 @@
 //! sure the proposal is. With `--out`, it writes a whole configuration to a file instead. If two
 //! arrays are likely, it shows both as pictures on stderr, and the user chooses.
 //!
-//! The files below are in reading order: the length of a frame, what each byte is, which arrays
-//! there may be, and which of them makes the likeliest picture of a press.
+//! The files below are in reading order: the length of a frame, what each byte is, how good a picture
+//! of a press is, which checksums hold, where the cells may be, and how an array is written as
+//! settings. Each uses only those above it.
 
 mod period;
 mod columns;
-mod checks;
 mod picture;
-mod hypotheses;
+mod checks;
+mod places;
 mod proposal;
+mod found;
 mod text;
 mod find;
 #[cfg(test)]
@@ -28,9 +30,9 @@ use std::time::Duration;
 
 use clap::{ArgGroup, Args as ClapArgs};
 
-pub use self::find::Failure;
-use self::find::{Found, Shown, find};
-use self::hypotheses::Known;
+use self::find::find;
+pub use self::found::Failure;
+use self::found::{Found, Known, Shown};
 use self::picture::draw;
 use super::doctor;
 use super::simulate::positive;

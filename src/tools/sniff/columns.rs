@@ -1,15 +1,16 @@
 //! Says what each byte of a frame is, as far as its own values show it.
 //!
-//! In: frames of one length. Out: a [`Kind`] for each byte, the frames in which something presses,
-//! and the stretches that must hold the mark.
+//! In: frames of one length. Out: a [`Kind`] for each byte, and the numbers that grow.
 
 use super::period::Frames;
 
 /// What a byte of a frame does over the frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
-    /// It has one value, also while something presses.
-    Constant(u8),
+    /// It has one value, also while something presses. A taxel at rest may have this value.
+    Resting(u8),
+    /// It has one value, and no taxel at rest does: it must belong to a mark.
+    Marking(u8),
     /// It is a part of a number that grows steadily.
     Number,
     /// It changes as much in frames that hardly change as in others, as a checksum does.
@@ -22,6 +23,7 @@ pub(super) enum Kind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Number {
     pub(super) at: usize,
+    /// Without high bytes that never change.
     pub(super) bytes: usize,
     /// Whether the high byte is first. `None` for one byte.
     pub(super) is_big_endian: Option<bool>,
@@ -37,26 +39,26 @@ pub(super) struct Columns {
     pub(super) numbers: Vec<Number>,
 }
 
-/// A stretch of a frame, which may go on at its beginning.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Stretch {
-    pub(super) start: usize,
-    pub(super) length: usize,
-}
+/// Two frames that follow each other.
+type Pair<'a> = (&'a [u8], &'a [u8]);
 
 /// The share of frames in which damage may change a constant byte.
 const DAMAGED_SHARE: f64 = 0.05;
-/// Bytes that tell a mark from taxels at rest may have this many bytes between them.
-const WITHIN_MARK: usize = 16;
-/// Numbers beside the mark may have this many constant bytes before them: the field of a length, and
-/// their own high bytes.
-const BETWEEN_NUMBERS: usize = 8;
 /// The most bytes that count as restless. If there are more, they are noisy taxels.
 const MOST_RESTLESS: usize = 10;
 /// The mean difference of two random bytes is 64, counted the shorter way around.
 const RESTLESS_DIFFERENCE: f64 = 42.0;
-/// The number of pairs of frames that numbers are looked for in.
-const PAIRS: usize = 200;
+/// The longest number.
+const MOST_NUMBER_BYTES: usize = 8;
+
+impl Kind {
+    pub(super) fn constant(self) -> Option<u8> {
+        match self {
+            Kind::Resting(value) | Kind::Marking(value) => Some(value),
+            _ => None,
+        }
+    }
+}
 
 impl Columns {
     pub(super) fn new(frames: &Frames) -> Self {
@@ -69,7 +71,7 @@ impl Columns {
         }
         let most = |count: &[u32; 256]| (0..=u8::MAX).max_by_key(|&byte| count[usize::from(byte)]);
         let rest: Vec<u8> = counts.iter().filter_map(most).collect();
-        let pairs: Vec<(&[u8], &[u8])> = frames
+        let pairs: Vec<Pair> = frames
             .pairs()
             .map(|(a, b)| (frames.get(a), frames.get(b)))
             .collect();
@@ -82,7 +84,7 @@ impl Columns {
                 .filter(|(a, b)| a[at] != value && b[at] != value)
                 .count();
             if held < 2 && others <= (DAMAGED_SHARE * frames.len() as f64).max(1.0) {
-                Kind::Constant(value)
+                Kind::Resting(value)
             } else {
                 Kind::Active
             }
@@ -92,24 +94,21 @@ impl Columns {
             rest,
             numbers: Vec::new(),
         };
-        let step = pairs.len().div_ceil(PAIRS).max(1);
-        let some: Vec<_> = pairs.iter().copied().step_by(step).collect();
-        columns.find_numbers(&some, &pairs);
+        columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
+        columns.find_marking();
         columns
     }
 
-    fn find_numbers(&mut self, pairs: &[(&[u8], &[u8])], all: &[(&[u8], &[u8])]) {
+    fn find_numbers(&mut self, pairs: &[Pair]) {
         for bytes in [1, 2, 4] {
             for at in 0..self.kinds.len() {
                 for is_big_endian in [false, true] {
-                    let Some(number) = self.number(at, bytes, is_big_endian, pairs, all) else {
+                    let Some(number) = self.number(at, bytes, is_big_endian, pairs) else {
                         continue;
                     };
+                    self.kinds[number.at..number.at + number.bytes].fill(Kind::Number);
                     self.numbers.push(number);
-                    for own in number.at..number.at + number.bytes {
-                        self.kinds[own % self.rest.len()] = Kind::Number;
-                    }
                 }
             }
         }
@@ -121,70 +120,59 @@ impl Columns {
         at: usize,
         bytes: usize,
         is_big_endian: bool,
-        pairs: &[(&[u8], &[u8])],
-        all: &[(&[u8], &[u8])],
+        pairs: &[Pair],
     ) -> Option<Number> {
-        let period = self.rest.len();
-        if at + bytes > period || (at..at + bytes).any(|own| self.kinds[own] == Kind::Number) {
-            return None;
-        }
+        let kinds = self.kinds.get(at..at + bytes)?;
         // The lowest byte changes in any case.
-        let lowest = if is_big_endian { at + bytes - 1 } else { at };
-        if self.kinds[lowest] != Kind::Active {
+        let lowest = if is_big_endian { bytes - 1 } else { 0 };
+        if kinds.contains(&Kind::Number) || kinds[lowest] != Kind::Active {
             return None;
         }
-        let step = steady_step(pairs, at, bytes, is_big_endian)?;
-        let is_big_endian = (bytes > 1).then_some(is_big_endian);
+        let (step, mut steady) = steady_step(pairs, at, bytes, is_big_endian)?;
         let mut number = Number {
             at,
             bytes,
-            is_big_endian,
+            is_big_endian: (bytes > 1).then_some(is_big_endian),
             step,
         };
-        // Higher bytes count with it as long as they change.
-        while number.bytes < 8 {
-            let after = (
-                number.at + number.bytes < period,
-                number.at,
-                number.at + number.bytes,
-                false,
-            );
-            let before = (
-                number.at > 0,
-                number.at.wrapping_sub(1),
-                number.at.wrapping_sub(1),
-                true,
-            );
-            let longer = [after, before]
+        // A higher byte belongs to it if the longer number is as steady.
+        while number.bytes < MOST_NUMBER_BYTES {
+            let longer = [(false, number.at), (true, number.at.wrapping_sub(1))]
                 .into_iter()
-                .find(|&(exists, _, higher, is_big)| {
-                    exists
-                        && number.is_big_endian.is_none_or(|ours| ours == is_big)
-                        && self.kinds[higher] == Kind::Active
-                        && carries(all, &number, higher, is_big)
+                .find_map(|(is_big_endian, at)| {
+                    let higher = if is_big_endian { at } else { at + number.bytes };
+                    if number.is_big_endian == Some(!is_big_endian)
+                        || self.kinds.get(higher) != Some(&Kind::Active)
+                    {
+                        return None;
+                    }
+                    let bytes = number.bytes + 1;
+                    let (step, more) = steady_step(pairs, at, bytes, is_big_endian)?;
+                    let longer = Number {
+                        at,
+                        bytes,
+                        is_big_endian: Some(is_big_endian),
+                        step,
+                    };
+                    (more >= steady).then_some((longer, more))
                 });
-            let Some((_, from, _, is_big)) = longer else {
-                break;
-            };
-            number = Number {
-                at: from,
-                bytes: number.bytes + 1,
-                is_big_endian: Some(is_big),
-                ..number
-            };
+            match longer {
+                Some(longer) => (number, steady) = longer,
+                None => break,
+            }
         }
         Some(number)
     }
 
-    fn find_restless(&mut self, pairs: &[(&[u8], &[u8])]) {
-        let active: Vec<usize> = self.of_kind(|kind| kind == Kind::Active);
-        let change = |(a, b): &(&[u8], &[u8])| -> u32 {
-            active
-                .iter()
-                .map(|&at| u32::from(a[at].abs_diff(b[at]).min(32)))
-                .sum()
+    fn find_restless(&mut self, pairs: &[Pair]) {
+        let active: Vec<usize> = (0..self.kinds.len())
+            .filter(|&at| self.kinds[at] == Kind::Active)
+            .collect();
+        let change = |(a, b): &Pair| -> u32 {
+            let changes = active.iter().map(|&at| a[at].abs_diff(b[at]).min(32));
+            changes.map(u32::from).sum()
         };
-        let mut changed: Vec<_> = pairs
+        let mut changed: Vec<(u32, Pair)> = pairs
             .iter()
             .map(|pair| (change(pair), *pair))
             .filter(|(change, _)| *change > 0)
@@ -195,8 +183,13 @@ impl Columns {
         if little.len() < 6 {
             return;
         }
+        // The mean difference, counted the shorter way around.
         let is_restless = |&at: &usize| {
-            difference(little.iter().map(|(_, pair)| *pair), at) > RESTLESS_DIFFERENCE
+            let differences = little.iter().map(|(_, (a, b))| {
+                let difference = a[at].wrapping_sub(b[at]);
+                f64::from(difference.min(difference.wrapping_neg()))
+            });
+            differences.sum::<f64>() / little.len() as f64 > RESTLESS_DIFFERENCE
         };
         let restless: Vec<usize> = active.iter().copied().filter(is_restless).collect();
         if restless.len() <= MOST_RESTLESS.min(active.len() / 2) {
@@ -206,184 +199,67 @@ impl Columns {
         }
     }
 
-    pub(super) fn of_kind(&self, is_kind: impl Fn(Kind) -> bool) -> Vec<usize> {
-        (0..self.kinds.len())
-            .filter(|&at| is_kind(self.kinds[at]))
-            .collect()
-    }
-
-    /// How much the taxels of each frame differ from their rest.
-    pub(super) fn activity(&self, frames: &Frames) -> Vec<u32> {
-        let active = self.of_kind(|kind| kind == Kind::Active);
-        let of_frame = |frame: &[u8]| {
-            active
-                .iter()
-                .map(|&at| u32::from(frame[at].abs_diff(self.rest[at]).min(64)))
-                .sum()
-        };
-        frames.iter().map(of_frame).collect()
-    }
-
-    /// Stretches that have constant bytes unlike those of taxels at rest, most such bytes first. Each
-    /// reaches over the numbers and restless bytes beside it.
-    pub(super) fn marks(&self) -> Vec<Stretch> {
+    /// Tells the constant bytes that no taxel at rest has.
+    fn find_marking(&mut self) {
         let period = self.kinds.len();
-        let is_taxel_at_rest = self.at_rest();
-        let unlike: Vec<usize> =
-            self.of_kind(|kind| matches!(kind, Kind::Constant(value) if !is_taxel_at_rest(value)));
-        let Some(&first) = unlike.first() else {
-            return Vec::new();
-        };
-        // The stretches of such bytes, with their number of these bytes.
-        let mut groups: Vec<(usize, Stretch)> = Vec::new();
-        let is_joined = |from: usize, to: usize| {
-            to - from <= WITHIN_MARK && (from..to).all(|at| self.kinds[at % period] != Kind::Active)
-        };
-        for &at in &unlike {
-            match groups.last_mut() {
-                Some((count, group)) if is_joined(group.start + group.length, at) => {
-                    *count += 1;
-                    group.length = at + 1 - group.start;
-                }
-                _ => groups.push((
-                    1,
-                    Stretch {
-                        start: at,
-                        length: 1,
-                    },
-                )),
-            }
+        let mut constant = [0; 256];
+        for value in self.kinds.iter().filter_map(|kind| kind.constant()) {
+            constant[usize::from(value)] += 1;
         }
-        if let [(count, begins), .., (more, ends)] = &mut groups[..]
-            && is_joined(ends.start + ends.length, first + period)
-        {
-            ends.length = first + period + begins.length - ends.start;
-            *more += *count;
-            groups.remove(0);
-        }
-        groups.sort_by_key(|(count, _)| usize::MAX - count);
-        groups
-            .into_iter()
-            .map(|(_, group)| self.grown(group))
-            .collect()
-    }
-
-    /// The stretch with the numbers and restless bytes beside it.
-    pub(super) fn grown(&self, mut stretch: Stretch) -> Stretch {
-        let period = self.kinds.len();
-        let is_other = |at: usize| matches!(self.kinds[at % period], Kind::Number | Kind::Restless);
-        // The high bytes of a clock may be constant, and lie between.
-        let is_between = |at: usize| matches!(self.kinds[at % period], Kind::Constant(_));
-        let reach = |places: &mut dyn Iterator<Item = usize>| {
-            let mut reached = 0;
-            for (index, at) in places.take(WITHIN_MARK).enumerate() {
-                if is_other(at) {
-                    reached = index + 1;
-                } else if !is_between(at) || index - reached >= BETWEEN_NUMBERS {
-                    break;
-                }
-            }
-            reached
-        };
-        let end = stretch.start + stretch.length;
-        stretch.length += reach(&mut (end..));
-        let before = reach(&mut (1..).map(|back| stretch.start + 2 * period - back));
-        stretch.start = (stretch.start + period - before) % period;
-        stretch.length += before;
-        stretch
-    }
-
-    /// Whether a constant value may be that of a taxel at rest.
-    fn at_rest(&self) -> impl Fn(u8) -> bool {
-        let period = self.kinds.len();
-        let constants = self.of_kind(|kind| matches!(kind, Kind::Constant(_)));
-        let is_constant = |at: usize| matches!(self.kinds[at % period], Kind::Constant(_));
-        let is_alone = |&at: &usize| !is_constant(at + 1) && !is_constant(at + period - 1);
-        let alone: Vec<usize> = constants.iter().copied().filter(is_alone).collect();
-        let of: Vec<usize> = if 10 * constants.len() < period {
-            // Taxels at rest are noisy.
-            Vec::new()
-        } else if 5 * alone.len() > 4 * constants.len() {
-            // The high bytes of noisy taxels.
-            alone
-        } else {
-            self.of_kind(|kind| kind == Kind::Active)
-        };
-        let mut values: Vec<u8> = of.iter().map(|&at| self.rest[at]).collect();
+        // If nearly all bytes change, taxels at rest are noisy.
+        let is_noisy = 10 * constant.iter().sum::<usize>() < period;
+        let active = (0..period).filter(|&at| self.kinds[at] == Kind::Active);
+        let mut values: Vec<u8> = active.map(|at| self.rest[at]).collect();
         values.sort_unstable();
         // A few of these bytes may be a checksum.
         let few = (values.len() / 8 + 1).min(values.len().saturating_sub(1) / 2);
-        let range = values
-            .get(few)
-            .copied()
-            .zip(values.iter().rev().nth(few).copied());
-        // The high bytes of taxels at rest are often all 0, and never change.
-        let mut constant = [0; 256];
-        for &at in &constants {
-            constant[usize::from(self.rest[at])] += 1;
-        }
-        let many = (period / 10).max(6);
-        move |value| {
-            let Some((least, most)) = range else {
-                return false;
-            };
-            if constant[usize::from(value)] >= many {
-                return true;
-            }
+        let range = values.get(few).zip(values.iter().rev().nth(few));
+        let range = range.filter(|_| !is_noisy).map(|(&least, &most)| {
             let slack = if most > least {
                 (most - least) / 2 + 2
             } else {
                 0
             };
-            (least.saturating_sub(slack)..=most.saturating_add(slack)).contains(&value)
+            least.saturating_sub(slack)..=most.saturating_add(slack)
+        });
+        // The high bytes of taxels at rest are often all 0, and never change.
+        let many = (period / 10).max(6);
+        for kind in &mut self.kinds {
+            if let Kind::Resting(value) = *kind
+                && constant[usize::from(value)] < many
+                && !range.as_ref().is_some_and(|range| range.contains(&value))
+            {
+                *kind = Kind::Marking(value);
+            }
         }
     }
-}
 
-/// The mean difference of a byte in pairs of frames, counted the shorter way around.
-fn difference<'a>(pairs: impl ExactSizeIterator<Item = (&'a [u8], &'a [u8])>, at: usize) -> f64 {
-    let count = pairs.len().max(1) as f64;
-    let differences = pairs.map(|(a, b)| {
-        let difference = a[at].wrapping_sub(b[at]);
-        f64::from(difference.min(difference.wrapping_neg()))
-    });
-    differences.sum::<f64>() / count
-}
-
-/// The number in these bytes.
-fn value(bytes: &[u8], is_big_endian: bool) -> u64 {
-    let join = |value: u64, &byte: &u8| value << 8 | u64::from(byte);
-    if is_big_endian {
-        bytes.iter().fold(0, join)
-    } else {
-        bytes.iter().rev().fold(0, join)
+    /// How much the taxels of each frame differ from their rest.
+    pub(super) fn activity(&self, frames: &Frames) -> Vec<u32> {
+        let active: Vec<usize> = (0..self.kinds.len())
+            .filter(|&at| self.kinds[at] == Kind::Active)
+            .collect();
+        let of_frame = |frame: &[u8]| {
+            let changes = active
+                .iter()
+                .map(|&at| frame[at].abs_diff(self.rest[at]).min(64));
+            changes.map(u32::from).sum()
+        };
+        frames.iter().map(of_frame).collect()
     }
 }
 
-/// Whether the byte at `higher` grows by one where the number begins again, and nowhere else.
-fn carries(pairs: &[(&[u8], &[u8])], number: &Number, higher: usize, is_big_endian: bool) -> bool {
-    let own = number.at..number.at + number.bytes;
-    let (mut carried, mut wrong) = (0, 0);
-    for (a, b) in pairs {
-        let is_over = value(&b[own.clone()], is_big_endian) < value(&a[own.clone()], is_big_endian);
-        let grown = b[higher].wrapping_sub(a[higher]);
-        carried += usize::from(is_over && grown == 1);
-        wrong += usize::from(grown != u8::from(is_over));
-    }
-    carried > 0 && 40 * wrong <= pairs.len()
-}
-
-/// The step of the number at `at`, if it grows by about as much in nearly all pairs.
+/// The step of the number at `at`, and how many pairs have about this step, if nearly all have.
 fn steady_step(
-    pairs: &[(&[u8], &[u8])],
+    pairs: &[Pair],
     at: usize,
     bytes: usize,
     is_big_endian: bool,
-) -> Option<u64> {
+) -> Option<(u64, usize)> {
     if pairs.len() < 8 {
         return None;
     }
-    let value = |frame: &[u8]| value(&frame[at..at + bytes], is_big_endian);
+    let value = |frame: &[u8]| number(&frame[at..at + bytes], is_big_endian);
     let mask = u64::MAX >> (64 - 8 * bytes);
     let steps: Vec<u64> = pairs
         .iter()
@@ -398,5 +274,15 @@ fn steady_step(
         off.min((mask - off).wrapping_add(1)) <= slack
     };
     let steady = steps.iter().filter(is_steady).count();
-    (median > 0 && 10 * steady >= 9 * steps.len()).then_some(median)
+    (median > 0 && 10 * steady >= 9 * steps.len()).then_some((median, steady))
+}
+
+/// The number in these bytes.
+pub(super) fn number(bytes: &[u8], is_big_endian: bool) -> u64 {
+    let join = |value: u64, &byte: &u8| value << 8 | u64::from(byte);
+    if is_big_endian {
+        bytes.iter().fold(0, join)
+    } else {
+        bytes.iter().rev().fold(0, join)
+    }
 }

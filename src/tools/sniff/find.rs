@@ -1,92 +1,32 @@
-//! From bytes to layouts: the order of the search, and when its outcome is sure.
+//! From bytes to layouts: the order of the search.
 //!
 //! In: raw bytes, and what the user knows of the array. Out: the layout, two pictures to choose from,
 //! or the reason why there is neither.
 
-use hardnessd_core::frame::Array;
+use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::{Cell, Layout, Preset, Settings};
 
-use super::checks::{self, Holds};
-use super::columns::{Columns, Kind, Stretch};
-use super::hypotheses::{Framed, Hypothesis, Known};
+use super::checks;
+use super::columns::{Columns, Kind};
+use super::found::{Failure, Found, Known, LEAST_FRAMES, Shown, elongation, is_too_large};
 use super::period::{Frames, periods};
-use super::picture::Score;
-use super::proposal::{Proposal, keys, shortened};
+use super::picture::{Pictures, Presses, Score, cell_bytes, cells, some};
+use super::places::{Place, places};
+use super::proposal::{Parts, Proposal, keys};
 use super::text;
-
-/// A layout was found.
-#[derive(Debug, Clone)]
-pub(super) struct Found {
-    pub(super) best: Shown,
-    /// The next array, if there is one.
-    pub(super) next: Option<Shown>,
-    /// Whether the bytes or the user say the array.
-    pub(super) is_given: bool,
-}
-
-/// A layout with the picture that it makes.
-#[derive(Debug, Clone)]
-pub(super) struct Shown {
-    pub(super) array: Array,
-    /// `None` for frames whose cells are no bytes of a fixed number.
-    pub(super) cell: Option<Cell>,
-    pub(super) score: Score,
-    pub(super) picture: Vec<f32>,
-    pub(super) proposal: Proposal,
-}
-
-/// The reason why no layout was found.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Failure {
-    /// There are no bytes.
-    #[error(
-        "nothing arrives: check the wiring, or the sensor sends only on a request (`request` and `start` of [sensor.frame])"
-    )]
-    Nothing,
-    /// Lines of text, but not as many numbers on each.
-    #[error("text, but no array: {0}")]
-    Text(String),
-    /// Frames of one length without an array.
-    #[error(
-        "{0} bytes recur, but they hold no array with a mark: press the sensor at several places meanwhile"
-    )]
-    NoArray(usize),
-    /// Frames of one length, but nothing presses.
-    #[error(
-        "frames of {0} bytes, but nothing presses the sensor: sniff again, and press it at several places"
-    )]
-    NoPress(usize),
-    /// The array is larger than any that the daemon reads.
-    #[error("found an array of about {rows}x{cols} taxels, expected at most 64x64", rows = .0.rows, cols = .0.cols)]
-    TooLarge(Array),
-    /// Nothing recurs.
-    #[error("nothing recurs in {0} bytes: try another --baud, or listen for longer")]
-    NotPeriodic(usize),
-}
 
 /// The least score of an array. Cells in any other order have about 0.
 const LEAST_SCORE: f64 = 0.5;
 /// What it adds to the score of an array that it is the one of a preset.
 const PRESET: f64 = 1.0;
-/// The least score of an array that is sure.
-const SMOOTH_SCORE: f64 = 1.0;
-/// The number of frames that are needed.
-const LEAST_FRAMES: usize = 8;
-
-impl Found {
-    /// By what factor the best is likelier than the next.
-    pub(super) fn lead(&self) -> Option<f64> {
-        let next = self.next.as_ref()?;
-        Some((self.best.score.total() - next.score.total()).exp())
-    }
-
-    /// Whether pictures show that no other array is likely.
-    pub(super) fn is_sure(&self) -> bool {
-        let is_more = |next: &Shown| self.best.score.is_surely_more(&next.score);
-        let is_smooth = self.best.score.total() >= SMOOTH_SCORE;
-        self.is_given || is_smooth && self.next.as_ref().is_none_or(is_more)
-    }
-}
+/// The longest side that is tried, so that an array that is too large is found.
+const LONGEST_SIDE: usize = 128;
+/// The most arrays whose checksum is looked for.
+const MOST_ARRAYS: usize = 40;
+/// The number of frames that a checksum is tried on.
+const CHECKED: usize = 40;
+/// The logarithm of how much more the low byte of a cell changes from cell to cell than the high one.
+const UNLIKE: f64 = 1.4;
 
 /// The layout that explains `bytes`.
 pub(super) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
@@ -113,6 +53,17 @@ pub(super) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
     Err(failure)
 }
 
+/// The glove of Weihai JQ, whose packets have two lengths.
+fn glove(bytes: &[u8]) -> Option<Found> {
+    let settings = Settings {
+        preset: Preset::JqGlove,
+        ..Settings::default()
+    };
+    let array = Layout::new(&settings).ok()?.array();
+    let proposal = Proposal::decoded(settings, bytes)?;
+    Some(Found::said(array, Some(Cell::U8), proposal))
+}
+
 /// Of several failures, the one with the highest rank says most.
 fn rank(failure: &Failure) -> usize {
     match failure {
@@ -123,68 +74,75 @@ fn rank(failure: &Failure) -> usize {
     }
 }
 
-/// The most bytes that are skipped without a reason, if there is no array otherwise.
-const MOST_UNKNOWN: usize = 4;
-/// The most arrays of a mark that are examined further.
-const MOST_ARRAYS: usize = 40;
-/// The number of marks that are examined. Stuck taxels look like another one.
-const MARKS: usize = 2;
+/// An array at a place.
+#[derive(Debug, Clone)]
+struct Candidate {
+    array: Array,
+    cell: Cell,
+    place: Place,
+    score: Score,
+    picture: Vec<f32>,
+}
 
 fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failure> {
+    let period = frames.period();
     // At a wrong distance, hardly a frame begins where the one before it ended.
     if frames.len() < LEAST_FRAMES || 2 * frames.pairs().count() < frames.len() {
         return Err(Failure::NotPeriodic(bytes.len()));
     }
-    let period = frames.period();
-    let mut failure = Failure::NoArray(period);
-    let mut arrays: Vec<(Hypothesis, Framed)> = Vec::new();
-    let columns = Columns::new(frames);
+    let frames = &undamaged(frames);
+    if frames.len() < LEAST_FRAMES {
+        return Err(Failure::NotPeriodic(bytes.len()));
+    }
+    let columns = &Columns::new(frames);
     if !columns.kinds.contains(&Kind::Active) {
         return Err(Failure::NoPress(period));
     }
-    for mark in columns.marks().into_iter().take(MARKS) {
-        let Some(mut framed) = framed(frames, mark) else {
-            continue;
-        };
-        for most_unknown in [0, MOST_UNKNOWN] {
-            framed.most_unknown = most_unknown;
-            let Some(found) = framed.hypotheses(known) else {
-                failure = Failure::NoPress(period);
-                break;
-            };
-            let is_likely = found
-                .first()
-                .is_some_and(|best| best.score.total() >= LEAST_SCORE);
-            let found = found.into_iter().take(MOST_ARRAYS);
-            arrays.extend(found.map(|hypothesis| (hypothesis, framed.clone())));
-            if is_likely {
-                break;
-            }
-        }
+    let places = places(columns);
+    if places.is_empty() {
+        return Err(Failure::NoArray(period));
     }
-    arrays.sort_by(|(a, _), (b, _)| b.score.total().total_cmp(&a.score.total()));
+    let presses = Presses::of(&columns.activity(frames)).ok_or(Failure::NoPress(period))?;
+    let mut candidates = candidates(places, frames, columns, &presses, known);
+    candidates.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
+    candidates.truncate(MOST_ARRAYS);
+    check(&mut candidates, frames, columns);
+    candidates.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
     let mut shown: Vec<Shown> = Vec::new();
-    for (hypothesis, framed) in &arrays {
-        let Hypothesis { array, cell, .. } = *hypothesis;
-        if shown.is_empty() && hypothesis.score.total() < LEAST_SCORE && !known.is_complete() {
+    for candidate in &candidates {
+        let Candidate { array, cell, .. } = *candidate;
+        if shown.is_empty() && candidate.score.total() < LEAST_SCORE && !known.is_complete() {
             break;
         }
-        if Framed::is_too_large(array) {
+        if is_too_large(array) {
             if shown.is_empty() {
                 return Err(Failure::TooLarge(array));
             }
             continue;
         }
-        let is_other = shown
-            .iter()
-            .all(|other| other.array != array || other.cell != Some(cell));
-        if is_other && let Some(proposal) = Proposal::of(framed, hypothesis, bytes) {
-            let (score, picture) = (hypothesis.score.clone(), hypothesis.picture.clone());
+        let is_other =
+            |shown: &Shown| shown.array != array || shown.cell.is_some_and(|other| other != cell);
+        let parts = Parts {
+            frames,
+            columns,
+            place: &candidate.place,
+            array,
+            cell,
+        };
+        if shown.iter().all(is_other)
+            && let Some(mut proposal) = Proposal::of(&parts, bytes)
+        {
+            proposal.doubt = doubt(candidate, &candidates);
+            let mut score = candidate.score.clone();
+            // Boards with the layout of a preset have its array.
+            if keys(&proposal.settings) == 1 {
+                score.prior += PRESET;
+            }
             shown.push(Shown {
                 array,
                 cell: Some(cell),
                 score,
-                picture,
+                picture: candidate.picture.clone(),
                 proposal,
             });
         }
@@ -192,121 +150,152 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
             break;
         }
     }
-    // Boards with the layout of a preset have its array.
-    for one in &mut shown {
-        if keys(&one.proposal.settings) == 1 {
-            one.score.prior += PRESET;
+    Found::among(shown, known.is_complete()).ok_or(Failure::NoArray(period))
+}
+
+/// The frames that have at least half of the bytes that are constant and no cells.
+fn undamaged<'a>(frames: &Frames<'a>) -> Frames<'a> {
+    let kinds = Columns::new(frames).kinds;
+    let is_whole = |index: usize| {
+        let frame = frames.get(index);
+        let marks = || {
+            frame
+                .iter()
+                .zip(&kinds)
+                .filter(|(_, kind)| matches!(kind, Kind::Marking(_)))
+        };
+        let right = marks()
+            .filter(|(byte, kind)| kind.constant() == Some(**byte))
+            .count();
+        2 * right >= marks().count() && frames.from(index, 0, 2 * frames.period()).is_some()
+    };
+    frames.kept(is_whole)
+}
+
+/// The arrays at all places.
+fn candidates(
+    places: Vec<Place>,
+    frames: &Frames,
+    columns: &Columns,
+    presses: &Presses,
+    known: Known,
+) -> Vec<Candidate> {
+    let mut found = Vec::new();
+    for place in places {
+        let of_frame = |index: usize| {
+            let bytes = frames.from(index, place.start, place.bytes);
+            bytes.expect("damaged and cut frames are left out")
+        };
+        let cost = place.cost(columns).expect("a place has a cost");
+        for cell in [Cell::U8, Cell::U16le, Cell::U16be] {
+            let count = place.bytes / cell_bytes(cell);
+            if !place.bytes.is_multiple_of(cell_bytes(cell))
+                || known.cell.is_some_and(|known| known != cell)
+                || is_other_order(columns, &place, cell)
+            {
+                continue;
+            }
+            let pictures = Pictures::of(presses, |index| {
+                cells(of_frame(index), cell).map(f32::from).collect()
+            });
+            let cost = cost + unlikeness(presses.frames().map(of_frame), cell);
+            for array in known.arrays(count, LONGEST_SIDE) {
+                // Where a smaller array may be it, the larger ones are not.
+                if is_too_large(array) && count <= MOST_SIDE * MOST_SIDE {
+                    continue;
+                }
+                found.push(Candidate {
+                    array,
+                    cell,
+                    place: place.clone(),
+                    score: pictures.score(array.cols, -cost - elongation(array)),
+                    picture: pictures.strongest().to_vec(),
+                });
+            }
         }
     }
-    shown.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
-    let mut shown = shown.into_iter();
-    let mut best = shown.next().ok_or(failure)?;
-    let is_same = |(other, _): &&(Hypothesis, Framed)| {
-        other.array == best.array
-            && Some(other.cell) == best.cell
-            && !best.score.is_surely_more(&other.score)
-    };
-    let places: Vec<(usize, usize)> = arrays
-        .iter()
-        .filter(is_same)
-        .map(|(other, _)| other.skipped)
-        .collect();
-    if let Some((before, after)) = places.iter().find(|&&other| other != places[0]) {
-        best.proposal.doubt = Some(format!(
-            "not sure where the cells begin: {} bytes beside the mark are skipped before them and {} after \
-             them, but it may be {before} and {after}; press the first taxels and the last to see",
-            places[0].0, places[0].1
-        ));
-    }
-    Ok(Found {
-        best,
-        next: shown.next(),
-        is_given: known.is_complete(),
-    })
+    found
 }
 
-/// The frames from the first byte after `mark` on, with their checksum.
-fn framed<'a>(frames: &Frames<'a>, mark: Stretch) -> Option<Framed<'a>> {
-    let period = frames.period();
-    if mark.length >= period {
-        return None;
+/// Whether the high bytes change and the low ones never do: then the other order is right.
+fn is_other_order(columns: &Columns, place: &Place, cell: Cell) -> bool {
+    let period = columns.kinds.len();
+    let low = if cell == Cell::U16be { 1 } else { 0 };
+    let mut lows = (low..place.bytes)
+        .step_by(2)
+        .map(|at| (place.start + at) % period);
+    cell != Cell::U8 && lows.all(|at| columns.kinds[at].constant().is_some())
+}
+
+/// What it costs that the high bytes of cells of two bytes change as much from cell to cell as the
+/// low ones do, as if they were cells of one byte, or more, as if the order were the other one.
+fn unlikeness<'a>(frames: impl Iterator<Item = &'a [u8]>, cell: Cell) -> f64 {
+    if cell == Cell::U8 {
+        return 0.0;
     }
-    let turned = frames.turned((mark.start + mark.length) % period);
-    let columns = Columns::new(&turned);
-    // Frames without the mark are damaged.
-    let constants: Vec<(usize, u8)> = (period - mark.length..period)
-        .filter_map(|at| match columns.kinds[at] {
-            Kind::Constant(value) => Some((at, value)),
-            _ => None,
-        })
-        .collect();
-    let is_marked = |frame: &[u8]| {
-        let right = constants
+    let mut differences = [1.0_f64; 2];
+    for bytes in frames {
+        for (at, [a, _, b]) in bytes.array_windows().enumerate() {
+            differences[at % 2] += f64::from(a.abs_diff(*b)).powi(2);
+        }
+    }
+    let [first, second] = differences;
+    let ratio = if cell == Cell::U16le {
+        first / second
+    } else {
+        second / first
+    };
+    UNLIKE - ratio.ln().clamp(-UNLIKE, UNLIKE)
+}
+
+/// Finds what holds for the bytes beside the cells.
+fn check(candidates: &mut [Candidate], frames: &Frames, columns: &Columns) {
+    let indices: Vec<usize> = (0..frames.len()).collect();
+    let indices = some(&indices, CHECKED);
+    let mut found: Vec<(Place, Cell, Place)> = Vec::new();
+    for candidate in candidates {
+        let Candidate {
+            cell, ref place, ..
+        } = *candidate;
+        let known = found
             .iter()
-            .filter(|&&(at, value)| frame[at] == value)
-            .count();
-        2 * right >= constants.len()
-    };
-    let frames = turned.kept(|index| is_marked(turned.get(index)));
-    if frames.len() < LEAST_FRAMES {
-        return None;
+            .find(|(before, of, _)| before == place && *of == cell);
+        let checked = match known {
+            Some((.., checked)) => checked.clone(),
+            None => {
+                let length = place.beside.len();
+                let first = (place.start + frames.period() - length) % frames.period();
+                let spans: Vec<&[u8]> = indices
+                    .iter()
+                    .filter_map(|&index| frames.from(index, first, frames.period() + length))
+                    .collect();
+                let check = checks::holding(&spans, &place.beside, cell);
+                let checked = Place {
+                    check,
+                    ..place.clone()
+                };
+                found.push((place.clone(), cell, checked.clone()));
+                checked
+            }
+        };
+        let cost = |place: &Place| place.cost(columns).expect("a place has a cost");
+        candidate.score.prior += cost(&candidate.place) - cost(&checked);
+        candidate.place = checked;
     }
-    let mut columns = Columns::new(&frames);
-    let mut overhead = mark.length;
-    let holds = checks::holding(&frames, &columns, overhead);
-    let skipped = match &holds {
-        Some(Holds::Checksum(check)) => check.at..check.at + check.checksum.bytes(),
-        Some(Holds::Sum(sum)) => sum.clone(),
-        None => period - overhead..period - overhead,
-    };
-    overhead = overhead.max(period - skipped.start);
-    columns.kinds[skipped].fill(Kind::Restless);
-    // A number may stand before the checksum.
-    let mark = columns.grown(Stretch {
-        start: period - overhead,
-        length: overhead,
-    });
-    overhead = period - mark.start;
-    Some(Framed {
-        frames,
-        columns,
-        overhead,
-        holds,
-        most_unknown: 0,
-    })
 }
 
-/// The glove of Weihai JQ, whose packets have two lengths.
-fn glove(bytes: &[u8]) -> Option<Found> {
-    let settings = Settings {
-        preset: Preset::JqGlove,
-        ..Settings::default()
-    };
-    let proposal = Proposal::decoded(settings.clone(), bytes)?;
-    let array = Layout::new(&settings).ok()?.array();
-    let (score, picture) = (Score::default(), Vec::new());
-    let best = Shown {
-        array,
-        cell: Some(Cell::U8),
-        score,
-        picture,
-        proposal,
-    };
-    Some(Found {
-        best,
-        next: None,
-        is_given: true,
-    })
-}
-
-/// The layout of a preset that has only rows and columns.
-pub(super) fn sized(preset: Preset, array: Array, bytes: &[u8]) -> Option<Proposal> {
-    let settings = Settings {
-        preset,
-        rows: Some(array.rows),
-        cols: Some(array.cols),
-        ..Settings::default()
-    };
-    let layout = Layout::new(&settings).ok()?;
-    Proposal::decoded(shortened(settings, &layout), bytes)
+/// Says where else the cells may begin, if that is as likely.
+fn doubt(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
+    let other = candidates.iter().find(|other| {
+        other.array == best.array
+            && other.cell == best.cell
+            && other.place.start != best.place.start
+            && !best.score.is_surely_more(&other.score)
+    })?;
+    let skipped = |candidate: &Candidate| candidate.place.skipped();
+    let ((after, before), (other_after, other_before)) = (skipped(best), skipped(other));
+    Some(format!(
+        "not sure where the cells begin: {before} bytes beside the mark are skipped before them and {after} after \
+         them, but it may be {other_before} and {other_after}; press the first taxels and the last to see"
+    ))
 }

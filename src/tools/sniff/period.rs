@@ -145,17 +145,6 @@ impl<'a> Frames<'a> {
         }
     }
 
-    /// The same frames, each beginning `turn` bytes later. Fewer, if the last one is then cut.
-    pub(super) fn turned(&self, turn: usize) -> Self {
-        let starts = self.starts.iter().map(|start| start + turn);
-        Self {
-            starts: starts
-                .filter(|start| start + self.period <= self.bytes.len())
-                .collect(),
-            ..*self
-        }
-    }
-
     /// The frames that `keep` says to keep, by their number.
     pub(super) fn kept(&self, keep: impl Fn(usize) -> bool) -> Self {
         let starts = self.starts.iter().enumerate();
@@ -185,10 +174,10 @@ impl<'a> Frames<'a> {
         (0..self.len()).map(|index| self.get(index))
     }
 
-    /// The bytes before a frame, which may be fewer than a period.
-    pub(super) fn before(&self, index: usize, length: usize) -> Option<&'a [u8]> {
-        let start = self.starts[index];
-        Some(&self.bytes[start.checked_sub(length)?..start])
+    /// `length` bytes from `offset` on, counted from the beginning of a frame. They may reach into the
+    /// next one.
+    pub(super) fn from(&self, index: usize, offset: usize, length: usize) -> Option<&'a [u8]> {
+        self.bytes.get(self.starts[index] + offset..)?.get(..length)
     }
 
     /// The pairs of frames that follow each other without a gap.

@@ -4,10 +4,95 @@
 //! columns. A press is smooth from taxel to taxel, also from row to row. With a wrong number of
 //! columns it is striped, or it goes on from the end of a row at the beginning of the next.
 
+use hardnessd_core::wire::Cell;
+
 /// What some presses did to the cells: for each press and several of its frames, the change of each
 /// cell.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Pictures(pub(super) Vec<Vec<Vec<f32>>>);
+pub(super) struct Pictures(Vec<Vec<Vec<f32>>>);
+
+/// The numbers of some frames in which something presses, by press, and of some in which nothing does.
+#[derive(Debug, Clone)]
+pub(super) struct Presses {
+    presses: Vec<Vec<usize>>,
+    rest: Vec<usize>,
+}
+
+/// The share of the strongest press at which a frame makes a picture.
+const STRONG: f64 = 0.3;
+/// The most presses, the most frames of a press that make pictures, and the most that make the rest.
+const PRESSES: usize = 16;
+const PICTURES: usize = 4;
+const RESTS: usize = 15;
+
+impl Presses {
+    /// Finds the presses by how much each frame differs from rest. `None` if nothing presses in any.
+    pub(super) fn of(activity: &[u32]) -> Option<Self> {
+        let mut sorted = activity.to_vec();
+        sorted.sort_unstable();
+        let at = |share: usize| f64::from(sorted[(sorted.len() - 1) * share / 100]);
+        let (least, quarter, most) = (at(0), at(25), at(98));
+        let mean =
+            activity.iter().map(|&value| f64::from(value)).sum::<f64>() / activity.len() as f64;
+        let spread: f64 = activity
+            .iter()
+            .map(|&value| (f64::from(value) - mean).powi(2))
+            .sum();
+        let steps: f64 = activity
+            .array_windows()
+            .map(|&[a, b]| f64::from(a.abs_diff(b)).powi(2))
+            .sum();
+        // Noise differs from frame to frame as much as from its mean. A press lasts.
+        if most <= least || (steps > spread && most - quarter < 4.0 * (quarter - least).max(1.0)) {
+            return None;
+        }
+        let over = |share: f64| least + share * (most - least);
+        let is_strong = |frame: &usize| f64::from(activity[*frame]) > over(STRONG);
+        let strong: Vec<usize> = (0..activity.len()).filter(is_strong).collect();
+        let presses: Vec<Vec<usize>> = strong
+            .chunk_by(|a, b| a + 1 == *b)
+            .filter(|press| press.len() > 1)
+            .map(|press| some(press, PICTURES))
+            .collect();
+        let quiet = quarter.min(over(STRONG / 2.0));
+        let rest: Vec<usize> = (0..activity.len())
+            .filter(|&frame| f64::from(activity[frame]) <= quiet)
+            .collect();
+        Some(Self {
+            presses: some(&presses, PRESSES),
+            rest: some(&rest, RESTS),
+        })
+    }
+
+    /// The frames of all presses.
+    pub(super) fn frames(&self) -> impl Iterator<Item = usize> + '_ {
+        self.presses.iter().flatten().copied()
+    }
+}
+
+/// About `most` of `of`, from all over it.
+pub(super) fn some<T: Clone>(of: &[T], most: usize) -> Vec<T> {
+    of.iter()
+        .cloned()
+        .step_by(of.len().div_ceil(most).max(1))
+        .collect()
+}
+
+/// The cells in some bytes.
+pub(super) fn cells(bytes: &[u8], cell: Cell) -> impl Iterator<Item = u16> + '_ {
+    bytes.chunks_exact(cell_bytes(cell)).map(move |bytes| {
+        let number = |join: fn([u8; 2]) -> u16| join([bytes[0], bytes[1]]);
+        match cell {
+            Cell::U8 => bytes[0].into(),
+            Cell::U16le => number(u16::from_le_bytes),
+            Cell::U16be => number(u16::from_be_bytes),
+        }
+    })
+}
+
+pub(super) fn cell_bytes(cell: Cell) -> usize {
+    if cell == Cell::U8 { 1 } else { 2 }
+}
 
 /// How likely an array is, by each press. One more is about a factor of e.
 #[derive(Debug, Clone, Default)]
@@ -86,12 +171,33 @@ impl Roughness {
 }
 
 impl Pictures {
-    /// How likely `cells` cells from `first` on are rows of `cols` cells.
-    pub(super) fn score(&self, first: usize, cells: usize, cols: usize, prior: f64) -> Score {
-        let of_press = |pictures: &Vec<Vec<f32>>| {
-            let scores = pictures
+    /// The pictures of presses, if `frame` returns the cells of a frame.
+    pub(super) fn of(presses: &Presses, frame: impl Fn(usize) -> Vec<f32>) -> Self {
+        let rests: Vec<Vec<f32>> = presses.rest.iter().map(|&index| frame(index)).collect();
+        let cells = rests.first().map_or(0, Vec::len);
+        let rest: Vec<f32> = (0..cells)
+            .map(|at| {
+                let mut values: Vec<f32> = rests.iter().map(|frame| frame[at]).collect();
+                values.sort_by(f32::total_cmp);
+                values[values.len() / 2]
+            })
+            .collect();
+        let change = |&index: &usize| -> Vec<f32> {
+            let values = frame(index);
+            values
                 .iter()
-                .map(|picture| score(&picture[first..first + cells], cols));
+                .zip(&rest)
+                .map(|(value, rest)| value - rest)
+                .collect()
+        };
+        let of_press = |press: &Vec<usize>| press.iter().map(change).collect();
+        Self(presses.presses.iter().map(of_press).collect())
+    }
+
+    /// How likely the cells are rows of `cols` cells.
+    pub(super) fn score(&self, cols: usize, prior: f64) -> Score {
+        let of_press = |pictures: &Vec<Vec<f32>>| {
+            let scores = pictures.iter().map(|picture| score(picture, cols));
             scores.sum::<f64>() / pictures.len() as f64
         };
         Score {

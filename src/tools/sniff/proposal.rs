@@ -1,16 +1,20 @@
-//! Writes a hypothesis as settings, and decodes the bytes with them.
+//! Writes an array at its place as settings, and decodes the bytes with them.
 //!
-//! In: frames, a [`Hypothesis`] and all the bytes. Out: a [`Proposal`] that the daemon's own decoder
+//! In: the [`Parts`] of a frame, and all the bytes. Out: a [`Proposal`] that the daemon's own decoder
 //! has tried.
 
+use std::ops::Range;
+
+use hardnessd_core::frame::Array;
 use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, FooterBytes, HexBytes, Layout, LengthField, Preset,
     Settings,
 };
 
-use super::checks::{Check, Holds, Over};
-use super::columns::{Kind, Number};
-use super::hypotheses::{Framed, Hypothesis, cell_bytes};
+use super::checks::What;
+use super::columns::{Columns, Kind, Number};
+use super::period::Frames;
+use super::places::Place;
 
 /// A layout, and the outcome of decoding the bytes with it.
 #[derive(Debug, Clone)]
@@ -71,19 +75,11 @@ impl Proposal {
     }
 
     /// The proposal for an array in frames.
-    pub(super) fn of(framed: &Framed, hypothesis: &Hypothesis, bytes: &[u8]) -> Option<Self> {
-        let parts = Parts { framed, hypothesis };
-        let checked = match &framed.holds {
-            Some(Holds::Checksum(check)) => Some(parts.settings(Some(check))),
-            _ => None,
-        };
-        let plain = || parts.settings(None);
-        let tried = checked
-            .into_iter()
-            .flatten()
-            .chain(std::iter::once_with(plain).flatten());
+    pub(super) fn of(parts: &Parts, bytes: &[u8]) -> Option<Self> {
+        let tried = [parts.check(), None].map(|check| parts.settings(check));
         let mut proposal = tried
             .into_iter()
+            .flatten()
             .find_map(|settings| Self::decoded(settings, bytes))?;
         proposal.remarks = parts.remarks();
         Some(proposal)
@@ -91,58 +87,54 @@ impl Proposal {
 }
 
 /// The parts of a frame of an array.
-struct Parts<'a> {
-    framed: &'a Framed<'a>,
-    hypothesis: &'a Hypothesis,
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts<'a> {
+    pub(super) frames: &'a Frames<'a>,
+    pub(super) columns: &'a Columns,
+    pub(super) place: &'a Place,
+    pub(super) array: Array,
+    pub(super) cell: Cell,
 }
 
-/// A stretch of the bytes between the cells of two frames, counted from the first of them.
-type Between = std::ops::Range<usize>;
+/// A stretch of the bytes beside the cells, counted from the end of the cells.
+type Beside = Range<usize>;
+
+/// A checksum, the place of its first byte, and where what it covers begins if it is not the cells.
+type Checked = (Checksum, usize, Option<usize>);
 
 impl Parts<'_> {
-    /// The place in a frame of a byte between the cells.
-    fn column(&self, between: usize) -> usize {
-        let period = self.framed.columns.kinds.len();
-        (period - self.framed.overhead - self.hypothesis.skipped.1 + between) % period
-    }
-
-    /// The number of bytes between the cells of two frames.
-    fn between(&self) -> usize {
-        let (before, after) = self.hypothesis.skipped;
-        after + self.framed.overhead + before
-    }
-
-    /// The value of a byte between the cells, if it may belong to a mark. Skipped zeros do not,
-    /// unless they complete the field of the length or a mark of words.
-    fn constant(&self, between: usize) -> Option<u8> {
-        match self.framed.columns.kinds[self.column(between)] {
-            Kind::Constant(value) if self.may_be_mark(between) => Some(value),
-            _ => None,
+    fn check(&self) -> Option<Checked> {
+        let check = self.place.check.as_ref()?;
+        match check.what {
+            What::From(checksum, begin) => Some((checksum, check.at.start, Some(begin))),
+            What::Cells(checksum) => Some((checksum, check.at.start, None)),
+            What::Sum => None,
         }
     }
 
-    fn may_be_mark(&self, between: usize) -> bool {
-        let (before, after) = self.hypothesis.skipped;
-        let width = cell_bytes(self.hypothesis.cell);
-        let length = self.hypothesis.array.taxels() * width;
-        let is_skipped = between >= after + self.framed.overhead;
-        between >= after && (!is_skipped || self.framed.completes_mark(before, length, width))
+    /// The value of a byte beside the cells, if it may belong to a mark.
+    fn constant(&self, at: usize) -> Option<u8> {
+        let beside = &self.place.beside;
+        let (after, before) = self.place.skipped();
+        (after..beside.len() - before)
+            .contains(&at)
+            .then(|| beside[at].constant())?
     }
 
     /// The end of the constant bytes that begin at `from`.
     fn constant_end(&self, from: usize) -> usize {
-        (from..self.between())
+        (from..)
             .find(|&at| self.constant(at).is_none())
-            .unwrap_or(self.between())
+            .expect("there is an end of the bytes")
     }
 
     /// The likeliest mark: the constant bytes with the most that are not 0.
-    fn mark(&self) -> Option<Between> {
-        let begins = (0..self.between()).filter(|&at| {
+    fn mark(&self) -> Option<Beside> {
+        let begins = (0..self.place.beside.len()).filter(|&at| {
             self.constant(at).is_some() && (at == 0 || self.constant(at - 1).is_none())
         });
         let runs = begins.map(|start| self.without_numbers(start..self.constant_end(start)));
-        let weight = |run: &Between| {
+        let weight = |run: &Beside| {
             let values = run.clone().map(|at| self.constant(at));
             values.filter(|&value| value != Some(0)).count()
         };
@@ -150,137 +142,115 @@ impl Parts<'_> {
     }
 
     /// Constant bytes without the zeros at their ends that may be the high bytes of a number.
-    fn without_numbers(&self, mut run: Between) -> Between {
-        let is_number = |at: usize| self.framed.columns.kinds[self.column(at)] == Kind::Number;
-        if run.start > 0 && is_number(run.start - 1) {
-            run.start = run
-                .clone()
-                .find(|&at| self.constant(at) != Some(0))
-                .unwrap_or(run.end);
+    fn without_numbers(&self, run: Beside) -> Beside {
+        let beside = &self.place.beside;
+        let is_number = |at: usize| beside.get(at) == Some(&Kind::Number);
+        let is_other = |&at: &usize| self.constant(at) != Some(0);
+        let (mut start, mut end) = (run.start, run.end);
+        if is_number(run.start.wrapping_sub(1)) {
+            start = run.clone().find(is_other).unwrap_or(run.end);
         }
-        if run.end < self.between() && is_number(run.end) {
-            let last = run.clone().rfind(|&at| self.constant(at) != Some(0));
-            run.end = last.map_or(run.start, |at| at + 1);
+        if is_number(run.end) {
+            end = run.clone().rfind(is_other).map_or(run.start, |at| at + 1);
         }
-        run
+        start..end.max(start)
     }
 
-    /// Settings for this array, those with the fewest keys first. All of them find the same frames.
-    fn settings(&self, check: Option<&Check>) -> Vec<Settings> {
-        let end =
-            self.framed.columns.kinds.len() - self.framed.overhead - self.hypothesis.skipped.1;
-        let check_at = check.map(|check| check.at.wrapping_sub(end));
-        let check_end = check_at.map_or(0, |at| {
-            at.wrapping_add(check.map_or(0, |check| check.checksum.bytes()))
-        });
-        if check_end > self.between() {
-            return Vec::new();
-        }
-        let begins = match check.map(|check| &check.over) {
-            Some(Over::All(start)) => Some(start - end),
-            _ => self.beginning(),
+    /// The settings for this array with the fewest keys.
+    fn settings(&self, check: Option<Checked>) -> Option<Settings> {
+        let begin = check
+            .and_then(|(_, _, begin)| begin)
+            .or_else(|| self.beginning());
+        let mark = match check {
+            Some((checksum, at, _)) => {
+                let end = at + checksum.bytes();
+                end..self.constant_end(begin.unwrap_or(end).max(end))
+            }
+            None => self.mark()?,
         };
-        let mark = match (check_at, begins) {
-            (Some(_), Some(begins)) => check_end..self.constant_end(begins.max(check_end)),
-            (Some(_), None) => check_end..self.constant_end(check_end),
-            (None, _) => match self.mark() {
-                Some(mark) => mark,
-                None => return Vec::new(),
-            },
-        };
-        if mark.clone().any(|at| self.constant(at).is_none()) || mark.is_empty() {
-            return Vec::new();
+        if mark.is_empty() || mark.clone().any(|at| self.constant(at).is_none()) {
+            return None;
         }
-        let begins = begins.filter(|&at| (mark.start..=mark.end).contains(&at));
-        let splits = match begins {
+        let splits = match begin.filter(|at| (mark.start..=mark.end).contains(at)) {
             Some(at) => at..=at,
             None => mark.start..=mark.end,
         };
-        let mut found: Vec<Settings> = splits
-            .filter_map(|split| self.of_split(&mark, split, check, check_at.unwrap_or(mark.start)))
-            .collect();
-        found.sort_by_key(keys);
-        found
+        splits
+            .filter_map(|split| self.of_split(&mark, split, check))
+            .min_by_key(keys)
     }
 
-    /// The place between the cells at which the stream begins.
+    /// The place beside the cells at which the stream begins.
     fn beginning(&self) -> Option<usize> {
-        let turn = self.framed.frames.turn_of_beginning()?;
-        (0..=self.between()).find(|&between| self.column(between) == turn)
+        let period = self.columns.kinds.len();
+        let turn = self.frames.turn_of_beginning()?;
+        let end = self.place.start + self.place.bytes;
+        let at = (turn + 2 * period - end) % period;
+        (at <= self.place.beside.len()).then_some(at)
     }
 
     /// The settings for a frame that begins at `split` within the mark.
-    fn of_split(
-        &self,
-        mark: &Between,
-        split: usize,
-        check: Option<&Check>,
-        footer: usize,
-    ) -> Option<Settings> {
+    fn of_split(&self, mark: &Beside, split: usize, check: Option<Checked>) -> Option<Settings> {
         let values =
-            |range: Between| -> Vec<u8> { range.filter_map(|at| self.constant(at)).collect() };
+            |range: Beside| -> Vec<u8> { range.filter_map(|at| self.constant(at)).collect() };
         let (tail, mut sync) = (values(mark.start..split), values(split..mark.end));
-        let Hypothesis { array, cell, .. } = *self.hypothesis;
-        let length = (array.taxels() * cell_bytes(cell)) as u16;
+        let Self { array, cell, .. } = *self;
+        let bytes = self.place.bytes as u16;
         let fields = [
-            (LengthField::U16le, length.to_le_bytes().to_vec()),
-            (LengthField::U16be, length.to_be_bytes().to_vec()),
-            (LengthField::U8, vec![length as u8]),
+            (LengthField::U16le, bytes.to_le_bytes().to_vec()),
+            (LengthField::U16be, bytes.to_be_bytes().to_vec()),
+            (LengthField::U8, vec![bytes as u8]),
         ];
-        let field = fields.into_iter().find(|(field, bytes)| {
-            (*field != LengthField::U8 || length <= 0xFF)
-                && sync.len() > bytes.len()
-                && sync.ends_with(bytes)
+        let field = fields.into_iter().find(|(field, written)| {
+            (*field != LengthField::U8 || bytes <= 0xFF)
+                && sync.len() > written.len()
+                && sync.ends_with(written)
         });
-        let length = field.map_or(LengthField::None, |(field, bytes)| {
-            sync.truncate(sync.len() - bytes.len());
+        let length = field.map_or(LengthField::None, |(field, written)| {
+            sync.truncate(sync.len() - written.len());
             field
         });
+        let sides = Settings {
+            rows: Some(array.rows),
+            cols: Some(array.cols),
+            ..Settings::default()
+        };
+        let is_ff_tail = self.place.beside.len() == 1 && tail == [0xFF] && cell == Cell::U8;
+        let is_ff = |byte: &&u8| **byte == 0xFF;
+        if is_ff_tail
+            && self
+                .frames
+                .iter()
+                .all(|frame| frame.iter().filter(is_ff).count() <= 1)
+        {
+            return simplest(&[Preset::FfTail], &sides);
+        }
         let settings = Settings {
             sync: Some(HexBytes(sync)),
             tail: Some(HexBytes(tail)),
             length: Some(length),
-            header_bytes: Some(self.between() - mark.end),
+            header_bytes: Some(self.place.beside.len() - mark.end),
             cell: Some(cell),
-            footer_bytes: Some(FooterBytes::Each(footer)),
-            checksum: Some(check.map_or(Checksum::None, |check| check.checksum)),
-            checksum_over: Some(match check.map(|check| &check.over) {
-                Some(Over::Cells(_)) => ChecksumOver::Cells,
+            footer_bytes: Some(FooterBytes::Each(check.map_or(mark.start, |(_, at, _)| at))),
+            checksum: Some(check.map_or(Checksum::None, |(checksum, ..)| checksum)),
+            checksum_over: Some(match check {
+                Some((_, _, None)) => ChecksumOver::Cells,
                 _ => ChecksumOver::All,
             }),
-            rows: Some(array.rows),
-            cols: Some(array.cols),
-            ..Settings::default()
+            ..sides
         };
-        let layout = Layout::new(&settings).ok()?;
-        let marked = Settings {
-            preset: Preset::FfTail,
-            rows: Some(array.rows),
-            cols: Some(array.cols),
-            ..Settings::default()
-        };
-        let plain =
-            self.between() == 1 && settings.tail == Some(HexBytes(vec![0xFF])) && cell == Cell::U8;
-        if plain
-            && self
-                .framed
-                .frames
-                .iter()
-                .all(|frame| frame.iter().filter(|byte| **byte == 0xFF).count() <= 1)
-        {
-            let layout = Layout::new(&marked).ok()?;
-            return Some(shortened(marked, &layout));
-        }
-        Some(simplest(&settings, &layout))
+        simplest(&FREE, &settings)
     }
 
     fn remarks(&self) -> Vec<String> {
-        let (_, after) = self.hypothesis.skipped;
-        let end = self.framed.columns.kinds.len() - self.framed.overhead;
+        let period = self.columns.kinds.len();
         let number = |number: &Number| {
-            let place = match number.at.checked_sub(end) {
-                Some(offset) => format!("{} after the last cell", bytes(offset + after)),
-                None => "before the cells".to_owned(),
+            let at = (number.at + 2 * period - self.place.start - self.place.bytes) % period;
+            let is_after = at < self.mark().map_or(0, |mark| mark.start);
+            let place = if is_after {
+                format!("{} after the last cell", bytes(at))
+            } else {
+                "before the cells".to_owned()
             };
             let kind = if number.step == 1 {
                 "a counter"
@@ -293,22 +263,29 @@ impl Parts<'_> {
                 number.step
             )
         };
-        let mut remarks: Vec<String> = self.framed.columns.numbers.iter().map(number).collect();
-        let kinds = (0..self.between()).map(|at| self.framed.columns.kinds[self.column(at)]);
-        let unknown = kinds.filter(|&kind| kind == Kind::Active).count();
+        let mut remarks: Vec<String> = self.columns.numbers.iter().map(number).collect();
+        let checked = self
+            .place
+            .check
+            .as_ref()
+            .map_or(0..0, |check| check.at.clone());
+        let beside = self.place.beside.iter().enumerate();
+        let unknown = beside
+            .filter(|(at, kind)| **kind == Kind::Active && !checked.contains(at))
+            .count();
         if unknown > 0 {
             remarks.push(format!(
                 "the meaning of {} beside the cells is unknown: skipped",
                 bytes(unknown)
             ));
         }
-        let is_checked_from_mark = matches!(&self.framed.holds, Some(Holds::Checksum(check)) if matches!(check.over, Over::All(_)));
-        if let Some(Holds::Sum(sum)) = &self.framed.holds {
+        if matches!(&self.place.check, Some(check) if check.what == What::Sum) {
             remarks.push(format!(
                 "a sum of the cells takes {}: no key describes it, so it is skipped",
-                bytes(sum.len())
+                bytes(checked.len())
             ));
         }
+        let is_checked_from_mark = matches!(self.check(), Some((_, _, Some(_))));
         if !is_checked_from_mark && self.beginning().is_none() {
             remarks.push(
                 "whether the mark begins a frame or ends it does not show here: record from the moment the sensor is \
@@ -320,51 +297,48 @@ impl Parts<'_> {
     }
 }
 
-/// The same layout with the fewest keys.
-fn simplest(settings: &Settings, layout: &Layout) -> Settings {
-    let bases = [
-        Preset::Jx255n,
-        Preset::Jx255nU16,
-        Preset::Jq,
-        Preset::JqTail,
-        Preset::JqU16,
-        Preset::Flexitac,
-        Preset::M1616,
-    ];
-    bases
-        .into_iter()
-        .map(|preset| Settings {
-            preset,
-            ..settings.clone()
-        })
-        .filter(|other| Layout::new(other).as_ref() == Ok(layout))
-        .map(|other| shortened(other, layout))
-        .min_by_key(keys)
-        .unwrap_or_else(|| settings.clone())
+/// The layout of a preset that has only rows and columns.
+pub(super) fn sized(preset: Preset, array: Array, bytes: &[u8]) -> Option<Proposal> {
+    let settings = Settings {
+        rows: Some(array.rows),
+        cols: Some(array.cols),
+        ..Settings::default()
+    };
+    Proposal::decoded(simplest(&[preset], &settings)?, bytes)
 }
 
-/// The settings without the keys whose absence changes nothing.
-pub(super) fn shortened(mut settings: Settings, layout: &Layout) -> Settings {
-    let forget: [fn(&mut Settings); 10] = [
-        |settings| settings.sync = None,
-        |settings| settings.tail = None,
-        |settings| settings.length = None,
-        |settings| settings.header_bytes = None,
-        |settings| settings.cell = None,
-        |settings| settings.footer_bytes = None,
-        |settings| settings.checksum = None,
-        |settings| settings.checksum_over = None,
-        |settings| settings.rows = None,
-        |settings| settings.cols = None,
-    ];
-    for forget in forget {
-        let mut shorter = settings.clone();
-        forget(&mut shorter);
-        if Layout::new(&shorter).as_ref() == Ok(layout) {
-            settings = shorter;
+/// The presets of frames of one length whose keys are all free.
+const FREE: [Preset; 7] = [
+    Preset::Jx255n,
+    Preset::Jx255nU16,
+    Preset::Jq,
+    Preset::JqTail,
+    Preset::JqU16,
+    Preset::Flexitac,
+    Preset::M1616,
+];
+
+/// The same layout with the fewest keys, below one of these presets.
+fn simplest(presets: &[Preset], settings: &Settings) -> Option<Settings> {
+    let below = presets.iter().filter_map(|&preset| {
+        let settings = Settings {
+            preset,
+            ..settings.clone()
+        };
+        let layout = Layout::new(&settings).ok()?;
+        let mut table = toml::Table::try_from(&settings).expect("settings are a table");
+        let keys: Vec<String> = table.keys().cloned().collect();
+        for key in keys.iter().filter(|key| *key != "preset") {
+            let mut shorter = table.clone();
+            shorter.remove(key);
+            let settings = shorter.clone().try_into::<Settings>().ok()?;
+            if Layout::new(&settings).as_ref() == Ok(&layout) {
+                table = shorter;
+            }
         }
-    }
-    settings
+        table.try_into().ok()
+    });
+    below.min_by_key(keys)
 }
 
 /// The number of keys, the preset included.

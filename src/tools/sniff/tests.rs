@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use super::find::{Failure, Found, find};
+use super::find::find;
+use super::found::{Failure, Found, Known};
 use super::generator::{case, frames};
-use super::hypotheses::Known;
 use super::toml;
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{Cell, Decoder, HexBytes, Layout, Preset, Settings};

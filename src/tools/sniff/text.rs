@@ -4,17 +4,15 @@
 
 use std::collections::BTreeMap;
 
-use hardnessd_core::frame::Array;
+use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::Preset;
 
-use super::find::{Failure, Found, Shown, sized};
-use super::hypotheses::{ELONGATED, Known, pressed};
-use super::picture::{Pictures, Score};
+use super::found::{Failure, Found, Known, LEAST_FRAMES, Shown, elongation, is_too_large};
+use super::picture::{Pictures, Presses};
+use super::proposal::sized;
 
 /// The share of the lines, or packed frames, that must have the same number of cells.
 const SAME_SHARE: f64 = 0.6;
-/// The least number of frames.
-const LEAST_FRAMES: usize = 8;
 /// The most frames that are examined.
 const MOST_FRAMES: usize = 2000;
 /// The fewest cells of an array.
@@ -151,27 +149,17 @@ fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize
 
 /// The text says the array itself.
 fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
-    if array.rows.max(array.cols) > hardnessd_core::frame::MOST_SIDE {
+    if is_too_large(array) {
         return Err(Failure::TooLarge(array));
     }
+    let is_allowed = known
+        .arrays(array.taxels(), MOST_SIDE)
+        .any(|allowed| allowed == array);
+    let proposal = is_allowed
+        .then(|| sized(Preset::Ascii, array, bytes))
+        .flatten();
     let no_array = || Failure::Text("its blocks of lines are not frames of one array".to_owned());
-    let allowed = known
-        .allows(array, None)
-        .then_some(array)
-        .ok_or_else(no_array)?;
-    let proposal = sized(Preset::Ascii, allowed, bytes).ok_or_else(no_array)?;
-    let (score, picture) = (Score::default(), Vec::new());
-    Ok(Found {
-        best: Shown {
-            array,
-            cell: None,
-            score,
-            picture,
-            proposal,
-        },
-        next: None,
-        is_given: true,
-    })
+    Ok(Found::said(array, None, proposal.ok_or_else(no_array)?))
 }
 
 /// The number of lines after which a line is like this one, if that is more than one.
@@ -211,65 +199,34 @@ fn in_order(
 ) -> Result<Found, Failure> {
     let frames = &frames[..frames.len().min(MOST_FRAMES)];
     let cells = frames.first().map_or(0, Vec::len);
-    let mut rest = Vec::new();
-    for at in 0..cells {
-        let mut values: Vec<f32> = frames.iter().map(|frame| frame[at]).collect();
-        values.sort_by(f32::total_cmp);
-        rest.push(values[values.len() / 4]);
-    }
-    let change = |frame: &Vec<f32>| -> Vec<f32> {
-        frame
-            .iter()
-            .zip(&rest)
-            .map(|(value, rest)| value - rest)
-            .collect()
-    };
-    let changes: Vec<Vec<f32>> = frames.iter().map(change).collect();
-    let activity: Vec<u32> = changes
-        .iter()
-        .map(|frame| frame.iter().map(|value| value.abs() as u32).sum())
+    let rest: Vec<f32> = (0..cells)
+        .map(|at| {
+            let mut values: Vec<f32> = frames.iter().map(|frame| frame[at]).collect();
+            values.sort_by(f32::total_cmp);
+            values[values.len() / 4]
+        })
         .collect();
-    let (presses, _) = pressed(&activity).ok_or(Failure::NoPress(cells))?;
-    let of_press = |press: &Vec<usize>| press.iter().map(|&index| changes[index].clone()).collect();
-    let pictures = Pictures(presses.iter().map(of_press).collect());
-    let mut shown: Vec<Shown> = Vec::new();
-    let mut too_large = None;
-    for cols in (1..=cells).filter(|&cols| cells.is_multiple_of(cols)) {
-        let array = Array {
-            rows: cells / cols,
-            cols,
-        };
-        if (cols == 1 && cells > 1) || !known.allows(array, None) {
-            continue;
-        }
-        if array.rows.max(array.cols) > hardnessd_core::frame::MOST_SIDE {
-            too_large = Some(array);
-            continue;
-        }
-        let elongated = (array.rows as f64 / array.cols as f64).ln().abs();
-        let score = pictures.score(0, cells, cols, -ELONGATED * elongated);
-        let Some(proposal) = sized(preset, array, bytes) else {
-            continue;
-        };
-        shown.push(Shown {
+    let change = |frame: &Vec<f32>| {
+        let changes = frame.iter().zip(&rest).map(|(value, rest)| value - rest);
+        changes.map(|change| change.abs() as u32).sum()
+    };
+    let activity: Vec<u32> = frames.iter().map(change).collect();
+    let presses = Presses::of(&activity).ok_or(Failure::NoPress(cells))?;
+    let pictures = Pictures::of(&presses, |index| frames[index].clone());
+    let arrays: Vec<Array> = known.arrays(cells, cells).collect();
+    let shown = arrays.iter().filter_map(|&array| {
+        Some(Shown {
             array,
             cell: None,
-            score,
+            score: pictures.score(array.cols, -elongation(array)),
             picture: pictures.strongest().to_vec(),
-            proposal,
-        });
-    }
-    shown.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
-    let mut shown = shown.into_iter();
-    match (shown.next(), too_large) {
-        (Some(best), _) => Ok(Found {
-            best,
-            next: shown.next(),
-            is_given: known.rows.is_some() && known.cols.is_some(),
-        }),
-        (None, Some(array)) => Err(Failure::TooLarge(array)),
-        (None, None) => Err(Failure::Text(format!(
-            "{cells} numbers on each line make no array"
-        ))),
-    }
+            proposal: sized(preset, array, bytes)?,
+        })
+    });
+    let is_given = known.rows.is_some() && known.cols.is_some();
+    let too_large = arrays.iter().copied().filter(|&array| is_too_large(array));
+    Found::among(shown.collect(), is_given).ok_or_else(|| match too_large.last() {
+        Some(array) => Failure::TooLarge(array),
+        None => Failure::Text(format!("{cells} numbers on each line make no array")),
+    })
 }

@@ -1,0 +1,175 @@
+//! The places where the cells of a frame may be, the likeliest first.
+//!
+//! In: what each byte of a frame is. Out: [`Place`]s with what they cost. Cells are anywhere in the
+//! period, and what is beside them holds a mark. Each byte that is on the unlikely side of the border
+//! costs something.
+
+use super::checks::{Check, What};
+use super::columns::{Columns, Kind};
+
+/// A stretch of each frame that may be the cells.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Place {
+    /// The place of the first cell, counted from where the frames begin.
+    pub(super) start: usize,
+    /// The number of bytes of the cells.
+    pub(super) bytes: usize,
+    /// What the other bytes are, from the last cell to the first cell of the next frame.
+    pub(super) beside: Vec<Kind>,
+    /// What holds for the bytes beside the cells.
+    pub(super) check: Option<Check>,
+}
+
+/// The most bytes beside the cells.
+const MOST_BESIDE: usize = 40;
+/// The fewest bytes of the cells.
+const FEWEST_BYTES: usize = 4;
+/// Places that cost this much more than the best one are left out.
+const MOST_COST: f64 = 5.0;
+/// The most places that are examined further.
+const PLACES: usize = 40;
+/// What it costs, as a score, that a cell has a constant value that no taxel at rest has.
+const MARK_IN_CELLS: f64 = 2.0;
+/// What it costs that a cell changes as a checksum does.
+const RESTLESS_CELL: f64 = 0.3;
+/// What a byte beside the cells costs that changes in an unknown way.
+const UNKNOWN: f64 = 1.0;
+/// What it costs that bytes at the cells are left out though they look like cells at rest, and each
+/// of them.
+const SKIPPED: f64 = 1.5;
+const SKIPPED_BYTE: f64 = 0.5;
+/// What is gained by a field with the number of bytes of the cells.
+const LENGTH_FIELD: f64 = 2.0;
+/// What is gained by a checksum.
+const CHECKED: f64 = 1.0;
+
+/// The places, the likeliest first.
+pub(super) fn places(columns: &Columns) -> Vec<Place> {
+    let period = columns.kinds.len();
+    let mut found: Vec<(f64, Place)> = Vec::new();
+    for length in 1..=MOST_BESIDE.min(period.saturating_sub(FEWEST_BYTES)) {
+        for start in 0..period {
+            let place = Place {
+                start,
+                bytes: period - length,
+                beside: beside(columns, start, length),
+                check: None,
+            };
+            found.extend(place.cost(columns).map(|cost| (cost, place)));
+        }
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let most = found.first().map_or(0.0, |(cost, _)| cost + MOST_COST);
+    let places = found.into_iter().take_while(|(cost, _)| *cost <= most);
+    places.take(PLACES).map(|(_, place)| place).collect()
+}
+
+/// The `length` bytes that end where the cells start.
+fn beside(columns: &Columns, start: usize, length: usize) -> Vec<Kind> {
+    let period = columns.kinds.len();
+    (0..length)
+        .map(|at| columns.kinds[(start + period - length + at) % period])
+        .collect()
+}
+
+impl Place {
+    /// How unlikely the place is, as a score. `None` if no array can be there.
+    pub(super) fn cost(&self, columns: &Columns) -> Option<f64> {
+        let all = |is: fn(&Kind) -> bool| columns.kinds.iter().filter(|kind| is(kind)).count();
+        let here = |is: fn(&Kind) -> bool| self.beside.iter().filter(|kind| is(kind)).count();
+        let is_mark = |kind: &Kind| matches!(kind, Kind::Marking(_));
+        let is_number = |kind: &Kind| *kind == Kind::Number;
+        let is_restless = |kind: &Kind| *kind == Kind::Restless;
+        let marks = here(is_mark);
+        if marks == 0 || here(is_number) < all(is_number) {
+            return None;
+        }
+        let mut cost = MARK_IN_CELLS * (all(is_mark) - marks) as f64;
+        cost += RESTLESS_CELL * (all(is_restless) - here(is_restless)) as f64;
+        let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
+        let unknown = (0..self.beside.len())
+            .filter(|at| self.beside[*at] == Kind::Active && !checked.contains(at));
+        cost += UNKNOWN * unknown.count() as f64;
+        let (after, before) = self.skipped();
+        if after > 0 && !self.begins_with_number(columns, after) {
+            cost += SKIPPED + SKIPPED_BYTE * after as f64;
+        }
+        if before > 0 && !self.ends_with_number(columns, before) {
+            cost += SKIPPED + SKIPPED_BYTE * before as f64;
+        }
+        if self.length_field().is_some() {
+            cost -= LENGTH_FIELD;
+        }
+        if self.check.is_some() {
+            cost -= CHECKED;
+        }
+        Some(cost)
+    }
+
+    /// The numbers of bytes after the last cell and before the first one that are no part of a mark,
+    /// a check or a field: they look like cells at rest.
+    pub(super) fn skipped(&self) -> (usize, usize) {
+        let is_resting = |kind: &&Kind| matches!(kind, Kind::Resting(_));
+        let after = self.beside.iter().take_while(is_resting).count();
+        let before = self.beside.iter().rev().take_while(is_resting).count();
+        let length = self.beside.len();
+        let checked = self.check.as_ref().map_or(length, |check| check.at.start);
+        let field_end = self.length_field().unwrap_or(0);
+        let before = if self.is_mark_of_words() { 0 } else { before };
+        (after.min(checked), before.min(length - field_end))
+    }
+
+    /// The end of a field of two bytes with the number of bytes of the cells.
+    fn length_field(&self) -> Option<usize> {
+        let bytes = self.bytes as u16;
+        let fields = [bytes.to_le_bytes(), bytes.to_be_bytes()].map(|field| field.map(Some));
+        let is_field = |pair: &[Kind]| {
+            fields
+                .iter()
+                .any(|field| pair.iter().map(|kind| kind.constant()).eq(*field))
+        };
+        self.beside.windows(2).position(is_field).map(|at| at + 2)
+    }
+
+    /// Whether the mark is written in words of two bytes, each with a high byte of 0.
+    fn is_mark_of_words(&self) -> bool {
+        let mut words = self.beside.chunks(2);
+        let is_word = |word: &[Kind]| {
+            word.len() == 2 && word[0].constant().is_some() && word[1].constant() == Some(0)
+        };
+        self.beside.len() >= 4 && words.all(is_word)
+    }
+
+    /// Whether the first `skipped` bytes are the high ones of a number or a sum.
+    fn begins_with_number(&self, columns: &Columns, skipped: usize) -> bool {
+        if let Some(Check {
+            at,
+            what: What::Sum,
+        }) = &self.check
+            && at.start == skipped
+        {
+            return is_whole(at.len() + skipped);
+        }
+        let at = (self.start + self.bytes + skipped) % columns.kinds.len();
+        columns.numbers.iter().any(|number| {
+            number.at == at
+                && number.is_big_endian != Some(false)
+                && is_whole(number.bytes + skipped)
+        })
+    }
+
+    /// Whether the last `skipped` bytes are the high ones of a number.
+    fn ends_with_number(&self, columns: &Columns, skipped: usize) -> bool {
+        let period = columns.kinds.len();
+        columns.numbers.iter().any(|number| {
+            (number.at + number.bytes + skipped) % period == self.start
+                && number.is_big_endian != Some(true)
+                && is_whole(number.bytes + skipped)
+        })
+    }
+}
+
+/// Whether numbers have so many bytes.
+fn is_whole(bytes: usize) -> bool {
+    [2, 3, 4].contains(&bytes)
+}
