@@ -206,15 +206,13 @@ impl Columns {
         for value in self.kinds.iter().filter_map(|kind| kind.constant()) {
             constant[usize::from(value)] += 1;
         }
-        // If nearly all bytes change, taxels at rest are noisy.
-        let is_noisy = 10 * constant.iter().sum::<usize>() < period;
         let active = (0..period).filter(|&at| self.kinds[at] == Kind::Active);
         let mut values: Vec<u8> = active.map(|at| self.rest[at]).collect();
         values.sort_unstable();
         // A few of these bytes may be a checksum.
-        let few = (values.len() / 8 + 1).min(values.len().saturating_sub(1) / 2);
+        let few = (values.len() / 8).min(values.len().saturating_sub(1) / 2);
         let range = values.get(few).zip(values.iter().rev().nth(few));
-        let range = range.filter(|_| !is_noisy).map(|(&least, &most)| {
+        let range = range.map(|(&least, &most)| {
             let slack = if most > least {
                 (most - least) / 2 + 2
             } else {

@@ -90,10 +90,7 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
     if frames.len() < LEAST_FRAMES || 2 * frames.pairs().count() < frames.len() {
         return Err(Failure::NotPeriodic(bytes.len()));
     }
-    let frames = &undamaged(frames);
-    if frames.len() < LEAST_FRAMES {
-        return Err(Failure::NotPeriodic(bytes.len()));
-    }
+    let frames = &frames.followed();
     let columns = &Columns::new(frames);
     if !columns.kinds.contains(&Kind::Active) {
         return Err(Failure::NoPress(period));
@@ -153,25 +150,6 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
     Found::among(shown, known.is_complete()).ok_or(Failure::NoArray(period))
 }
 
-/// The frames that have at least half of the bytes that are constant and no cells.
-fn undamaged<'a>(frames: &Frames<'a>) -> Frames<'a> {
-    let kinds = Columns::new(frames).kinds;
-    let is_whole = |index: usize| {
-        let frame = frames.get(index);
-        let marks = || {
-            frame
-                .iter()
-                .zip(&kinds)
-                .filter(|(_, kind)| matches!(kind, Kind::Marking(_)))
-        };
-        let right = marks()
-            .filter(|(byte, kind)| kind.constant() == Some(**byte))
-            .count();
-        2 * right >= marks().count() && frames.from(index, 0, 2 * frames.period()).is_some()
-    };
-    frames.kept(is_whole)
-}
-
 /// The arrays at all places.
 fn candidates(
     places: Vec<Place>,
@@ -191,7 +169,6 @@ fn candidates(
             let count = place.bytes / cell_bytes(cell);
             if !place.bytes.is_multiple_of(cell_bytes(cell))
                 || known.cell.is_some_and(|known| known != cell)
-                || is_other_order(columns, &place, cell)
             {
                 continue;
             }
@@ -215,16 +192,6 @@ fn candidates(
         }
     }
     found
-}
-
-/// Whether the high bytes change and the low ones never do: then the other order is right.
-fn is_other_order(columns: &Columns, place: &Place, cell: Cell) -> bool {
-    let period = columns.kinds.len();
-    let low = if cell == Cell::U16be { 1 } else { 0 };
-    let mut lows = (low..place.bytes)
-        .step_by(2)
-        .map(|at| (place.start + at) % period);
-    cell != Cell::U8 && lows.all(|at| columns.kinds[at].constant().is_some())
 }
 
 /// What it costs that the high bytes of cells of two bytes change as much from cell to cell as the

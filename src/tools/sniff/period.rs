@@ -145,14 +145,11 @@ impl<'a> Frames<'a> {
         }
     }
 
-    /// The frames that `keep` says to keep, by their number.
-    pub(super) fn kept(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let starts = self.starts.iter().enumerate();
+    /// The frames whose cells may reach over their end, because enough bytes follow.
+    pub(super) fn followed(&self) -> Self {
+        let is_followed = |start: &usize| start + 2 * self.period <= self.bytes.len();
         Self {
-            starts: starts
-                .filter(|&(index, _)| keep(index))
-                .map(|(_, &start)| start)
-                .collect(),
+            starts: self.starts.iter().copied().filter(is_followed).collect(),
             ..*self
         }
     }

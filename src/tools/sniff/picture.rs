@@ -144,8 +144,6 @@ const BREAK: f64 = 0.6;
 const BREAK_SLOPE: f64 = 6.0;
 /// The most that such steps add to a score, and take from it.
 const MOST_BREAK: (f64, f64) = (1.0, 4.0);
-/// What an array of one row costs: most have several.
-const STRIP: f64 = 1.0;
 
 /// Differences of some pairs of cells, against their values.
 #[derive(Default)]
@@ -245,11 +243,7 @@ fn score(cells: &[f32], cols: usize) -> f64 {
         values: along.values + around.values,
     }
     .logarithm(UNKNOWN_ROUGHNESS);
-    let smooth_down = if cells.len() > cols {
-        down.logarithm(UNKNOWN_ROUGHNESS)
-    } else {
-        UNKNOWN_ROUGHNESS.ln() + STRIP
-    };
+    let smooth_down = down.logarithm(UNKNOWN_ROUGHNESS);
     // The share of the steps around the end of a row that a press reaches.
     let expected = along.values / (cols as f64 - 1.0).max(1.0);
     let reached = if expected > 0.0 {
