@@ -224,8 +224,12 @@ fn in_order(
         })
     });
     let is_given = known.rows.is_some() && known.cols.is_some();
-    let too_large = arrays.iter().copied().filter(|&array| is_too_large(array));
-    Found::among(shown.collect(), is_given).ok_or_else(|| match too_large.last() {
+    let mut too_large = arrays
+        .iter()
+        .rev()
+        .copied()
+        .filter(|&array| is_too_large(array));
+    Found::among(shown.collect(), is_given).ok_or_else(|| match too_large.next() {
         Some(array) => Failure::TooLarge(array),
         None => Failure::Text(format!("{cells} numbers on each line make no array")),
     })
