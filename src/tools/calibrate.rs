@@ -8,18 +8,16 @@
 mod arm;
 mod force;
 mod gather;
-mod out;
 mod taxels;
 
 use std::future::Future;
-use std::io;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::{Args as ClapArgs, ValueEnum};
 
 use self::gather::{Press, Unreadable};
-use self::out::Out;
 use super::configuration::Configuration;
 use super::live;
 use super::simulate::{OutOfRange, within};
@@ -27,6 +25,7 @@ use crate::daemon::config::Setup;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
+use hardnessd_core::part::Part;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::Hrn;
@@ -170,6 +169,9 @@ impl Coded for Error {
 /// Weights that disagree by more than this share get a warning.
 const DOUBTFUL_ERROR: f64 = 0.1;
 
+/// The name of the file for the gains, beside the configuration, if the command line names none.
+const GAINS: &str = "gains.npy";
+
 /// The number of presses if `--presses` does not give it.
 const ARM_PRESSES: u64 = 5;
 const TAXEL_PRESSES: u64 = 200;
@@ -207,7 +209,7 @@ pub async fn run(
     let sensor = chosen(&args, &setup)?;
     // Test the output file now, before anybody presses two hundred times.
     let out = match args.what {
-        What::Taxels => Some(Out::begin(args.out.clone(), config)?),
+        What::Taxels => Some(begin(args.out.clone(), config)?),
         What::Arm | What::Force => None,
     };
     let presses = if args.from.is_empty() {
@@ -257,16 +259,37 @@ pub async fn run(
             let array = sensor.layout().array();
             let fit = taxels::Fit::of(&plain, array, dead)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
-            let out = out.expect("the gains have a file");
-            let path = super::as_in(config, out.path());
-            out.finish(&bytes)?;
-            of_taxels(&fit, array, dead, &path)
+            let (path, part) = out.expect("the gains have a file");
+            let written = part.as_file().write_all(&bytes);
+            let written = written.and_then(|()| part.finish());
+            written.map_err(|source| Error::Out {
+                path: path.clone(),
+                source,
+            })?;
+            of_taxels(&fit, array, dead, &super::as_in(config, &path))
         }
     };
     super::print_apart(text.into_bytes())
         .await
         .map_err(Error::Print)?;
     Ok(())
+}
+
+/// Begins the file for the gains. A file that the command line names will be replaced. Without a name, the
+/// file lies beside `config`, and replaces nothing.
+fn begin(named: Option<PathBuf>, config: &Path) -> Result<(PathBuf, Part), Error> {
+    let (path, part) = match named {
+        Some(path) => (path.clone(), Part::over(&path)),
+        None => {
+            let path = config.with_file_name(GAINS);
+            (path.clone(), Part::new(&path))
+        }
+    };
+    match part {
+        Ok(part) => Ok((path, part)),
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Err(Error::Taken { path }),
+        Err(source) => Err(Error::Out { path, source }),
+    }
 }
 
 /// The presses that the sensor sends from now on; `None` if `shutdown` comes first.

@@ -3,7 +3,7 @@
 //! A daemon with sockets serves the sensor meanwhile, so the robot's controller runs as it always
 //! does. The recording has no name: it vanishes with the command.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::future::Future;
 use std::io::{self, Seek, SeekFrom};
 use std::path::PathBuf;
@@ -27,7 +27,7 @@ pub enum Error {
     /// The temporary file for the recording cannot be used.
     #[error("{path}: {source}")]
     Temporary {
-        /// The path of the recording.
+        /// The directory of temporary files.
         path: PathBuf,
         /// The system's error.
         source: io::Error,
@@ -59,19 +59,13 @@ pub(super) async fn record(
 ) -> Result<Option<File>, Error> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
-    let path = std::env::temp_dir().join(format!("hardnessd-presses-{}.mcap", std::process::id()));
+    let path = std::env::temp_dir();
     let temporary = |source| Error::Temporary {
         path: path.clone(),
         source,
     };
-    let open = File::options()
-        .read(true)
-        .write(true)
-        .create_new(true)
-        .open(&path);
-    let file = open.map_err(temporary)?;
-    // Nobody else needs the file. Without its name, it vanishes when this process ends.
-    fs::remove_file(&path).map_err(temporary)?;
+    // Nobody else needs the file. Without a name, it vanishes when this process ends.
+    let file = tempfile::tempfile().map_err(temporary)?;
     let mut recorded = file.try_clone().map_err(temporary)?;
 
     let (progress, mut counted) = watch::channel(Progress::default());

@@ -1,15 +1,14 @@
 //! `hardnessd recover`: saves the whole parts of a damaged recording in a new one.
 
-use std::fs::{File, Permissions};
+use std::fs::File;
 use std::io::{self, BufReader, BufWriter, ErrorKind};
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
-use tempfile::NamedTempFile;
 
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT};
+use hardnessd_core::part::Part;
 use hardnessd_core::recording::{self, RecoverError, Recovered};
 
 /// Arguments of `recover`.
@@ -102,7 +101,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         path: args.out.clone(),
         source,
     };
-    let part = part(&args.out).map_err(|error| unwritten(error.into()))?;
+    let part = Part::new(&args.out).map_err(|error| unwritten(error.into()))?;
     let recovered = save(broken, part.as_file()).map_err(|error| match error {
         RecoverError::Read(error) if error.kind() == ErrorKind::NotSeekable => unreadable(error),
         RecoverError::Read(source) => Error::Broken {
@@ -118,10 +117,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
             messages => Error::Foreign { path, messages },
         });
     }
-    let put = part.persist_noclobber(&args.out);
-    put.map_err(|error| taken(error.error))
-        .and_then(|_| sync_directory(&args.out))
-        .map_err(|error| unwritten(error.into()))?;
+    part.finish().map_err(|error| unwritten(error.into()))?;
     hardnessd_core::say!("{}", account(&recovered));
     match recovered.unread.len() {
         0 => Ok(()),
@@ -132,46 +128,11 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
 }
 
-/// Makes a file beside `out`, so that a file at `out` is always whole. Unless the process is killed,
-/// the file is removed when it is dropped. Fails if anything is at `out`, even a link to a file that
-/// does not exist.
-fn part(out: &Path) -> io::Result<NamedTempFile> {
-    if out.symlink_metadata().is_ok() {
-        return Err(taken(ErrorKind::AlreadyExists.into()));
-    }
-    tempfile::Builder::new()
-        .prefix(".recover-")
-        .permissions(Permissions::from_mode(0o666))
-        .tempfile_in(directory_of(out))
-}
-
-/// An error of the system, in words for a file that exists.
-fn taken(error: io::Error) -> io::Error {
-    match error.kind() {
-        ErrorKind::AlreadyExists => {
-            let exists = "a file or link is there already: name a new one";
-            io::Error::new(ErrorKind::AlreadyExists, exists)
-        }
-        _ => error,
-    }
-}
-
-fn directory_of(file: &Path) -> &Path {
-    let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
-    directory.unwrap_or(Path::new("."))
-}
-
 fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
     let (recovered, written) = recording::recover(BufReader::new(broken), BufWriter::new(part))?;
     let written = written.into_inner().map_err(io::IntoInnerError::into_error);
-    let synced = written.and_then(File::sync_all);
-    synced.map_err(recording::Error::from)?;
+    written.map_err(recording::Error::from)?;
     Ok(recovered)
-}
-
-/// Flushes the directory, because only then is the file's name on the disk.
-fn sync_directory(file: &Path) -> io::Result<()> {
-    File::open(directory_of(file))?.sync_all()
 }
 
 /// Whether any message of this program was saved.
@@ -222,19 +183,4 @@ fn account(recovered: &Recovered) -> String {
         text += "\nlost nothing";
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use std::os::unix::fs::symlink;
-
-    use super::*;
-
-    #[test]
-    fn a_link_counts_as_a_file_that_exists() {
-        let directory = tempfile::tempdir().unwrap();
-        let out = directory.path().join("good.mcap");
-        symlink(directory.path().join("theirs"), &out).unwrap();
-        assert_eq!(part(&out).unwrap_err().kind(), ErrorKind::AlreadyExists);
-    }
 }

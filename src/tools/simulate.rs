@@ -22,6 +22,7 @@ use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::socket;
 use crate::maybe;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
 use hardnessd_simulator::{
@@ -280,10 +281,10 @@ fn record(
         let device = File::options().write(true).open(path)?;
         return write(&device, layout, settings, faults, stopped);
     }
-    let written = write(&File::create_new(path)?, layout, settings, faults, stopped);
+    let file = File::create_new(path)?;
+    let written = write(&file, layout, settings, faults, stopped);
     if written.is_err() {
-        // The first error says more than a second one.
-        let _ = std::fs::remove_file(path);
+        part::remove(path, &file);
     }
     written
 }

@@ -23,7 +23,6 @@ mod generator;
 mod tests;
 
 use std::fmt::Write;
-use std::fs::File;
 use std::io::{self, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -40,6 +39,7 @@ use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
 use hardnessd_core::frame::MOST_SIDE;
+use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
@@ -218,8 +218,12 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
         args,
         listened_s.map(|s| found.best.proposal.frames as f64 / s),
     ) + &frame;
-    let written = File::create_new(out).and_then(|mut file| file.write_all(text.as_bytes()));
-    written.map_err(|source| Error::Write {
+    let write = || {
+        let part = Part::new(out)?;
+        part.as_file().write_all(text.as_bytes())?;
+        part.finish()
+    };
+    write().map_err(|source| Error::Write {
         path: out.clone(),
         source,
     })?;

@@ -3,7 +3,7 @@
 use std::fs;
 use std::process::{Command, Stdio};
 
-use crate::bench::{Bench, Process, by_terminal, hardnessd};
+use crate::bench::{BINARY, Bench, Process, by_terminal, hardnessd};
 use hardnessd_core::test_support::of_a_press;
 use rustix::process::Signal;
 
@@ -231,9 +231,20 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     );
     assert_eq!(why.lines().count(), 1, "{why}");
     assert_eq!(fs::read(&out).unwrap(), b"of somebody else");
-    // A file that --out names is replaced.
-    assert!(taxels(&from).status.success());
+    // A file that --out names is replaced, but nothing else, whatever its name.
+    let script = "echo theirs > \"$1.$$.part\"; echo \"$1.$$.part\"; shift; exec \"$@\"";
+    let taxels = ["calibrate", "taxels", "--config", config];
+    let output = Command::new("sh")
+        .args(["-c", script, "sh", &out, BINARY])
+        .args(taxels)
+        .args(["--from", &from, "--out", &out])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
     assert_eq!(fs::read(&out).unwrap(), gains);
+    let said = String::from_utf8(output.stdout).unwrap();
+    let theirs = fs::read_to_string(said.lines().next().unwrap());
+    assert_eq!(theirs.unwrap(), "theirs\n");
 }
 
 #[test]

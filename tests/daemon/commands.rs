@@ -147,6 +147,15 @@ fn sniff_writes_a_configuration_that_check_takes() {
         text(&stdout).contains("28x28 taxels in 790 bytes"),
         "{written}"
     );
+    // With this limit, the file fails as on a full disk, and the next try finds its path free.
+    fs::remove_file(&config).unwrap();
+    let mut full = Command::new("sh");
+    full.args(["-c", "ulimit -f 0; exec \"$@\"", "sh", BINARY]);
+    full.args(arguments).arg("--out").arg(&config);
+    let full = full.output().unwrap();
+    assert_eq!(full.status.code(), Some(74), "{}", text(&full.stderr));
+    assert!(!config.exists());
+    fs::write(&config, &written).unwrap();
     // The file now exists, and must not be overwritten.
     let Output { status, stderr, .. } = sniff();
     assert_eq!(status.code(), Some(74), "{}", text(&stderr));

@@ -2,12 +2,14 @@
 //!
 //! The modules are in reading order: each uses only the modules above it. They wait for nothing and ask
 //! no clock: callers pass in the bytes and the time at which they arrived. [`recording`] is given a
-//! reader or a writer. Only [`trial`] does I/O: it starts a child process that tries a model.
+//! reader or a writer. Only two do I/O: [`part`] writes files, and [`trial`] starts a child process that tries
+//! a model.
 
 pub mod frame;
 pub mod colour;
 pub mod wording;
 pub mod exit;
+pub mod part;
 pub mod npy;
 pub mod wire;
 pub mod tare;

@@ -2,11 +2,11 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, ErrorKind};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use hardnessd_core::part;
 use hardnessd_core::recording::{self, About, Writer};
 
 /// The bytes of a megabyte in the decimal sense, as in the sizes of disks.
@@ -34,12 +34,7 @@ impl Open {
 
     /// Whether the file is no longer at its path. Bytes that are then written to it are lost.
     pub(super) fn is_deleted(&self) -> bool {
-        let identity = |file: fs::Metadata| (file.dev(), file.ino());
-        match (self.file.metadata(), fs::symlink_metadata(&self.path)) {
-            (Ok(ours), Ok(there)) => identity(ours) != identity(there),
-            (_, Err(error)) => error.kind() == ErrorKind::NotFound,
-            (Err(_), _) => false,
-        }
+        part::is_at(&self.path, &self.file).is_ok_and(|is_there| !is_there)
     }
 
     pub(super) fn finish(self) -> Result<(), recording::Error> {

@@ -1,0 +1,255 @@
+//! Files that are whole or not there.
+//!
+//! In: a path, and bytes. The bytes go into a file with another name in the same directory, which gets its
+//! own name once it is whole and on the disk. Nothing is removed but what this process has made: what else
+//! is in the directory, whatever its name, stays as it is.
+
+use std::fs::{self, File, Permissions};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
+use std::path::{Path, PathBuf};
+
+use tempfile::NamedTempFile;
+
+/// A file that is being written. Unless the process is killed, it is removed if it is dropped before
+/// [`Part::finish`].
+#[derive(Debug)]
+pub struct Part {
+    file: NamedTempFile,
+    path: PathBuf,
+    to: To,
+}
+
+/// What may be at the path when the file is finished.
+#[derive(Debug)]
+enum To {
+    /// Nothing.
+    Free,
+    /// An earlier file, which is replaced.
+    Any,
+}
+
+impl Part {
+    /// Begins a new file.
+    ///
+    /// # Errors
+    ///
+    /// Fails if anything is at `path`, even a link to a file that does not exist, or if no file can be made
+    /// there.
+    pub fn new(path: &Path) -> io::Result<Self> {
+        if path.symlink_metadata().is_ok() {
+            return Err(taken());
+        }
+        Ok(Self {
+            file: beside(path)?,
+            path: path.to_owned(),
+            to: To::Free,
+        })
+    }
+
+    /// Begins a file that may replace an earlier one, whose mode it takes. A link stays, and its target is
+    /// written.
+    ///
+    /// # Errors
+    ///
+    /// Fails if something other than a file is at `path`, or if no file can be made there.
+    pub fn over(path: &Path) -> io::Result<Self> {
+        let before = match fs::metadata(path) {
+            Ok(found) if !found.is_file() => {
+                let found = "found no file, but perhaps a pipe or a device: name a file";
+                return Err(io::Error::other(found));
+            }
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            found => found.ok(),
+        };
+        // The links end somewhere, because the system has just followed them.
+        let mut target = path.to_owned();
+        while let Ok(next) = fs::read_link(&target) {
+            target = directory_of(&target).join(next);
+        }
+        let file = beside(&target)?;
+        if let Some(before) = before {
+            // Only root may give a file away.
+            let _ = fchown(file.as_file(), Some(before.uid()), Some(before.gid()));
+            file.as_file().set_permissions(before.permissions())?;
+        }
+        Ok(Self {
+            file,
+            path: target,
+            to: To::Any,
+        })
+    }
+
+    /// The file to write to.
+    pub fn as_file(&self) -> &File {
+        self.file.as_file()
+    }
+
+    /// Gives the file its name.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a new file's path has been taken meanwhile, or if the file cannot be written to the disk or
+    /// renamed.
+    pub fn finish(self) -> io::Result<()> {
+        self.as_file().sync_all()?;
+        let named = match self.to {
+            To::Free => self.file.persist_noclobber(&self.path),
+            To::Any => self.file.persist(&self.path),
+        };
+        named.map_err(|failed| match failed.error.kind() {
+            ErrorKind::AlreadyExists => taken(),
+            _ => failed.error,
+        })?;
+        // The name is on the disk only after the directory is flushed.
+        File::open(directory_of(&self.path))?.sync_all()
+    }
+}
+
+/// Whether `file` is still at `path`.
+///
+/// # Errors
+///
+/// Fails if the system does not say so.
+pub fn is_at(path: &Path, file: &File) -> io::Result<bool> {
+    let identity = |found: fs::Metadata| (found.dev(), found.ino());
+    match fs::symlink_metadata(path) {
+        Ok(there) => Ok(identity(there) == identity(file.metadata()?)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// Removes `file`, which this process has made at `path`. A file that took its place stays.
+pub fn remove(path: &Path, file: &File) {
+    if is_at(path, file).unwrap_or_default() {
+        // The caller reports a first error, which says more than a second one.
+        let _ = fs::remove_file(path);
+    }
+}
+
+/// The directory of a file.
+pub fn directory_of(file: &Path) -> &Path {
+    let directory = file.parent().filter(|path| !path.as_os_str().is_empty());
+    directory.unwrap_or(Path::new("."))
+}
+
+fn beside(path: &Path) -> io::Result<NamedTempFile> {
+    let directory = directory_of(path);
+    if !directory.exists() {
+        let text = format!("the directory {} does not exist", directory.display());
+        return Err(io::Error::new(ErrorKind::NotFound, text));
+    }
+    // What a killed process leaves shows what it was going to be.
+    let mut prefix = path.file_name().unwrap_or_default().to_owned();
+    prefix.push(".");
+    tempfile::Builder::new()
+        .prefix(&prefix)
+        .suffix(".part")
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(directory)
+}
+
+fn taken() -> io::Error {
+    let found = "a file or link is there already: name a new one";
+    io::Error::new(ErrorKind::AlreadyExists, found)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    fn write(part: io::Result<Part>, bytes: &[u8]) -> io::Result<()> {
+        let part = part?;
+        part.as_file().write_all(bytes)?;
+        part.finish()
+    }
+
+    fn names(directory: &Path) -> Vec<String> {
+        let names = fs::read_dir(directory).unwrap();
+        let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_new_file_replaces_nothing_not_even_what_came_meanwhile() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        write(Part::new(&path("new")), b"ours").unwrap();
+        assert_eq!(fs::read(path("new")).unwrap(), b"ours");
+        let is_taken = |result: io::Result<()>| {
+            assert_eq!(result.unwrap_err().kind(), ErrorKind::AlreadyExists);
+        };
+        is_taken(write(Part::new(&path("new")), b"again"));
+        symlink(path("nowhere"), path("link")).unwrap();
+        is_taken(write(Part::new(&path("link")), b"through"));
+        let part = Part::new(&path("late"));
+        fs::write(path("late"), "theirs").unwrap();
+        is_taken(write(part, b"ours"));
+        assert_eq!(fs::read(path("late")).unwrap(), b"theirs");
+        drop(Part::new(&path("given up")).unwrap());
+        assert_eq!(names(directory.path()), ["late", "link", "new"]);
+    }
+
+    #[test]
+    fn only_an_own_file_is_removed() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        let file = File::create_new(&path).unwrap();
+        fs::rename(&path, directory.path().join("moved")).unwrap();
+        remove(&path, &file);
+        fs::write(&path, "theirs").unwrap();
+        remove(&path, &file);
+        assert_eq!(names(directory.path()), ["file", "moved"]);
+        remove(&directory.path().join("moved"), &file);
+        assert_eq!(names(directory.path()), ["file"]);
+    }
+
+    #[test]
+    fn a_file_that_is_replaced_keeps_its_mode_and_its_links() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        fs::create_dir(path("elsewhere")).unwrap();
+        fs::write(path("elsewhere/file"), "before").unwrap();
+        let only_own = Permissions::from_mode(0o600);
+        fs::set_permissions(path("elsewhere/file"), only_own).unwrap();
+        symlink("elsewhere/file", path("link")).unwrap();
+        symlink("link", path("link of a link")).unwrap();
+        symlink("elsewhere/new", path("link to none")).unwrap();
+        for (link, target) in [
+            ("link", "elsewhere/file"),
+            ("link of a link", "elsewhere/file"),
+            ("link to none", "elsewhere/new"),
+        ] {
+            write(Part::over(&path(link)), link.as_bytes()).unwrap();
+            assert!(path(link).is_symlink(), "{link}");
+            assert_eq!(fs::read(path(target)).unwrap(), link.as_bytes());
+        }
+        let mode = fs::metadata(path("elsewhere/file")).unwrap().mode();
+        assert_eq!(mode & 0o777, 0o600);
+        assert_eq!(names(&path("elsewhere")), ["file", "new"]);
+    }
+
+    #[test]
+    fn what_is_no_file_is_not_replaced() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        symlink("loop", path("loop")).unwrap();
+        symlink("/dev/null", path("device")).unwrap();
+        for (name, part) in [
+            ("", "found no file"),
+            ("device", "found no file"),
+            ("loop", "symbolic links"),
+            ("none/file", "none does not exist"),
+        ] {
+            let error = write(Part::over(&path(name)), b"never").unwrap_err();
+            assert!(error.to_string().contains(part), "{name}: {error}");
+        }
+        assert_eq!(names(directory.path()), ["device", "loop"]);
+    }
+}
