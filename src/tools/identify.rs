@@ -6,7 +6,7 @@
 
 use std::fs::{self, File};
 use std::future::Future;
-use std::io::{self, BufReader, Read, Write};
+use std::io::{self, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -19,6 +19,7 @@ use super::{live, open, print_apart};
 use crate::daemon::config::{self, Config, Setup};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::motion::Point;
+use hardnessd_core::part::{Part, directory_of};
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{self, FileKind, Labels, Playback, PlaybackError, Reader};
 use hardnessd_core::references;
@@ -264,7 +265,8 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let sensor = chosen(&args, &setup)?;
-    let known = known(&args)?;
+    // A file that cannot be made or added to shows before anything is pressed.
+    begin(&args)?;
     let levels = setup.hrn.card().levels.clone();
     let file = if args.files.is_empty() {
         let Some(what) = args.what else {
@@ -291,11 +293,7 @@ pub async fn run(
             () = shutdown => return Ok(()),
         }
     };
-    let all: Vec<ReferencePress> = known.into_iter().chain(file).collect();
-    if all.len() > MOST_REFERENCES {
-        return Err(Error::Many { found: all.len() });
-    }
-    write(&args, &all)?;
+    let all = write(&args, file)?;
     let text = account(&super::as_in(config, &args.out), &all);
     print_apart(text.into_bytes()).await.map_err(Error::Print)?;
     Ok(())
@@ -313,16 +311,26 @@ fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
     })
 }
 
-/// The presses that the file has already. Fails if there is a file that nothing is to be added to.
-fn known(args: &Args) -> Result<Vec<ReferencePress>, Error> {
+/// Begins the file, and reads the presses that it has already. Fails if there is a file that nothing is to
+/// be added to.
+fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Error> {
     let path = || args.out.clone();
+    let failed = |source| Error::Out {
+        path: path(),
+        source,
+    };
     match fs::read(&args.out) {
         Ok(_) if !args.append => Err(Error::Taken { path: path() }),
-        Ok(bytes) => references::read(&bytes).map_err(|source| Error::References {
-            path: path(),
-            source,
-        }),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Vec::new()),
+        Ok(bytes) => {
+            let known = references::read(&bytes).map_err(|source| Error::References {
+                path: path(),
+                source,
+            })?;
+            Ok((known, Part::over(&args.out).map_err(failed)?))
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            Ok((Vec::new(), Part::new(&args.out).map_err(failed)?))
+        }
         Err(source) => Err(Error::Unreadable {
             path: path(),
             source,
@@ -479,30 +487,25 @@ fn of_bytes(
     }
 }
 
-/// Writes the file beside its place first, so that it is whole or not there.
-fn write(args: &Args, references: &[ReferencePress]) -> Result<(), Error> {
+/// Writes the file, and returns all its presses.
+fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, Error> {
     let failed = |source| Error::Out {
         path: args.out.clone(),
         source,
     };
-    let bytes = references::write(references).map_err(failed)?;
-    let directory = args
-        .out
-        .parent()
-        .filter(|parent| !parent.as_os_str().is_empty());
-    let part = tempfile::Builder::new()
-        .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))
-        .tempfile_in(directory.unwrap_or(Path::new(".")));
-    let mut part = part.map_err(failed)?;
-    part.write_all(&bytes).map_err(failed)?;
-    part.as_file().sync_all().map_err(failed)?;
-    let persisted = match args.append {
-        true => part.persist(&args.out),
-        false => part.persist_noclobber(&args.out),
-    };
-    persisted
-        .map(|_: File| ())
-        .map_err(|error| failed(error.error))
+    // Two calls may add to the file at once. The later one reads what the earlier one wrote.
+    let directory = File::open(directory_of(&args.out)).map_err(failed)?;
+    // Some file systems have no locks. There, one call at a time may add.
+    let _ = directory.lock();
+    let (mut all, part) = begin(args)?;
+    all.extend(made);
+    if all.len() > MOST_REFERENCES {
+        return Err(Error::Many { found: all.len() });
+    }
+    let bytes = references::write(&all).map_err(failed)?;
+    part.as_file().write_all(&bytes).map_err(failed)?;
+    part.finish().map_err(failed)?;
+    Ok(all)
 }
 
 /// What the file holds, what is missing, and the lines of the configuration. `out` is the file's path as

@@ -1,6 +1,8 @@
 //! References: made of recordings and of presses that are made now, judged with, and recorded.
 
-use std::fs;
+use std::fs::{self, Permissions};
+use std::io::Write;
+use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Output, Stdio};
 
 use crate::bench::{BINARY, Bench, Process, by_terminal, wait_for};
@@ -154,7 +156,13 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         ("--out n.npz", "--as: found nothing", 2),
         (
             "--out no/where.npz --as flat:20 wood.bin",
-            "no/where.npz: No such file",
+            "no/where.npz: the directory no does not exist",
+            74,
+        ),
+        // It says so before anything is pressed, and here before it finds that there is no sensor.
+        (
+            "--out no/where.npz --as flat:20",
+            "no/where.npz: the directory no does not exist",
             74,
         ),
     ] {
@@ -177,6 +185,45 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         "{said}"
     );
     assert_eq!(code, 78);
+}
+
+#[test]
+fn calls_that_add_at_once_take_nothing_from_each_other() {
+    let bench = bench();
+    let (link, file) = (bench.path("r.npz"), bench.path("own.npz"));
+    let pipe = bench.path("pipe");
+    let made = Command::new("mkfifo").arg(&pipe).status().unwrap();
+    assert!(made.success());
+    let append = "identify --config plain.toml --append --out r.npz";
+    for expected in [2, 4] {
+        let mut slow = Command::new(BINARY);
+        slow.args(append.split_whitespace())
+            .args(["--as", "flat:20", "pipe"])
+            .current_dir(bench.path("."))
+            .stdout(Stdio::piped());
+        let slow = slow.spawn().unwrap();
+        // This waits until the first call reads. By then it has looked at the file.
+        let mut bytes = fs::File::options().write(true).open(&pipe).unwrap();
+        succeed(&bench, &format!("{append} --as level:1 wood.bin"));
+        if !file.exists() {
+            // From now on the file lies elsewhere, and only its owner may read it.
+            fs::rename(&link, &file).unwrap();
+            symlink(&file, &link).unwrap();
+            let only_own = Permissions::from_mode(0o600);
+            fs::set_permissions(&file, only_own).unwrap();
+        }
+        bytes
+            .write_all(&fs::read(bench.path("wood.bin")).unwrap())
+            .unwrap();
+        drop(bytes);
+        let output = slow.wait_with_output().unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        let all = format!("rigid flat piece {expected}, rigid ball 0, known hardness {expected}");
+        assert!(output.status.success() && text.contains(&all), "{text}");
+        assert_eq!(fs::read_link(&link).unwrap(), file);
+        let mode = fs::metadata(&file).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+    }
 }
 
 #[test]
