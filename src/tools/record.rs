@@ -8,7 +8,7 @@ mod session;
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs::File;
 use std::future::Future;
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -29,6 +29,7 @@ use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
+use hardnessd_core::part;
 use hardnessd_core::recording::{LabelError, Labels, check_label};
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
@@ -174,7 +175,7 @@ pub async fn run(
     let path = args
         .out
         .expect("clap asks for it where there is no session");
-    let file = create(&path)?;
+    let (file, own) = create(&path)?;
     let (progress, counted) = watch::channel(Progress::default());
     // The time begins with the first wait.
     let over = async { maybe::until(maybe::after(args.seconds)).await };
@@ -195,14 +196,16 @@ pub async fn run(
     };
     // The recording may have ended by itself.
     clear();
-    if matches!(recorded, Err(Error::Unavailable { .. })) {
-        return recorded;
-    }
     let Progress {
         frames,
         tared,
         presses,
     } = *counted.borrow();
+    if holds_nothing(&recorded, frames) {
+        // The path must be free for the next try.
+        part::remove(&path, &own);
+        return recorded;
+    }
     let seen = said_frames(frames);
     if io::stderr().is_terminal() {
         hardnessd_core::say!(
@@ -228,16 +231,27 @@ pub async fn run(
     recorded
 }
 
-/// Makes the file of a recording. A file that exists is left alone.
-fn create(path: &Path) -> Result<File, Error> {
-    File::create_new(path).map_err(|source| Error::Create {
+/// Makes the file of a recording, twice open: to record into, and to know it again. A file that exists is
+/// left alone.
+fn create(path: &Path) -> Result<(File, File), Error> {
+    let created = File::create_new(path).and_then(|file| Ok((file.try_clone()?, file)));
+    created.map_err(|source| Error::Create {
         path: path.to_owned(),
         source,
     })
 }
 
-/// Records into `file`, which [`create`] made at `path`, until `end` comes or no sensor is left.
-/// Removes the file if recording cannot begin.
+/// Whether nothing of a recording that failed is worth keeping: it could not begin, or it has no frame.
+/// What lost sensors sent is kept, because its bytes may say why it has no frame.
+fn holds_nothing(recorded: &Result<(), Error>, frames: u64) -> bool {
+    match recorded {
+        Ok(()) | Err(Error::Daemon(daemon::Error::Record(RecordError::Lost { .. }))) => false,
+        Err(Error::Unavailable { .. }) => true,
+        Err(_) => frames == 0,
+    }
+}
+
+/// Records into `file`, which is at `path`, until `end` comes or no sensor is left.
 async fn record(
     setup: Setup,
     sockets: Sockets,
@@ -248,14 +262,9 @@ async fn record(
     end: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let ports: BTreeMap<String, Port> = setup.config.sensors.iter().map(port_of).collect();
-    let begun = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets);
-    let daemon = begun.inspect_err(|_| {
-        // The file holds nothing, and its path must be free for the next try.
-        let _ = fs::remove_file(path);
-    })?;
+    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
-            let _ = fs::remove_file(path);
             let port = ports[&sensor].clone();
             let obstacle = doctor::obstacle(&port).unwrap_or(reason);
             Err(Error::Unavailable {

@@ -167,8 +167,12 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.says("its level");
     fs::write(own.join("008-foam.mcap"), "theirs").unwrap();
     session.answer("2");
-    session.says("008-foam.mcap: File exists");
-    assert_eq!(session.process.exit_code(), Some(74));
+    session.says("it is object 9, because another session took a number");
+    session.says("presses: 0");
+    session.press("q");
+    session.says("recorded 0 objects");
+    assert_eq!(session.process.exit_code(), Some(0));
+    assert!(!own.join("009-foam.mcap").exists());
     for theirs in ["007-sponge.mcap", "008-foam.mcap"] {
         assert_eq!(fs::read(own.join(theirs)).unwrap(), b"theirs");
     }
@@ -224,6 +228,19 @@ fn a_recording_that_cannot_begin_leaves_no_file() {
     ];
     let output = hardnessd(&[&record[..], &[out.to_str().unwrap()]].concat());
     assert!(!output.status.success(), "{output:?}");
+    assert!(!out.exists());
+
+    // With this limit, the file fails as on a full disk.
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    let full = Command::new("sh")
+        .args(["-c", "ulimit -f 0; exec \"$@\"", "sh", BINARY])
+        .args(["record", "--seconds", "9", "--config"])
+        .arg(config)
+        .arg("--out")
+        .arg(&out)
+        .output()
+        .unwrap();
+    assert_eq!(full.status.code(), Some(74), "{full:?}");
     assert!(!out.exists());
 }
 

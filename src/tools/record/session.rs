@@ -5,7 +5,7 @@
 
 use std::fs::{self, File};
 use std::future::Future;
-use std::io::{self, ErrorKind, IsTerminal, Write};
+use std::io::{self, ErrorKind, IsTerminal, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::time::Duration;
@@ -13,11 +13,12 @@ use std::time::Duration;
 use rustix::termios::{LocalModes, OptionalActions, Termios};
 use tokio::sync::{mpsc, watch};
 
-use super::{Error, clear, create, levels, record, said};
+use super::{Error, clear, levels, record, said};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
+use hardnessd_core::part;
 use hardnessd_core::recording::{LabelError, Labels, check_label};
 use hardnessd_core::verdict::Level;
 
@@ -164,7 +165,6 @@ enum Unusable {
 
 /// An object to press.
 struct Object {
-    number: u32,
     name: String,
     shore: Option<String>,
     level: u8,
@@ -207,10 +207,18 @@ pub(super) async fn run(
         Some(false)
     };
     while let Some(has_durometer) = asked
-        && let Some(object) = ask_for_object(&mut user, list.next()?, has_durometer, &levels).await
+        && let expected = list.next()?
+        && let Some(object) = ask_for_object(&mut user, expected, has_durometer, &levels).await
     {
+        let place = list.take(&object.name)?;
+        if place.number != expected {
+            say(&format!(
+                "it is object {}, because another session took a number\n",
+                place.number
+            ));
+        }
         let is_next = record_object(
-            &mut user, &object, directory, labels, &setup, sockets, &mut list,
+            &mut user, &object, place, labels, &setup, sockets, &mut list,
         )
         .await?;
         // A late line would cut through the next question.
@@ -279,12 +287,7 @@ async fn ask_for_object(
             .await?;
         (None, level)
     };
-    Some(Object {
-        number,
-        name,
-        shore,
-        level,
-    })
+    Some(Object { name, shore, level })
 }
 
 /// A level by its number or its name; 0 means that it is unknown.
@@ -328,25 +331,23 @@ fn upper_limit(shore: &str) -> f64 {
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
-    directory: &Path,
+    place: Place,
     labels: &Labels,
     setup: &Setup,
     sockets: Sockets,
     list: &mut List,
 ) -> Result<bool, Error> {
-    let name = format!("{:03}-{}.mcap", object.number, slug(&object.name));
-    let path = directory.join(&name);
+    let Place { number, path, file } = place;
+    let failed = |source| listed(&path, source);
     let mut labels = labels.clone();
     labels.extend([
-        ("object".to_owned(), object.number.to_string()),
+        ("object".to_owned(), number.to_string()),
         ("name".to_owned(), object.name.clone()),
         ("level".to_owned(), object.level.to_string()),
     ]);
     let shore = object.shore.clone();
     labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
     loop {
-        // From here on the file is this session's own, so it may be removed.
-        let file = create(&path)?;
         say("do not touch the sensor until the zero is taken\n");
         let mut next = Next::KeepAndQuit;
         let (progress, mut counted) = watch::channel(Progress::default());
@@ -358,7 +359,7 @@ async fn record_object(
                 setup.clone(),
                 sockets,
                 &path,
-                file,
+                file.try_clone().map_err(failed)?,
                 labels.clone(),
                 progress,
                 end,
@@ -367,22 +368,23 @@ async fn record_object(
         };
         clear();
         let presses = counted.borrow().presses;
-        if presses == 0 || matches!(next, Next::Redo) {
+        let is_kept = presses > 0 && !matches!(next, Next::Redo);
+        if is_kept {
+            list.add(number, object, presses, &path)?;
+        } else if recorded.is_err() || matches!(next, Next::KeepAndQuit) {
             // A recording without a press would stop `hrn-train collect`.
-            let _ = fs::remove_file(&path);
-        } else if recorded.is_err() {
-            list.add(object, presses, &name)?;
+            part::remove(&path, &file);
         }
         recorded?;
         match next {
+            _ if is_kept => return Ok(matches!(next, Next::Keep)),
+            Next::KeepAndQuit => return Ok(false),
             Next::Redo => say(&format!("again: {}\n", said(Path::new(&object.name)))),
-            Next::Keep if presses == 0 => say("no press was recorded: again\n"),
-            Next::KeepAndQuit if presses == 0 => return Ok(false),
-            Next::Keep | Next::KeepAndQuit => {
-                list.add(object, presses, &name)?;
-                return Ok(matches!(next, Next::Keep));
-            }
+            Next::Keep => say("no press was recorded: again\n"),
         }
+        // The file stays, because it keeps the number from other sessions.
+        let emptied = file.set_len(0).and_then(|()| (&file).rewind());
+        emptied.map_err(failed)?;
     }
 }
 
@@ -437,6 +439,13 @@ fn slug(name: &str) -> String {
     slug.trim_matches('-').to_owned()
 }
 
+/// The place of an object's recording: an empty file, and the number in its name.
+struct Place {
+    number: u32,
+    path: PathBuf,
+    file: File,
+}
+
 /// `session.csv`: a line for each object.
 struct List {
     path: PathBuf,
@@ -446,18 +455,39 @@ struct List {
 impl List {
     fn open(directory: &Path) -> Result<Self, Error> {
         let path = directory.join(LIST);
-        let text = match fs::read_to_string(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => {
-                fs::write(&path, HEADING).map_err(|source| listed(&path, source))?;
-                HEADING.to_owned()
+        let begin = || {
+            File::options().append(true).create(true).open(&path)?;
+            let mut list = locked(&path)?;
+            let mut text = String::new();
+            list.read_to_string(&mut text)?;
+            if text.is_empty() {
+                list.write_all(HEADING.as_bytes())?;
+            } else if !text.starts_with(HEADING) {
+                let strange = "not the list of a session";
+                return Err(io::Error::new(ErrorKind::InvalidData, strange));
             }
-            read => read.map_err(|source| listed(&path, source))?,
+            Ok(())
         };
-        if !text.starts_with(HEADING) {
-            let strange = io::Error::new(ErrorKind::InvalidData, "not the list of a session");
-            return Err(listed(&path, strange));
-        }
+        begin().map_err(|source| listed(&path, source))?;
         Ok(Self { path, added: 0 })
+    }
+
+    /// Makes the file of the next object. Its number is decided now, because another session may have
+    /// taken the one that was next before the questions.
+    fn take(&self, name: &str) -> Result<Place, Error> {
+        let _locked = locked(&self.path).map_err(|source| listed(&self.path, source))?;
+        let mut number = self.next()?;
+        loop {
+            let file = format!("{number:03}-{}.mcap", slug(name));
+            let path = self.path.with_file_name(file);
+            match File::create_new(&path) {
+                Ok(file) => return Ok(Place { number, path, file }),
+                Err(error) if error.kind() == ErrorKind::AlreadyExists && number < u32::MAX => {
+                    number += 1;
+                }
+                Err(source) => return Err(listed(&path, source)),
+            }
+        }
     }
 
     /// The number of the next object: above those in the list and those of all recordings in the
@@ -482,24 +512,31 @@ impl List {
         Ok(last.saturating_add(1))
     }
 
-    fn add(&mut self, object: &Object, presses: u64, file: &str) -> Result<(), Error> {
-        let Object {
-            number,
-            name,
-            shore,
-            level,
-        } = object;
+    fn add(
+        &mut self,
+        number: u32,
+        object: &Object,
+        presses: u64,
+        recording: &Path,
+    ) -> Result<(), Error> {
+        let Object { name, shore, level } = object;
+        let file = recording.file_name().unwrap_or_default().display();
         let name = name.replace('"', "\"\"");
         let shore = shore.as_deref().unwrap_or_default();
         let line = format!("{number},\"{name}\",{shore},{level},{presses},{file}\n");
-        let written = File::options()
-            .append(true)
-            .open(&self.path)
-            .and_then(|mut list| list.write_all(line.as_bytes()));
+        let written = locked(&self.path).and_then(|mut list| list.write_all(line.as_bytes()));
         written.map_err(|source| listed(&self.path, source))?;
         self.added += 1;
         Ok(())
     }
+}
+
+/// Opens a list to read it and to add to it, while no other session does.
+fn locked(path: &Path) -> io::Result<File> {
+    let list = File::options().read(true).append(true).open(path)?;
+    // Some file systems have no locks. There, one session at a time may run.
+    let _ = list.lock();
+    Ok(list)
 }
 
 fn listed(path: &Path, source: io::Error) -> Error {
@@ -568,30 +605,43 @@ mod tests {
     #[test]
     fn a_session_goes_on_with_the_numbers_of_the_one_before() {
         let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
         let mut list = List::open(directory.path()).unwrap();
         assert_eq!(list.next().unwrap(), 1);
         let object = Object {
-            number: 1,
             name: "a \"b\", c".to_owned(),
             shore: Some("63.5".to_owned()),
             level: 2,
         };
-        list.add(&object, 20, "001-a.mcap").unwrap();
+        list.add(1, &object, 20, &path("001-a.mcap")).unwrap();
         assert_eq!(list.next().unwrap(), 2);
         // The list of a session that was killed lacks its last recording.
-        fs::write(directory.path().join("007-foam.mcap"), "").unwrap();
+        fs::write(path("007-foam.mcap"), "").unwrap();
         assert_eq!(list.next().unwrap(), 8);
-        fs::remove_file(directory.path().join(LIST)).unwrap();
-        let list = List::open(directory.path()).unwrap();
-        assert_eq!(list.next().unwrap(), 8);
+        fs::remove_file(path(LIST)).unwrap();
         let mut list = List::open(directory.path()).unwrap();
-        list.add(&object, 20, "001-a.mcap").unwrap();
-        let text = fs::read_to_string(directory.path().join(LIST)).unwrap();
+        assert_eq!(list.next().unwrap(), 8);
+        list.add(1, &object, 20, &path("001-a.mcap")).unwrap();
+        let text = fs::read_to_string(path(LIST)).unwrap();
         assert_eq!(
             text,
             format!("{HEADING}1,\"a \"\"b\"\", c\",63.5,2,20,001-a.mcap\n")
         );
-        fs::write(directory.path().join(LIST), "x,y\n").unwrap();
+        fs::write(path(LIST), "x,y\n").unwrap();
         assert!(List::open(directory.path()).is_err());
+    }
+
+    #[test]
+    fn each_object_of_many_sessions_has_a_number_of_its_own() {
+        let directory = tempfile::tempdir().unwrap();
+        let lists = ["foam", "rubber", "foam"].map(|name| {
+            let list = List::open(directory.path()).unwrap();
+            assert_eq!(list.next().unwrap(), 1);
+            (list, name)
+        });
+        let taken = lists.map(|(list, name)| list.take(name).unwrap());
+        assert_eq!(taken.each_ref().map(|place| place.number), [1, 2, 3]);
+        let names = taken.map(|place| place.path.file_name().unwrap().to_owned());
+        assert_eq!(names, ["001-foam.mcap", "002-rubber.mcap", "003-foam.mcap"]);
     }
 }
