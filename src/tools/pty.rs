@@ -9,6 +9,7 @@ pub(crate) mod pair;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::os::fd::OwnedFd;
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -44,7 +45,7 @@ impl Pty {
     ///
     /// # Errors
     ///
-    /// Fails if the system has no pair to give, or `link` is there and leads somewhere.
+    /// Fails if the system has no pair to give, or `link` is there and is not a killed simulation's.
     pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
         let Pair {
             master,
@@ -140,25 +141,24 @@ impl Drop for Pty {
     }
 }
 
-/// Makes `link` point to `device`, in one atomic step. It may replace only a link that leads nowhere,
-/// such as that of a killed process.
+/// Makes `link` point to `device`. It replaces only what a killed simulation left: a link to a
+/// pseudo-terminal that is gone.
 fn place(device: &Path, link: &Path) -> io::Result<()> {
-    match fs::symlink_metadata(link) {
-        Ok(file) if !file.file_type().is_symlink() => {
-            let found = "a file that is no link is there: remove it, or name another path";
-            return Err(io::Error::new(ErrorKind::AlreadyExists, found));
-        }
-        Ok(_) if link.exists() => {
-            let found = "a link to something else is there, perhaps that of another `hardnessd simulate`: \
-                         remove it, or name another path";
-            return Err(io::Error::new(ErrorKind::AlreadyExists, found));
-        }
-        Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
-        _ => {}
+    match symlink(device, link) {
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+        made => return made,
     }
-    let mut born = link.as_os_str().to_owned();
-    born.push(format!(".{}", std::process::id()));
-    let _ = fs::remove_file(&born);
-    std::os::unix::fs::symlink(device, &born)?;
-    fs::rename(&born, link)
+    let found = match fs::read_link(link) {
+        Err(_) => "a file that is no link is there: remove it, or name another path".to_owned(),
+        Ok(target) if link.exists() || !target.starts_with("/dev/pts") => format!(
+            "a link to {} is there, perhaps that of another `hardnessd simulate`: remove it, or name \
+             another path",
+            target.display()
+        ),
+        Ok(_) => {
+            fs::remove_file(link)?;
+            return symlink(device, link);
+        }
+    };
+    Err(io::Error::new(ErrorKind::AlreadyExists, found))
 }

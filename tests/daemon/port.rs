@@ -286,6 +286,29 @@ fn a_simulation_leaves_files_and_links_of_others_alone() {
     assert_eq!(code, 74, "{error}");
     assert!(error.contains("another `hardnessd simulate`"), "{error}");
     assert_eq!(fs::read_link(&link).unwrap(), first);
+
+    // Of the links that lead nowhere, only that of a killed simulation is replaced.
+    for (target, code) in [("/dev/ttyUSB99", 74), ("/dev/pts/99999", 0)] {
+        let link = bench.path(&format!("dead{code}"));
+        std::os::unix::fs::symlink(target, &link).unwrap();
+        let script =
+            "echo theirs > \"$1.$$\"; exec \"$2\" simulate --presses 1 --speed 100 --link \"$1\"";
+        let simulate = Command::new("sh")
+            .args(["-c", script, "sh"])
+            .args([&link, Path::new(BINARY)])
+            .output()
+            .unwrap();
+        assert_eq!(simulate.status.code(), Some(code), "{target}: {simulate:?}");
+        assert_eq!(link.is_symlink(), code == 74, "{target}");
+    }
+    // What has the name of a temporary file stays.
+    let files = fs::read_dir(bench.path(".")).unwrap();
+    let theirs = files.filter(|file| {
+        let name = file.as_ref().unwrap().file_name();
+        let name = name.to_string_lossy();
+        name.starts_with("dead") && name.contains('.')
+    });
+    assert_eq!(theirs.count(), 2);
 }
 
 #[test]
