@@ -214,8 +214,8 @@ fn recordings_can_be_added_to_simulated_samples() {
 
 #[test]
 fn shards_give_the_same_data_set_as_one_call() {
-    let desk = Desk::new();
     for sequences in [&[][..], &["--sequences"]] {
+        let desk = Desk::new();
         let captures = ["1", "2", "3"].map(|object| {
             let material = ["material=oak", "material=pine"][usize::from(object == "2")];
             let labels = ["level=2", &format!("object={object}"), material];
@@ -230,7 +230,7 @@ fn shards_give_the_same_data_set_as_one_call() {
             let output = collect(shard, &[sequences, &[text(capture)]].concat());
             assert!(output.status.success(), "{output:?}");
         }
-        let joined = desk.path(&format!("joined{}.npz", sequences.len()));
+        let joined = desk.path("joined.npz");
         let shards = shards.each_ref().map(|path| text(path));
         for shards in [&shards[..2], &shards[2..]] {
             let output = collect(&joined, &[&["--append"], sequences, shards].concat());
@@ -251,6 +251,7 @@ fn shards_give_the_same_data_set_as_one_call() {
     }
 
     // Objects without a number of their own stay apart.
+    let desk = Desk::new();
     let shards = ["x", "y"].map(|name| {
         let labels = ["level=2", &format!("note={name}")];
         let capture = desk.recording("nameless.mcap", &labels);
@@ -594,8 +595,42 @@ fn what_cannot_be_used_is_left_out_with_its_reason() {
 
     // A data set needs one recording at least.
     let nothing = ["--skip-unusable", text(&none), FIXTURE];
-    assert_refused(&out, &nothing, 1, "no recording can be used: ");
+    let unusable = desk.path("unusable.npz");
+    assert_refused(&unusable, &nothing, 1, "no recording can be used: ");
+    let list = desk.path("unusable.npz.left-out.tsv");
     assert_eq!(fs::read_to_string(&list).unwrap().lines().count(), 2);
+}
+
+#[test]
+fn a_data_set_and_its_list_are_added_to_and_never_replaced() {
+    let desk = Desk::new();
+    let capture = desk.recording("a.mcap", &["level=1", "object=7"]);
+    let other = desk.recording("b.mcap", &["level=2", "object=8"]);
+    let (out, list) = (desk.path("own.npz"), desk.path("own.npz.left-out.tsv"));
+    let (capture, other) = (text(&capture), text(&other));
+    let theirs = desk.write("own.npz.part", "theirs");
+    collected(&out, &[capture]);
+    assert_eq!(fs::read(theirs).unwrap(), b"theirs");
+    let expected = "own.npz: exists already: add to it with --append, or name another --out";
+    assert_refused(&out, &[other], 74, expected);
+    assert_eq!(collected(&out, &["--append", other]).len(), 2);
+
+    fs::remove_file(&out).unwrap();
+    fs::write(&list, "theirs\n").unwrap();
+    let skipping = ["--skip-unusable", capture, FIXTURE];
+    let expected = "own.npz.left-out.tsv: exists already: ";
+    assert_refused(&out, &skipping, 74, expected);
+    assert_eq!(fs::read_to_string(&list).unwrap(), "theirs\n");
+    collected(&out, &[&["--append"], &skipping[..]].concat());
+    let lines = fs::read_to_string(&list).unwrap();
+    assert!(
+        lines.starts_with(&format!("theirs\n{FIXTURE}\t")),
+        "{lines}"
+    );
+
+    // A pipe takes no data set.
+    let expected = "/dev/null: is no file";
+    assert_refused(Path::new("/dev/null"), &[other], 74, expected);
 }
 
 #[test]

@@ -236,7 +236,7 @@ pub(super) struct Courses {
 #[derive(Debug, clap::Args)]
 #[command(after_help = COLLECTED)]
 pub(super) struct Collect {
-    /// Data set to write; an existing file is replaced
+    /// Data set to write; a file that exists is left alone without --append
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
     /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]

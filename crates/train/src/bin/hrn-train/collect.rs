@@ -1,14 +1,17 @@
 //! `hrn-train collect`.
 
 use std::fmt::Write as _;
+use std::fs;
+use std::io::{self, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::bail;
+use anyhow::{Context as _, bail};
+use hardnessd_core::part;
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hrn_train::data::collect::{self, Collection, Labelling, Part, Settings};
-use hrn_train::run::disk::{lock, write_streamed, write_whole};
+use hrn_train::run::disk::lock;
 
 use super::arguments::Collect;
 use super::configuration::first_sensor;
@@ -43,10 +46,8 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         1 => anyhow::Error::new(error),
         _ => NotCollected(error).into(),
     })?;
-    if arguments.skip_unusable {
-        write_left_out(&collection, out)?;
-    }
     if collection.left_out.len() == captures.len() {
+        write_left_out(&collection, arguments)?;
         let list = left_out_of(out);
         bail!("no recording can be used: {} says why", list.display());
     }
@@ -55,13 +56,9 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
             "the recordings lack the begin of every press: start to record before you touch the sensor"
         );
     }
-    let is_replaced = !is_appended && out.is_file();
-    write_streamed(out, |file| {
-        collection.write(file)?;
-        Ok(())
-    })?;
-    if is_replaced {
-        hardnessd_core::say!("{}: replaced the earlier file", out.display());
+    write(out, is_appended, |file| collection.write(file).map(drop))?;
+    if arguments.skip_unusable {
+        write_left_out(&collection, arguments)?;
     }
     Ok(account(arguments, &collection))
 }
@@ -71,17 +68,36 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
 fn check_out(arguments: &Collect, captures: &[PathBuf]) -> anyhow::Result<()> {
     let out = &arguments.out;
     apart("--out", out, captures.iter().map(PathBuf::as_path))?;
-    if out.is_dir() {
-        bail!("{}: is a directory: name a file", out.display());
-    }
-    if arguments.skip_unusable && out.exists() && !out.is_file() {
-        bail!(
-            "{}: is no file, so no list of what is left out can be beside it: name a file, or leave \
-             --skip-unusable out",
-            out.display()
-        );
+    let list = arguments.skip_unusable.then(|| left_out_of(out));
+    for path in [Some(out.clone()), list].into_iter().flatten() {
+        let found = if path.exists() && !path.is_file() {
+            "is no file: name a file"
+        } else if path.symlink_metadata().is_ok() && !arguments.append {
+            "exists already: add to it with --append, or name another --out"
+        } else {
+            continue;
+        };
+        let error = io::Error::new(ErrorKind::AlreadyExists, found);
+        return Err(error).with_context(|| path.display().to_string());
     }
     Ok(())
+}
+
+/// Writes a file as a whole. It replaces only what it adds to.
+fn write(
+    path: &Path,
+    is_appended: bool,
+    write: impl FnOnce(&fs::File) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let written = || -> anyhow::Result<()> {
+        let part = match is_appended {
+            true => part::Part::over(path)?,
+            false => part::Part::new(path)?,
+        };
+        write(part.as_file())?;
+        Ok(part.finish()?)
+    };
+    written().with_context(|| path.display().to_string())
 }
 
 fn left_out_of(out: &Path) -> PathBuf {
@@ -90,14 +106,22 @@ fn left_out_of(out: &Path) -> PathBuf {
     out.with_file_name(name)
 }
 
-fn write_left_out(collection: &Collection, out: &Path) -> anyhow::Result<()> {
-    let mut list = String::new();
+/// Writes the list, or adds to that of the data set.
+fn write_left_out(collection: &Collection, arguments: &Collect) -> anyhow::Result<()> {
+    let path = left_out_of(&arguments.out);
+    let is_appended = arguments.append && path.exists();
+    let mut list = match is_appended {
+        true => fs::read_to_string(&path).with_context(|| path.display().to_string())?,
+        false => String::new(),
+    };
     for (path, reason) in &collection.left_out {
         let path = path.display().to_string();
         let one = |text: &str| text.replace(char::is_control, " ");
         let _ = writeln!(list, "{}\t{}", one(&path), one(reason));
     }
-    write_whole(&left_out_of(out), list.as_bytes())
+    write(&path, is_appended, |mut file| {
+        Ok(file.write_all(list.as_bytes())?)
+    })
 }
 
 /// A number with a noun, whose plural is `many`.
