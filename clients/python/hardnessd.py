@@ -113,6 +113,9 @@ take together. The daemon answers within 50 ms, but a service manager may have t
 MOST_EARLY_LINES = 4096
 """As many events as the daemon holds. It never sends more lines before it answers a request."""
 
+MOST_EARLY_BYTES = 16 << 20
+"""Nor does it send more bytes: the last verdicts of 1,000 sensors are 2 MB."""
+
 Address = Union[str, "os.PathLike[str]", Tuple[str, int]]
 """Path of a Unix socket, "HOST:PORT", or (host, port)."""
 
@@ -419,6 +422,9 @@ class Connection:
         return self._receive(self._until())
 
     def _receive(self, deadline: Optional[float]) -> Message:
+        return _parse(self._line(deadline))
+
+    def _line(self, deadline: Optional[float]) -> bytes:
         searched = 0
         while (end := self._bytes.find(b"\n", searched)) < 0:
             searched = len(self._bytes)
@@ -439,7 +445,7 @@ class Connection:
             self._bytes += received
         line = bytes(self._bytes[:end])
         del self._bytes[: end + 1]
-        return _parse(line)
+        return line
 
     def close(self) -> None:
         """Closes the connection. A thread that waits in `receive` wakes with ConnectionError."""
@@ -782,11 +788,14 @@ class Control:
         deadline = self.connection._until()
         self.connection.send({**request, "id": self._requests})
         lines: List[Message] = []
+        early_bytes = 0
         while True:
-            line = self.connection._receive(deadline)
+            text = self.connection._line(deadline)
+            line = _parse(text)
             if line["type"] not in ("ok", "error"):
                 lines.append(line)
-                if len(lines) > MOST_EARLY_LINES:
+                early_bytes += len(text)
+                if len(lines) > MOST_EARLY_LINES or early_bytes > MOST_EARLY_BYTES:
                     raise ProtocolError("too many lines before the answer to a request")
             elif "id" not in line:
                 # The daemon has no room for this connection.
@@ -794,6 +803,7 @@ class Control:
             elif line["id"] != self._requests:
                 # The late answer to a request that was given up.
                 lines.clear()
+                early_bytes = 0
             elif line["type"] == "error":
                 raise Refused(line.get("message", "no reason given"))
             else:

@@ -113,10 +113,10 @@ def check(sent, said, before=0, **more):
             assert server.most_bytes < 4 * hardnessd.LONGEST_LINE_BYTES, server.most_bytes
 
 
-def by_control(sent, raised, said, **more):
+def by_control(sent, raised, said, timeout_s=0.5, **more):
     with Server(sent, **more) as server:
         try:
-            hardnessd.Control(server.path, timeout_s=0.5)
+            hardnessd.Control(server.path, timeout_s)
         except raised as error:
             assert said in str(error), error
         else:
@@ -219,6 +219,9 @@ def main():
     by_control(hello, TimeoutError, "in time", endless=b"x", slowly=0.05)
     by_control(hello, TimeoutError, "in time", endless=line({"type": "hail"}), slowly=0.005)
     by_control(hello, hardnessd.ProtocolError, "too many lines", endless=line({"type": "hail"}))
+    # Fewer lines than the daemon may send, but more bytes.
+    long = line({"type": "hail", "of": "z" * 1_000_000})
+    by_control(hello, hardnessd.ProtocolError, "too many lines", timeout_s=30, endless=long)
     by_control(hello + b"5\n", hardnessd.ProtocolError, "not an object with a type")
     by_control(b"", ConnectionError, "the daemon closed the connection")
     by_control(hello, TimeoutError, "in time", stays=True)
