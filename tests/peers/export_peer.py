@@ -6,7 +6,7 @@
 
 Claims: the tables have every event that a subscriber read, every field of it, every frame and every position of the
 arm; a data set for LeRobot has the files and columns of v3.0, whose episodes are recordings or presses, with the
-verdicts that were known at each frame; memory does not grow with the number of recordings; a bad file is one line, and
+verdicts that were known at each frame; times go on after 2038; memory does not grow with the number of recordings; a bad file is one line, and
 nothing of the output stays. `lerobot_peer.py` reads the data sets with LeRobot itself.
 """
 
@@ -15,6 +15,7 @@ import json
 import os
 import pathlib
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -28,6 +29,8 @@ import pandas
 import pyarrow.parquet as pq
 from bench import Bench
 from hardnessd import export, observation, recording
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 UTC = datetime.timezone.utc
 
@@ -93,7 +96,7 @@ def tables(path, live, directory):
             same(key, touched[key], event[key])
     assert any(event["approach_mm"] is not None for event in frames.values())
     with recording.open(path) as opened:
-        points = [point for _, _, line in opened._messages(["motion"]) for point in zip(line.at_ns, line.approach_mm)]
+        points = [point for _, _, _, line in opened._messages(["motion"]) for point in zip(line.at_ns, line.approach_mm)]
         labels = opened.labels
     assert [(row["mono_ns"], row["approach_mm"]) for row in read["motion"]] == points and len(points) > 100
     (about,) = read["recording"]
@@ -106,6 +109,37 @@ def tables(path, live, directory):
     assert list(hardness["level"]) == [row["level"] for row in read["hardness"]]
     assert str(hardness["time"].dtype) == "datetime64[us, UTC]", hardness.dtypes
     return {name: len(rows) for name, rows in read.items()}
+
+
+def after_2038(path, directory):
+    """In a recording of 2046 everything has its time, though the headers of ROS have ended."""
+    later_us = 20 * 365 * 86_400 * 10**6
+    later, last = directory / "2046.mcap", struct.pack("<i", 2**31 - 1)
+    with open(path, "rb") as source, open(later, "wb") as target:
+        reader, writer, channels = make_reader(source), Writer(target), {}
+        writer.start("ros2")
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels:
+                of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
+            # The seconds of the header come first, after four bytes of CDR.
+            data = message.data[:4] + last + message.data[8:]
+            time_ns = message.log_time + later_us * 1000
+            writer.add_message(channels[channel.id], time_ns, data, time_ns)
+        writer.finish()
+    with recording.open(path) as now, recording.open(later) as then:
+        for kind in (recording.Recording.frames, recording.Recording.chunks):
+            assert [one.time_ns for one in kind(then)] == [one.time_ns + later_us * 1000 for one in kind(now)], kind
+    run(later, "--to", "parquet", "--out", directory / "2046")
+    for table in ("frames", "motion", "press", "hardness"):
+        now, then = (
+            pq.read_table(directory / name / f"{table}.parquet")["time"].cast("int64").to_pylist()
+            for name in ("tables", "2046")
+        )
+        assert then == [time_us + later_us for time_us in now], table
+    return len(now)
 
 
 def same(key, found, expected):
@@ -369,6 +403,7 @@ def main(binary):
         directory = pathlib.Path(name)
         path, live = take(binary, directory)
         print("tables:", tables(path, live, directory))
+        print("after 2038: %d verdicts" % after_2038(path, directory))
         for episodes in ("recordings", "presses"):
             print("a data set of %d episodes and %d frames" % data_set(path, live, directory, episodes))
         keys(path, directory)

@@ -23,6 +23,7 @@ import numpy as np
 import rerun
 from bench import Bench, wait_for
 from export_peer import moment, take
+from hostile import HELLO, Server, line
 from rerun.chunk import RrdReader
 
 VIEWER = [sys.executable, "-m", "hardnessd.rerun_viewer"]
@@ -107,7 +108,26 @@ def a_recording(path, live, directory):
         refused = subprocess.run([*VIEWER, source, "--save", directory / "no.rrd"], capture_output=True, text=True)
         assert refused.returncode == code and len(refused.stderr.splitlines()) == 1, refused
         assert not (directory / "no.rrd").exists()
+    # A link that leads nowhere is somebody's too.
+    link, nowhere = directory / "link.rrd", directory / "nowhere.rrd"
+    link.symlink_to(nowhere)
+    refused = subprocess.run([*VIEWER, broken, "--save", link], capture_output=True, text=True)
+    assert refused.returncode == 74 and "exists already" in refused.stderr, refused
+    assert link.is_symlink() and not nowhere.exists()
     return compare(entities, live)
+
+
+def a_live_run_that_fails(directory):
+    """What came before a frame that makes no sense is kept."""
+    sensors = [{"name": "forearm", "rows": 1, "cols": 2, "pitch_mm": 3.5}]
+    hello = line({**HELLO, "sensors": sensors, "model": {"levels": []}})
+    frame = {"type": "frame", "sensor": "forearm", "time": "2026-11-21T10:00:00Z", "rows": 1, "cols": 2}
+    frame.update(newtons=[0.0, 1.0], contact_area_taxels=1, approach_mm=None)
+    out = directory / "failed.rrd"
+    with Server(hello + line(frame) + line({**frame, "newtons": [0.0]}), stays=True) as server:
+        failed = subprocess.run([*VIEWER, server.path, "--save", out], capture_output=True, text=True, timeout=60)
+    assert failed.returncode == 1 and "reshape" in failed.stderr, failed
+    assert len(read(out)["/forearm/force_n"]) == 2, read(out)
 
 
 def the_bridge(binary, directory):
@@ -167,6 +187,7 @@ def main():
         directory = pathlib.Path(name)
         path, live = take(binary, directory)
         print("a recording: %d frames and %d verdicts" % a_recording(path, live, directory))
+        a_live_run_that_fails(directory)
         print("the live bridge: %d frames and %d verdicts" % the_bridge(binary, directory))
         if options.pictures:
             options.pictures.mkdir(parents=True, exist_ok=True)

@@ -194,8 +194,8 @@ class Tables:
         )
         # A frame is followed by its contact, which has its number.
         frames: Dict[str, Any] = {}
-        for sensor, topic, message in take._messages(["frame", "contact", "motion", "press", "hardness"]):
-            time_us = recording._time_ns(message) // 1000
+        for sensor, topic, time_ns, message in take._messages(["frame", "contact", "motion", "press", "hardness"]):
+            time_us = time_ns // 1000
             place = {"recording": name, "sensor": sensor, "time": time_us}
             if topic == "frame":
                 frames[sensor] = message
@@ -486,10 +486,9 @@ def _rows(
     # A verdict is in the recording at the time of its frame, and is known only later.
     coming: List[Tuple[int, Dict[str, Any]]] = []
     last: Optional[Tuple[int, Dict[str, Any]]] = None
-    for name, topic, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
+    for name, topic, time_ns, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
         if name != sensor.name:
             continue
-        time_ns = recording._time_ns(message)
         if topic == "frame":
             frame = message
         elif topic == "press":

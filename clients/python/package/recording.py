@@ -127,33 +127,34 @@ class Recording:
         with self._reading():
             events = [
                 {"type": topic, **{key: _value(key, message) for key in _fields(topic)}}
-                for _, topic, message in self._messages(types)
+                for _, topic, _, message in self._messages(types)
             ]
         return iter(cast("List[Event]", sorted(events, key=lambda event: event["seq"])))
 
     def frames(self) -> Iterator[Frame]:
         """Frames after tare, in the order of time."""
-        for sensor, _, message in self._messages(["frame"]):
+        for sensor, _, time_ns, message in self._messages(["frame"]):
             newtons = array.array("f", bytes(message.data))
             if sys.byteorder == "big":
                 newtons.byteswap()
-            yield Frame(sensor, _time_ns(message), newtons, message.height, message.width)
+            yield Frame(sensor, time_ns, newtons, message.height, message.width)
 
     def chunks(self) -> Iterator[Chunk]:
         """The bytes that came from the sensors, as they were read, in the order of time."""
-        for sensor, _, message in self._messages(["input"]):
+        for sensor, _, time_ns, message in self._messages(["input"]):
             if message.kind == _BYTES:
-                yield Chunk(sensor, _time_ns(message), message.mono_ns, bytes(message.data))
+                yield Chunk(sensor, time_ns, message.mono_ns, bytes(message.data))
 
-    def _messages(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, Any]]:
-        """Sensor, topic and message."""
+    def _messages(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, int, Any]]:
+        """Sensor, topic, nanoseconds since 1970, and message."""
         names = [f"/tactile/{sensor}/{topic}" for sensor in self.sensors for topic in topics]
         count = 0
         with self._reading():
-            for _, channel, _, message in self._reader.iter_decoded_messages(names):
+            for _, channel, record, message in self._reader.iter_decoded_messages(names):
                 _, _, sensor, topic = channel.topic.split("/")
                 count += 1
-                yield sensor, topic, message
+                # MCAP's own time goes on after 2038, where a ROS header ends, but does not know the time before 1970.
+                yield sensor, topic, record.log_time or _time_ns(message), message
             # The library takes a chunk of zeros, as a power failure leaves it, for an empty one.
             summary = self._reader.get_summary()
             if summary is not None and summary.statistics is not None:

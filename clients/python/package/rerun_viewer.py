@@ -74,6 +74,8 @@ class Log:
         self._sensors: List[str] = []
         self._hello: Optional[hardnessd.Message] = None
         self._labels: List[str] = []
+        self.is_empty = True
+        """Whether there is nothing but the state of links."""
 
     def begin(self, sensors: Sequence[str], levels: Sequence[Dict[str, Any]], live: bool) -> None:
         """The sensors, and the levels with their labels as `hello` has them."""
@@ -84,6 +86,7 @@ class Log:
 
     def event(self, event: hardnessd.Event) -> None:
         """Any event of a `Client` or a recording, but a frame of a recording."""
+        self.is_empty = self.is_empty and event["type"] in ("status", "disconnected")
         if event["type"] == "frame":
             newtons = np.array(event["newtons"], np.float32).reshape(event["rows"], event["cols"])
             time_ns = _time_ns(event["time"])
@@ -148,14 +151,14 @@ def log_recording(take: recording.Recording, log: Log) -> None:
     levels = [{"level": level, "label": labels.get(level) or f"level {level}"} for level in known]
     log.begin(list(take.sensors), levels, live=False)
     frames: Dict[str, Any] = {}
-    for sensor, topic, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
+    for sensor, topic, time_ns, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
         if topic == "frame":
             frames[sensor] = message
         elif topic == "contact":
             frame = frames[sensor]
             newtons = np.frombuffer(bytes(frame.data), "<f4").reshape(frame.height, frame.width)
             approach_mm = recording._value("approach_mm", message)
-            log.frame(sensor, recording._time_ns(message), newtons, message.contact_area_taxels, approach_mm)
+            log.frame(sensor, time_ns, newtons, message.contact_area_taxels, approach_mm)
         else:
             fields = {key: recording._value(key, message) for key in recording._fields(topic)}
             log.event(cast(hardnessd.Event, {"type": topic, **fields}))
@@ -214,9 +217,12 @@ def _stop(*_: Any) -> NoReturn:
     raise SystemExit(143)
 
 
-def _show(options: argparse.Namespace, stream: rr.RecordingStream) -> None:
-    log = Log(stream)
-    if options.source and options.source.endswith(".mcap"):
+def _is_recording(options: argparse.Namespace) -> bool:
+    return bool(options.source and options.source.endswith(".mcap"))
+
+
+def _show(options: argparse.Namespace, log: Log) -> None:
+    if _is_recording(options):
         with recording.open(options.source) as take:
             log_recording(take, log)
         return
@@ -232,12 +238,19 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The program. Returns its exit code."""
     options = _arguments().parse_args(arguments)
     signal.signal(signal.SIGTERM, _stop)
-    if options.save and os.path.exists(options.save):
-        print(f"{options.save}: it exists already: name a new file", file=sys.stderr)
-        return 74
-    if options.source and options.source.endswith(".mcap") and not os.path.exists(options.source):
+    if _is_recording(options) and not os.path.exists(options.source):
         print(f"{options.source}: no such file", file=sys.stderr)
         return 66
+    if options.save:
+        try:
+            # From here on the file is this program's own, so it may be removed.
+            open(options.save, "x").close()
+        except FileExistsError:
+            print(f"{options.save}: it exists already: name a new file", file=sys.stderr)
+            return 74
+        except OSError as error:
+            print(error, file=sys.stderr)
+            return 74
     stream = rr.RecordingStream("hardnessd")
     # When an event was logged says nothing of a recording.
     stream.set_log_time_enabled(False)
@@ -252,13 +265,15 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     except RuntimeError as error:
         print(error, file=sys.stderr)
         return 74
+    log = Log(stream)
     try:
-        _show(options, stream)
+        _show(options, log)
         return 0
     except KeyboardInterrupt:
         return 130
     except (hardnessd.Refused, ValueError) as error:
-        if options.save:
+        # Hours of live events stay. The half of a recording goes: another try makes it whole.
+        if options.save and (_is_recording(options) or log.is_empty):
             pathlib.Path(options.save).unlink(missing_ok=True)
         print(error, file=sys.stderr)
         return 1
