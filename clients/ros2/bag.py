@@ -10,6 +10,7 @@ allows it, else copied; nothing is changed. `ros2 bag reindex -s mcap take` does
 """
 
 import argparse
+import contextlib
 import json
 import os
 import pathlib
@@ -86,15 +87,21 @@ def main():
     try:
         sources = sorted((summary(path), path) for path in args.recordings)
         out.mkdir()
-        files = []
-        for number, (found, path) in enumerate(sources):
-            name = f"{out.name}_{number}.mcap"
-            try:
-                os.link(path, out / name)
-            except OSError:
-                shutil.copyfile(path, out / name)
-            files.append((name, found))
-        (out / "metadata.yaml").write_text(metadata(files))
+        # Without its last file it is no bag. Then nothing of it stays, and the next try finds the path free.
+        with contextlib.ExitStack() as made:
+            made.callback(out.rmdir)
+            files = []
+            for number, (found, path) in enumerate(sources):
+                name = f"{out.name}_{number}.mcap"
+                made.callback((out / name).unlink, missing_ok=True)
+                try:
+                    os.link(path, out / name)
+                except OSError:
+                    shutil.copyfile(path, out / name)
+                files.append((name, found))
+            made.callback((out / "metadata.yaml").unlink, missing_ok=True)
+            (out / "metadata.yaml").write_text(metadata(files))
+            made.pop_all()
     except (OSError, ValueError) as error:
         sys.exit(f"bag.py: {error}")
     except Exception as error:  # of the library: what is no MCAP
