@@ -37,6 +37,9 @@ use hardnessd_core::tare::RetareError;
 /// The longest line that a subscriber may send (`docs/protocol.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
+/// The largest buffer that a connection keeps between two writes. A batch of the hub fits.
+const KEPT_BYTES: usize = 64 * 1024;
+
 /// The first and the longest pause between checks of a connection whose other end has stopped
 /// sending. If that end is closed altogether, the runtime learns of it a moment after the last
 /// read.
@@ -271,17 +274,18 @@ async fn serve<S: Stream>(stream: S, service: Service) -> Result<(), End> {
     let (id, hello) = service.hub.join().await?;
     let mut lines = vec![hello];
     lines.extend(service.snapshots.current().await?.statuses.clone());
+    drop(turn);
     let (asked, inbox) = mpsc::channel(1);
     let mut writer = Writer {
         id,
-        hub: service.hub.clone(),
+        service: service.clone(),
         output,
         outgoing: Vec::new(),
         inbox,
     };
     let written = service.writers.spawn(async move {
-        let written = writer.write(lines, turn).await;
-        writer.hub.leave(id).await;
+        let written = writer.write(lines).await;
+        writer.service.hub.leave(id).await;
         written
     });
     let lines = Lines::new(input, LONGEST_LINE_BYTES);
@@ -294,7 +298,7 @@ async fn serve<S: Stream>(stream: S, service: Service) -> Result<(), End> {
 /// Reads requests until the writer has ended or the other end sends no more.
 async fn read<I: AsyncRead + Unpin>(
     mut lines: Lines<I>,
-    asked: mpsc::Sender<(Asked, Option<OwnedSemaphorePermit>)>,
+    asked: mpsc::Sender<Asked>,
     service: &Service,
 ) -> Result<(), End> {
     loop {
@@ -307,14 +311,16 @@ async fn read<I: AsyncRead + Unpin>(
             heard = lines.next() => match heard? {
                 LineRead::Line(line) => line,
                 LineRead::TooLong => {
-                    place.send((Asked::TooLong, None));
+                    place.send(Asked::TooLong);
                     return Ok(());
                 }
                 LineRead::End => return Ok(()),
             },
             () = asked.closed() => return Ok(()),
         };
-        let turn = service.turn().await;
+        // The turn ends before the writer has the answer: a client that reads nothing keeps its
+        // writer waiting for as long as it likes.
+        let _turn = service.turn().await;
         let line = request::parse(&line);
         let id = line.id;
         let request = match line.request {
@@ -344,7 +350,7 @@ async fn read<I: AsyncRead + Unpin>(
             }
             Err(unusable) => Asked::Answer(vec![answer(Err(unusable.into()), id)]),
         };
-        place.send((request, turn));
+        place.send(request);
     }
 }
 
@@ -352,24 +358,19 @@ async fn read<I: AsyncRead + Unpin>(
 struct Writer<O> {
     /// The number of the subscriber.
     id: u64,
-    hub: hub::Handle,
+    service: Service,
     output: O,
     /// The bytes being written. One call writes a whole batch.
     outgoing: Vec<u8>,
-    inbox: mpsc::Receiver<(Asked, Option<OwnedSemaphorePermit>)>,
+    inbox: mpsc::Receiver<Asked>,
 }
 
 impl<O: Output> Writer<O> {
     /// Writes `lines`, then what the hub and the reader have, until the hub has closed or the other
-    /// end is gone. The turn of a request ends when there is no more to do for it but to write.
-    async fn write(
-        &mut self,
-        lines: Vec<Line>,
-        turn: Option<OwnedSemaphorePermit>,
-    ) -> Result<(), End> {
-        drop(turn);
-        self.send(&lines).await?;
-        let mut next = self.hub.take(self.id).await?;
+    /// end is gone.
+    async fn write(&mut self, lines: Vec<Line>) -> Result<(), End> {
+        self.send(lines).await?;
+        let mut next = self.service.hub.take(self.id).await?;
         let mut reading = true;
         let mut pause = HALF_CLOSED_CHECKS.0;
         loop {
@@ -379,12 +380,12 @@ impl<O: Output> Writer<O> {
                     let Ok(lines) = lines else {
                         return self.finish().await;
                     };
-                    self.send(&lines).await?;
-                    next = self.hub.take(self.id).await?;
+                    self.send(lines).await?;
+                    next = self.service.hub.take(self.id).await?;
                 }
                 asked = self.inbox.recv(), if reading => match asked {
-                    Some((asked, turn)) => {
-                        self.answer(asked, turn, &mut next).await?;
+                    Some(asked) => {
+                        self.answer(asked, &mut next).await?;
                         busy::rest();
                     }
                     // The other end sends no more, but it may still read.
@@ -404,9 +405,9 @@ impl<O: Output> Writer<O> {
     /// The hub has closed. Only the answer to a command that is being carried out is still sent.
     async fn finish(&mut self) -> Result<(), End> {
         self.inbox.close();
-        while let Some((asked, _)) = self.inbox.recv().await {
+        while let Some(asked) = self.inbox.recv().await {
             if let Asked::Answer(lines) = asked {
-                self.send(&lines).await?;
+                self.send(lines).await?;
             }
         }
         Ok(())
@@ -425,12 +426,13 @@ impl<O: Output> Writer<O> {
     async fn answer(
         &mut self,
         asked: Asked,
-        turn: Option<OwnedSemaphorePermit>,
         next: &mut oneshot::Receiver<Vec<Line>>,
     ) -> Result<(), End> {
         let answer = match asked {
             Asked::Subscribe(subscription, id) => {
-                let subscribed = self.hub.subscribe(self.id, subscription).await?;
+                let turn = self.service.turn().await;
+                let subscribed = self.service.hub.subscribe(self.id, subscription).await?;
+                drop(turn);
                 let done = subscribed.map(|()| Done::default());
                 vec![answer(done.map_err(Refused::from), id)]
             }
@@ -438,30 +440,32 @@ impl<O: Output> Writer<O> {
             Asked::TooLong => {
                 let message =
                     format!("found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one");
-                self.send(&[error(message, None)]).await?;
+                self.send(vec![error(message, None)]).await?;
                 return Err(End::TooLong);
             }
         };
-        drop(turn);
         // Lines that the hub gave before it answered are sent before the answer.
         let given = next.try_recv();
-        if let Ok(lines) = &given {
+        let is_pending = given == Err(TryRecvError::Empty);
+        if let Ok(lines) = given {
             self.send(lines).await?;
         }
-        self.send(&answer).await?;
+        self.send(answer).await?;
         // Either the pending `take` gave its lines, or another subscription ended it.
-        if given != Err(TryRecvError::Empty) {
-            *next = self.hub.take(self.id).await?;
+        if !is_pending {
+            *next = self.service.hub.take(self.id).await?;
         }
         Ok(())
     }
 
-    async fn send(&mut self, lines: &[Line]) -> Result<(), End> {
-        self.outgoing.clear();
+    async fn send(&mut self, lines: Vec<Line>) -> Result<(), End> {
         for line in lines {
             self.outgoing.extend_from_slice(line.json.as_bytes());
         }
-        Ok(self.output.write_all(&self.outgoing).await?)
+        self.output.write_all(&self.outgoing).await?;
+        self.outgoing.clear();
+        self.outgoing.shrink_to(KEPT_BYTES);
+        Ok(())
     }
 }
 

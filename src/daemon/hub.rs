@@ -70,7 +70,7 @@ impl Line {
     }
 
     /// The same line to hold for a long time, with its text but without its event.
-    fn to_hold(&self) -> Self {
+    pub(crate) fn to_hold(&self) -> Self {
         Self {
             event: None,
             ..self.clone()

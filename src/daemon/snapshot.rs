@@ -71,7 +71,8 @@ impl Snapshots {
         let begun = Instant::now();
         let survey = self.hub.survey().await?;
         let (vitals, is_whole) = self.sensors.vitals().await;
-        let statuses = vitals.iter().map(|vitals| vitals.status.clone().into());
+        let line = |vitals: &Vitals| Line::from(vitals.status.clone()).to_hold();
+        let statuses = vitals.iter().map(line);
         let snapshot = Arc::new(Snapshot {
             statuses: statuses.collect(),
             survey,
