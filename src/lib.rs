@@ -1,5 +1,6 @@
 //! `hardnessd`: the daemon and the tools around it, the two ends of the core that touch the world.
 
+pub mod apart;
 mod maybe;
 pub mod daemon;
 pub mod tools;

@@ -8,7 +8,8 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
-use hardnessd::daemon::config::{Error as ConfigError, Setup};
+use hardnessd::apart;
+use hardnessd::daemon::config::Setup;
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::{Daemon, Reload, busy};
 use hardnessd::tools::args::{Args, Command};
@@ -64,7 +65,10 @@ fn main() -> ExitCode {
     let prints = !matches!(args.command, Command::Run(_));
     let done = runtime.block_on(dispatch(args.command, signals));
     // A thread may still wait for a port's driver or for the reader of stdout.
-    runtime.shutdown_timeout(if prints { LAST_LINES } else { Duration::ZERO });
+    runtime.shutdown_background();
+    if prints {
+        apart::finish(LAST_LINES);
+    }
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -143,7 +147,7 @@ async fn identify(args: identify::Args, signals: Signals) -> Result<(), Failure>
     let path = args.config.path()?;
     let mut end = pin!(signals.end());
     let named = path.clone();
-    let load = tokio::task::spawn_blocking(move || identify::load(&named));
+    let load = apart::start("load", move || identify::load(&named))?;
     let setup = tokio::select! {
         loaded = load => loaded.expect("a configuration is read without a panic")?,
         stop = &mut end => return Err(stop.into()),
@@ -171,7 +175,7 @@ async fn finish_blocking<E: Into<Failure> + Send + 'static>(
     signals: Signals,
     work: impl FnOnce() -> Result<(), E> + Send + 'static,
 ) -> Result<(), Failure> {
-    let done = tokio::task::spawn_blocking(work);
+    let done = apart::start("work", work)?;
     finish(signals, async {
         done.await.expect("the work does not panic")
     })
@@ -184,11 +188,10 @@ async fn load(
     path: PathBuf,
     model: Option<PathBuf>,
     end: impl Future<Output = ()>,
-) -> Result<Option<Setup>, ConfigError> {
+) -> Result<Option<Setup>, Failure> {
+    let load = apart::start("load", move || Setup::load(&path, model.as_deref()))?;
     tokio::select! {
-        loaded = tokio::task::spawn_blocking(move || Setup::load(&path, model.as_deref())) => {
-            loaded.expect("a configuration is read without a panic").map(Some)
-        }
+        loaded = load => Ok(Some(loaded.expect("a configuration is read without a panic")?)),
         () = end => Ok(None),
     }
 }

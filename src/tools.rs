@@ -37,6 +37,7 @@ use std::process::ExitCode;
 
 use clap::error::ErrorKind;
 
+use crate::apart;
 use hardnessd_core::wording;
 pub use hardnessd_core::wording::{line, lines};
 
@@ -95,7 +96,8 @@ pub fn print(lines: &[u8]) -> io::Result<bool> {
 
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
 async fn print_apart(lines: Vec<u8>) -> io::Result<bool> {
-    tokio::task::spawn_blocking(move || print(&lines)).await?
+    let printed = apart::start("stdout", move || print(&lines))?;
+    printed.await.map_err(io::Error::other)?
 }
 
 /// A path as the configuration may name it: relative, if it lies beside the configuration.

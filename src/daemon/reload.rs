@@ -10,10 +10,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use tokio::sync::{Semaphore, TryAcquireError, mpsc, oneshot};
+use tokio::sync::{Semaphore, TryAcquireError, mpsc};
 
 use super::config::{self, Setup};
 use super::log::{self, Log};
+use crate::apart::{self, NoThread};
 
 /// How long reading the files of a configuration may take. The built-in model takes well under a
 /// second.
@@ -95,20 +96,15 @@ async fn load<T: Send + 'static>(
             return Err(Refusal::Stuck { path });
         }
     };
-    let (done, result) = oneshot::channel();
     let thread_path = path.clone();
-    // Do not use one of the runtime's threads, because the runtime would wait for it at its end.
-    let started = std::thread::Builder::new()
-        .name("reload".to_owned())
-        .spawn(move || {
-            let loaded = read(&thread_path);
-            drop(reader);
-            // After the timeout there is no receiver any more.
-            let _ = done.send(loaded);
-        });
-    if let Err(source) = started {
-        return Err(Refusal::Thread { path, source });
-    }
+    let result = match apart::start("reload", move || {
+        let loaded = read(&thread_path);
+        drop(reader);
+        loaded
+    }) {
+        Ok(result) => result,
+        Err(NoThread(source)) => return Err(Refusal::Thread { path, source }),
+    };
     match tokio::time::timeout(patience, result).await {
         Ok(Ok(loaded)) => Ok(loaded?),
         Ok(Err(_)) => Err(Refusal::Ended { path }),

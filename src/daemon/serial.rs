@@ -23,6 +23,7 @@ use tokio_serial::SerialStream;
 use self::network::{Datagram, Udp};
 use self::tty::{Changed, LineSettings};
 use super::port::Port;
+use crate::apart::{self, NoThread};
 use crate::maybe;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
@@ -165,7 +166,7 @@ impl Link {
                     let opening = start_opening(&self.port, self.baud, self.settings.opening());
                     match opening {
                         Ok(opening) => self.state = State::Opening(opening),
-                        Err(error) => {
+                        Err(NoThread(error)) => {
                             self.wait();
                             return Turn::Unavailable(format!("no thread to open it: {error}"));
                         }
@@ -323,21 +324,16 @@ impl Line {
 ///
 /// # Errors
 ///
-/// Fails if the system has no thread to spare. The runtime's own threads would panic then.
+/// Fails if the system has no thread to spare.
 fn start_opening(
     port: &Port,
     baud: u32,
     first: Vec<u8>,
-) -> io::Result<oneshot::Receiver<Result<Opened, String>>> {
-    let (sender, opening) = oneshot::channel();
+) -> Result<oneshot::Receiver<Result<Opened, String>>, NoThread> {
     let port = port.clone();
-    let thread = std::thread::Builder::new().name("port".to_owned());
-    thread.spawn(move || {
-        // The daemon may have ended meanwhile.
-        let opened = open(&port, baud, &first);
-        let _ = sender.send(opened.map_err(|error| reason(&port, &error)));
-    })?;
-    Ok(opening)
+    apart::start("port", move || {
+        open(&port, baud, &first).map_err(|error| reason(&port, &error))
+    })
 }
 
 fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {

@@ -17,6 +17,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::player::Played;
+use crate::apart::NoThread;
 use crate::daemon::accept::Listener;
 use crate::daemon::lines::{LineRead, Lines};
 use crate::daemon::socket::{self, Socket};
@@ -138,15 +139,20 @@ impl Arm {
     }
 
     /// The frames of the sensor, the first of which shows the moment `start`.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the system has no thread to compute them on.
     pub(crate) fn frames(
         &self,
         settings: SequenceSettings,
         start: Instant,
-    ) -> mpsc::Receiver<Played> {
+    ) -> Result<mpsc::Receiver<Played>, NoThread> {
         let (frames, played) = mpsc::channel(1);
         let state = Arc::clone(&self.state);
-        std::thread::spawn(move || simulate(&state, settings, start, &frames));
-        played
+        let thread = std::thread::Builder::new();
+        thread.spawn(move || simulate(&state, settings, start, &frames))?;
+        Ok(played)
     }
 
     /// Obeys one controller after the other, for ever.

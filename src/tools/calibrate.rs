@@ -21,6 +21,7 @@ use self::gather::{Press, Unreadable};
 use super::configuration::Configuration;
 use super::live;
 use super::simulate::{OutOfRange, within};
+use crate::apart::{self, NoThread};
 use crate::daemon::config::Setup;
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::frame::Array;
@@ -80,6 +81,9 @@ pub enum What {
 /// The reason why there are no values.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// The configuration has no sensor of this name.
     #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
     NoSensor {
@@ -161,7 +165,7 @@ impl Coded for Error {
             | Error::Taxels(_)
             | Error::Count { .. }
             | Error::Recording { .. } => FAILED,
-            Error::Taken { .. } | Error::Out { .. } | Error::Print(_) => IO,
+            Error::Taken { .. } | Error::Out { .. } | Error::Print(_) | Error::Thread(_) => IO,
         }
     }
 }
@@ -220,7 +224,8 @@ pub async fn run(
     } else {
         let with_track = matches!(args.what, What::Arm);
         let (files, sensor, hrn) = (args.from.clone(), sensor.clone(), setup.hrn.clone());
-        let read = tokio::task::spawn_blocking(move || recorded(&files, &sensor, &hrn, with_track));
+        let work = move || recorded(&files, &sensor, &hrn, with_track);
+        let read = apart::start("calibrate", work)?;
         tokio::select! {
             read = read => read.expect("recordings are read without a panic")?,
             () = shutdown => return Ok(()),

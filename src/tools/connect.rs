@@ -7,6 +7,7 @@
 use std::fmt;
 use std::fs;
 use std::io::{self, ErrorKind};
+use std::net::{SocketAddr, ToSocketAddrs};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,6 +18,7 @@ use tokio::io::{AsyncRead, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 
 use super::demo;
+use crate::apart;
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{LineRead, Lines};
 
@@ -197,6 +199,13 @@ fn keep_alive(stream: &TcpStream) -> io::Result<()> {
     Ok(sockopt::set_tcp_keepcnt(stream, 3)?)
 }
 
+/// Connects to one of the addresses of a name. A lookup may take long.
+async fn connect(name: String) -> io::Result<TcpStream> {
+    let found = apart::start("lookup", move || name.to_socket_addrs())?;
+    let addresses: Vec<SocketAddr> = found.await.map_err(io::Error::other)??.collect();
+    TcpStream::connect(&addresses[..]).await
+}
+
 impl Connection {
     async fn open(address: Address) -> Result<Self, Error> {
         let opened: io::Result<(Box<dyn AsyncRead + Send + Unpin>, Output)> = match &address {
@@ -204,7 +213,7 @@ impl Connection {
                 let (input, output) = stream.into_split();
                 (Box::new(input) as Box<_>, Output::Unix(output))
             }),
-            Address::Tcp(address) => TcpStream::connect(address).await.and_then(|stream| {
+            Address::Tcp(address) => connect(address.clone()).await.and_then(|stream| {
                 keep_alive(&stream)?;
                 let (input, output) = stream.into_split();
                 Ok((Box::new(input) as Box<_>, Output::Tcp(output)))

@@ -30,6 +30,7 @@ use super::faults::Faults;
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
 use super::simulate::{OutOfRange, within};
+use crate::apart::NoThread;
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
 use crate::daemon::{self, Daemon};
@@ -91,6 +92,9 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// Some presses got no verdict.
     #[error("only {found} of {presses} presses got a verdict")]
     Missed {
@@ -111,7 +115,7 @@ impl Coded for Error {
             Error::Model(error) => error.exit_code(),
             Error::Daemon(error) => error.exit_code(),
             Error::Missed { .. } | Error::Closed => FAILED,
-            Error::Io { .. } => IO,
+            Error::Io { .. } | Error::Thread(_) => IO,
             Error::Layout(_) => CONFIG,
         }
     }
@@ -271,7 +275,8 @@ async fn print_events(
     let mut finals = 0;
     // Whether a slow reader missed events. Verdicts may be among them.
     let mut missed = false;
-    let mut played = std::pin::pin!(player.play(player::sequence(sequence), Instant::now()));
+    let frames = player::sequence(sequence)?;
+    let mut played = std::pin::pin!(player.play(frames, Instant::now()));
     let mut shutdown = std::pin::pin!(shutdown);
     let mut last_byte: Option<Instant> = None;
     // The line that is being written. The sensor and the daemon do not wait for the reader of

@@ -16,6 +16,7 @@ use clap::Args as ClapArgs;
 use super::configuration::Configuration;
 use super::replay::{self, feed, no_frame};
 use super::{live, open, print_apart};
+use crate::apart::{self, NoThread};
 use crate::daemon::config::{self, Config, Setup};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::motion::Point;
@@ -106,6 +107,9 @@ pub enum Error {
     /// The configuration or its model cannot be used.
     #[error(transparent)]
     Config(#[from] config::Error),
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// The configuration has no sensor of this name.
     #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
     NoSensor {
@@ -233,7 +237,8 @@ impl Coded for Error {
             }
             | Self::Taken { .. }
             | Self::Out { .. }
-            | Self::Print(_) => IO,
+            | Self::Print(_)
+            | Self::Thread(_) => IO,
             _ => FAILED,
         }
     }
@@ -287,7 +292,8 @@ pub async fn run(
         made_of(courses, piece(what, &levels)?, &path, &sensor)?
     } else {
         let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());
-        let read = tokio::task::spawn_blocking(move || of_files(&args, &sensor, &hrn, &levels));
+        let work = move || of_files(&args, &sensor, &hrn, &levels);
+        let read = apart::start("identify", work)?;
         tokio::select! {
             read = read => read.expect("recordings are read without a panic")?,
             () = shutdown => return Ok(()),

@@ -13,6 +13,7 @@ use tokio::time::Instant;
 
 use super::faults::{Faults, Line};
 use super::pty::Pty;
+use crate::apart::NoThread;
 use crate::daemon::baud::BITS_A_BYTE;
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::Layout;
@@ -187,9 +188,13 @@ pub(crate) struct Played {
 }
 
 /// The frames of a sequence.
-pub(crate) fn sequence(settings: SequenceSettings) -> mpsc::Receiver<Played> {
+///
+/// # Errors
+///
+/// Fails if the system has no thread to compute them on.
+pub(crate) fn sequence(settings: SequenceSettings) -> Result<mpsc::Receiver<Played>, NoThread> {
     let (frames, played) = mpsc::channel(AHEAD);
-    std::thread::spawn(move || {
+    std::thread::Builder::new().spawn(move || {
         let mut sequence = Sequence::new(settings).peekable();
         for number in 0.. {
             let Some(frame) = sequence.next() else {
@@ -205,8 +210,8 @@ pub(crate) fn sequence(settings: SequenceSettings) -> mpsc::Receiver<Played> {
                 return;
             }
         }
-    });
-    played
+    })?;
+    Ok(played)
 }
 
 /// The present motion of the arm.

@@ -22,6 +22,7 @@ use tokio::time::Instant;
 use super::configuration::Configuration;
 use super::doctor;
 use super::simulate::positive;
+use crate::apart::NoThread;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::port::Port;
@@ -122,6 +123,9 @@ pub enum Error {
         /// The fault, and the remedy.
         obstacle: String,
     },
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// Recording failed, or all sensors were lost.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
@@ -133,7 +137,7 @@ impl Coded for Error {
             Error::Level { .. } | Error::Twice { .. } | Error::Asked { .. } | Error::NoTerminal => {
                 USAGE
             }
-            Error::Session { .. } | Error::Create { .. } => IO,
+            Error::Session { .. } | Error::Create { .. } | Error::Thread(_) => IO,
             Error::Unavailable { .. } => UNAVAILABLE,
             Error::Daemon(error) => error.exit_code(),
         }

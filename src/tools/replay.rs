@@ -17,6 +17,7 @@ use clap::Args as ClapArgs;
 use super::configuration::{ModelFile, NoModel};
 use super::readable::Printer;
 use super::simulate::positive;
+use crate::apart::{self, NoThread};
 use crate::daemon::config::{self, Config, SensorTable, Setup};
 use crate::daemon::now;
 use hardnessd_core::event::{Event, Kind};
@@ -116,6 +117,9 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
@@ -133,7 +137,7 @@ impl Coded for Error {
             | Error::Sensor { .. }
             | Error::NoFrame { .. } => FAILED,
             Error::OwnMotion { .. } => USAGE,
-            Error::Broken { .. } | Error::Print(_) => IO,
+            Error::Broken { .. } | Error::Print(_) | Error::Thread(_) => IO,
         }
     }
 }
@@ -151,7 +155,7 @@ pub async fn run(args: Args) -> Result<(), Error> {
     let (_stop, stopped) = mpsc::channel();
     // The replay runs on a thread of its own, so that a signal waits neither for a recording that
     // is a pipe nor for the reader of stdout.
-    let played = tokio::task::spawn_blocking(move || play(&args, &stopped));
+    let played = apart::start("replay", move || play(&args, &stopped))?;
     played.await.expect("a replay does not panic")
 }
 

@@ -18,6 +18,7 @@ use super::arm::{self, Arm};
 use super::faults::{self, Faults, Line};
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
+use crate::apart::{self, NoThread};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::socket;
 use crate::maybe;
@@ -120,6 +121,9 @@ pub enum Error {
         /// The system's error.
         source: std::io::Error,
     },
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// The arm's socket cannot be made.
     #[error(transparent)]
     Arm(#[from] socket::Error),
@@ -139,7 +143,7 @@ impl Coded for Error {
             Error::Faults(error) if error.is_unreadable() => NO_INPUT,
             Error::Faults(_) => FAILED,
             Error::Layout(_) | Error::Baud { .. } => USAGE,
-            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) => IO,
+            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) | Error::Thread(_) => IO,
         }
     }
 }
@@ -159,7 +163,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         Some(path) => {
             // The script may be a pipe without a writer.
             let seed = args.seed;
-            let loaded = tokio::task::spawn_blocking(move || Faults::load(&path, seed));
+            let loaded = apart::start("faults", move || Faults::load(&path, seed))?;
             tokio::select! {
                 loaded = loaded => loaded.expect("a script is read without a panic")?,
                 () = &mut shutdown => return Ok(()),
@@ -173,8 +177,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         // disk.
         let to = path.clone();
         let (stop, stopped) = mpsc::channel();
-        let mut recorded =
-            tokio::task::spawn_blocking(move || record(&to, &layout, settings, faults, &stopped));
+        let work = move || record(&to, &layout, settings, faults, &stopped);
+        let mut recorded = apart::start("record", work)?;
         let finished = tokio::select! {
             finished = &mut recorded => Some(finished),
             () = shutdown => {
@@ -216,8 +220,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let robot = maybe::wait(robot.map(Robot::run));
     let start = Instant::now();
     let (frames, start) = match &arm {
-        Some(arm) => (arm.frames(settings, start), start + arm::SCAN),
-        None => (player::sequence(settings), start),
+        Some(arm) => (arm.frames(settings, start)?, start + arm::SCAN),
+        None => (player::sequence(settings)?, start),
     };
     let serving = maybe::wait(arm.map(Arm::serve));
     let play = async {

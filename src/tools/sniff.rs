@@ -35,6 +35,7 @@ use self::found::{Found, Known, Shown};
 use self::picture::draw;
 use super::doctor;
 use super::simulate::positive;
+use crate::apart::{self, NoThread};
 use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
@@ -141,6 +142,9 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
+    /// The system has no thread for it.
+    #[error(transparent)]
+    Thread(#[from] NoThread),
     /// Stdout cannot be written to.
     #[error("stdout: {0}")]
     Print(#[source] io::Error),
@@ -152,7 +156,7 @@ impl Coded for Error {
             Error::Unreadable { .. } => NO_INPUT,
             Error::Recording { .. } | Error::Unexplained { .. } | Error::Unsure { .. } => FAILED,
             Error::Unavailable { .. } => UNAVAILABLE,
-            Error::Print(_) | Error::Write { .. } => IO,
+            Error::Print(_) | Error::Write { .. } | Error::Thread(_) => IO,
         }
     }
 }
@@ -172,10 +176,10 @@ pub async fn run(args: Args) -> Result<(), Error> {
         None => None,
     };
     // This runs on another thread, because the file may be a pipe and many bytes take long.
-    let told = tokio::task::spawn_blocking(move || match listened {
+    let told = apart::start("sniff", move || match listened {
         Some(bytes) => tell(&args, &bytes),
         None => read(&args.source()).and_then(|bytes| tell(&args, &bytes)),
-    });
+    })?;
     told.await.expect("a proposal is made without a panic")
 }
 

@@ -6,20 +6,20 @@
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::bench::{BINARY, Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
+use crate::bench::{Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
 use crate::pair::Pair;
+use crate::shortage::User;
 use hardnessd_core::frame::{RawFrame, Stamp};
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
-use rustix::process::{Resource, Signal, geteuid, getrlimit};
+use rustix::process::Signal;
 use rustix::termios::OptionalActions;
 use serde_json::{Value, json};
 
@@ -346,37 +346,14 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
     rig.press(5);
 }
 
-/// Runs `program` without privileges, because no limit of processes holds for root.
-fn unprivileged(program: &Path) -> Command {
-    if !geteuid().is_root() {
-        return Command::new(program);
-    }
-    let mut command = Command::new("setpriv");
-    command
-        .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
-        .args(["--bounding-set=-all", "--inh-caps=-all", "--"])
-        .arg(program);
-    command
-}
-
 #[test]
 fn a_port_that_no_thread_can_open_is_unavailable_and_opened_once_a_thread_can() {
     let bench = Bench::new();
-    let config = configure(&bench, "");
-    // Another user can start the program, and make sockets beside it.
-    let program = bench.path("hardnessd");
-    fs::copy(BINARY, &program).unwrap();
-    fs::set_permissions(bench.path(""), Permissions::from_mode(0o777)).unwrap();
-    let daemon = Daemon::start_by(&mut unprivileged(&program), &config);
+    let user = User::new(&bench, 0);
+    let daemon = Daemon::start_by(&mut user.runs(user.program()), &configure(&bench, ""));
     let mut subscriber = bench.subscriber();
     subscriber.until(&json!({"state": "connecting", "reason": "no such device"}));
-    let limit = |processes: &str| {
-        let mut command = unprivileged(Path::new("prlimit"));
-        command.arg(format!("--pid={}", daemon.process.0.id()));
-        command.arg(format!("--nproc={processes}:"));
-        assert!(command.status().unwrap().success());
-    };
-    limit("1");
+    user.limit(&daemon.process, Some(1));
     let refused = loop {
         let line = subscriber.until(&json!({"type": "status"}));
         if line["reason"] != "no such device" {
@@ -386,8 +363,7 @@ fn a_port_that_no_thread_can_open_is_unavailable_and_opened_once_a_thread_can() 
     assert_eq!(refused["state"], "connecting", "{refused}");
     let reason = refused["reason"].as_str().unwrap();
     assert!(reason.starts_with("no thread to open it: "), "{refused}");
-    let most = getrlimit(Resource::Nproc).maximum;
-    limit(&most.map_or("unlimited".to_owned(), |most| most.to_string()));
+    user.limit(&daemon.process, None);
     let cable = Cable::plug(bench.path("port"));
     let device = &cable.pair.as_ref().unwrap().path;
     fs::set_permissions(device, Permissions::from_mode(0o666)).unwrap();

@@ -26,6 +26,7 @@ mod publish;
 mod sensors;
 mod service;
 mod shipped;
+mod shortage;
 mod stdout;
 mod subscribe;
 #[cfg(feature = "watch")]

@@ -6,16 +6,18 @@
 //! child is the same program, which calls [`entry`] first. If nobody has called [`entry`], as in a
 //! test of the library, there is no trial.
 
-use std::io::{Read, Write};
+use std::fs::File;
+use std::io::{self, Read, Seek, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::panic::{self, PanicHookInfo};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
 use std::sync::OnceLock;
-use std::sync::mpsc;
-use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::fs::MemfdFlags;
+use rustix::io::Errno;
 use rustix::process::{Resource, Rlimit, Signal};
 use rustix::time::ClockId;
 use serde::{Deserialize, Serialize};
@@ -141,13 +143,15 @@ fn answered(
     deadline: Duration,
 ) -> Result<Result<Duration, String>, ModelError> {
     let trial = |problem: String| ModelError::Trial(format!("model: {problem}"));
+    let file =
+        in_memory(bytes).map_err(|error| trial(format!("no memory to try it from: {error}")))?;
     let mut child = command
-        .stdin(Stdio::piped())
+        .stdin(file)
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
         .map_err(|error| trial(format!("no process to try it in: {error}")))?;
-    let answer = ask(&mut child, bytes, deadline);
+    let answer = hear(&mut child, deadline);
     // The child may have answered and still hang.
     let _ = child.kill();
     let ended = child.wait();
@@ -167,29 +171,35 @@ fn answered(
     }
 }
 
-/// Gives the child the file and waits for its answer. `None` if there is no answer.
-fn ask(child: &mut Child, bytes: &[u8], deadline: Duration) -> Option<Answer> {
-    let (mut stdin, stdout) = (child.stdin.take()?, child.stdout.take()?);
-    thread::scope(|scope| {
-        // A child that ends early does not read everything. Killing the child ends both threads.
-        scope.spawn(move || {
-            let _ = stdin.write_all(bytes);
-        });
-        let (say, heard) = mpsc::channel();
-        scope.spawn(move || {
-            let mut line = Vec::new();
-            let read = stdout.take(ANSWER_BYTES).read_to_end(&mut line);
-            let _ = say.send(read.ok().map(|_| line));
-        });
-        let line = heard.recv_timeout(deadline).ok().flatten();
-        if line.is_none() {
-            let _ = child.kill();
-        }
-        // After a panic, a second answer may follow. Only the first answer counts.
-        let line = line?;
-        let mut answers = serde_json::Deserializer::from_slice(&line).into_iter();
-        answers.next()?.ok()
-    })
+/// A file that holds `bytes` and is nowhere on a disk. A child that does not read it keeps nobody
+/// waiting, as a pipe would.
+fn in_memory(bytes: &[u8]) -> io::Result<File> {
+    let mut file = File::from(rustix::fs::memfd_create("model", MemfdFlags::CLOEXEC)?);
+    file.write_all(bytes)?;
+    file.rewind()?;
+    Ok(file)
+}
+
+/// Waits for the child's answer, in this thread: there may be no other. `None` if there is no answer.
+fn hear(child: &mut Child, deadline: Duration) -> Option<Answer> {
+    let mut stdout = child.stdout.take()?.take(ANSWER_BYTES);
+    let end = Instant::now() + deadline;
+    let mut line = Vec::new();
+    let mut read = 1;
+    while read > 0 {
+        let left = end.checked_duration_since(Instant::now())?;
+        let mut waiting = [PollFd::new(stdout.get_ref(), PollFlags::IN)];
+        match poll(&mut waiting, Some(&left.try_into().ok()?)) {
+            Ok(0) | Err(Errno::INTR) => continue,
+            ready => ready.ok()?,
+        };
+        let mut part = [0; 4096];
+        read = stdout.read(&mut part).ok()?;
+        line.extend(&part[..read]);
+    }
+    // After a panic, a second answer may follow. Only the first answer counts.
+    let mut answers = serde_json::Deserializer::from_slice(&line).into_iter();
+    answers.next()?.ok()
 }
 
 /// The reason why a child that has ended gave no answer.
@@ -313,8 +323,7 @@ mod tests {
         let check = |script: &str, expected: &str| {
             let mut command = Command::new("sh");
             command.args(["-c", script]);
-            // A pipe holds less than this: the parent must not wait for a child that does not read
-            // it.
+            // A pipe holds less than this, and no child reads it.
             let bytes = vec![0; 1 << 20];
             let error = tried(command, &bytes, Duration::from_millis(500)).unwrap_err();
             let line = error.to_string();

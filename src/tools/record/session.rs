@@ -14,6 +14,7 @@ use rustix::termios::{LocalModes, OptionalActions, Termios};
 use tokio::sync::{mpsc, watch};
 
 use super::{Error, clear, levels, record, said};
+use crate::apart::NoThread;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
@@ -73,22 +74,24 @@ const END_OF_INPUT: u8 = 4;
 
 impl User<'_> {
     /// Reads stdin on a thread of its own, which ends with the process.
-    fn at_terminal<'a>(shutdown: Pin<&'a mut dyn Future<Output = ()>>) -> User<'a> {
+    fn at_terminal<'a>(
+        shutdown: Pin<&'a mut dyn Future<Output = ()>>,
+    ) -> Result<User<'a>, NoThread> {
         let (sender, input) = mpsc::channel(1);
-        std::thread::spawn(move || {
+        std::thread::Builder::new().spawn(move || {
             let mut bytes = [0; 1024];
             while let Ok(read @ 1..) = rustix::io::read(rustix::stdio::stdin(), &mut bytes) {
                 if sender.blocking_send(bytes[..read].to_vec()).is_err() {
                     return;
                 }
             }
-        });
-        User {
+        })?;
+        Ok(User {
             input,
             unused: Vec::new(),
             shutdown,
             has_gone: false,
-        }
+        })
     }
 
     /// Waits for input. Returns `false` if no more comes.
@@ -195,7 +198,7 @@ pub(super) async fn run(
     }
     fs::create_dir_all(directory).map_err(|source| listed(directory, source))?;
     let mut list = List::open(directory)?;
-    let mut user = User::at_terminal(shutdown);
+    let mut user = User::at_terminal(shutdown)?;
     say("One recording for each object. `q` ends the session.\n");
     let levels = setup.hrn.card().levels.clone();
     let has_limits = levels

@@ -12,20 +12,20 @@ use signal_hook::iterator::Signals;
 ///
 /// # Errors
 ///
-/// Fails if the system refuses a handler.
+/// Fails if the system refuses a handler, or has no thread to wait on.
 pub(super) fn end_at_signals(how_to_continue: Option<String>) -> std::io::Result<()> {
     // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not end
     // the process.
     signal_hook::flag::register(SIGXFSZ, Arc::default())?;
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
-    std::thread::spawn(move || {
+    std::thread::Builder::new().spawn(move || {
         if let Some(signal) = signals.forever().next() {
             let hint = how_to_continue
                 .map_or_else(String::new, |command| format!("; to continue: {command}"));
             hardnessd_core::say!("hrn-train: interrupted{hint}");
             std::process::exit(128 + signal);
         }
-    });
+    })?;
     Ok(())
 }
 
