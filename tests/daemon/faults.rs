@@ -19,6 +19,7 @@ use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
+use rustix::fs::{FlockOperation, flock};
 use rustix::process::Signal;
 use rustix::termios::OptionalActions;
 use serde_json::{Value, json};
@@ -60,7 +61,10 @@ impl Cable {
 
     /// Puts a new port behind the link. The old port, if there is one, is closed after that.
     fn replug(&mut self) {
-        let pair = Pair::open().unwrap();
+        self.replug_at(Pair::open().unwrap());
+    }
+
+    fn replug_at(&mut self, pair: Pair) {
         // A new tty echoes and edits lines, so make it raw.
         let mut settings = rustix::termios::tcgetattr(&pair.device).unwrap();
         settings.make_raw();
@@ -370,6 +374,23 @@ fn a_port_that_no_thread_can_open_is_unavailable_and_opened_once_a_thread_can() 
     subscriber.until(&json!({"state": "stale"}));
     cable.wake();
     subscriber.until(&json!({"state": "live"}));
+}
+
+#[test]
+fn a_lost_sensor_says_what_keeps_it_from_being_live_now() {
+    let mut rig = Rig::start();
+    let lost = |reason: &str| json!({"type": "status", "state": "lost", "reason": reason});
+    rig.cable.unplug();
+    rig.sees(&lost("no such device"));
+    let held = Pair::open().unwrap();
+    let device = held.device.try_clone().unwrap();
+    flock(&device, FlockOperation::LockExclusive).unwrap();
+    rig.cable.replug_at(held);
+    rig.sees(&lost("port held by another process"));
+    flock(&device, FlockOperation::Unlock).unwrap();
+    rig.sees(&lost("no frame for 25 ms"));
+    rig.cable.wake();
+    rig.sees(&json!({"type": "status", "state": "live"}));
 }
 
 #[test]

@@ -283,15 +283,21 @@ impl Pipeline {
     }
 
     /// Call this when the port is open. The next bytes do not continue the earlier bytes.
+    ///
+    /// Of a port that was lost, a status follows only with a frame, or when the frame is late: a port
+    /// that is lost again as soon as it is open would be two statuses each time.
     pub fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
         self.seen.chunks.clear();
-        self.seen.link.opened(at.mono);
+        self.seen.link.opened(at.mono, self.decoder.received());
+        if self.seen.link.was_lost() {
+            return Vec::new();
+        }
         self.status_if_changed(at)
     }
 
-    /// Call this when the port could not be opened. If the port was open before, the sensor is
-    /// already lost, and its reason stays.
+    /// Call this when the port could not be opened. A changed reason is a status, also of a sensor that
+    /// is lost.
     pub fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
         self.seen.link.unavailable(reason);
         self.status_if_changed(at)
@@ -325,10 +331,15 @@ impl Pipeline {
         if let Some(deadline) = self.stale_deadline()
             && at.mono >= deadline
         {
+            // Count from the last frame, so that both times come from one clock reading.
+            let last_frame = self
+                .seen
+                .link
+                .last_frame
+                .filter(|_| self.seen.link.is_live());
+            let since = last_frame.unwrap_or(at);
             self.seen.link.silent();
             self.tare.give_up(RetareError::NotLive);
-            // Count from the last frame, so that both times come from one clock reading.
-            let since = self.seen.link.last_frame.unwrap_or(at);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);
             events.extend(self.status_if_changed(Stamp {

@@ -32,6 +32,8 @@ pub(super) const RATE_FRAMES: usize = 32;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Link {
     port: Port,
+    /// Whether the port was lost, and no frame has come since.
+    was_lost: bool,
     /// The arrival times of the latest frames.
     recent: VecDeque<Duration>,
     /// The latest silences that were longer than the sensor's stale time, one after the other. Frames
@@ -47,18 +49,18 @@ pub(super) struct Link {
 /// The state of the port.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum Port {
-    /// The port was never opened. The reason is that of the last try.
+    /// The port is not open. The reason is that of the last try, or of the loss.
     Closed { reason: Option<String> },
-    /// The port has been open since then, and no frame has come yet.
-    Opened { since: Duration },
+    /// The port has been open since then, and no frame has come yet. Before that, so many bytes had
+    /// come.
+    Opened { since: Duration, received: u64 },
     /// The last frame came at this time.
     Live { since: Duration },
-    /// The port is open, and no first frame came in time.
-    Silent,
+    /// The port is open, and no first frame came in time. Before it was opened, so many bytes had
+    /// come.
+    Silent { received: u64 },
     /// The port is open, and silent after its last frame.
     Stale,
-    /// The port was open and is gone, or it is open again and no frame has come.
-    Lost { reason: String },
 }
 
 impl Link {
@@ -66,6 +68,7 @@ impl Link {
     pub(super) fn new() -> Self {
         Self {
             port: Port::Closed { reason: None },
+            was_lost: false,
             recent: VecDeque::with_capacity(RATE_FRAMES),
             silences: VecDeque::with_capacity(STEADY_SILENCES),
             last_bytes: None,
@@ -82,24 +85,26 @@ impl Link {
             && self.silences.iter().all(are_silences)
     }
 
+    pub(super) fn was_lost(&self) -> bool {
+        self.was_lost
+    }
+
     pub(super) fn is_live(&self) -> bool {
         matches!(self.port, Port::Live { .. })
     }
 
-    /// The port is open.
-    pub(super) fn opened(&mut self, at: Duration) {
+    /// The port is open. So many bytes have come before.
+    pub(super) fn opened(&mut self, since: Duration, received: u64) {
         self.last_bytes = None;
         if matches!(self.port, Port::Closed { .. }) {
-            self.port = Port::Opened { since: at };
+            self.port = Port::Opened { since, received };
         }
     }
 
     /// The port could not be opened.
     pub(super) fn unavailable(&mut self, reason: String) {
-        match &mut self.port {
-            Port::Closed { reason: known } => *known = Some(reason),
-            Port::Lost { reason: known } => *known = reason,
-            _ => {}
+        if let Port::Closed { reason: known } = &mut self.port {
+            *known = Some(reason);
         }
     }
 
@@ -109,7 +114,7 @@ impl Link {
             self.silence(stamp.mono.saturating_sub(last.mono), sensor);
         }
         // A rate measured across a silence would be meaningless.
-        if matches!(self.port, Port::Silent | Port::Stale) {
+        if matches!(self.port, Port::Silent { .. } | Port::Stale) {
             self.recent.clear();
         }
         if self.recent.len() == RATE_FRAMES {
@@ -117,6 +122,7 @@ impl Link {
         }
         self.recent.push_back(stamp.mono);
         self.port = Port::Live { since: stamp.mono };
+        self.was_lost = false;
         self.last_frame.replace(stamp)
     }
 
@@ -157,7 +163,7 @@ impl Link {
     /// The silence has lasted until [`Self::stale_deadline`].
     pub(super) fn silent(&mut self) {
         self.port = match self.port {
-            Port::Opened { .. } => Port::Silent,
+            Port::Opened { received, .. } => Port::Silent { received },
             _ => Port::Stale,
         };
     }
@@ -170,13 +176,16 @@ impl Link {
 
     /// No more bytes will come. The measured rate stays.
     pub(super) fn ended(&mut self, reason: String) {
-        self.port = Port::Lost { reason };
+        self.port = Port::Closed {
+            reason: Some(reason),
+        };
+        self.was_lost = true;
     }
 
     /// When a silence makes the link stale.
     fn stale_deadline(&self, sensor: &Sensor) -> Option<Duration> {
         match self.port {
-            Port::Opened { since } => Some(since.saturating_add(sensor.late_after())),
+            Port::Opened { since, .. } => Some(since.saturating_add(sensor.late_after())),
             Port::Live { since } => Some(since.saturating_add(self.stale_after(sensor))),
             _ => None,
         }
@@ -224,24 +233,32 @@ impl Pipeline {
             let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
             Some(format!("no frame for {ms} ms"))
         };
+        // A port that was lost is lost until a frame comes, whatever happens to it.
+        let or_lost = |state| match self.seen.link.was_lost {
+            true => LinkState::Lost,
+            false => state,
+        };
         match &self.seen.link.port {
-            Port::Closed { reason } => (LinkState::Connecting, reason.clone()),
-            Port::Opened { .. } => (LinkState::Connecting, None),
+            Port::Closed { reason } => (or_lost(LinkState::Connecting), reason.clone()),
+            Port::Opened { .. } => {
+                let was_lost = self.seen.link.was_lost;
+                let again = was_lost.then(|| "open, no frame yet".to_owned());
+                (or_lost(LinkState::Connecting), again)
+            }
             Port::Live { .. } => (LinkState::Live, tare()),
-            Port::Silent => {
+            Port::Silent { received } => {
                 let mut reason = no_frame_for(self.sensor.late_after());
-                if self.decoder.received() > 0
+                if self.decoder.received() > *received
                     && let Some(reason) = &mut reason
                 {
                     reason.push_str(", but bytes come: is the baud rate or the layout wrong?");
                 }
-                (LinkState::Stale, reason)
+                (or_lost(LinkState::Stale), reason)
             }
             Port::Stale => (
                 LinkState::Stale,
                 no_frame_for(self.seen.link.stale_after(&self.sensor)),
             ),
-            Port::Lost { reason } => (LinkState::Lost, Some(reason.clone())),
         }
     }
 

@@ -6,7 +6,7 @@ use super::*;
 mod course;
 mod drift;
 mod arrays;
-use crate::event::{Note, Rejection};
+use crate::event::{LinkState, Note, Rejection};
 use crate::frame::Array;
 use crate::sensor::Description;
 use crate::verdict::BUILT_IN_HRN;
@@ -413,12 +413,51 @@ fn a_lost_device_aborts_the_press_and_numbers_go_on() {
         pipeline.opened(at(2000)).is_empty(),
         "lost until a frame arrives"
     );
-    assert!(pipeline.tick(at(9000)).is_empty());
     assert_eq!(
-        play(&mut pipeline, 50, &vec![raw(5, 50); 1]),
+        play(&mut pipeline, 11, &vec![raw(5, 50); 1]),
         ["Live", "Begin 2"]
     );
     assert_eq!(pipeline.status(at(0)).frames, 8);
+}
+
+#[test]
+fn a_lost_device_that_is_open_again_and_sends_no_frame_says_so() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let (silent, noisy) = (
+        "no frame for 500 ms",
+        "no frame for 500 ms, but bytes come: is the baud rate or the layout wrong?",
+    );
+    // The bytes before the loss do not count.
+    for (begin, bytes, expected) in [(1000, 0, silent), (5000, 100, noisy), (9000, 0, silent)] {
+        pipeline.lost("end of file".to_owned(), at(begin));
+        pipeline.unavailable("no such device".to_owned(), at(begin + 100));
+        // A port that is lost again and again as soon as it is open says nothing new.
+        for cycle in 200..204 {
+            assert_eq!(words(&pipeline.opened(at(begin + cycle))), [""; 0]);
+            let status = pipeline.status(at(begin + cycle));
+            assert_eq!(status.state, LinkState::Lost);
+            assert_eq!(status.reason.as_deref(), Some("open, no frame yet"));
+            if cycle < 203 {
+                let lost = pipeline.lost("no such device".to_owned(), at(begin + cycle));
+                assert_eq!(words(&lost), [""; 0]);
+            }
+        }
+        assert_eq!(
+            words(&pipeline.push(&vec![0; bytes], at(begin + 300))),
+            [""; 0]
+        );
+        let late = at(begin + 800);
+        assert_eq!(words(&pipeline.tick(at(begin + 702))), [""; 0]);
+        let said = pipeline.tick(late);
+        assert_eq!(words(&said), [format!("Lost ({expected})")]);
+        let Event::Status(status) = &said[0] else {
+            panic!("{said:?}")
+        };
+        assert_eq!(status.time, late.wall);
+        assert_eq!(pipeline.deadline(), None);
+    }
+    assert_eq!(play(&mut pipeline, 60, &[raw(0, 0)]), ["Live"]);
 }
 
 #[test]
