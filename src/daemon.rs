@@ -43,10 +43,10 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use jiff::Timestamp;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -360,12 +360,8 @@ fn announce(setup: &Setup, run: &str) {
         announce_sensor(sensor, checked);
     }
     let clock = now().wall;
-    if !ROS_SECONDS.contains(&clock.as_second()) {
-        warn!(
-            %clock,
-            "the header of a ROS 2 message cannot hold the time of this machine's clock: it has the nearest \
-             that it can"
-        );
+    if let Some(fault) = fault_of(clock) {
+        warn!(%clock, "{fault}");
     }
 }
 
@@ -377,8 +373,24 @@ fn announce_sensor(sensor: &SensorTable, checked: &Sensor) {
     }
 }
 
-/// A ROS 2 header counts seconds in 32 bits (builtin_interfaces/msg/Time).
-const ROS_SECONDS: RangeInclusive<i64> = -(1 << 31)..=(1 << 31) - 1;
+/// The last second that a ROS 2 header can hold: it counts them in 32 bits (builtin_interfaces/msg/Time).
+const ROS_END: i64 = (1 << 31) - 1;
+
+/// What cannot hold the time of this machine's clock.
+fn fault_of(clock: Timestamp) -> Option<&'static str> {
+    if clock < Timestamp::UNIX_EPOCH {
+        Some(
+            "a recording and Foxglove cannot hold a time before 1970: they have the beginning of 1970",
+        )
+    } else if clock.as_second() > ROS_END {
+        Some(
+            "the header of a ROS 2 message cannot hold the time of this machine's clock: it has the \
+             nearest that it can",
+        )
+    } else {
+        None
+    }
+}
 
 /// The model's name in events.
 fn short(setup: &Setup) -> &str {
@@ -447,4 +459,27 @@ fn run_token() -> std::io::Result<String> {
     let mut bytes = [0; 8];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;
     Ok(hex::encode(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_whose_time_not_every_output_can_hold_is_a_warning() {
+        for (clock, expected) in [
+            ("1969-12-31T23:59:59.9Z", Some("before 1970")),
+            ("1900-01-01T00:00:00Z", Some("before 1970")),
+            ("1970-01-01T00:00:00Z", None),
+            ("2038-01-19T03:14:07.9Z", None),
+            ("2038-01-19T03:14:08Z", Some("ROS 2")),
+        ] {
+            let fault = fault_of(clock.parse().unwrap());
+            let is_expected = match (fault, expected) {
+                (Some(fault), Some(part)) => fault.contains(part),
+                (fault, expected) => fault == expected,
+            };
+            assert!(is_expected, "{clock}: {fault:?}");
+        }
+    }
 }

@@ -261,6 +261,17 @@ fn no_route_changes_anything() {
     assert_eq!((head.code, head.body.as_str()), (200, ""));
 }
 
+/// hyper panics while it writes a date before 1970.
+#[test]
+fn no_answer_has_a_date() {
+    let bench = Bench::new();
+    let (_daemon, address) = serving(&bench);
+    for path in ["/", "/api/status", "/metrics", "/livez", "/none"] {
+        let head = get(address, path).head;
+        assert!(!head.contains("\r\ndate:"), "{head}");
+    }
+}
+
 #[test]
 fn the_page_is_one_file_that_may_load_nothing() {
     let bench = Bench::new();
