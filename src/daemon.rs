@@ -109,7 +109,10 @@ impl Coded for Error {
 
 impl Coded for log::Error {
     fn exit_code(&self) -> u8 {
-        CONFIG
+        match self {
+            log::Error::Thread(_) => IO,
+            _ => CONFIG,
+        }
     }
 }
 

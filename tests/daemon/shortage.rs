@@ -134,7 +134,7 @@ fn a_command_without_a_thread_ends_with_one_line() {
         &["demo"],
         &["record", "--config", config, "--out", new],
         &["check", "--config", config],
-        &["doctor", "--config", config],
+        &["doctor", "--port", foam],
         &["replay", foam],
         &["recover", foam, "--out", new],
         &["sniff", foam],
