@@ -127,7 +127,10 @@ fn a_command_without_a_thread_ends_with_one_line() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
         assert_eq!(said.lines().count(), 1, "{arguments:?}: {said}");
-        assert!(said.contains("thread"), "{arguments:?}: {said}");
+        assert!(
+            said.contains("temporarily unavailable"),
+            "{arguments:?}: {said}"
+        );
     };
     for arguments in [
         &["run", "--config", config][..],
