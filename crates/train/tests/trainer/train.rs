@@ -234,8 +234,8 @@ fn a_run_learns_and_leaves_what_it_promises() {
 }
 
 /// Starts or resumes a run, and sends `signal` once there are `count` checkpoints of `stage`,
-/// wherever the run is by then. Returns the exit code, if there is one, and the last line of
-/// stderr.
+/// wherever the run is by then. Returns the exit code, if there is one, and the line of
+/// stderr about the interruption. A line of progress may follow it.
 fn interrupted(
     trial: &Trial,
     seed: &'static str,
@@ -263,8 +263,8 @@ fn interrupted(
     rustix::process::kill_process(Pid::from_child(&process), signal).unwrap();
     let output = process.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
-    let last = said.lines().last().unwrap_or_default().to_owned();
-    (output.status.code(), last)
+    let about = said.lines().find(|line| line.starts_with("hrn-train: "));
+    (output.status.code(), about.unwrap_or_default().to_owned())
 }
 
 #[test]
