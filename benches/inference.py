@@ -50,10 +50,13 @@ def compare(binary, path, rounds, peak):
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    apart = max(
-        numpy.abs(session.run(["probabilities"], call)[0][0] - probabilities).max()
-        for call, probabilities in zip(calls, expected, strict=True)
-    )
+    # The daemon computes the features of a press for a model with bins; tests/peers/course.py compares those.
+    apart = "not compared"
+    if any(output.name == "probabilities" for output in session.get_outputs()):
+        apart = max(
+            numpy.abs(session.run(["probabilities"], call)[0][0] - probabilities).max()
+            for call, probabilities in zip(calls, expected, strict=True)
+        )
     theirs, ours = [], []
     for _ in range(rounds):
         theirs.append(their_us(session, calls))
@@ -67,7 +70,7 @@ def compare(binary, path, rounds, peak):
         f" ours {our:.0f} us (least {min(ours):.0f}); its time over ours {statistics.median(ratios):.2f}"
         f" ({ratios[len(ratios) // 10]:.2f} to {ratios[-1 - len(ratios) // 10]:.2f});"
         f" floor {floor:.1f} us for {work / 1e6:.2f} M multiply-adds, ours over it {our / floor:.1f};"
-        f" its probabilities differ from the file's by {apart:.1e} at most"
+        f" greatest difference to the file's probabilities: {apart}"
     )
 
 
