@@ -6,7 +6,9 @@
 //! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
 //! never prints and never trains.
 
+mod card;
 mod course;
+mod error;
 pub mod features;
 mod file;
 mod grid;
@@ -14,17 +16,16 @@ mod guard;
 mod references;
 mod shore;
 
-use std::time::Duration;
-
-use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use tract_onnx::prelude::*;
 
+pub use self::card::{Card, Check, Checks, Conformal, Level, Range};
 pub use self::course::{
     COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, course_inputs,
     extents, identified_inputs,
 };
 use self::course::{Input, Lengths, Query};
+pub use self::error::{LevelsError, ModelError, ReferencesError};
 pub use self::file::{check_levels, describe};
 pub use self::grid::{COLS, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS};
 pub use self::guard::NodeProblem;
@@ -32,7 +33,6 @@ pub use self::references::{
     MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
 };
 pub use self::shore::{Borders, BordersError, Distribution, Shore};
-use crate::frame::Pitch;
 
 /// The default model, built into the binary; `models/course.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
@@ -48,358 +48,6 @@ pub const MIN_OPSET: i64 = 17;
 pub const CHECK_TOLERANCE: f32 = 1e-4;
 /// The largest accepted difference from the check presses' Shore hardness.
 pub const SHORE_TOLERANCE: f32 = 1e-2;
-
-/// One hardness level, as `hello` publishes it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Level {
-    /// The level's number, from 1; 1 is the hardest.
-    pub level: u8,
-    /// A short name without control characters, such as `very-soft`.
-    pub label: String,
-    /// The Shore hardness that the level covers, such as `51-60`.
-    pub shore: String,
-}
-
-/// The range of forces and areas in training, and for a model of format 2 the range of its presses.
-/// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
-/// `None` excludes nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Range {
-    /// The least and the greatest total force of a training frame, in newtons.
-    pub force_n: [f32; 2],
-    /// The least and the greatest contact area of a training frame, in taxels.
-    pub contact_area_taxels: [u32; 2],
-    /// The shortest and the longest training press, in seconds from its first to its last frame.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub duration_s: Option<[f32; 2]>,
-    /// The least and the greatest time between two frames that the model gets, in seconds: the
-    /// median of a press.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub frame_period_s: Option<[f32; 2]>,
-    /// The least and the greatest speed of the approach, in mm/s.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub speed_mm_s: Option<[f32; 2]>,
-    /// The least and the greatest approach of a training press at its furthest, in mm.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub approach_mm: Option<[f32; 2]>,
-    /// The least and the greatest stiffness of the arm, in N/mm.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub arm_n_per_mm: Option<[f32; 2]>,
-    /// The least and the greatest distance between the taxels of the training sensors, in mm.
-    /// `None` means that of the model's grid.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pitch_mm: Option<[f32; 2]>,
-}
-
-impl Range {
-    /// The range of a model of which nothing is known: no frame is outside it.
-    pub const ANY: Self = Self {
-        force_n: [0.0, f32::MAX],
-        contact_area_taxels: [0, u32::MAX],
-        duration_s: None,
-        frame_period_s: None,
-        speed_mm_s: None,
-        approach_mm: None,
-        arm_n_per_mm: None,
-        pitch_mm: Some([0.0, f32::MAX]),
-    };
-
-    /// The ranges of the presses, in the order of [`Extents`].
-    pub fn of_presses(&self) -> Extents {
-        [
-            self.duration_s,
-            self.frame_period_s,
-            self.speed_mm_s,
-            self.approach_mm,
-            self.arm_n_per_mm,
-        ]
-    }
-
-    /// The same range of frames with these ranges of the presses.
-    #[must_use]
-    pub fn with_presses(self, ranges: Extents) -> Self {
-        let [
-            duration_s,
-            frame_period_s,
-            speed_mm_s,
-            approach_mm,
-            arm_n_per_mm,
-        ] = ranges;
-        Self {
-            duration_s,
-            frame_period_s,
-            speed_mm_s,
-            approach_mm,
-            arm_n_per_mm,
-            ..self
-        }
-    }
-
-    /// Whether a press may be one of the range of the presses. An unknown number may.
-    pub fn holds(&self, course: &Course) -> bool {
-        let pairs = self.of_presses().into_iter().zip(course.extents());
-        pairs.into_iter().all(|pair| match pair {
-            (Some([least, most]), Some([low, high])) => low <= most && least <= high,
-            _ => true,
-        })
-    }
-}
-
-/// The description of a model in its file: the `hrn.*` metadata.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Card {
-    /// `hrn.format`: "1", "2" or "3".
-    pub format: String,
-    /// `hrn.levels`: levels 1 to L in order.
-    pub levels: Vec<Level>,
-    /// `hrn.pitch_mm`: the distance between taxels in the training data.
-    pub pitch_mm: f32,
-    /// `hrn.method`: the method of training, such as `hrn100`.
-    pub method: String,
-    /// `hrn.data`: name, seed and hash of the training data, as the file has it.
-    pub data: String,
-    /// `hrn.metrics`: the trainer's measurements.
-    pub metrics: serde_json::Value,
-    /// `hrn.validation`: the data of the validation, such as `simulated data only`.
-    pub validation: String,
-    /// `hrn.range`: the forces, areas and presses in training.
-    pub range: Range,
-    /// `hrn.conformal`: only a file of format 2 or 3 may have it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub conformal: Option<Conformal>,
-}
-
-impl Card {
-    /// A taxel of the model's grid is in contact at or above this force.
-    pub fn contact_threshold_n(&self) -> f32 {
-        Pitch::square(f64::from(self.pitch_mm)).contact_threshold_n()
-    }
-
-    /// Whether the model was trained on sensors of this pitch. Taxels that are finer than the
-    /// model's add up to what the model's would read, so only coarser ones are foreign to a model
-    /// that knows one pitch.
-    pub fn holds(&self, pitch: Pitch) -> bool {
-        let [least, most] = self.range.pitch_mm.unwrap_or([0.0, self.pitch_mm]);
-        let known = f64::from(least) * 0.98..=f64::from(most) * 1.02;
-        known.contains(&pitch.rows_mm) && known.contains(&pitch.cols_mm)
-    }
-}
-
-/// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Conformal {
-    /// The set misses the true level in at most this share of presses.
-    pub alpha: f32,
-    /// The set holds every level of at least this probability, and the most likely one.
-    pub threshold: f32,
-}
-
-impl Conformal {
-    /// The levels of the set, ascending.
-    pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
-        let (best, _) = argmax(probabilities);
-        let levels = (1..).zip(probabilities.iter().enumerate());
-        levels
-            .filter(|&(_, (place, &p))| place == best || p >= self.threshold)
-            .map(|(level, _)| level)
-            .collect()
-    }
-}
-
-/// The checks in a model file: inputs, and the trainer's outputs for them.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Checks {
-    /// The check frames of format 1.
-    Frames(Check),
-    /// The check presses of format 2 or 3.
-    Courses(CourseCheck),
-}
-
-impl Checks {
-    /// The number of check frames or check presses.
-    pub fn count(&self) -> usize {
-        match self {
-            Self::Frames(check) => check.frames.len(),
-            Self::Courses(check) => check.presses.len(),
-        }
-    }
-
-    /// The probabilities that the trainer computed for check `index`.
-    fn probabilities(&self, index: usize) -> &[f32] {
-        match self {
-            Self::Frames(check) => &check.probabilities[index],
-            Self::Courses(check) => &check.presses[index].probabilities,
-        }
-    }
-
-    /// The Shore hardness that the trainer computed for check `index`.
-    fn shore(&self, index: usize) -> Option<Shore> {
-        match self {
-            Self::Frames(_) => None,
-            Self::Courses(check) => Some(check.presses[index].shore),
-        }
-    }
-}
-
-/// `hrn.check` of format 1: frames and the probabilities that the trainer computed for them.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Check {
-    /// The frames: 784 newtons each, row-major. There are 8 frames, or two frames of each level.
-    pub frames: Vec<Vec<f32>>,
-    /// One row of L probabilities for each frame.
-    pub probabilities: Vec<Vec<f32>>,
-}
-
-/// The reason why a model file is refused, or why a judgement failed.
-#[derive(Debug, thiserror::Error)]
-pub enum ModelError {
-    /// The file has more than [`MAX_FILE_BYTES`].
-    #[error("model file of {found} bytes: at most {MAX_FILE_BYTES} are accepted")]
-    TooLarge {
-        /// The size of the file.
-        found: usize,
-    },
-    /// The bytes are no ONNX model.
-    #[error("not an ONNX model: {0}")]
-    NotOnnx(String),
-    /// The operator set is too old or missing.
-    #[error("ONNX opset {}: expected {MIN_OPSET} or newer", .found.map_or("missing".into(), |v| v.to_string()))]
-    Opset {
-        /// The default domain's version, if the file has one.
-        found: Option<i64>,
-    },
-    /// A tensor's data lies outside the file.
-    #[error("tensor `{tensor}` lies in an external file: expected all data inside the model file")]
-    ExternalData {
-        /// The name of the tensor.
-        tensor: String,
-    },
-    /// The inputs or outputs have wrong names, types or shapes.
-    #[error("model {what} {found}: expected {expected}")]
-    Signature {
-        /// `input`, `inputs` or `outputs`.
-        what: &'static str,
-        /// The names, types and shapes in the file.
-        found: String,
-        /// The names, types and shapes of the format.
-        expected: String,
-    },
-    /// A metadata key is missing.
-    #[error("model metadata `{key}` is missing")]
-    KeyMissing {
-        /// The key.
-        key: &'static str,
-    },
-    /// A metadata key has an unusable value.
-    #[error("model metadata `{key}`: found {found}, expected {expected}")]
-    KeyInvalid {
-        /// The key.
-        key: &'static str,
-        /// The value, or the problem with it.
-        found: String,
-        /// The expected value.
-        expected: String,
-    },
-    /// The graph has a node that no model may have.
-    #[error("model node {node}: {problem}")]
-    Node {
-        /// The name and the operator of the node.
-        node: String,
-        /// The problem with it.
-        problem: NodeProblem,
-    },
-    /// The graph cannot be run.
-    #[error("model graph cannot be run: {0}")]
-    Graph(String),
-    /// The probabilities differ from the trainer's.
-    #[error(
-        "check frame {frame}: probabilities differ from the trainer's by up to {difference:.6}: \
-         expected at most {CHECK_TOLERANCE}"
-    )]
-    CheckDiffers {
-        /// The check's index in `hrn.check`.
-        frame: usize,
-        /// The largest difference in that check.
-        difference: f32,
-    },
-    /// The Shore hardness differs from the trainer's.
-    #[error(
-        "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
-         at most {SHORE_TOLERANCE}"
-    )]
-    ShoreDiffers {
-        /// The press's index in `hrn.check`.
-        press: usize,
-        /// The largest difference of the three numbers.
-        difference: f32,
-    },
-    /// `probabilities` is not the softmax of `logits`.
-    #[error(
-        "check frame {frame}: `probabilities` differs from softmax(`logits`) by up to \
-         {difference:.6}: expected at most {CHECK_TOLERANCE}"
-    )]
-    NotSoftmax {
-        /// The check's index in `hrn.check`.
-        frame: usize,
-        /// The largest difference in that check.
-        difference: f32,
-    },
-    /// A judgement returned NaN or infinity.
-    #[error("model gave a number that is not finite in `{output}`")]
-    NotFinite {
-        /// The name of the output.
-        output: &'static str,
-    },
-    /// A judgement failed inside the inference library.
-    #[error("model could not judge a frame: {0}")]
-    Inference(String),
-    /// The trial process refused the file, or did not complete.
-    #[error("{0}")]
-    Trial(String),
-    /// A verdict takes so long that frames would have to wait.
-    #[error(
-        "model takes {:.1} ms for a verdict: expected at most {:.1} ms, a tenth of the fastest \
-         sensor's frame period (but 1 to 20 ms)",
-        .found.as_secs_f64() * 1e3,
-        .expected.as_secs_f64() * 1e3
-    )]
-    Slow {
-        /// The median processor time of a verdict.
-        found: Duration,
-        /// The time that the sensors allow for a verdict.
-        expected: Duration,
-    },
-}
-
-/// The reason why a model cannot take other levels.
-#[derive(Debug, thiserror::Error)]
-pub enum LevelsError {
-    /// The model gives no distribution over the scale.
-    #[error(
-        "found levels, expected none: the model has levels of its own, and only a model of format 3 takes others"
-    )]
-    Fixed,
-    /// The levels are no parts of the scale.
-    #[error("found {0}, expected ranges of Shore OO from the hardest to the softest")]
-    Borders(#[from] BordersError),
-}
-
-/// References that another model computed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "references: found {count} with {numbers} numbers, expected at most {most} with {features} numbers each, \
-     as this model computes them"
-)]
-pub struct ReferencesError {
-    count: usize,
-    numbers: usize,
-    most: usize,
-    features: usize,
-}
 
 /// The verdict of an HRN on a press.
 ///

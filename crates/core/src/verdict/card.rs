@@ -1,0 +1,213 @@
+//! What a model file says of itself: its levels, ranges, metrics and checks (`docs/formats.md`).
+
+use serde::{Deserialize, Serialize};
+
+use super::argmax;
+use super::course::{Course, CourseCheck, Extents};
+use super::shore::Shore;
+use crate::frame::Pitch;
+
+/// One hardness level, as `hello` publishes it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Level {
+    /// The level's number, from 1; 1 is the hardest.
+    pub level: u8,
+    /// A short name without control characters, such as `very-soft`.
+    pub label: String,
+    /// The Shore hardness that the level covers, such as `51-60`.
+    pub shore: String,
+}
+
+/// The range of forces and areas in training, and for a model of format 2 the range of its presses.
+/// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
+/// `None` excludes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Range {
+    /// The least and the greatest total force of a training frame, in newtons.
+    pub force_n: [f32; 2],
+    /// The least and the greatest contact area of a training frame, in taxels.
+    pub contact_area_taxels: [u32; 2],
+    /// The shortest and the longest training press, in seconds from its first to its last frame.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub duration_s: Option<[f32; 2]>,
+    /// The least and the greatest time between two frames that the model gets, in seconds: the
+    /// median of a press.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame_period_s: Option<[f32; 2]>,
+    /// The least and the greatest speed of the approach, in mm/s.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_mm_s: Option<[f32; 2]>,
+    /// The least and the greatest approach of a training press at its furthest, in mm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub approach_mm: Option<[f32; 2]>,
+    /// The least and the greatest stiffness of the arm, in N/mm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm_n_per_mm: Option<[f32; 2]>,
+    /// The least and the greatest distance between the taxels of the training sensors, in mm.
+    /// `None` means that of the model's grid.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pitch_mm: Option<[f32; 2]>,
+}
+
+impl Range {
+    /// The range of a model of which nothing is known: no frame is outside it.
+    pub const ANY: Self = Self {
+        force_n: [0.0, f32::MAX],
+        contact_area_taxels: [0, u32::MAX],
+        duration_s: None,
+        frame_period_s: None,
+        speed_mm_s: None,
+        approach_mm: None,
+        arm_n_per_mm: None,
+        pitch_mm: Some([0.0, f32::MAX]),
+    };
+
+    /// The ranges of the presses, in the order of [`Extents`].
+    pub fn of_presses(&self) -> Extents {
+        [
+            self.duration_s,
+            self.frame_period_s,
+            self.speed_mm_s,
+            self.approach_mm,
+            self.arm_n_per_mm,
+        ]
+    }
+
+    /// The same range of frames with these ranges of the presses.
+    #[must_use]
+    pub fn with_presses(self, ranges: Extents) -> Self {
+        let [
+            duration_s,
+            frame_period_s,
+            speed_mm_s,
+            approach_mm,
+            arm_n_per_mm,
+        ] = ranges;
+        Self {
+            duration_s,
+            frame_period_s,
+            speed_mm_s,
+            approach_mm,
+            arm_n_per_mm,
+            ..self
+        }
+    }
+
+    /// Whether a press may be one of the range of the presses. An unknown number may.
+    pub fn holds(&self, course: &Course) -> bool {
+        let pairs = self.of_presses().into_iter().zip(course.extents());
+        pairs.into_iter().all(|pair| match pair {
+            (Some([least, most]), Some([low, high])) => low <= most && least <= high,
+            _ => true,
+        })
+    }
+}
+
+/// The description of a model in its file: the `hrn.*` metadata.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Card {
+    /// `hrn.format`: "1", "2" or "3".
+    pub format: String,
+    /// `hrn.levels`: levels 1 to L in order.
+    pub levels: Vec<Level>,
+    /// `hrn.pitch_mm`: the distance between taxels in the training data.
+    pub pitch_mm: f32,
+    /// `hrn.method`: the method of training, such as `hrn100`.
+    pub method: String,
+    /// `hrn.data`: name, seed and hash of the training data, as the file has it.
+    pub data: String,
+    /// `hrn.metrics`: the trainer's measurements.
+    pub metrics: serde_json::Value,
+    /// `hrn.validation`: the data of the validation, such as `simulated data only`.
+    pub validation: String,
+    /// `hrn.range`: the forces, areas and presses in training.
+    pub range: Range,
+    /// `hrn.conformal`: only a file of format 2 or 3 may have it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub conformal: Option<Conformal>,
+}
+
+impl Card {
+    /// A taxel of the model's grid is in contact at or above this force.
+    pub fn contact_threshold_n(&self) -> f32 {
+        Pitch::square(f64::from(self.pitch_mm)).contact_threshold_n()
+    }
+
+    /// Whether the model was trained on sensors of this pitch. Taxels that are finer than the
+    /// model's add up to what the model's would read, so only coarser ones are foreign to a model
+    /// that knows one pitch.
+    pub fn holds(&self, pitch: Pitch) -> bool {
+        let [least, most] = self.range.pitch_mm.unwrap_or([0.0, self.pitch_mm]);
+        let known = f64::from(least) * 0.98..=f64::from(most) * 1.02;
+        known.contains(&pitch.rows_mm) && known.contains(&pitch.cols_mm)
+    }
+}
+
+/// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conformal {
+    /// The set misses the true level in at most this share of presses.
+    pub alpha: f32,
+    /// The set holds every level of at least this probability, and the most likely one.
+    pub threshold: f32,
+}
+
+impl Conformal {
+    /// The levels of the set, ascending.
+    pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
+        let (best, _) = argmax(probabilities);
+        let levels = (1..).zip(probabilities.iter().enumerate());
+        levels
+            .filter(|&(_, (place, &p))| place == best || p >= self.threshold)
+            .map(|(level, _)| level)
+            .collect()
+    }
+}
+
+/// The checks in a model file: inputs, and the trainer's outputs for them.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Checks {
+    /// The check frames of format 1.
+    Frames(Check),
+    /// The check presses of format 2 or 3.
+    Courses(CourseCheck),
+}
+
+impl Checks {
+    /// The number of check frames or check presses.
+    pub fn count(&self) -> usize {
+        match self {
+            Self::Frames(check) => check.frames.len(),
+            Self::Courses(check) => check.presses.len(),
+        }
+    }
+
+    /// The probabilities that the trainer computed for check `index`.
+    pub(super) fn probabilities(&self, index: usize) -> &[f32] {
+        match self {
+            Self::Frames(check) => &check.probabilities[index],
+            Self::Courses(check) => &check.presses[index].probabilities,
+        }
+    }
+
+    /// The Shore hardness that the trainer computed for check `index`.
+    pub(super) fn shore(&self, index: usize) -> Option<Shore> {
+        match self {
+            Self::Frames(_) => None,
+            Self::Courses(check) => Some(check.presses[index].shore),
+        }
+    }
+}
+
+/// `hrn.check` of format 1: frames and the probabilities that the trainer computed for them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Check {
+    /// The frames: 784 newtons each, row-major. There are 8 frames, or two frames of each level.
+    pub frames: Vec<Vec<f32>>,
+    /// One row of L probabilities for each frame.
+    pub probabilities: Vec<Vec<f32>>,
+}

@@ -1,0 +1,154 @@
+//! The reasons why a model is refused, or takes no levels or references.
+
+use std::time::Duration;
+
+use super::guard::NodeProblem;
+use super::shore::BordersError;
+use super::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, SHORE_TOLERANCE};
+
+/// The reason why a model file is refused, or why a judgement failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The file has more than [`MAX_FILE_BYTES`].
+    #[error("model file of {found} bytes: at most {MAX_FILE_BYTES} are accepted")]
+    TooLarge {
+        /// The size of the file.
+        found: usize,
+    },
+    /// The bytes are no ONNX model.
+    #[error("not an ONNX model: {0}")]
+    NotOnnx(String),
+    /// The operator set is too old or missing.
+    #[error("ONNX opset {}: expected {MIN_OPSET} or newer", .found.map_or("missing".into(), |v| v.to_string()))]
+    Opset {
+        /// The default domain's version, if the file has one.
+        found: Option<i64>,
+    },
+    /// A tensor's data lies outside the file.
+    #[error("tensor `{tensor}` lies in an external file: expected all data inside the model file")]
+    ExternalData {
+        /// The name of the tensor.
+        tensor: String,
+    },
+    /// The inputs or outputs have wrong names, types or shapes.
+    #[error("model {what} {found}: expected {expected}")]
+    Signature {
+        /// `input`, `inputs` or `outputs`.
+        what: &'static str,
+        /// The names, types and shapes in the file.
+        found: String,
+        /// The names, types and shapes of the format.
+        expected: String,
+    },
+    /// A metadata key is missing.
+    #[error("model metadata `{key}` is missing")]
+    KeyMissing {
+        /// The key.
+        key: &'static str,
+    },
+    /// A metadata key has an unusable value.
+    #[error("model metadata `{key}`: found {found}, expected {expected}")]
+    KeyInvalid {
+        /// The key.
+        key: &'static str,
+        /// The value, or the problem with it.
+        found: String,
+        /// The expected value.
+        expected: String,
+    },
+    /// The graph has a node that no model may have.
+    #[error("model node {node}: {problem}")]
+    Node {
+        /// The name and the operator of the node.
+        node: String,
+        /// The problem with it.
+        problem: NodeProblem,
+    },
+    /// The graph cannot be run.
+    #[error("model graph cannot be run: {0}")]
+    Graph(String),
+    /// The probabilities differ from the trainer's.
+    #[error(
+        "check frame {frame}: probabilities differ from the trainer's by up to {difference:.6}: \
+         expected at most {CHECK_TOLERANCE}"
+    )]
+    CheckDiffers {
+        /// The check's index in `hrn.check`.
+        frame: usize,
+        /// The largest difference in that check.
+        difference: f32,
+    },
+    /// The Shore hardness differs from the trainer's.
+    #[error(
+        "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
+         at most {SHORE_TOLERANCE}"
+    )]
+    ShoreDiffers {
+        /// The press's index in `hrn.check`.
+        press: usize,
+        /// The largest difference of the three numbers.
+        difference: f32,
+    },
+    /// `probabilities` is not the softmax of `logits`.
+    #[error(
+        "check frame {frame}: `probabilities` differs from softmax(`logits`) by up to \
+         {difference:.6}: expected at most {CHECK_TOLERANCE}"
+    )]
+    NotSoftmax {
+        /// The check's index in `hrn.check`.
+        frame: usize,
+        /// The largest difference in that check.
+        difference: f32,
+    },
+    /// A judgement returned NaN or infinity.
+    #[error("model gave a number that is not finite in `{output}`")]
+    NotFinite {
+        /// The name of the output.
+        output: &'static str,
+    },
+    /// A judgement failed inside the inference library.
+    #[error("model could not judge a frame: {0}")]
+    Inference(String),
+    /// The trial process refused the file, or did not complete.
+    #[error("{0}")]
+    Trial(String),
+    /// A verdict takes so long that frames would have to wait.
+    #[error(
+        "model takes {:.1} ms for a verdict: expected at most {:.1} ms, a tenth of the fastest \
+         sensor's frame period (but 1 to 20 ms)",
+        .found.as_secs_f64() * 1e3,
+        .expected.as_secs_f64() * 1e3
+    )]
+    Slow {
+        /// The median processor time of a verdict.
+        found: Duration,
+        /// The time that the sensors allow for a verdict.
+        expected: Duration,
+    },
+}
+
+/// The reason why a model cannot take other levels.
+#[derive(Debug, thiserror::Error)]
+pub enum LevelsError {
+    /// The model gives no distribution over the scale.
+    #[error(
+        "found levels, expected none: the model has levels of its own, and only a model of format 3 takes others"
+    )]
+    Fixed,
+    /// The levels are no parts of the scale.
+    #[error("found {0}, expected ranges of Shore OO from the hardest to the softest")]
+    Borders(#[from] BordersError),
+}
+
+/// References that another model computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "references: found {count} with {numbers} numbers, expected at most {most} with {features} numbers each, \
+     as this model computes them"
+)]
+pub struct ReferencesError {
+    pub(super) count: usize,
+    pub(super) numbers: usize,
+    pub(super) most: usize,
+    pub(super) features: usize,
+}
