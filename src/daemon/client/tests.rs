@@ -2,10 +2,9 @@ use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, BufReader};
 
 use super::*;
-use crate::daemon::hub::tests::{hello, press};
+use crate::daemon::hub::tests::{hello, live, press};
 use crate::daemon::record::EventRecorder;
 use crate::daemon::sensor::{SensorHandle, Vitals};
-use hardnessd_core::event::{LinkState, Status};
 
 /// Far longer than any step of the test takes.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -32,17 +31,7 @@ fn service(access: Access) -> (Service, mpsc::Receiver<Command>) {
 async fn answer_statuses(mut inbox: mpsc::Receiver<Command>) {
     while let Some(Command::Status(reply)) = inbox.recv().await {
         let _ = reply.send(Vitals {
-            status: Status {
-                seq: None,
-                sensor: "a".to_owned(),
-                time: jiff::Timestamp::UNIX_EPOCH,
-                state: LinkState::Live,
-                reason: None,
-                frames: 0,
-                frames_damaged: 0,
-                bytes_skipped: 0,
-                frame_rate_hz: None,
-            },
+            status: live("a"),
             last_frame_age: None,
             contact_threshold_n: 0.0,
             unjudged: 0,

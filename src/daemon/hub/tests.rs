@@ -33,8 +33,9 @@ fn hub() -> Hub {
     Hub::new(hello())
 }
 
-fn status(sensor: &str) -> Event {
-    Event::Status(Status {
+/// The status of a live sensor.
+pub(in crate::daemon) fn live(sensor: &str) -> Status {
+    Status {
         seq: None,
         sensor: sensor.to_owned(),
         time: jiff::Timestamp::UNIX_EPOCH,
@@ -44,7 +45,11 @@ fn status(sensor: &str) -> Event {
         frames_damaged: 0,
         bytes_skipped: 0,
         frame_rate_hz: None,
-    })
+    }
+}
+
+fn status(sensor: &str) -> Event {
+    Event::Status(live(sensor))
 }
 
 pub(in crate::daemon) fn press(sensor: &str) -> Event {

@@ -168,18 +168,22 @@ impl Roughness {
     }
 }
 
+/// Of each cell the value that one in `part` of the frames does not exceed.
+pub(super) fn of_each_cell(frames: &[Vec<f32>], part: usize) -> Vec<f32> {
+    let cells = frames.first().map_or(0, Vec::len);
+    let value = |cell: usize| {
+        let mut values: Vec<f32> = frames.iter().map(|frame| frame[cell]).collect();
+        values.sort_by(f32::total_cmp);
+        values[values.len() / part]
+    };
+    (0..cells).map(value).collect()
+}
+
 impl Pictures {
     /// The pictures of presses, if `frame` returns the cells of a frame.
     pub(super) fn of(presses: &Presses, frame: impl Fn(usize) -> Vec<f32>) -> Self {
         let rests: Vec<Vec<f32>> = presses.rest.iter().map(|&index| frame(index)).collect();
-        let cells = rests.first().map_or(0, Vec::len);
-        let rest: Vec<f32> = (0..cells)
-            .map(|at| {
-                let mut values: Vec<f32> = rests.iter().map(|frame| frame[at]).collect();
-                values.sort_by(f32::total_cmp);
-                values[values.len() / 2]
-            })
-            .collect();
+        let rest = of_each_cell(&rests, 2);
         let change = |&index: &usize| -> Vec<f32> {
             let values = frame(index);
             values

@@ -8,7 +8,7 @@ use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::Preset;
 
 use super::found::{Failure, Found, Known, LEAST_FRAMES, Shown, elongation, is_too_large};
-use super::picture::{Pictures, Presses};
+use super::picture::{Pictures, Presses, of_each_cell};
 use super::proposal::sized;
 
 /// The share of the lines, or packed frames, that must have the same number of cells.
@@ -198,14 +198,8 @@ fn in_order(
     known: Known,
 ) -> Result<Found, Failure> {
     let frames = &frames[..frames.len().min(MOST_FRAMES)];
-    let cells = frames.first().map_or(0, Vec::len);
-    let rest: Vec<f32> = (0..cells)
-        .map(|at| {
-            let mut values: Vec<f32> = frames.iter().map(|frame| frame[at]).collect();
-            values.sort_by(f32::total_cmp);
-            values[values.len() / 4]
-        })
-        .collect();
+    let rest = of_each_cell(frames, 4);
+    let cells = rest.len();
     let change = |frame: &Vec<f32>| {
         let changes = frame.iter().zip(&rest).map(|(value, rest)| value - rest);
         changes.map(|change| change.abs() as u32).sum()
