@@ -38,8 +38,33 @@ use std::process::ExitCode;
 use clap::error::ErrorKind;
 
 use crate::apart;
+use hardnessd_core::recording::{self, PlaybackError};
 use hardnessd_core::wording;
 pub use hardnessd_core::wording::{line, lines};
+
+/// The reason why a recording cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum Unreadable {
+    /// The recording is damaged, or of another program.
+    #[error(transparent)]
+    Recording(#[from] recording::Error),
+    /// The recording describes an impossible sensor.
+    #[error(transparent)]
+    Playback(#[from] PlaybackError),
+}
+
+impl Unreadable {
+    /// Whether the system could not read the file, whatever the file holds.
+    fn is_io(&self) -> bool {
+        matches!(self, Self::Recording(recording::Error::Io(_)))
+    }
+}
+
+impl From<std::io::Error> for Unreadable {
+    fn from(error: std::io::Error) -> Self {
+        Self::Recording(error.into())
+    }
+}
 
 /// Prints clap's error on one line, or the help or the version if the command line asks for it. A
 /// command line without a command gets the help too.

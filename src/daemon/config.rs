@@ -412,7 +412,32 @@ pub struct Setup {
     identified: BTreeMap<String, Arc<Hrn>>,
 }
 
+/// A name on the command line is that of no configured sensor.
+#[derive(Debug, thiserror::Error)]
+#[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
+pub struct UnknownSensor {
+    found: String,
+    names: Vec<String>,
+}
+
 impl Setup {
+    /// The sensor of this name, or the first one without a name.
+    ///
+    /// # Errors
+    ///
+    /// Fails if no sensor has the name.
+    pub fn sensor_named(&self, name: Option<&str>) -> Result<&Sensor, UnknownSensor> {
+        let Some(name) = name else {
+            return Ok(&self.sensors[0]);
+        };
+        let mut sensors = self.sensors.iter();
+        let named = sensors.find(|sensor| sensor.name() == name);
+        named.ok_or_else(|| UnknownSensor {
+            found: name.to_owned(),
+            names: self.sensors.iter().map(|s| s.name().to_owned()).collect(),
+        })
+    }
+
     /// The name of the model's file, or `built in`.
     pub fn model_name(&self) -> String {
         let path = self.config.model.path.as_ref();

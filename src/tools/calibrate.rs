@@ -17,12 +17,13 @@ use std::sync::Arc;
 
 use clap::{Args as ClapArgs, ValueEnum};
 
-use self::gather::{Press, Unreadable};
+use self::gather::Press;
+use super::Unreadable;
 use super::configuration::Configuration;
 use super::live;
 use super::simulate::{OutOfRange, within};
 use crate::apart::{self, NoThread};
-use crate::daemon::config::Setup;
+use crate::daemon::config::{Setup, UnknownSensor};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
@@ -85,13 +86,8 @@ pub enum Error {
     #[error(transparent)]
     Thread(#[from] NoThread),
     /// The configuration has no sensor of this name.
-    #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
-    NoSensor {
-        /// The name on the command line.
-        found: String,
-        /// The names of the configured sensors.
-        names: Vec<String>,
-    },
+    #[error(transparent)]
+    NoSensor(#[from] UnknownSensor),
     /// Weights were given, but not for `calibrate force`.
     #[error("--newtons is only for `calibrate force`: leave it out")]
     Unasked,
@@ -157,7 +153,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Live(error) => error.exit_code(),
-            Error::NoSensor { .. } | Error::Unasked | Error::NoFile => USAGE,
+            Error::NoSensor(_) | Error::Unasked | Error::NoFile => USAGE,
             Error::Missing { .. } => NO_INPUT,
             Error::Recording { source, .. } if source.is_io() => IO,
             Error::Arm(_)
@@ -210,7 +206,7 @@ pub async fn run(
     if !matches!(args.what, What::Taxels) && args.out.is_some() {
         return Err(Error::NoFile);
     }
-    let sensor = chosen(&args, &setup)?;
+    let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // Test the output file now, before anybody presses two hundred times.
     let out = match args.what {
         What::Taxels => Some(begin(args.out.clone(), config)?),
@@ -369,18 +365,6 @@ fn plain(press: &Press) -> taxels::Plain {
         }
     }
     taxels::Plain { frames }
-}
-
-fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
-    let Some(found) = &args.sensor else {
-        return Ok(setup.sensors[0].clone());
-    };
-    let mut sensors = setup.sensors.iter();
-    let chosen = sensors.find(|sensor| sensor.name() == found);
-    chosen.cloned().ok_or_else(|| Error::NoSensor {
-        found: found.clone(),
-        names: setup.sensors.iter().map(|s| s.name().to_owned()).collect(),
-    })
 }
 
 /// Says on stderr what to do next, after `seen` presses.

@@ -15,14 +15,14 @@ use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
 use super::replay::{self, feed, no_frame};
-use super::{live, open, print_apart};
+use super::{Unreadable, live, open, print_apart};
 use crate::apart::{self, NoThread};
-use crate::daemon::config::{self, Config, Setup};
+use crate::daemon::config::{self, Config, Setup, UnknownSensor};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::motion::Point;
 use hardnessd_core::part::{Part, directory_of};
 use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{self, FileKind, Labels, Playback, PlaybackError, Reader};
+use hardnessd_core::recording::{FileKind, Labels, Playback, Reader};
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{
@@ -111,13 +111,8 @@ pub enum Error {
     #[error(transparent)]
     Thread(#[from] NoThread),
     /// The configuration has no sensor of this name.
-    #[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
-    NoSensor {
-        /// The name on the command line.
-        found: String,
-        /// The names of the configured sensors.
-        names: Vec<String>,
-    },
+    #[error(transparent)]
+    NoSensor(#[from] UnknownSensor),
     /// Nothing says what is pressed now.
     #[error("--as: found nothing, expected what will be pressed, such as flat:20 or ball:10")]
     Unnamed,
@@ -183,18 +178,10 @@ pub enum Error {
     /// A recording cannot be read.
     #[error("{path}: {source}")]
     Recording {
-        /// The path of the recording.
+        /// The path of the recording, or words for the recording that was made just now.
         path: String,
         /// The error of the recording.
-        source: recording::Error,
-    },
-    /// A recording describes an impossible sensor.
-    #[error("{path}: {source}")]
-    Playback {
-        /// The path of the recording.
-        path: String,
-        /// The error of the description.
-        source: PlaybackError,
+        source: Unreadable,
     },
     /// The file to add to is none of references.
     #[error("{path}: {source}")]
@@ -229,16 +216,10 @@ impl Coded for Error {
             Self::Config(error) => error.exit_code(),
             Self::Live(error) => error.exit_code(),
             Self::Raw(error) => error.exit_code(),
-            Self::NoSensor { .. } | Self::Unnamed => USAGE,
+            Self::NoSensor(_) | Self::Unnamed => USAGE,
             Self::Unreadable { .. } => NO_INPUT,
-            Self::Recording {
-                source: recording::Error::Io(_),
-                ..
-            }
-            | Self::Taken { .. }
-            | Self::Out { .. }
-            | Self::Print(_)
-            | Self::Thread(_) => IO,
+            Self::Recording { source, .. } if source.is_io() => IO,
+            Self::Taken { .. } | Self::Out { .. } | Self::Print(_) | Self::Thread(_) => IO,
             _ => FAILED,
         }
     }
@@ -269,7 +250,7 @@ pub async fn run(
     config: &Path,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let sensor = chosen(&args, &setup)?;
+    let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // A file that cannot be made or added to shows before anything is pressed.
     begin(&args)?;
     let levels = setup.hrn.card().levels.clone();
@@ -303,18 +284,6 @@ pub async fn run(
     let text = account(&super::as_in(config, &args.out), &all);
     print_apart(text.into_bytes()).await.map_err(Error::Print)?;
     Ok(())
-}
-
-fn chosen(args: &Args, setup: &Setup) -> Result<Sensor, Error> {
-    let Some(found) = &args.sensor else {
-        return Ok(setup.sensors[0].clone());
-    };
-    let mut sensors = setup.sensors.iter();
-    let chosen = sensors.find(|sensor| sensor.name() == found);
-    chosen.cloned().ok_or_else(|| Error::NoSensor {
-        found: found.clone(),
-        names: setup.sensors.iter().map(|s| s.name().to_owned()).collect(),
-    })
 }
 
 /// Begins the file, and reads the presses that it has already. Fails if there is a file that nothing is to
@@ -457,23 +426,21 @@ fn of_recording(
     sensor: &str,
     hrn: Arc<Hrn>,
 ) -> Result<(Vec<Course>, Labels), Error> {
-    let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
-    playback.keep_courses();
-    for found in Reader::new(file) {
-        let found = found.map_err(|source| Error::Recording {
-            path: path.to_owned(),
-            source,
-        })?;
-        let fed = playback.feed(found);
-        fed.map_err(|source| Error::Playback {
-            path: path.to_owned(),
-            source,
-        })?;
+    let read = || -> Result<_, Unreadable> {
+        let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
+        playback.keep_courses();
+        for found in Reader::new(file) {
+            playback.feed(found?)?;
+            courses.extend(playback.courses(sensor));
+        }
+        playback.end();
         courses.extend(playback.courses(sensor));
-    }
-    playback.end();
-    courses.extend(playback.courses(sensor));
-    Ok((courses, playback.labels()))
+        Ok((courses, playback.labels()))
+    };
+    read().map_err(|source| Error::Recording {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// The courses of the presses in raw bytes.

@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use crate::tools::Unreadable;
 use hardnessd_core::event::{Event, Note, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{self, Entry, FileKind, Playback, PlaybackError, Reader};
+use hardnessd_core::recording::{Entry, FileKind, Playback, Reader};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::Hrn;
 
@@ -46,30 +47,6 @@ struct Taken {
     number: u64,
     mono: Duration,
     newtons: Vec<f32>,
-}
-
-/// The reason why a recording cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum Unreadable {
-    /// The recording is damaged, or of another program.
-    #[error(transparent)]
-    Recording(#[from] recording::Error),
-    /// The recording describes an impossible sensor.
-    #[error(transparent)]
-    Playback(#[from] PlaybackError),
-}
-
-impl Unreadable {
-    /// Whether the system could not read the file, whatever the file holds.
-    pub(in crate::tools) fn is_io(&self) -> bool {
-        matches!(self, Self::Recording(recording::Error::Io(_)))
-    }
-}
-
-impl From<std::io::Error> for Unreadable {
-    fn from(error: std::io::Error) -> Self {
-        Self::Recording(error.into())
-    }
 }
 
 /// This long after a press, all its positions have come.
