@@ -6,6 +6,8 @@
     python3 results/course/own.py target/release/hrn-train --work WORK
     python3 results/course/own.py --table         # prints the table from the committed file
 
+The committed file was made with the trainer of revision 5703f13, the last one with `adapt`.
+
 A draw has 12 objects of random materials, three of each level, with 20 presses each, and 160 other objects, 40 of each
 level, with 6 presses each for the test, all on one sensor. Random materials are seldom of the middle levels, so more
 are simulated, and the first ones of each level are kept. The references are one press of each of the 12 objects.
