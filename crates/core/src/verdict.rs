@@ -13,41 +13,36 @@ pub mod features;
 mod file;
 mod grid;
 mod guard;
+mod inputs;
+mod probabilities;
 mod references;
 mod shore;
 
 use sha2::{Digest, Sha256};
 use tract_onnx::prelude::*;
 
-pub use self::card::{Card, Check, Checks, Conformal, Level, Range};
-pub use self::course::{
-    COURSE_FRAMES, CheckedCourse, Course, CourseCheck, CourseMoment, Extents, course_inputs,
-    extents, identified_inputs,
+pub use self::card::{Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Range};
+pub use self::course::{COURSE_FRAMES, Course, CourseMoment, Extents, extents};
+pub use self::error::{
+    CHECK_TOLERANCE, LevelsError, MAX_FILE_BYTES, MIN_OPSET, ModelError, NodeProblem,
+    ReferencesError, SHORE_TOLERANCE,
 };
-use self::course::{Input, Lengths, Query};
-pub use self::error::{LevelsError, ModelError, ReferencesError};
 pub use self::file::{check_levels, describe};
 pub use self::grid::{COLS, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS};
-pub use self::guard::NodeProblem;
+use self::inputs::{Input, Lengths, Query};
+pub use self::inputs::{course_inputs, identified_inputs};
+pub use self::probabilities::argmax;
+use self::probabilities::{largest_difference, softmax};
 pub use self::references::{
     MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
 };
-pub use self::shore::{Borders, BordersError, Distribution, Shore};
+pub use self::shore::{Borders, BordersError, Distribution, Level, Shore};
 
 /// The default model, built into the binary; `models/course.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
 
 /// The model of single frames, also built into the binary; `models/README.md` is its card.
 pub const BUILT_IN_HRN: &[u8] = include_bytes!("../../../models/hrn.onnx");
-
-/// The largest accepted model file, in bytes: 64 MB.
-pub const MAX_FILE_BYTES: usize = 64_000_000;
-/// The oldest accepted ONNX operator set.
-pub const MIN_OPSET: i64 = 17;
-/// The largest accepted difference from the check frames' probabilities.
-pub const CHECK_TOLERANCE: f32 = 1e-4;
-/// The largest accepted difference from the check presses' Shore hardness.
-pub const SHORE_TOLERANCE: f32 = 1e-2;
 
 /// The verdict of an HRN on a press.
 ///
@@ -82,18 +77,6 @@ pub struct Verdict {
     pub shore: Option<Shore>,
     /// The conformal set, if the file has a threshold.
     pub levels: Option<Vec<u8>>,
-}
-
-/// The input that a model judges.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
-    /// Format 1: the frame of the largest contact area.
-    Frame,
-    /// Formats 2 and 3: the course of a press.
-    Course {
-        /// The largest number of frames in a course.
-        most_frames: usize,
-    },
 }
 
 /// A hardness recognition network, ready to judge.
@@ -567,31 +550,6 @@ fn read(outputs: &[TValue], place: usize, output: &'static str) -> Result<Vec<f3
         true => Ok(values),
         false => Err(ModelError::NotFinite { output }),
     }
-}
-
-/// The index and the value of the largest element. Of equal elements, the first wins.
-pub fn argmax(values: &[f32]) -> (usize, f32) {
-    let mut best = (0, f32::NEG_INFINITY);
-    for (index, &value) in values.iter().enumerate() {
-        if value > best.1 {
-            best = (index, value);
-        }
-    }
-    best
-}
-
-fn softmax(logits: &[f32]) -> Vec<f32> {
-    let (_, largest) = argmax(logits);
-    let exponentials: Vec<f32> = logits.iter().map(|logit| (logit - largest).exp()).collect();
-    let sum: f32 = exponentials.iter().sum();
-    exponentials.iter().map(|value| value / sum).collect()
-}
-
-fn largest_difference(left: &[f32], right: &[f32]) -> f32 {
-    left.iter()
-        .zip(right)
-        .map(|(l, r)| (l - r).abs())
-        .fold(0.0, f32::max)
 }
 
 /// The SHA-256 of `bytes` as 64 hexadecimal digits.

@@ -2,22 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::argmax;
-use super::course::{Course, CourseCheck, Extents};
-use super::shore::Shore;
+use super::course::{Course, Extents};
+use super::probabilities::argmax;
+use super::references::ReferencePress;
+use super::shore::{Level, Shore};
 use crate::frame::Pitch;
-
-/// One hardness level, as `hello` publishes it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Level {
-    /// The level's number, from 1; 1 is the hardest.
-    pub level: u8,
-    /// A short name without control characters, such as `very-soft`.
-    pub label: String,
-    /// The Shore hardness that the level covers, such as `51-60`.
-    pub shore: String,
-}
 
 /// The range of forces and areas in training, and for a model of format 2 the range of its presses.
 /// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
@@ -210,4 +199,43 @@ pub struct Check {
     pub frames: Vec<Vec<f32>>,
     /// One row of L probabilities for each frame.
     pub probabilities: Vec<Vec<f32>>,
+}
+
+/// `hrn.check` of a model of courses: presses, and the outputs of the trainer's own software for
+/// them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CourseCheck {
+    /// The presses: 8, or two of each level.
+    pub presses: Vec<CheckedCourse>,
+    /// The references of a model of format 3.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub references: Vec<ReferencePress>,
+}
+
+/// A press of [`CourseCheck`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CheckedCourse {
+    /// The course of the press.
+    #[serde(flatten)]
+    pub course: Course,
+    /// `[L]`: the trainer's probabilities.
+    pub probabilities: Vec<f32>,
+    /// The trainer's Shore hardness: value, low and high.
+    pub shore: Shore,
+    /// Whether the trainer judged the press with the references.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub identified: bool,
+}
+
+/// The input that a model judges.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Format 1: the frame of the largest contact area.
+    Frame,
+    /// Formats 2 and 3: the course of a press.
+    Course {
+        /// The largest number of frames in a course.
+        most_frames: usize,
+    },
 }

@@ -1,10 +1,19 @@
-//! The reasons why a model is refused, or takes no levels or references.
+//! The bounds of a model, and the reasons why it is refused or takes no levels or references.
 
 use std::time::Duration;
 
-use super::guard::NodeProblem;
 use super::shore::BordersError;
-use super::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, SHORE_TOLERANCE};
+
+/// The largest accepted model file, in bytes: 64 MB.
+pub const MAX_FILE_BYTES: usize = 64_000_000;
+/// The oldest accepted ONNX operator set.
+pub const MIN_OPSET: i64 = 17;
+/// The largest accepted difference from the check frames' probabilities.
+pub const CHECK_TOLERANCE: f32 = 1e-4;
+/// The largest accepted difference from the check presses' Shore hardness.
+pub const SHORE_TOLERANCE: f32 = 1e-2;
+/// The most numbers in all values of a graph, which are 256 MB of `f32`.
+pub(super) const MOST_NUMBERS: usize = 64_000_000;
 
 /// The reason why a model file is refused, or why a judgement failed.
 #[derive(Debug, thiserror::Error)]
@@ -151,4 +160,53 @@ pub struct ReferencesError {
     pub(super) numbers: usize,
     pub(super) most: usize,
     pub(super) features: usize,
+}
+
+/// The problem with a node of a graph.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeProblem {
+    /// The operator is not in the list.
+    #[error("this operator is not supported (docs/formats.md has the list)")]
+    Operator,
+    /// The inference library would ignore the value of this attribute.
+    #[error("this value of attribute `{0}` is not supported")]
+    Attribute(&'static str),
+    /// A shape is unknown until the model runs.
+    #[error("the shape of its output depends on an input of the model")]
+    Shape,
+    /// An index, a length or a divisor is unknown until the model runs.
+    #[error("it takes integers that depend on an input of the model")]
+    Integers,
+    /// The values of the graph are too large.
+    #[error("with it more than {MOST_NUMBERS} numbers are computed")]
+    Numbers,
+    /// The lists of a forest's nodes, or of its votes, differ in length.
+    #[error("the lists of its trees differ in length")]
+    TreeLists,
+    /// The numbers of a tree's nodes are not 0, 1, 2, ... in this order.
+    #[error("node {id} of tree {tree} is out of order")]
+    TreeOrder {
+        /// The number of the tree.
+        tree: i64,
+        /// The number of the node.
+        id: i64,
+    },
+    /// A branch leads to no later node of its tree.
+    #[error("node {id} of tree {tree} leads nowhere")]
+    TreeEnd {
+        /// The number of the tree.
+        tree: i64,
+        /// The number of the node.
+        id: i64,
+    },
+    /// A vote names a class or a leaf that does not exist.
+    #[error("a vote for class {class} at node {id} of tree {tree}")]
+    Vote {
+        /// The number of the class.
+        class: i64,
+        /// The number of the tree.
+        tree: i64,
+        /// The number of the node.
+        id: i64,
+    },
 }

@@ -8,15 +8,14 @@ use std::ops::RangeInclusive;
 use serde::Deserialize;
 use tract_onnx::pb;
 
-use super::course::{Input, Lengths};
+use super::card::{Card, Check, Checks, Conformal, CourseCheck, Format, Range};
+use super::course::COURSE_FRAMES;
+use super::error::{MIN_OPSET, ModelError};
 use super::features::FEATURES;
 use super::grid::{COLS, ROWS, TAXELS};
+use super::inputs::{Input, Lengths};
 use super::references::{MOST_REFERENCES, PIECE};
-use super::shore::Borders;
-use super::{
-    COURSE_FRAMES, Card, Check, Checks, Conformal, CourseCheck, Format, Level, MIN_OPSET,
-    ModelError, Range,
-};
+use super::shore::{Borders, Level};
 use crate::wording::is_plain;
 
 /// The longest `label` and `shore` of a level: every event carries a label.

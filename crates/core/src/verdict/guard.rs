@@ -12,7 +12,7 @@ use tract_onnx::pb;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::ops::scan::Scan;
 
-use super::ModelError;
+use super::error::{MOST_NUMBERS, ModelError, NodeProblem};
 
 /// The domain of ONNX's classic learners.
 const LEARNERS: &str = "ai.onnx.ml";
@@ -142,58 +142,6 @@ const TAKES_ANY_INTEGER: [&str; 12] = [
     "Reshape",
     "RmAxis",
 ];
-
-/// The most numbers in all values of a graph, which are 256 MB of `f32`.
-const MOST_NUMBERS: usize = 64_000_000;
-
-/// The problem with a node of a graph.
-#[derive(Debug, thiserror::Error)]
-pub enum NodeProblem {
-    /// The operator is not in the list.
-    #[error("this operator is not supported (docs/formats.md has the list)")]
-    Operator,
-    /// The inference library would ignore the value of this attribute.
-    #[error("this value of attribute `{0}` is not supported")]
-    Attribute(&'static str),
-    /// A shape is unknown until the model runs.
-    #[error("the shape of its output depends on an input of the model")]
-    Shape,
-    /// An index, a length or a divisor is unknown until the model runs.
-    #[error("it takes integers that depend on an input of the model")]
-    Integers,
-    /// The values of the graph are too large.
-    #[error("with it more than {MOST_NUMBERS} numbers are computed")]
-    Numbers,
-    /// The lists of a forest's nodes, or of its votes, differ in length.
-    #[error("the lists of its trees differ in length")]
-    TreeLists,
-    /// The numbers of a tree's nodes are not 0, 1, 2, ... in this order.
-    #[error("node {id} of tree {tree} is out of order")]
-    TreeOrder {
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
-    /// A branch leads to no later node of its tree.
-    #[error("node {id} of tree {tree} leads nowhere")]
-    TreeEnd {
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
-    /// A vote names a class or a leaf that does not exist.
-    #[error("a vote for class {class} at node {id} of tree {tree}")]
-    Vote {
-        /// The number of the class.
-        class: i64,
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
-}
 
 /// Checks the operators of a graph as it is in the file.
 pub(super) fn check_operators(graph: &pb::GraphProto) -> Result<(), ModelError> {

@@ -6,7 +6,19 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Level, argmax, softmax};
+use super::probabilities::{argmax, softmax};
+
+/// One hardness level, as `hello` publishes it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Level {
+    /// The level's number, from 1; 1 is the hardest.
+    pub level: u8,
+    /// A short name without control characters, such as `very-soft`.
+    pub label: String,
+    /// The Shore hardness that the level covers, such as `51-60`.
+    pub shore: String,
+}
 
 /// The end of the scale.
 const MOST: f32 = 100.0;
