@@ -6,13 +6,12 @@
     python3 results/course/own.py target/release/hrn-train --work WORK
     python3 results/course/own.py --table         # prints the table from the committed file
 
-The committed file was made with the trainer of revision 5703f13, the last one with `adapt`.
-
 A draw has 12 objects of random materials, three of each level, with 20 presses each, and 160 other objects, 40 of each
 level, with 6 presses each for the test, all on one sensor. Random materials are seldom of the middle levels, so more
 are simulated, and the first ones of each level are kept. The references are one press of each of the 12 objects.
 
-With a trainer of revision 5703f13 or before, which has `adapt`, it also trains the model on the 240 presses.
+Revision 5703f13 is the last one whose trainer has `adapt`. With that trainer, which made the committed file, the model
+is also trained on the 240 presses.
 
 WORK keeps data sets and runs, so an interrupted call goes on. own.json, beside this file, has what `evaluate --json`
 prints for every draw and way.
