@@ -29,7 +29,7 @@ pub(super) fn igan(profile: Profile) -> Settings {
 pub(super) fn ours_steady(profile: Profile) -> Settings {
     let mut settings = Settings::of(profile);
     for (gan, measured) in [(&mut settings.ustgan, 5), (&mut settings.stgan, 20)] {
-        gan.gradient_penalty = 1.0;
+        gan.gradient_penalty = 0.001;
         gan.generator_averaging = averaging(profile);
         gan.keep = Keep::Best;
         gan.picture_every_epochs = gan.picture_every_epochs.min(measured);

@@ -184,7 +184,8 @@ impl Checkpoint {
     }
 
     /// Returns an error unless the checkpoint has each of the lists of `fresh`, with weights of the
-    /// same names and sizes. Its other lists must be like the first one of `fresh`.
+    /// same names and sizes. Each of its other lists, such as `generator best`, must be like a list of
+    /// the same learner.
     ///
     /// # Errors
     ///
@@ -194,7 +195,7 @@ impl Checkpoint {
             self.list(name)?;
         }
         for (name, list) in &self.lists {
-            let like = fresh.iter().find(|(own, _)| own == name).or(fresh.first());
+            let like = fresh.iter().find(|(own, _)| learner(own) == learner(name));
             let like = like.map_or(&[][..], |(_, weights)| &weights.entries);
             let shapes = |weights: &[Weight]| -> Vec<(String, Vec<usize>)> {
                 let shape = |weight: &Weight| (weight.name.clone(), weight.dims.clone());
@@ -211,6 +212,11 @@ impl Checkpoint {
         }
         Ok(())
     }
+}
+
+/// The learner of a list: `generator` of `generator best`, and none of `best`.
+fn learner(list: &str) -> Option<&str> {
+    list.rsplit_once(' ').map(|(learner, _)| learner)
 }
 
 fn flat(values: Vec<f32>, device: &Device) -> Tensor<1> {

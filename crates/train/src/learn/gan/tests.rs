@@ -243,6 +243,7 @@ fn the_nearest_generator_is_kept_through_a_checkpoint() {
     let first = numbers(&near.generator.entries[0].values);
     let sensor = Sensor::of(&[]);
     let mut state = State::fresh(near, &settings, sensor);
+    let fresh = state.checkpoint("").lists;
     let keep = |state: &mut State, distance| {
         let generator = state.generator.evaluated();
         state.keep(distance, generator, settings.keep);
@@ -250,6 +251,8 @@ fn the_nearest_generator_is_kept_through_a_checkpoint() {
     keep(&mut state, 0.5);
     state.generator.weights = far.generator;
     keep(&mut state, 0.7);
-    let resumed = State::resumed(&state.checkpoint(""), &settings, sensor).unwrap();
+    let checkpoint = state.checkpoint("");
+    checkpoint.check_like(&fresh).unwrap();
+    let resumed = State::resumed(&checkpoint, &settings, sensor).unwrap();
     assert_eq!(numbers(&resumed.kept().generator.entries[0].values), first);
 }
