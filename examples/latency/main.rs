@@ -42,6 +42,9 @@ struct Args {
     /// Sensors
     #[arg(long, default_value_t = 1)]
     sensors: usize,
+    /// Rows and columns of each array, with hardnessd
+    #[arg(long, default_value_t = 28)]
+    side: usize,
     /// Frames a second of each
     #[arg(long, default_value_t = 100.0)]
     rate: f64,
@@ -154,11 +157,12 @@ fn measure(args: &Args) -> Result<(), Failure> {
     let figures = heard.figures(args, &sent);
     let frames = args.sensors as f64 * args.rate * taken.as_secs_f64();
     println!(
-        "{:?} sensors {} rate {} clients {} {:?} scheduling {:?} s {:.0}: {figures}; \
+        "{:?} sensors {} side {} rate {} clients {} {:?} scheduling {:?} s {:.0}: {figures}; \
          processor {:.1} us a frame, {:.1} % of a core; anonymous memory {memory} kB; \
          the sensors were at most {:.2} ms late{}",
         args.server,
         args.sensors,
+        args.side,
         args.rate,
         args.clients,
         args.event,

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use hardnessd_core::frame::RawFrame;
+use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{Layout, Settings};
 use rustix::termios::OptionalActions;
 
@@ -73,6 +73,7 @@ pub(crate) fn now_ns() -> u64 {
 pub(crate) struct Sensors {
     pairs: Vec<Pair>,
     sent: Arc<Sent>,
+    side: usize,
     rate: f64,
     kind: Kind,
 }
@@ -85,6 +86,7 @@ impl Sensors {
         Ok(Self {
             pairs: pairs?,
             sent: Arc::new(Sent((0..args.sensors).map(|_| list()).collect())),
+            side: args.side,
             rate: args.rate,
             kind: args.server,
         })
@@ -100,7 +102,11 @@ impl Sensors {
 
     /// Sends for `length`. Returns the largest delay of a frame.
     pub(crate) fn play(self, length: Duration) -> Result<(Self, Duration), Failure> {
-        let layout = Layout::new(&Settings::default())?;
+        let layout = Layout::new(&Settings {
+            rows: Some(self.side),
+            cols: Some(self.side),
+            ..Settings::default()
+        })?;
         let start = Instant::now();
         let period = Duration::from_secs_f64(1.0 / self.rate);
         let count = self.pairs.len();
@@ -115,7 +121,7 @@ impl Sensors {
                 let mut bytes = Vec::new();
                 match self.kind {
                     Kind::Gpsd => bytes.extend(sentences(number).as_bytes()),
-                    _ => layout.encode(&frame(number, is_loaded), &mut bytes),
+                    _ => layout.encode(&frame(self.side, number, is_loaded), &mut bytes),
                 }
                 bytes
             };
@@ -151,16 +157,22 @@ fn plug() -> io::Result<Pair> {
     Ok(pair)
 }
 
-/// Frame `number`. Its first taxels carry the number. They are too few for a contact.
-fn frame(number: i32, is_loaded: bool) -> RawFrame {
-    let mut frame = RawFrame::default();
+/// Frame `number` of an array of `side` rows and columns. Its first taxels carry the number. They
+/// are too few for a contact. The load is on a seventh of the rows and of the columns.
+fn frame(side: usize, number: i32, is_loaded: bool) -> RawFrame {
+    let array = Array {
+        rows: side,
+        cols: side,
+    };
+    let mut frame = RawFrame::zero(array);
     for (count, byte) in frame.counts.iter_mut().zip(number.to_le_bytes()) {
         *count = u16::from(byte);
     }
     if is_loaded {
-        for row in 12..16 {
-            for col in 12..16 {
-                frame.counts[row * 28 + col] = 60;
+        let loaded = side * 3 / 7..side * 4 / 7;
+        for row in loaded.clone() {
+            for col in loaded.clone() {
+                frame.counts[array.place(row, col)] = 60;
             }
         }
     }

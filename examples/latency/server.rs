@@ -182,11 +182,13 @@ impl Drop for Server {
 
 fn configuration(args: &Args, devices: &[PathBuf], port: u16, metrics: u16) -> String {
     let mut text = String::from("robot = \"bench\"\n");
+    let (side, pitch_mm) = (args.side, 3.5 * 28.0 / args.side as f64);
     for (index, device) in devices.iter().enumerate() {
         let _ = write!(
             text,
             "[[sensor]]\nname = \"s{index}\"\nport = \"{}\"\nframe_rate_hz = {:?}\n\
-             [sensor.calibration]\ntare_frames = 0\n",
+             [sensor.frame]\nrows = {side}\ncols = {side}\n\
+             [sensor.calibration]\ntare_frames = 0\npitch_mm = {pitch_mm}\n",
             device.display(),
             args.rate
         );
