@@ -1,6 +1,8 @@
 use super::super::object::Shapes;
+use super::super::sensor::Design;
 use super::super::settings::Materials;
 use super::*;
+use hardnessd_core::verdict::{self, BUILT_IN, Course, Hrn, ModelFrame};
 
 fn small() -> CourseSettings {
     CourseSettings {
@@ -139,4 +141,93 @@ fn errors_are_in_what_is_told_and_nowhere_else() {
         assert!((most(wrong) - most(truth)).abs() <= slack);
     }
     assert!((2..20).contains(&unknown), "{unknown} of {}", wrong.len());
+}
+
+/// The levels that the built-in model gives to presses that arrays of other pitches read, with the
+/// electronics of the JX255N and forces by area.
+#[test]
+fn arrays_of_other_pitches_mostly_give_the_same_levels() {
+    let model = Hrn::load(BUILT_IN).unwrap();
+    // The second is another instance of the first: a level near a border changes with the noise.
+    let pitches_mm = [3.5, 3.5, 1.75, 7.0];
+    for (materials, shapes, least) in [
+        (Materials::Named, Shapes::Matched, [0.95, 0.95, 0.88]),
+        (Materials::Broad, Shapes::Matched, [0.90, 0.88, 0.75]),
+        (Materials::Broad, Shapes::Wide, [0.90, 0.88, 0.72]),
+    ] {
+        let settings = CourseSettings {
+            objects: DatasetSettings {
+                seed: 411,
+                materials,
+                shapes,
+                objects: 0,
+                test_objects: 10,
+                presses: 6,
+                ..DatasetSettings::default()
+            },
+            ..CourseSettings::default()
+        };
+        let of = &settings.objects;
+        let sensors: Vec<Sensor> = (0_u64..)
+            .zip(pitches_mm)
+            .map(|(k, pitch_mm)| {
+                let design = Design::jx255n(of.profile).at_pitch(pitch_mm);
+                Sensor::draw(design, &Stream::new(of.seed, "pitches").child(k))
+            })
+            .collect();
+        let mut bench = Bench::default();
+        let mut levels = Vec::new();
+        for unit in units(of) {
+            let subject = Subject::draw(of, unit, &[]);
+            for press in 0..of.presses.into() {
+                let mut paired = subject.draws.geometry.child(3).child(press);
+                let plan = Plan::draw(&settings, &mut paired);
+                let arm_n_per_mm = plan.reported_n_per_mm(&plan.reading);
+                let read = subject.pressed(&mut bench, &plan, press, |solved, _, noise| {
+                    let read = |sensor| read_press(sensor, solved, &plan.reading, noise);
+                    sensors.iter().map(read).collect::<Option<Vec<_>>>()
+                });
+                levels.extend(read.map(|presses| {
+                    presses
+                        .iter()
+                        .map(|press| model.judge_course(&course_of(press, arm_n_per_mm)))
+                        .map(|verdict| verdict.unwrap().level)
+                        .collect::<Vec<_>>()
+                }));
+            }
+        }
+        let alike = |sensor: usize| {
+            let same = levels.iter().filter(|own| own[sensor] == own[0]);
+            same.count() as f64 / levels.len() as f64
+        };
+        let shares = [alike(1), alike(2), alike(3)];
+        println!(
+            "{materials:?} materials, {shapes:?} shapes, {} presses: the level of a 3.5 mm array by \
+             another one, at 1.75 mm and at 7 mm: {shares:.3?}",
+            levels.len()
+        );
+        assert!(
+            shares
+                .iter()
+                .zip(least)
+                .all(|(&share, least)| share > least),
+            "{shares:?}"
+        );
+    }
+}
+
+fn course_of(press: &ReadPress, arm_n_per_mm: f32) -> Course {
+    let moments = press.moments.iter().filter(|moment| moment.time_s >= 0.0);
+    Course {
+        moments: moments
+            .map(|moment| verdict::CourseMoment {
+                time_s: moment.time_s,
+                approach_mm: Some(moment.approach_mm),
+                frame: ModelFrame {
+                    newtons: std::array::from_fn(|k| 1e-3 * f32::from(moment.millinewtons[k])),
+                },
+            })
+            .collect(),
+        arm_n_per_mm,
+    }
 }
