@@ -58,6 +58,27 @@ def by_object(verdicts):
     return counts
 
 
+# The arrays of a data set of courses that have a row for each frame. The others have one for each press.
+OF_FRAMES = ("frames_mn", "press", "time_s", "approach_mm", "known")
+
+
+def presses(data, kept):
+    """The arrays of a data set of courses with only the presses where `kept` is true."""
+    import numpy
+
+    data = dict(data)
+    rows = kept[data["press"]]
+    # The numbers of the kept presses and rows, counted anew.
+    press, row = numpy.cumsum(kept) - 1, numpy.cumsum(rows) - 1
+    data["press"], data["best"] = press[data["press"]], row[data["best"]]
+    for name, values in data.items():
+        if name != "meta":
+            data[name] = values[rows if name in OF_FRAMES else kept]
+    for name in ("press", "best"):
+        data[name] = data[name].astype(numpy.uint32)
+    return data
+
+
 CONFIDENCES = (0.5, 0.7, 0.9, 0.95)
 
 

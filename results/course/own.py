@@ -30,8 +30,6 @@ import trainer as training  # noqa: E402
 MODEL = HERE.parent.parent / "models/course.onnx"
 DRAWS = (1, 2, 3)
 FACTORS = (1.0, 1.5)
-# The arrays that have a row for each frame. The others have one for each press.
-OF_FRAMES = ("frames_mn", "press", "time_s", "approach_mm", "known")
 COMMON = "--sequences --materials broad --gaps --shapes wide --cover 0.8 --sensor-profile raw --fps 20"
 
 
@@ -45,15 +43,7 @@ def first(path, objects, factor):
         names = numpy.unique(data["object"][data["level"] == level])
         assert len(names) >= objects, f"level {level} has {len(names)} objects, not {objects}"
         kept |= numpy.isin(data["object"], names[:objects]) & (data["level"] == level)
-    rows = kept[data["press"]]
-    # The numbers of the kept presses and rows, counted anew.
-    press, row = numpy.cumsum(kept) - 1, numpy.cumsum(rows) - 1
-    data["press"], data["best"] = press[data["press"]], row[data["best"]]
-    for name, values in data.items():
-        if name != "meta":
-            data[name] = values[rows if name in OF_FRAMES else kept]
-    for name in ("press", "best"):
-        data[name] = data[name].astype(numpy.uint32)
+    data = training.presses(data, kept)
     data["frames_mn"] = numpy.round(data["frames_mn"] * factor).astype(numpy.uint16)
     meta = json.loads(bytes(data["meta"]))
     meta["settings"] = None

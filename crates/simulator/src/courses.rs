@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-pub use self::world::{BroadSensors, REFERENCES, SensorDesigns};
+pub use self::world::{BroadSensors, REFERENCES, SensorDesigns, SensorSummary};
 use super::body::{Body, draw_patch};
 use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};

@@ -86,6 +86,23 @@ struct Place {
     index: u32,
 }
 
+/// What a sensor of a data set is, as far as studies ask.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SensorSummary {
+    /// Its number in the data set.
+    pub sensor: u32,
+    /// Distance between its taxels, mm.
+    pub pitch_mm: f64,
+    /// Whether its reading grows linearly with the force.
+    pub linear: bool,
+    /// The greatest share that an unloading taxel reads too much.
+    pub hysteresis: f32,
+    /// Young's modulus of its cover, MPa.
+    pub cover_mpa: f64,
+    /// Thickness of its cover, mm.
+    pub cover_mm: f64,
+}
+
 impl SensorDesigns {
     /// The distances between the taxels of the sensors, in mm.
     pub fn pitches_mm(self) -> [f64; 2] {
@@ -139,6 +156,60 @@ impl CourseSettings {
         };
         let contacts = |place| objects(place) * u64::from(of.presses) + 2 * u64::from(REFERENCES);
         places.iter().map(contacts).sum::<u64>() * u64::from(sensors.electronics)
+    }
+
+    /// The sensors of this shard, whose number is that of a press's sensor. Empty if the settings
+    /// have one kind of sensor.
+    pub fn sensors(&self) -> Vec<SensorSummary> {
+        let Some(sensors) = &self.sensors else {
+            return Vec::new();
+        };
+        let summary = |place: Place, k: u32| {
+            let draws = self.draws(place);
+            let cover = self.cover(sensors.designs, &mut draws.child(0));
+            let electronics = draws.child(1).child(u64::from(k));
+            let design = self.design(sensors.designs, cover, &electronics);
+            SensorSummary {
+                sensor: place.index * sensors.electronics + k,
+                pitch_mm: design.pitch_mm,
+                linear: design.is_linear(),
+                hysteresis: design.hysteresis,
+                cover_mpa: cover.young_mpa,
+                cover_mm: cover.thickness_mm,
+            }
+        };
+        let places = sensors.places(&self.objects).into_iter();
+        places
+            .flat_map(|place| (0..sensors.electronics).map(move |k| summary(place, k)))
+            .collect()
+    }
+
+    fn draws(&self, place: Place) -> Stream {
+        let name = match place.split {
+            Split::Train => "train covers",
+            Split::Test => "test covers",
+        };
+        let seed = self.objects.sensor_seed.unwrap_or(self.objects.seed);
+        Stream::new(seed, name).child(u64::from(place.number))
+    }
+
+    fn cover(&self, designs: SensorDesigns, own: &mut Stream) -> Cover {
+        // Drawn for every design, so that what is drawn after it does not depend on the design.
+        let drawn = Cover {
+            young_mpa: log_even(COVER_MPA, own),
+            thickness_mm: log_even(COVER_MM, own),
+        };
+        match designs {
+            SensorDesigns::Broad => drawn,
+            SensorDesigns::Jx255n => Cover::of(self.objects.cover_young_mpa),
+        }
+    }
+
+    fn design(&self, designs: SensorDesigns, cover: Cover, electronics: &Stream) -> Design {
+        match designs {
+            SensorDesigns::Broad => Design::broad(cover.thickness_mm, &mut electronics.child(0)),
+            SensorDesigns::Jx255n => Design::jx255n(self.objects.profile),
+        }
     }
 
     /// The names that a press's `material` indexes.
@@ -204,10 +275,7 @@ impl Electronics {
         draws: &Stream,
     ) -> Self {
         let is_broad = designs == SensorDesigns::Broad;
-        let design = match designs {
-            SensorDesigns::Broad => Design::broad(cover.thickness_mm, &mut draws.child(0)),
-            SensorDesigns::Jx255n => Design::jx255n(settings.objects.profile),
-        };
+        let design = settings.design(designs, cover, draws);
         let mut sensor = Sensor::draw(design, &draws.child(1));
         sensor.calibrate(weights);
         let mut own = draws.child(2);
@@ -235,22 +303,9 @@ impl Electronics {
 
 impl Station {
     fn draw(settings: &CourseSettings, sensors: &BroadSensors, place: Place) -> Self {
-        let of = &settings.objects;
-        let name = match place.split {
-            Split::Train => "train covers",
-            Split::Test => "test covers",
-        };
-        let seed = of.sensor_seed.unwrap_or(of.seed);
-        let draws = Stream::new(seed, name).child(u64::from(place.number));
+        let draws = settings.draws(place);
         let mut own = draws.child(0);
-        let drawn = Cover {
-            young_mpa: log_even(COVER_MPA, &mut own),
-            thickness_mm: log_even(COVER_MM, &mut own),
-        };
-        let cover = match sensors.designs {
-            SensorDesigns::Broad => drawn,
-            SensorDesigns::Jx255n => Cover::of(of.cover_young_mpa),
-        };
+        let cover = settings.cover(sensors.designs, &mut own);
         let arm_n_per_mm = log_even(settings.arm_n_per_mm, &mut own);
         let mut bench = Bench::under(cover);
         let weights = rigid::weights(&mut bench);

@@ -23,7 +23,7 @@ pub(crate) struct Design {
     /// Time constant of the film's delay, s.
     pub(super) lag_s: f32,
     /// The greatest share that an unloading taxel reads too much.
-    pub(super) hysteresis: f32,
+    pub(crate) hysteresis: f32,
     /// The share of its force that a taxel gives to each of its four neighbours, through the cover.
     pub(super) crosstalk_neighbour: f32,
     /// The share of its force that the loaded taxels of its row and column read.
@@ -172,6 +172,10 @@ impl Design {
             least_counts: 2.0,
             spread: profile.spread(),
         }
+    }
+
+    pub(crate) fn is_linear(&self) -> bool {
+        self.response == Response::Linear
     }
 
     /// How long the film is not settled after its load has gone, s.
