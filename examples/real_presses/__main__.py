@@ -13,7 +13,7 @@
     python3 examples/real_presses squeezes EstimateModulus TactileEstimateModulus
 
 The daemon judges the presses of `stamp`. The other two have no frames that it could judge, so the programs here judge
-them. docs/real-presses.md has the commits and what came out.
+them. docs/results.md says what came out, and results/real-presses.md has the commits and more tables.
 """
 
 import argparse
