@@ -25,8 +25,9 @@ use crate::daemon::lines::{LineRead, Lines};
 /// Options that name a daemon.
 #[derive(Debug, Clone, Default, ClapArgs)]
 pub struct Source {
-    /// Socket of the daemon [default: the first that answers: the user's own daemon, the
-    /// system's, a running demo]
+    /// Socket of the daemon [default: of the first daemon that answers]
+    ///
+    /// Tried in this order: the user's own daemon, the system's, running demos.
     #[arg(long, value_name = "P", conflicts_with = "connect")]
     socket: Option<PathBuf>,
     /// Connect over TCP instead, to the address under [publish.tcp]

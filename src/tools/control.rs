@@ -17,7 +17,7 @@ pub struct Target {
     /// Name of the sensor
     #[arg(value_name = "SENSOR")]
     sensor: String,
-    /// Control socket of the daemon [default: beside the events of the first daemon that answers]
+    /// Control socket of the daemon [default: of the first daemon that answers]
     #[arg(long, value_name = "P")]
     socket: Option<PathBuf>,
 }

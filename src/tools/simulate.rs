@@ -80,7 +80,7 @@ pub struct Args {
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<PathBuf>,
     /// The daemon's sensor on the arm [default: its first]
-    #[arg(long, value_name = "NAME", requires = "motion")]
+    #[arg(long, hide_short_help = true, value_name = "NAME", requires = "motion")]
     motion_sensor: Option<String>,
     /// Play no presses: move the arm as a controller says on this new Unix socket
     #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]

@@ -2,7 +2,7 @@
 //! else.
 //!
 //! A block whose fence names a source is made from that source: `text hardnessd run -h` from what the
-//! program prints, `toml config/hardnessd.toml [press]` from that part of the file. `MAKE_PAGES=1 cargo test
+//! program prints but for the option that every command has, `toml config/hardnessd.toml [press]` from that part of the file. `MAKE_PAGES=1 cargo test
 //! --workspace --test pages blocks` writes them.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -112,12 +112,23 @@ fn parts(file: &str) -> Vec<(String, String)> {
     parts.collect()
 }
 
+/// The output of `-h` without the line of `-h` itself. It is the last option, and may be the only one.
+fn without_help(output: &str) -> String {
+    let lines = output.lines();
+    let kept: Vec<&str> = lines
+        .filter(|line| !line.starts_with("  -h, --help"))
+        .collect();
+    let kept = kept.join("\n");
+    let kept = kept.trim_end();
+    kept.strip_suffix("\n\nOptions:").unwrap_or(kept).to_owned()
+}
+
 /// What a source says now. Nothing if this build does not have the command.
 fn content(source: &str) -> Option<String> {
     let words: Vec<&str> = source.split(' ').collect();
     let content = match words[0] {
         "hardnessd" | "hrn-train" if !has_command(words[1]) => return None,
-        program @ ("hardnessd" | "hrn-train") => output(program, &words[1..]),
+        program @ ("hardnessd" | "hrn-train") => without_help(&output(program, &words[1..])),
         file => {
             let part = parts(file).into_iter().find(|(name, _)| name == words[1]);
             part.unwrap_or_else(|| panic!("no part {source}")).1

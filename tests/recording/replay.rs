@@ -227,7 +227,7 @@ fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
     outcome
 }
 
-/// The figures are in `docs/configuration.md`, "Slow drift".
+/// The figures are in `docs/operator.md`, "Slow drift".
 #[test]
 fn with_auto_tare_an_hour_of_drift_costs_no_press() {
     let directory = tempfile::tempdir().unwrap();

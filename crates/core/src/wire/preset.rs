@@ -1,6 +1,6 @@
 //! The presets: every key of `[sensor.frame]`, before the configuration overrides some.
 //!
-//! `docs/configuration.md` says where each preset comes from.
+//! `docs/your-array.md` says where each preset comes from.
 
 use super::checksum::{Checksum, ChecksumOver};
 use super::settings::{Cell, FooterBytes, HexBytes, LengthField, Packets, Preset, Settings};

@@ -156,7 +156,7 @@ pub(super) struct Simulate {
     #[arg(long)]
     pub(super) sequences: bool,
     /// Threads that simulate [default: as many as cores]
-    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1024))]
+    #[arg(long, hide_short_help = true, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1024))]
     pub(super) jobs: Option<usize>,
     #[command(flatten)]
     pub(super) courses: Courses,
@@ -185,13 +185,13 @@ impl From<Sensors> for SensorDesigns {
 #[group(requires = "sequences")]
 pub(super) struct Courses {
     /// With --sequences, drawn for each press: frames a second, 1 to 200 [default: 5..100]
-    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
+    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
     pub(super) fps: Option<[f64; 2]>,
     /// Speed of the arm in mm/s, 1 to 100 [default: 2..20]
-    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 100>)]
+    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 100>)]
     pub(super) speed: Option<[f64; 2]>,
     /// Stiffness of the arm in N/mm, 1 to 1000 [default: 3..30]
-    #[arg(long, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
+    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
     pub(super) arm: Option<[f64; 2]>,
     /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
     #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
@@ -281,8 +281,8 @@ const COURSE: &str = "course";
 
 fn trained() -> impl TypedValueParser<Value = Trained> {
     let of_courses = PossibleValue::new(COURSE).help(
-        "Judges the course of a press with the arm's motion, and gives its Shore hardness: a temporal \
-         convolution. Takes data of `simulate --sequences`",
+        "Judges the course of a press, with the arm's motion and references of the sensor, and gives its Shore \
+         hardness. Takes data of `simulate --sequences`",
     );
     let methods = Method::all().iter();
     let of_frames = methods.filter_map(ValueEnum::to_possible_value);
