@@ -41,7 +41,7 @@ const MORE: &str = "\
 
 /// Arguments of `calibrate`.
 #[derive(Debug, Clone, ClapArgs)]
-#[command(after_help = MORE)]
+#[command(after_long_help = MORE)]
 pub struct Args {
     /// arm: press something rigid a few times, while the robot sends the positions of its arm. force: put
     /// known weights on the sensor, on a foot of at least three taxels. taxels: press something wide and soft at

@@ -44,7 +44,7 @@ const MORE: &str = "\
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
-#[command(after_help = MORE)]
+#[command(after_long_help = MORE)]
 pub struct Args {
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]

@@ -58,7 +58,7 @@ const MORE: &str = "\
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
-#[command(after_help = MORE)]
+#[command(after_long_help = MORE)]
 #[command(group(ArgGroup::new("source").args(["file", "port"]).required(true)))]
 pub struct Args {
     /// Recording of `record`, or raw bytes back to back, with presses in it

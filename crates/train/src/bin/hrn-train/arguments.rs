@@ -118,8 +118,9 @@ pub(super) struct Simulate {
     #[arg(long, default_value_t = DatasetSettings::default().test_objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
     pub(super) test_objects: u32,
-    /// Presses of each object: by default 50, with --sequences 6. The first 48 are six postures under eight
-    /// forces each; a smaller number takes some of these
+    /// Presses of each object [default: 50, with --sequences 6]
+    ///
+    /// The first 48 are six postures under eight forces each; a smaller number takes some of these.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
     pub(super) presses: Option<u32>,
     /// Least nominal force in newtons; the greatest is 25
@@ -234,7 +235,7 @@ pub(super) struct Courses {
 }
 
 #[derive(Debug, clap::Args)]
-#[command(after_help = COLLECTED)]
+#[command(after_long_help = COLLECTED)]
 pub(super) struct Collect {
     /// Data set to write; a file that exists is left alone without --append
     #[arg(long, value_name = "D.npz")]
@@ -263,8 +264,9 @@ pub(super) struct Collect {
     #[arg(long)]
     pub(super) skip_unusable: bool,
     /// Recordings of `record`, directories with recordings, raw bytes back to back, or data sets of
-    /// `collect` to put together. If all have a label "material" or "shore", the data set has that array; all
-    /// or none must have it
+    /// `collect` to put together
+    ///
+    /// If all have a label "material" or "shore", the data set has that array; all or none must have it.
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
 }
@@ -461,8 +463,10 @@ pub(super) struct Evaluate {
     /// objects are not judged
     #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) labelled: usize,
-    /// Also write every verdict as a line of CSV: object, level, the verdict's level, probabilities and Shore
-    /// hardness with its interval, true Shore hardness; an existing file is replaced
+    /// Also write every verdict as a line of CSV; an existing file is replaced
+    ///
+    /// The columns are object, level, the verdict's level, probabilities and Shore hardness with its interval, true
+    /// Shore hardness.
     #[arg(long, value_name = "V.csv")]
     pub(super) verdicts: Option<PathBuf>,
     /// Also write the input `features` of every press of the data, as CSV; an existing file is replaced
