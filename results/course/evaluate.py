@@ -117,6 +117,10 @@ def measure(trainer, work):
     for number, (name, options) in enumerate(SETS.items()):
         path = trainer.simulated(work / f"set-{number}.npz", f"{COMMON} {options}")
         ways = {told: judged(path, arguments) for told, arguments in TOLD.items()}
+        # The same presses of a robot that does not say where its arm is.
+        unknown = trainer.simulated(work / f"unknown-{number}.npz", f"{COMMON} {options} --unknown 1")
+        for told in ("nothing known", "2 + 2"):
+            ways[f"{told}, no positions"] = judged(unknown, TOLD[told])
         if number < 2:
             wrong = with_wrong_newtons(path, work / "wrong.npz")
             for told in ("nothing known", "2 + 2"):
@@ -145,11 +149,12 @@ def table():
         shares = [shore["coverage"], sets["coverage"], sets["ambiguous"], sets["accuracy_of_others"]]
         cells += [f"{100 * share:.1f} %" for share in shares]
         print("|", " | ".join([name, *cells, f"{all_of['ece']:.3f}"]), "|")
-    print("\nNewtons that are wrong by 0.5 to 2\n\n| Test presses | nothing known | 2 + 2 |")
-    for name, of_set in found.items():
-        ways = of_set["ways"]
-        if "2 + 2, wrong newtons" in ways:
-            print("|", name, "|", shown(ways["nothing known, wrong newtons"]), "|", shown(ways["2 + 2, wrong newtons"]), "|")
+    for title, way in (("Newtons that are wrong by 0.5 to 2", "wrong newtons"), ("No positions of the arm", "no positions")):
+        print(f"\n{title}\n\n| Test presses | nothing known | 2 + 2 |")
+        for name, of_set in found.items():
+            ways = of_set["ways"]
+            if f"2 + 2, {way}" in ways:
+                print("|", name, "|", shown(ways[f"nothing known, {way}"]), "|", shown(ways[f"2 + 2, {way}"]), "|")
 
 
 if __name__ == "__main__":

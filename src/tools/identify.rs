@@ -41,7 +41,7 @@ pub struct Args {
     /// Add to the file, which may exist
     #[arg(long)]
     append: bool,
-    /// What is pressed: flat:MM (a rigid flat piece so many mm across), ball:MM (a rigid ball of that radius),
+    /// What is pressed: flat:MM (a rigid flat piece, its width), ball:MM (a rigid ball, its radius),
     /// shore:OO or level:N [default: the recording's labels `reference`, `shore` or `level`]
     #[arg(long = "as", value_name = "WHAT")]
     what: Option<What>,

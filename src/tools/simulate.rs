@@ -50,8 +50,8 @@ pub struct Args {
     /// option for several in turn [default: all eight]
     #[arg(long = "material", value_name = "M", value_parser = named::<Material>)]
     materials: Vec<Material>,
-    /// Rigid piece to press in place of the materials, for `identify`: flat:MM (so many mm across) or ball:MM (of
-    /// that radius), 1 to 100 mm
+    /// Rigid piece to press in place of the materials, for `identify`: flat:MM (its width) or ball:MM (its radius),
+    /// 1 to 100 mm
     #[arg(long, value_name = "PIECE", conflicts_with_all = ["materials", "arm"], value_parser = piece)]
     piece: Option<Reference>,
     /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
