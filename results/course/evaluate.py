@@ -3,7 +3,7 @@
 
     cargo build --release --workspace
     pip install numpy
-    python3 results/course/evaluate.py target/release/hrn-train --work WORK     # half an hour of one core
+    python3 results/course/evaluate.py target/release/hrn-train --work WORK     # 40 minutes of one core
     python3 results/course/evaluate.py --table          # prints the tables from the committed file
 
 WORK keeps the data sets, so an interrupted call goes on. evaluations.json, beside this file, has the figures of every
