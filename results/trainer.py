@@ -108,10 +108,22 @@ def print_by_level_and_confidence(written, model):
         print("|", name, "|", " | ".join(cells), "|")
 
 
+def on_lines(value, indent=""):
+    """A value as JSON. What fits on a line is on one."""
+    line = json.dumps(value)
+    if len(line) <= 100 or not isinstance(value, (dict, list)):
+        return line
+    deeper = indent + " "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key)}: {on_lines(part, deeper)}" for key, part in value.items()]
+        return "{\n" + ",\n".join(deeper + part for part in parts) + f"\n{indent}}}"
+    return "[\n" + ",\n".join(deeper + on_lines(part, deeper) for part in value) + f"\n{indent}]"
+
+
 def write(path, trainer, found):
     """Writes what was found, with the program's version, and the revisions that made the runs."""
     program = {"program": trainer.run("--version").strip(), "revisions": sorted(trainer.revisions - {""})}
-    path.write_text(json.dumps(program | found, indent=1) + "\n")
+    path.write_text(on_lines(program | found) + "\n")
 
 
 def main(description, measure, table, *inputs):
