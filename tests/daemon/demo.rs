@@ -79,7 +79,7 @@ fn on_a_terminal_each_press_is_a_line_with_the_truth_beside_the_verdict() {
     let [right, wrong, without] = counts;
     let mut count = format!("4 presses: {right} right, {wrong} wrong");
     if without > 0 {
-        count += &format!(", {without} without a verdict");
+        count += &format!(", {without} without a level");
     }
     assert!(lines[4].starts_with(&count), "{shown}");
 }

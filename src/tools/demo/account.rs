@@ -120,7 +120,7 @@ impl Account {
         let mut line = format!("{presses} press{plural}: {right} right, {wrong} wrong");
         let without = presses - right - wrong;
         if without > 0 {
-            line += &format!(", {without} without a verdict");
+            line += &format!(", {without} without a level");
         }
         let judged = right + wrong;
         if judged > 0 {
@@ -172,7 +172,7 @@ mod tests {
         assert_eq!(account.line(&early), None);
         assert_eq!(
             account.close(),
-            "4 presses: 1 right, 1 wrong, 2 without a verdict (50 % right, on simulated presses)"
+            "4 presses: 1 right, 1 wrong, 2 without a level (50 % right, on simulated presses)"
         );
     }
 }
