@@ -183,6 +183,24 @@ def npz():
         keep("npz", name, out.getvalue())
 
 
+def references():
+    members = {
+        "piece": numpy.array([1, 3], dtype=numpy.uint8),
+        "piece_mm": numpy.array([20, 0], dtype=numpy.float32),
+        "shore": numpy.array([[0, 0], [61, 70]], dtype=numpy.float32),
+        "arm_n_per_mm": numpy.array([12.5, 0], dtype=numpy.float32),
+        "press": numpy.array([0, 0, 1], dtype=numpy.uint32),
+        "time_s": numpy.array([0, 0.1, 0], dtype=numpy.float32),
+        "approach_mm": numpy.array([0, 0.5, 0], dtype=numpy.float32),
+        "known": numpy.array([1, 1, 0], dtype=numpy.uint8),
+        "frames_mn": numpy.zeros((3, 28, 28), dtype=numpy.uint16),
+    }
+    for name, save in (("stored", numpy.savez), ("deflated", numpy.savez_compressed)):
+        out = io.BytesIO()
+        save(out, **members)
+        keep("references", name, out.getvalue())
+
+
 def motion():
     keep("motion", "table", b"\0time_s,approach_mm\n0,0\n0.1,0.5\n0.2,1e0\n0.15,1\n")
     steps = b"".join(bytes([10, mm]) for mm in range(40))
@@ -193,7 +211,7 @@ def motion():
 def main():
     whole = pathlib.Path(sys.argv[1]).read_bytes()
     os.chdir(TOP)
-    for make in (wire, lines, http, configuration, model, npz, motion):
+    for make in (wire, lines, http, configuration, model, npz, references, motion):
         make()
     recording(whole)
     total = sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file())

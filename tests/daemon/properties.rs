@@ -19,6 +19,7 @@ use hardnessd::daemon::config::{Config, Setup};
 use hardnessd::tools::replay::motion as table;
 use hardnessd_core::motion::{Point, Track};
 use hardnessd_core::recording::{Playback, Reader, recover};
+use hardnessd_core::references as known;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{
@@ -45,6 +46,7 @@ pub const ALL: &[(&str, Property)] = &[
     ("motion", motion),
     ("recording", recording),
     ("recover", recovered),
+    ("references", references),
     ("wire", wire),
 ];
 
@@ -345,6 +347,19 @@ pub fn model(bytes: &[u8]) {
         && let Ok(hrn) = Hrn::load(bytes)
     {
         hrn.judge_check(0).expect("a model that was loaded judges");
+    }
+}
+
+/// A file of references is refused in one line, or its presses are written and read again.
+pub fn references(bytes: &[u8]) {
+    match known::read(bytes) {
+        Ok(presses) => {
+            // The first writing rounds forces to millinewtons.
+            let written = known::write(&presses).expect("memory takes all");
+            let again = known::read(&written).expect("presses that were read before");
+            assert_eq!(known::write(&again).expect("memory takes all"), written);
+        }
+        Err(error) => assert!(!error.to_string().contains('\n'), "{error}"),
     }
 }
 
