@@ -202,13 +202,18 @@ pub(super) struct Text {
 impl Text {
     /// Returns `None` if the connections keep too many texts waiting.
     fn new(text: String, text_bytes: &Arc<Semaphore>) -> Option<Self> {
-        let bytes = u32::try_from(text.len()).ok()?;
-        let bytes = Arc::clone(text_bytes).try_acquire_many_owned(bytes).ok()?;
+        let bytes = reserve(text.len(), text_bytes)?;
         Some(Self {
             text,
             _bytes: bytes,
         })
     }
+}
+
+/// The share of a text of this length. `None` if the connections keep too many texts waiting.
+fn reserve(bytes: usize, text_bytes: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
+    let bytes = u32::try_from(bytes).ok()?;
+    Arc::clone(text_bytes).try_acquire_many_owned(bytes).ok()
 }
 
 impl AsRef<[u8]> for Text {

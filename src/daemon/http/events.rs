@@ -10,11 +10,11 @@ use std::time::Duration;
 use axum::extract::{Request, State};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
-use futures_util::stream::{self, StreamExt};
+use futures_util::stream::{self, Stream, StreamExt};
 use hyper::StatusCode;
-use tokio::sync::{SemaphorePermit, mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, SemaphorePermit, mpsc, oneshot};
 
-use super::{Sources, refusal};
+use super::{Sources, full, refusal, reserve};
 use crate::daemon::hub::{Ahead, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription, Unusable};
 use hardnessd_core::event::Kind;
@@ -30,7 +30,29 @@ const RETRY: Duration = Duration::from_secs(1);
 
 /// Events that go to the connection together. Events that the connection does not take stay in the
 /// hub, whose queue is bounded.
-type Batch = Vec<Event>;
+struct Batch {
+    events: Vec<Event>,
+    /// The share of [`super::MOST_TEXT_BYTES`] of the first batch. It grows with the number of sensors, and the
+    /// hub bounds all others.
+    bytes: Option<OwnedSemaphorePermit>,
+}
+
+impl Batch {
+    /// The events. The last one gives the share back.
+    fn events(self) -> impl Stream<Item = Event> {
+        let Self { events, bytes } = self;
+        stream::iter(events.into_iter().inspect(move |_| {
+            let _held = &bytes;
+        }))
+    }
+}
+
+/// The reason a subscription is refused.
+enum Refused {
+    Ahead(Ahead),
+    /// The connections keep too many texts waiting.
+    Full,
+}
 
 /// Answers a request.
 pub(super) async fn answer(
@@ -44,13 +66,14 @@ pub(super) async fn answer(
     Ok(match open(sources, wanted).await? {
         Ok(mut batches) => {
             let batches = stream::poll_fn(move |context| batches.poll_recv(context));
-            let events = batches.flat_map(stream::iter).map(Ok::<_, Infallible>);
+            let events = batches.flat_map(Batch::events).map(Ok::<_, Infallible>);
             let beat = KeepAlive::new().interval(HEARTBEAT);
             // Without it, nginx and its like hold events back.
             let unbuffered = [("x-accel-buffering", "no")];
             (unbuffered, Sse::new(events).keep_alive(beat)).into_response()
         }
-        Err(ahead) => refusal(StatusCode::BAD_REQUEST, ahead),
+        Err(Refused::Ahead(ahead)) => refusal(StatusCode::BAD_REQUEST, ahead),
+        Err(Refused::Full) => full(),
     })
 }
 
@@ -112,7 +135,7 @@ fn since(key: &'static str, token: &str) -> Result<Since, Unusable> {
 async fn open(
     sources: Sources,
     wanted: Subscription,
-) -> Result<Result<mpsc::Receiver<Batch>, Ahead>, Closed> {
+) -> Result<Result<mpsc::Receiver<Batch>, Refused>, Closed> {
     let (reply, opened) = oneshot::channel();
     tokio::spawn(async move {
         let turn = sources.turns.acquire().await;
@@ -128,11 +151,16 @@ async fn open(
 /// Answers the request of a subscriber that has joined, and serves the subscriber until its
 /// connection or the hub has ended.
 async fn serve(
-    Sources { hub, snapshots, .. }: &Sources,
+    Sources {
+        hub,
+        snapshots,
+        text_bytes,
+        ..
+    }: &Sources,
     id: u64,
     hello: Line,
     wanted: Subscription,
-    opened: oneshot::Sender<Result<mpsc::Receiver<Batch>, Ahead>>,
+    opened: oneshot::Sender<Result<mpsc::Receiver<Batch>, Refused>>,
     turn: Option<SemaphorePermit<'_>>,
 ) -> Option<()> {
     let now = snapshots.current().await.ok()?;
@@ -144,12 +172,19 @@ async fn serve(
         Some(_) => Some(0),
     };
     if let Err(ahead) = hub.subscribe(id, wanted).await.ok()? {
-        return opened.send(Err(ahead)).ok();
+        return opened.send(Err(Refused::Ahead(ahead))).ok();
     }
-    let hello = event(&run, &Line { seq: from, ..hello }).retry(RETRY);
     drop(turn);
-    let mut batch = vec![hello];
-    batch.extend(now.statuses.iter().map(|line| event(&run, line)));
+    let first = now.statuses.iter().chain([&hello]);
+    let Some(bytes) = reserve(first.map(|line| line.json.len()).sum(), text_bytes) else {
+        return opened.send(Err(Refused::Full)).ok();
+    };
+    let hello = event(&run, &Line { seq: from, ..hello }).retry(RETRY);
+    let statuses = now.statuses.iter().map(|line| event(&run, line));
+    let mut batch = Batch {
+        events: [hello].into_iter().chain(statuses).collect(),
+        bytes: Some(bytes),
+    };
     // The snapshot may hold long texts, and a connection may be open for days.
     drop(now);
     let (connection, batches) = mpsc::channel(1);
@@ -161,7 +196,10 @@ async fn serve(
             lines = &mut next => lines.ok()?,
             () = connection.closed() => return None,
         };
-        batch = lines.iter().map(|line| event(&run, line)).collect();
+        batch = Batch {
+            events: lines.iter().map(|line| event(&run, line)).collect(),
+            bytes: None,
+        };
         next = hub.take(id).await.ok()?;
     }
 }
@@ -176,7 +214,16 @@ fn event(run: &str, line: &Line) -> Event {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use axum::body::Body;
+    use tokio::sync::Semaphore;
+
     use super::*;
+    use crate::daemon::hub::{self, tests::hello};
+    use crate::daemon::record::EventRecorder;
+    use crate::daemon::sensor::Sensors;
+    use crate::daemon::snapshot::Snapshots;
 
     fn ask(uri: &str, last: Option<&[u8]>) -> Result<Subscription, Unusable> {
         let mut request = Request::builder().uri(uri);
@@ -217,5 +264,45 @@ mod tests {
             let message = ask(uri, last).unwrap_err().to_string();
             assert!(message.contains(found), "{message}");
         }
+    }
+
+    #[tokio::test]
+    async fn the_first_events_of_clients_that_never_read_are_bounded() {
+        const ROOM: usize = 64 << 10;
+        let hub = hub::start(hello(), EventRecorder::default());
+        let (_, sensors) = Sensors::new(Vec::new());
+        let snapshots = Snapshots::new(hub.clone(), sensors);
+        let room = Arc::new(Semaphore::new(ROOM));
+        let sources = Sources {
+            hub,
+            texts: snapshots.clone(),
+            snapshots,
+            turns: Arc::new(Semaphore::new(1)),
+            text_bytes: Arc::clone(&room),
+        };
+        let ask = async || {
+            let request = Request::get("/events").body(Body::empty()).unwrap();
+            answer(State(sources.clone()), request).await.unwrap()
+        };
+        let mut asleep = Vec::new();
+        let full = loop {
+            assert!(asleep.len() < ROOM, "no client is refused");
+            match ask().await {
+                refused if refused.status() != StatusCode::OK => break refused,
+                served => asleep.push(served),
+            }
+        };
+        assert_eq!(full.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert!(!asleep.is_empty());
+
+        // One that leaves makes room, and so does one that reads.
+        drop(asleep.pop());
+        let mut reading = ask().await.into_body().into_data_stream();
+        let hello = reading.next().await.unwrap().unwrap();
+        assert!(hello.starts_with(b"id: "), "{hello:?}");
+        drop(asleep);
+        let waits = tokio::time::timeout(Duration::from_millis(1), reading.next());
+        assert!(waits.await.is_err(), "nothing has happened yet");
+        assert_eq!(room.available_permits(), ROOM);
     }
 }
