@@ -4,7 +4,9 @@
 //! `docs/formats.md` has the arrays. A daemon gives them to its model, and they replace nothing of the
 //! calibration.
 
-use std::io::{Cursor, Read, Write};
+use std::fmt::Display;
+use std::io::{Cursor, Write};
+use std::ops::RangeInclusive;
 
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
@@ -72,21 +74,18 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
         found,
         expected: expected.to_owned(),
     };
-    let kinds = arrays.read("piece", &[], 0.0..=255.0)?;
+    let kinds = arrays.read("piece", &[], 1..=MOST_REFERENCES, 0.0..=255.0)?;
     let count = kinds.len();
-    if !(1..=MOST_REFERENCES).contains(&count) {
-        let expected = format!("1 to {MOST_REFERENCES}");
-        return Err(content("piece", format!("{count} presses"), &expected));
-    }
-    let piece_mm = arrays.of("piece_mm", &[], count, 0.0..=MOST_MM)?;
-    let shore = arrays.of("shore", &[2], count, 0.0..=100.0)?;
-    let arm_n_per_mm = arrays.of("arm_n_per_mm", &[], count, 0.0..=1e6)?;
-    let press = arrays.read("press", &[], 0.0..=f64::from(u32::MAX))?;
+    let piece_mm = arrays.read("piece_mm", &[], count..=count, 0.0..=MOST_MM)?;
+    let shore = arrays.read("shore", &[2], count..=count, 0.0..=100.0)?;
+    let arm_n_per_mm = arrays.read("arm_n_per_mm", &[], count..=count, 0.0..=1e6)?;
+    let most = MOST_REFERENCES * COURSE_FRAMES.1;
+    let press = arrays.read("press", &[], 1..=most, 0.0..=f64::from(u32::MAX))?;
     let frames = press.len();
-    let time_s = arrays.of("time_s", &[], frames, 0.0..=1e5)?;
-    let approach_mm = arrays.of("approach_mm", &[], frames, -1e6..=1e6)?;
-    let known = arrays.of("known", &[], frames, 0.0..=1.0)?;
-    let frames_mn = arrays.of("frames_mn", &[ROWS, COLS], frames, 0.0..=65535.0)?;
+    let time_s = arrays.read("time_s", &[], frames..=frames, 0.0..=1e5)?;
+    let approach_mm = arrays.read("approach_mm", &[], frames..=frames, -1e6..=1e6)?;
+    let known = arrays.read("known", &[], frames..=frames, 0.0..=1.0)?;
+    let frames_mn = arrays.read("frames_mn", &[ROWS, COLS], frames..=frames, 0.0..=65535.0)?;
 
     let (mut references, mut first) = (Vec::with_capacity(count), 0);
     for number in 0..count {
@@ -141,60 +140,51 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
 struct Arrays<'a>(ZipArchive<Cursor<&'a [u8]>>);
 
 impl Arrays<'_> {
-    /// An array with this many rows.
-    fn of(
-        &mut self,
-        array: &'static str,
-        row: &[usize],
-        rows: usize,
-        range: std::ops::RangeInclusive<f64>,
-    ) -> Result<Vec<f64>, Error> {
-        let values = self.read(array, row, range)?;
-        let found = values.len() / row.iter().product::<usize>();
-        if found == rows {
-            return Ok(values);
-        }
-        Err(Error::Content {
-            array,
-            found: format!("{found} rows"),
-            expected: rows.to_string(),
-        })
-    }
-
-    /// An array whose rows have this shape.
+    /// An array with so many rows of this shape. Nothing is unpacked of an array with another number of rows.
     fn read(
         &mut self,
         array: &'static str,
         row: &[usize],
-        range: std::ops::RangeInclusive<f64>,
+        rows: RangeInclusive<usize>,
+        range: RangeInclusive<f64>,
     ) -> Result<Vec<f64>, Error> {
-        let Ok(entry) = self.0.by_name(&format!("{array}.npy")) else {
+        let Ok(mut entry) = self.0.by_name(&format!("{array}.npy")) else {
             return Err(Error::Missing {
                 array,
                 expected: format!("an array with rows of shape {row:?}"),
             });
         };
         let failed = |source| Error::Array { array, source };
-        let most = MOST_REFERENCES * COURSE_FRAMES.1 * TAXELS * size_of::<f64>() + BLOCK_BYTES;
-        let mut entry = entry.take(most as u64);
+        let content = |found, expected| Error::Content {
+            array,
+            found,
+            expected,
+        };
         let header = Header::read(&mut entry).map_err(failed)?;
-        if header.fortran_order || header.shape.is_empty() || header.shape[1..] != *row {
-            return Err(failed(NpyError::Shape(header.shape)));
+        let found = match header.shape.split_first() {
+            Some((&found, rest)) if !header.fortran_order && rest == row => found,
+            _ => return Err(failed(NpyError::Shape(header.shape))),
+        };
+        if !rows.contains(&found) {
+            return Err(content(format!("{found} rows"), within(&rows)));
         }
         let values = header.elements(&mut entry, Some).map_err(failed)?;
         match values.iter().find(|value| !range.contains(*value)) {
             None => Ok(values),
-            Some(found) => Err(Error::Content {
-                array,
-                found: found.to_string(),
-                expected: format!("{} to {}", range.start(), range.end()),
-            }),
+            Some(found) => Err(content(found.to_string(), within(&range))),
         }
     }
 }
 
-/// More than the longest header of an array.
-const BLOCK_BYTES: usize = 1 << 16;
+/// A range in words.
+fn within<T: Display + PartialEq>(range: &RangeInclusive<T>) -> String {
+    let (least, most) = (range.start(), range.end());
+    if least == most {
+        least.to_string()
+    } else {
+        format!("{least} to {most}")
+    }
+}
 
 /// The bytes of a file with these presses. The same presses give the same bytes.
 ///
@@ -337,10 +327,10 @@ mod tests {
         refused(&bytes[..bytes.len() / 2], "found no .npz file");
         refused(
             &write(&[]).unwrap(),
-            "piece: found 0 presses, expected 1 to 64",
+            "piece: found 0 rows, expected 1 to 64",
         );
         let many = vec![presses()[1].clone(); 65];
-        refused(&write(&many).unwrap(), "65 presses");
+        refused(&write(&many).unwrap(), "piece: found 65 rows");
         let long = [press(49, Piece::Flat { width_mm: 1.0 })];
         refused(&write(&long).unwrap(), "press: found 49 frames of press 0");
         let none = [press(4, Piece::Ball { radius_mm: 0.0 })];
@@ -354,5 +344,40 @@ mod tests {
         refused(&write(&wrong).unwrap(), "Shore [70.0, 61.0]");
         let nan = [press(4, Piece::Flat { width_mm: f32::NAN })];
         refused(&write(&nan).unwrap(), "piece_mm: found NaN");
+    }
+
+    /// A packed file may hold a thousand times its size.
+    #[test]
+    fn an_array_with_too_many_rows_is_not_unpacked() {
+        let most = MOST_REFERENCES * COURSE_FRAMES.1;
+        for (array, rows, expected) in [
+            ("piece", 65, "1 to 64"),
+            ("piece_mm", 2, "1"),
+            ("press", most + 1, "1 to 3072"),
+            ("known", 5, "4"),
+        ] {
+            // The header tells the number of rows, and nothing follows it.
+            let mut bytes = Vec::new();
+            let mut whole = ZipArchive::new(Cursor::new(write(&presses()[..1]).unwrap())).unwrap();
+            let mut zip = ZipWriter::new(Cursor::new(&mut bytes));
+            for place in 0..whole.len() {
+                let entry = whole.by_index_raw(place).unwrap();
+                if entry.name() != format!("{array}.npy") {
+                    zip.raw_copy_file(entry).unwrap();
+                }
+            }
+            let header = Header {
+                descr: "|u1".to_owned(),
+                fortran_order: false,
+                shape: vec![rows],
+            };
+            zip.start_file(format!("{array}.npy"), SimpleFileOptions::default())
+                .unwrap();
+            zip.write_all(&header.to_bytes()).unwrap();
+            zip.finish().unwrap();
+            let error = read(&bytes).unwrap_err().to_string();
+            let told = format!("{array}: found {rows} rows, expected {expected}");
+            assert_eq!(error, told);
+        }
     }
 }
