@@ -4,7 +4,7 @@
 //! `references` of the configuration names. The presses are those that the daemon's pipeline sees, as
 //! it would give them to a model of courses.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::future::Future;
 use std::io::{self, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
@@ -294,19 +294,35 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Error> {
         path: path(),
         source,
     };
-    match fs::read(&args.out) {
-        Ok(_) if !args.append => Err(Error::Taken { path: path() }),
-        Ok(bytes) => {
-            let known = references::read(&bytes).map_err(|source| Error::References {
+    if !args.append {
+        return match Part::new(&args.out) {
+            Ok(part) => Ok((Vec::new(), part)),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                Err(Error::Taken { path: path() })
+            }
+            Err(error) => Err(failed(error)),
+        };
+    }
+    // It refuses a pipe, whose reading might never end.
+    let part = Part::over(&args.out).map_err(failed)?;
+    let mut bytes = Vec::new();
+    let read = File::open(&args.out).and_then(|file| {
+        file.take(references::MAX_FILE_BYTES as u64 + 1)
+            .read_to_end(&mut bytes)
+    });
+    match read {
+        Ok(_) => {}
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Vec::new(), part)),
+        Err(source) => {
+            return Err(Error::Unreadable {
                 path: path(),
                 source,
-            })?;
-            Ok((known, Part::over(&args.out).map_err(failed)?))
+            });
         }
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {
-            Ok((Vec::new(), Part::new(&args.out).map_err(failed)?))
-        }
-        Err(source) => Err(Error::Unreadable {
+    }
+    match references::read(&bytes) {
+        Ok(known) => Ok((known, part)),
+        Err(source) => Err(Error::References {
             path: path(),
             source,
         }),

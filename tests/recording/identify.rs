@@ -1,7 +1,7 @@
 //! References: made of recordings and of presses that are made now, judged with, and recorded.
 
 use std::fs::{self, Permissions};
-use std::io::Write;
+use std::io::{Read, Write};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Output, Stdio};
 
@@ -185,6 +185,31 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         "{said}"
     );
     assert_eq!(code, 78);
+}
+
+/// A pipe is there, and nobody writes to it.
+#[test]
+fn a_pipe_is_no_file_of_references() {
+    let bench = bench();
+    let made = Command::new("mkfifo").arg(bench.path("pipe.npz")).status();
+    assert!(made.unwrap().success());
+    for (append, expected) in [
+        (None, "pipe.npz exists already"),
+        (Some("--append"), "pipe.npz: found no file"),
+    ] {
+        let identify = "identify --config plain.toml --out pipe.npz --as ball:10 wood.bin";
+        let child = Command::new(BINARY)
+            .args(identify.split_whitespace().chain(append))
+            .current_dir(bench.path("."))
+            .stderr(Stdio::piped())
+            .spawn();
+        let mut identify = Process(child.unwrap());
+        assert_eq!(identify.exit_code(), Some(74));
+        let mut said = String::new();
+        let mut stderr = identify.0.stderr.take().unwrap();
+        stderr.read_to_string(&mut said).unwrap();
+        assert!(said.contains(expected), "{said}");
+    }
 }
 
 #[test]
