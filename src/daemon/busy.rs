@@ -15,6 +15,8 @@ static LONGEST: Longest = Longest::new();
 thread_local! {
     /// The processor time of this thread when its last wait ended.
     static BEGUN: Cell<Option<Duration>> = const { Cell::new(None) };
+    /// The processor time of this thread at its last pause by [`rest`].
+    static RESTED: Cell<Duration> = const { Cell::new(Duration::ZERO) };
 }
 
 /// For `on_thread_unpark` of the runtime: a wait of this thread has ended.
@@ -40,19 +42,18 @@ pub fn longest() -> Duration {
     LONGEST.get()
 }
 
-/// Work for this long without a wait is followed by a pause. `LimitRTTIME` in the unit is 500 ms.
+/// Work for this long is followed by a pause. `LimitRTTIME` in the unit is 500 ms.
 const MOST: Duration = Duration::from_millis(20);
 const PAUSE: Duration = Duration::from_micros(100);
 
-/// Pauses this thread for a moment if it has worked for long without a wait. In real-time scheduling the
-/// system kills a process whose thread never waits. Clients that subscribe again and again, each time
-/// since the start, could leave it no wait of its own. Call it after the work for a client.
+/// Pauses this thread for a moment after each 20 ms of work. In real-time scheduling the system kills a
+/// process whose thread never sleeps. Clients that subscribe again and again, each time since the start, or a
+/// sensor that sends without end could leave it no sleep of its own: where something is there, a wait returns
+/// at once. Call it between two pieces of work for others.
 pub(super) fn rest() {
-    let worked = match (BEGUN.get(), used()) {
-        (Some(begun), Some(now)) => now.saturating_sub(begun),
-        _ => return,
-    };
-    if worked > MOST {
+    let Some(now) = used() else { return };
+    if now.saturating_sub(RESTED.get()) > MOST {
+        RESTED.set(now);
         ends();
         std::thread::sleep(PAUSE);
         begins();

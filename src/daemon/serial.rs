@@ -22,6 +22,7 @@ use tokio_serial::SerialStream;
 
 use self::network::{Datagram, Udp};
 use self::tty::{Changed, LineSettings};
+use super::busy;
 use super::port::Port;
 use crate::apart::{self, NoThread};
 use crate::maybe;
@@ -191,6 +192,8 @@ impl Link {
                     }
                 }
                 State::Open(open) => {
+                    // A sensor may send faster than the daemon reads.
+                    busy::rest();
                     let happened = open.wait(&mut self.buffer, self.settings.stale_after).await;
                     let now = Instant::now();
                     let lost = match happened {
@@ -208,6 +211,7 @@ impl Link {
                         Happened::Read(Ok(Datagram::Stranger(address))) => {
                             return Turn::Stranger(address);
                         }
+                        Happened::Read(Ok(Datagram::Ignored)) => continue,
                         Happened::Read(Err(error)) => error.to_string(),
                         Happened::RequestIsDue => {
                             if let Some((request, every)) = &self.settings.request {

@@ -120,6 +120,45 @@ fn a_press_over_tcp_is_judged_silence_is_stale_and_the_end_of_the_peer_is_loss()
     assert_eq!(doctor.status.code(), Some(1));
 }
 
+/// In real-time scheduling, the system kills a process whose thread does not sleep for half a second.
+#[test]
+fn a_sensor_that_sends_without_end_leaves_the_daemon_its_sleep() {
+    let bench = Bench::new();
+    let still = frames(&bench)[0].repeat(2000);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = format!("tcp://{}", listener.local_addr().unwrap());
+    let mut daemon = Daemon::start(&configure(&bench, &port, ""));
+    let mut peer = accept(&listener);
+    // Until the daemon has ended.
+    let flood = std::thread::spawn(move || while peer.write_all(&still).is_ok() {});
+    bench
+        .subscriber()
+        .until(&json!({"type": "status", "state": "live"}));
+    // The first thread is that of the sensors.
+    let task = format!("/proc/{0}/task/{0}", daemon.process.0.id());
+    let sleeps = || -> u64 {
+        let status = fs::read_to_string(format!("{task}/status")).unwrap();
+        let mut lines = status.lines();
+        let count = lines.find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
+        count.unwrap().trim().parse().unwrap()
+    };
+    let worked_ticks = || -> u64 {
+        let stat = fs::read_to_string(format!("{task}/stat")).unwrap();
+        // After the name, which may have spaces, come 11 fields before the times of user and system.
+        let (_, fields) = stat.rsplit_once(") ").unwrap();
+        let times = fields.split(' ').skip(11).take(2);
+        times.map(|ticks| ticks.parse::<u64>().unwrap()).sum()
+    };
+    let (begun, before) = (worked_ticks(), sleeps());
+    // A second of work: a tick is 10 ms.
+    wait_for("work", || worked_ticks() >= begun + 100);
+    let slept = sleeps() - before;
+    assert!(slept >= 20, "{slept} times in a second of work");
+    daemon.process.signal(rustix::process::Signal::TERM);
+    assert_eq!(daemon.process.exit_code(), Some(0));
+    flood.join().unwrap();
+}
+
 #[test]
 fn datagrams_are_taken_from_one_sender_until_it_is_silent() {
     let bench = Bench::new();

@@ -54,6 +54,8 @@ pub(super) enum Datagram {
     First(usize),
     /// Another one sends, too. It is reported once.
     Stranger(SocketAddr),
+    /// It says nothing.
+    Ignored,
 }
 
 /// A socket that takes datagrams from one sender at a time.
@@ -86,32 +88,32 @@ impl Udp {
         buffer: &mut [u8],
         stale_after: Duration,
     ) -> io::Result<Datagram> {
-        loop {
-            let (bytes, address) = self.socket.recv_from(buffer).await?;
-            let now = Instant::now();
-            match &mut self.sender {
-                Some(sender) if sender.address == address => {
-                    sender.last = now;
-                    // An empty datagram is no end.
-                    if bytes > 0 {
-                        return Ok(Datagram::Bytes(bytes));
-                    }
-                }
-                Some(sender) if now.duration_since(sender.last) < stale_after => {
-                    if !std::mem::replace(&mut sender.reported, true) {
-                        return Ok(Datagram::Stranger(address));
-                    }
-                }
-                _ => {
-                    self.sender = Some(Sender {
-                        address,
-                        last: now,
-                        reported: false,
-                    });
-                    return Ok(Datagram::First(bytes));
+        let (bytes, address) = self.socket.recv_from(buffer).await?;
+        let now = Instant::now();
+        Ok(match &mut self.sender {
+            Some(sender) if sender.address == address => {
+                sender.last = now;
+                // An empty datagram is no end.
+                match bytes {
+                    0 => Datagram::Ignored,
+                    bytes => Datagram::Bytes(bytes),
                 }
             }
-        }
+            Some(sender) if now.duration_since(sender.last) < stale_after => {
+                match std::mem::replace(&mut sender.reported, true) {
+                    true => Datagram::Ignored,
+                    false => Datagram::Stranger(address),
+                }
+            }
+            _ => {
+                self.sender = Some(Sender {
+                    address,
+                    last: now,
+                    reported: false,
+                });
+                Datagram::First(bytes)
+            }
+        })
     }
 
     /// Sends bytes to the sender, if there is one and there is room.
