@@ -62,8 +62,8 @@ pub struct Args {
     /// Take the presses from these recordings, and leave the sensor alone
     #[arg(long, value_name = "FILE", num_args = 1..)]
     from: Vec<PathBuf>,
-    /// taxels: write the gains to this file, which `gains` of the configuration names [default: gains.npy beside the
-    /// configuration, if there is none yet]
+    /// taxels: new file for the gains, which `gains` of the configuration names [default: gains.npy beside the
+    /// configuration]
     #[arg(long, value_name = "FILE.npy")]
     out: Option<PathBuf>,
 }
@@ -130,12 +130,6 @@ pub enum Error {
         /// The number of weights.
         expected: usize,
     },
-    /// The default path of the gains is in use.
-    #[error("{path} exists already: name the file for the gains with --out")]
-    Taken {
-        /// The default path.
-        path: PathBuf,
-    },
     /// The gains cannot be written.
     #[error("{path}: {source}")]
     Out {
@@ -161,7 +155,7 @@ impl Coded for Error {
             | Error::Taxels(_)
             | Error::Count { .. }
             | Error::Recording { .. } => FAILED,
-            Error::Taken { .. } | Error::Out { .. } | Error::Print(_) | Error::Thread(_) => IO,
+            Error::Out { .. } | Error::Print(_) | Error::Thread(_) => IO,
         }
     }
 }
@@ -209,7 +203,14 @@ pub async fn run(
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // Test the output file now, before anybody presses two hundred times.
     let out = match args.what {
-        What::Taxels => Some(begin(args.out.clone(), config)?),
+        What::Taxels => {
+            let named = args.out.clone();
+            let path = named.unwrap_or_else(|| config.with_file_name(GAINS));
+            match Part::new(&path) {
+                Ok(part) => Some((path, part)),
+                Err(source) => return Err(Error::Out { path, source }),
+            }
+        }
         What::Arm | What::Force => None,
     };
     let presses = if args.from.is_empty() {
@@ -274,23 +275,6 @@ pub async fn run(
         .await
         .map_err(Error::Print)?;
     Ok(())
-}
-
-/// Begins the file for the gains. A file that the command line names will be replaced. Without a name, the
-/// file lies beside `config`, and replaces nothing.
-fn begin(named: Option<PathBuf>, config: &Path) -> Result<(PathBuf, Part), Error> {
-    let (path, part) = match named {
-        Some(path) => (path.clone(), Part::over(&path)),
-        None => {
-            let path = config.with_file_name(GAINS);
-            (path.clone(), Part::new(&path))
-        }
-    };
-    match part {
-        Ok(part) => Ok((path, part)),
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Err(Error::Taken { path }),
-        Err(source) => Err(Error::Out { path, source }),
-    }
 }
 
 /// The presses that the sensor sends from now on; `None` if `shutdown` comes first.

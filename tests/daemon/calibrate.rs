@@ -210,7 +210,7 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     assert!(!left.iter().any(is_gains), "{left:?}");
     assert_eq!(taxels(&path("nowhere.bin")).status.code(), Some(66));
 
-    // Without --out, the file lies beside the configuration, and replaces nothing.
+    // Without --out, the file lies beside the configuration.
     let beside =
         |from: &str| hardnessd(&["calibrate", "taxels", "--config", config, "--from", from]);
     let none = beside(&path("none.bin"));
@@ -222,16 +222,16 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     let gains = fs::read(&out).unwrap();
     assert!(gains.len() > 4 * 784, "{}", gains.len());
     fs::write(&out, "of somebody else").unwrap();
-    let refused = beside(&from);
-    assert_eq!(refused.status.code(), Some(74), "{refused:?}");
-    let why = String::from_utf8(refused.stderr).unwrap();
-    assert!(
-        why.contains("gains.npy exists already: name the file for the gains with --out"),
-        "{why}"
-    );
-    assert_eq!(why.lines().count(), 1, "{why}");
+    for refused in [beside(&from), taxels(&from)] {
+        assert_eq!(refused.status.code(), Some(74), "{refused:?}");
+        let why = String::from_utf8(refused.stderr).unwrap();
+        let expected = "gains.npy: a file or link is there already: name another one, or remove it";
+        assert!(why.contains(expected), "{why}");
+        assert_eq!(why.lines().count(), 1, "{why}");
+    }
     assert_eq!(fs::read(&out).unwrap(), b"of somebody else");
-    // A file that --out names is replaced, but nothing else, whatever its name.
+    fs::remove_file(&out).unwrap();
+    // Nothing else is replaced, whatever its name.
     let script = "echo theirs > \"$1.$$.part\"; echo \"$1.$$.part\"; shift; exec \"$@\"";
     let taxels = ["calibrate", "taxels", "--config", config];
     let output = Command::new("sh")

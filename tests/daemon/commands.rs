@@ -177,7 +177,7 @@ fn recover_follows_no_link() {
     let Output { status, stderr, .. } = command.output().unwrap();
     assert_eq!(status.code(), Some(74), "{}", text(&stderr));
     assert!(
-        text(&stderr).contains("name a new one"),
+        text(&stderr).contains("name another one"),
         "{}",
         text(&stderr)
     );

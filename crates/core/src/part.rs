@@ -151,7 +151,7 @@ fn beside(path: &Path) -> io::Result<NamedTempFile> {
 }
 
 fn taken() -> io::Error {
-    let found = "a file or link is there already: name a new one";
+    let found = "a file or link is there already: name another one, or remove it";
     io::Error::new(ErrorKind::AlreadyExists, found)
 }
 
