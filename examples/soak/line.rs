@@ -1,9 +1,9 @@
-//! The line from a simulated sensor to the daemon: a pty, or a TCP connection as of a board on
-//! Wi-Fi.
+//! The line from a simulated sensor to the daemon: a pty, or a TCP connection or datagrams as of a
+//! board on Wi-Fi.
 
 use std::fs;
 use std::io::{self, ErrorKind, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
@@ -20,7 +20,18 @@ pub(crate) enum Line {
         listener: Option<TcpListener>,
         stream: Option<TcpStream>,
     },
+    /// The daemon takes datagrams at the address.
+    Udp {
+        address: SocketAddr,
+        socket: Option<UdpSocket>,
+    },
 }
+
+/// The bytes of a datagram on Ethernet. A longer frame comes in several.
+const DATAGRAM_BYTES: usize = 1472;
+
+/// A free port of this machine.
+const ANY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
 fn plug(port: &Path) -> io::Result<Pair> {
     let pair = Pair::open()?;
@@ -37,6 +48,23 @@ fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     Ok(listener)
 }
 
+/// The bytes that wait at the socket with this address, and the datagrams that it dropped.
+fn waiting(address: SocketAddr) -> io::Result<(u64, u64)> {
+    let sockets = fs::read_to_string("/proc/net/udp")?;
+    // Each line has: number, address:port, peer, state, bytes out:bytes in, and others up to the drops.
+    let end = format!(":{:04X}", address.port());
+    let found = sockets.lines().skip(1).find_map(|line| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        if !fields.get(1)?.ends_with(&end) {
+            return None;
+        }
+        let (_, bytes) = fields.get(4)?.split_once(':')?;
+        let bytes = u64::from_str_radix(bytes, 16).ok()?;
+        Some((bytes, fields.last()?.parse().ok()?))
+    });
+    found.ok_or_else(|| io::Error::other(format!("no socket at {address} in /proc/net/udp")))
+}
+
 impl Line {
     pub(crate) fn pty(port: PathBuf) -> io::Result<Self> {
         let pair = plug(&port)?;
@@ -44,11 +72,20 @@ impl Line {
     }
 
     pub(crate) fn tcp() -> io::Result<Self> {
-        let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0)))?;
+        let listener = listen(ANY)?;
         Ok(Self::Tcp {
             address: listener.local_addr()?,
             listener: Some(listener),
             stream: None,
+        })
+    }
+
+    pub(crate) fn udp() -> io::Result<Self> {
+        // The daemon binds the port that is free now.
+        let address = UdpSocket::bind(ANY)?.local_addr()?;
+        Ok(Self::Udp {
+            address,
+            socket: Some(UdpSocket::bind(ANY)?),
         })
     }
 
@@ -57,6 +94,28 @@ impl Line {
         match self {
             Self::Pty { port, .. } => port.display().to_string(),
             Self::Tcp { address, .. } => format!("tcp://{address}"),
+            Self::Udp { address, .. } => format!("udp://{address}"),
+        }
+    }
+
+    /// The bytes that are lost together.
+    pub(crate) fn unit(&self) -> usize {
+        match self {
+            Self::Pty { .. } | Self::Tcp { .. } => 1,
+            Self::Udp { .. } => DATAGRAM_BYTES,
+        }
+    }
+
+    /// Whether the daemon sees that the cable is pulled. Datagrams only stop.
+    pub(crate) fn has_end(&self) -> bool {
+        !matches!(self, Self::Udp { .. })
+    }
+
+    /// The number of datagrams that found no room at the daemon, as the system counts them.
+    pub(crate) fn dropped(&self) -> io::Result<u64> {
+        match self {
+            Self::Pty { .. } | Self::Tcp { .. } => Ok(0),
+            Self::Udp { address, .. } => Ok(waiting(*address)?.1),
         }
     }
 
@@ -87,6 +146,14 @@ impl Line {
                     .as_mut()
                     .map_or(Ok(()), |stream| stream.write_all(bytes))
             }
+            Self::Udp { address, socket } => {
+                if let Some(socket) = socket {
+                    for datagram in bytes.chunks(DATAGRAM_BYTES) {
+                        socket.send_to(datagram, *address)?;
+                    }
+                }
+                Ok(())
+            }
         }
     }
 
@@ -96,6 +163,7 @@ impl Line {
         match self {
             Self::Pty { pair, .. } => Ok(rustix::io::ioctl_fionread(&pair.device)? == 0),
             Self::Tcp { .. } => Ok(true),
+            Self::Udp { address, .. } => Ok(waiting(*address)?.0 == 0),
         }
     }
 
@@ -110,6 +178,7 @@ impl Line {
             Self::Tcp {
                 listener, stream, ..
             } => (*listener, *stream) = (None, None),
+            Self::Udp { socket, .. } => *socket = None,
         }
         Ok(())
     }
@@ -122,6 +191,11 @@ impl Line {
                 address, listener, ..
             } => {
                 *listener = Some(listen(*address)?);
+                Ok(())
+            }
+            // The board has another port, so for the daemon it is another sender.
+            Self::Udp { socket, .. } => {
+                *socket = Some(UdpSocket::bind(ANY)?);
                 Ok(())
             }
         }

@@ -13,11 +13,12 @@ use serde_json::Value;
 
 use crate::Failure;
 
-/// How often a subscriber has read that a sensor is live, and that it is lost.
+/// How often a subscriber has read that a sensor is live, and that it is lost, and whether it is stale.
 #[derive(Default)]
 pub(crate) struct Link {
     pub(crate) lives: AtomicU64,
     pub(crate) losses: AtomicU64,
+    pub(crate) is_stale: AtomicBool,
 }
 
 /// The record of a subscriber.
@@ -43,11 +44,13 @@ pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard,
             .as_str()
             .and_then(|name| name.strip_prefix('s'));
         let sensor = name.and_then(|number| number.parse::<usize>().ok());
-        match (sensor, event["state"].as_str()) {
-            _ if event["type"] != "status" => {}
-            (Some(sensor), Some("live")) => drop(links[sensor].lives.fetch_add(1, Relaxed)),
-            (Some(sensor), Some("lost")) => drop(links[sensor].losses.fetch_add(1, Relaxed)),
-            _ => {}
+        if let (Some(sensor), "status") = (sensor, event["type"].as_str().unwrap_or_default()) {
+            let link = &links[sensor];
+            link.is_stale.store(event["state"] == "stale", Relaxed);
+            link.lives
+                .fetch_add(u64::from(event["state"] == "live"), Relaxed);
+            link.losses
+                .fetch_add(u64::from(event["state"] == "lost"), Relaxed);
         }
         // The number in a hello is that of the last event before it.
         let Some(seq) = event["seq"].as_u64() else {

@@ -3,11 +3,12 @@
 //!     cargo run --release --example soak -- --minutes 120
 //!
 //! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated
-//! presses over a pty or a TCP connection of its own, with a fault in every second press. Arrays
+//! presses over a pty, a TCP connection or datagrams, with a fault in every second press. Arrays
 //! are 28x28 to 64x64. There are subscribers of all
 //! kinds, recordings, and a reload every ten seconds. At the end, every press must have its
-//! verdict, or must be lost with the link, by its number. Memory, descriptors and threads must not
-//! have grown. Otherwise the exit code is 1.
+//! verdict, or must be lost with the link, by its number. A datagram that finds no room at the daemon
+//! may cost its frame and no press; how many there were is printed. Memory, descriptors and threads must
+//! not have grown. Otherwise the exit code is 1.
 
 mod account;
 mod line;
@@ -116,8 +117,18 @@ fn serve(config: &Path) -> Result<(), Failure> {
     })
 }
 
-/// The sides of the arrays, in taxels, which the sensors have in turn. Every second one is on TCP.
+/// The sides of the arrays, in taxels, which the sensors have in turn.
 const SIDES: [usize; 4] = [28, 28, 48, 64];
+
+/// The line of a sensor: every second one is on the network, and half of these send datagrams. Each kind has
+/// the smallest and the largest array.
+fn line(index: usize, port: PathBuf) -> io::Result<Line> {
+    match index % 8 {
+        1 | 7 => Line::tcp(),
+        3 | 5 => Line::udp(),
+        _ => Line::pty(port),
+    }
+}
 
 /// The `[[sensor]]` tables of the configuration.
 fn tables(players: &[Player], references: Option<&Path>) -> String {
@@ -182,11 +193,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
         let name = format!("s{index}");
         let library = libraries[index % SIDES.len()].as_ref();
         players.push(Player {
-            line: if index % 2 == 0 {
-                Line::pty(at(&name))?
-            } else {
-                Line::tcp()?
-            },
+            line: line(index, at(&name))?,
             name,
             library: Arc::clone(library.map_err(ToString::to_string)?),
             stream: root.child(index as u64),
@@ -351,6 +358,8 @@ struct Played {
     reloads: u64,
     /// The number of recordings that were removed.
     removed: u64,
+    /// The number of datagrams that found no room at the daemon.
+    dropped: u64,
 }
 
 impl Played {
@@ -388,7 +397,9 @@ impl Played {
         for player in playing {
             sent.push(player.join().map_err(|_| "a player panicked")??);
         }
+        let dropped = sent.iter().map(|player| player.line.dropped());
         Ok(Self {
+            dropped: dropped.sum::<io::Result<u64>>()?,
             sent,
             usages,
             reloads,
@@ -406,6 +417,7 @@ impl Played {
             "reloads: {}; recordings removed meanwhile: {}",
             self.reloads, self.removed
         );
+        println!("datagrams without room: {}", self.dropped);
     }
 }
 

@@ -75,6 +75,9 @@ pub(crate) fn library(side: usize) -> Result<Library, Failure> {
     Ok(Library { presses, rest })
 }
 
+/// The time in which a subscriber reads what has happened.
+const SETTLED: Duration = Duration::from_secs(1);
+
 pub(crate) const FAULTS: [&str; 7] = [
     "unplug", "silence", "stall", "flip", "drop", "noise", "double",
 ];
@@ -116,7 +119,7 @@ impl Player {
             let mut bytes = frame.clone();
             match fault {
                 "unplug" if index == middle => {
-                    self.sent.push(false);
+                    self.sent.push(!self.line.has_end());
                     return self.unplug(&bytes);
                 }
                 "silence" if index == middle => self.due += Duration::from_millis(400),
@@ -125,7 +128,11 @@ impl Player {
                     held.append(&mut bytes);
                 }
                 "flip" if struck => bytes[self.stream.below(frame.len())] ^= 1,
-                "drop" if struck => drop(bytes.remove(self.stream.below(frame.len()))),
+                "drop" if struck => {
+                    let unit = self.line.unit();
+                    let start = self.stream.below(frame.len()) / unit * unit;
+                    bytes.drain(start..(start + unit).min(frame.len()));
+                }
                 "noise" if struck => {
                     let noise = (0..300).map(|_| self.stream.next_u64() as u8);
                     bytes.splice(0..0, noise.collect::<Vec<u8>>());
@@ -144,14 +151,21 @@ impl Player {
         Ok(())
     }
 
-    /// Pulls the cable in the middle of a frame, and plugs it in again.
+    /// Pulls the cable in the middle of a frame, and plugs it in again. Datagrams only stop, so the press
+    /// stays open until the sensor is there again.
     fn unplug(&mut self, frame: &[u8]) -> Result<(), Failure> {
         let part = self.stream.below(frame.len());
         self.write(&frame[..part])?;
         self.drain()?;
         let losses = self.link.losses.load(Relaxed);
         self.line.unplug()?;
-        self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
+        if self.line.has_end() {
+            self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
+        } else {
+            // By then, the subscriber has read what an earlier silence has caused.
+            sleep(SETTLED);
+            self.wait("stale", || Ok(self.link.is_stale.load(Relaxed)))?;
+        }
         let lives = self.link.lives.load(Relaxed);
         sleep(Duration::from_secs_f64(self.stream.range(0.0, 1.5)));
         self.line.plug()?;
