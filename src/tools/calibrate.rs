@@ -291,10 +291,13 @@ async fn live(
         return Ok(None);
     };
     let read = gather::presses(recorded, sensor, hrn, matches!(args.what, What::Arm));
-    read.map(Some).map_err(|source| Error::Recording {
+    let mut presses = read.map_err(|source| Error::Recording {
         path: "what was recorded".to_owned(),
         source,
-    })
+    })?;
+    // Something else may have been pressed before the recording ended.
+    presses.truncate(args.wanted() as usize);
+    Ok(Some(presses))
 }
 
 /// The presses that recordings hold.

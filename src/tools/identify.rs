@@ -269,7 +269,9 @@ pub async fn run(
             return Ok(());
         };
         let path = "what was recorded".to_owned();
-        let (courses, _) = of_recording(file, &path, sensor.name(), hrn)?;
+        let (mut courses, _) = of_recording(file, &path, sensor.name(), hrn)?;
+        // Something else may have been pressed before the recording ended.
+        courses.truncate(wanted as usize);
         made_of(courses, piece(what, &levels)?, &path, &sensor)?
     } else {
         let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());

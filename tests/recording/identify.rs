@@ -2,6 +2,7 @@
 
 use std::fs::{self, Permissions};
 use std::io::{Read, Write};
+use std::net::TcpListener;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Output, Stdio};
 
@@ -185,6 +186,28 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         "{said}"
     );
     assert_eq!(code, 78);
+}
+
+#[test]
+fn presses_after_those_that_were_asked_for_do_not_count() {
+    let bench = bench();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = format!("tcp://{}", listener.local_addr().unwrap());
+    let config = SENSOR.replace("port = \"port\"", &format!("port = \"{port}\""));
+    assert!(config.contains(&port), "{config}");
+    let sockets = "[publish.unix]\npath = \"events.sock\"\n";
+    fs::write(bench.path("tcp.toml"), config + sockets).unwrap();
+    // The arm goes on at once, and presses twenty times in all.
+    let bytes = fs::read(bench.path("wood.bin")).unwrap().repeat(10);
+    let pressing = std::thread::spawn(move || {
+        let (mut peer, _) = listener.accept().unwrap();
+        // The connection stays open until the command has ended.
+        (peer.write_all(&bytes).is_ok(), peer)
+    });
+    let identify = "identify --config tcp.toml --out r.npz --as flat:20 --presses 3";
+    let text = succeed(&bench, identify);
+    assert!(text.contains("rigid flat piece 3,"), "{text}");
+    assert!(pressing.join().unwrap().0);
 }
 
 /// A pipe is there, and nobody writes to it.
