@@ -20,6 +20,9 @@ const ALIKE: f32 = 0.75;
 /// Below it, the logarithm of a probability is not believed.
 const LEAST_PROBABILITY: f32 = 1e-4;
 
+/// No sum of presses reaches it, and what is computed of a smaller one is finite.
+const MOST_SUM: f32 = 1e24;
+
 /// The objects that were pressed.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Objects {
@@ -65,7 +68,7 @@ impl Objects {
 
     /// Whether presses can have made these objects. A recording may hold anything.
     pub(super) fn is_possible(&self, frames: u64) -> bool {
-        let is_finite = |sum: &f32| sum.is_finite();
+        let is_reached = |sum: &f32| sum.abs() <= MOST_SUM;
         self.known.len() <= MOST_OBJECTS
             && self.known.iter().all(|object| {
                 (1..=frames).contains(&object.presses)
@@ -73,7 +76,7 @@ impl Objects {
                         .log_sums
                         .iter()
                         .chain(&object.shore_sums)
-                        .all(is_finite)
+                        .all(is_reached)
             })
     }
 }
@@ -186,6 +189,29 @@ mod tests {
         objects.add("99", &other);
         assert_eq!(objects.with("99", &other).presses, 2);
         assert!(objects.is_possible(100));
+    }
+
+    #[test]
+    fn a_recorded_object_gives_finite_numbers_or_is_impossible() {
+        let press = verdict(&[0.5, 0.5], Some([60.0, 0.0, 100.0]));
+        for (sum, is_possible) in [
+            (1e24, true),
+            (3e38, false),
+            (-3e38, false),
+            (f32::NAN, false),
+        ] {
+            let mut objects = Objects::default();
+            objects.add("cup", &press);
+            assert!(objects.is_possible(1));
+            objects.known[0].shore_sums = [sum, sum, sum, 0.0];
+            assert_eq!(objects.is_possible(1), is_possible, "{sum}");
+            let shore = objects.with("cup", &press).shore.unwrap();
+            let all = [shore.value, shore.low, shore.high];
+            assert!(
+                !is_possible || all.iter().all(|x| x.is_finite()),
+                "{shore:?}"
+            );
+        }
     }
 
     #[test]
