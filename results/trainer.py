@@ -40,6 +40,11 @@ class Trainer:
         """What `evaluate --json` prints."""
         return json.loads(self.run("evaluate", "--model", model, "--data", data, *more, "--json"))
 
+    def judged(self, model, data, verdicts, *more):
+        """The same. The file `verdicts` has the verdicts of this call, and not those of an earlier one."""
+        verdicts.unlink(missing_ok=True)
+        return self.evaluated(model, data, *more, "--verdicts", verdicts)
+
 
 def by_object(verdicts):
     """Object -> level, presses, right ones, those in the interval, and the sum of squared Shore errors."""

@@ -111,7 +111,7 @@ def measure(trainer, work):
     verdicts = work / "verdicts.csv"
 
     def judged(path, told):
-        evaluated = trainer.evaluated(MODEL, path, *told, "--verdicts", verdicts)
+        evaluated = trainer.judged(MODEL, path, verdicts, *told)
         return figures(evaluated, verdicts, numpy.load(path))
 
     for number, (name, options) in enumerate(SETS.items()):

@@ -101,7 +101,7 @@ def measure(trainer, before, work):
         found["confident"][name] = {}
         for model, path in models.items():
             verdicts = work / "verdicts.csv"
-            evaluated = trainer.evaluated(path, test, "--split", split, "--verdicts", verdicts)
+            evaluated = trainer.judged(path, test, verdicts, "--split", split)
             found["evaluations"][name][model] = evaluated
             found["confident"][name][model] = training.by_confidence(verdicts)
             for key, (level, n, right, held, squares) in training.by_object(verdicts).items():

@@ -101,13 +101,21 @@ def hrn_train(*arguments):
     return subprocess.run(["hrn-train", *arguments], capture_output=True, text=True, timeout=120)
 
 
+def without(path):
+    """Removes the file of an earlier call."""
+    if os.path.exists(path):
+        os.remove(path)
+
+
 def adopted(path, data):
     """What `adopt` makes of the file: for each frame of the data set its probabilities."""
+    without("adopted.onnx")
     done = hrn_train("adopt", path, "--data", data, "--out", "adopted.onnx")
     assert done.returncode == 0, done.stderr
     found = []
     for split in ("train", "test"):
         options = ["--model", "adopted.onnx", "--data", data, "--split", split, "--verdicts", "verdicts.csv"]
+        without("verdicts.csv")
         done = hrn_train("evaluate", *options)
         assert done.returncode == 0, done.stderr
         with open("verdicts.csv") as lines:

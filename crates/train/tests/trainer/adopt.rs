@@ -19,6 +19,7 @@ fn hrn_train(arguments: &[&str]) -> Output {
 
 /// What `adopt` says of a foreign model.
 fn adopt(foreign: &str, data: &str, out: &Path) -> Output {
+    let _ = fs::remove_file(out);
     hrn_train(&[
         "adopt",
         foreign,
@@ -448,6 +449,7 @@ fn the_levels_of_an_adopted_model_are_those_of_its_data() {
         {"level": 3, "label": "jelly", "shore": "<40"},
     ]);
     let adopt = || {
+        let _ = fs::remove_file(&out);
         let [data, out] = [&data, &out].map(|path| path.to_str().unwrap());
         hrn_train(&["adopt", &of_three, "--data", data, "--out", out])
     };

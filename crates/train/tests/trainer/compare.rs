@@ -596,6 +596,7 @@ fn a_report_needs_no_network_and_has_all_its_sections() {
     assert!(page.contains("@media (prefers-color-scheme: dark)"));
 
     let run = whole().out.join("runs/hrn100-1");
+    std::fs::remove_file(&out).unwrap();
     succeed(&[
         "report",
         run.to_str().unwrap(),

@@ -47,37 +47,54 @@ fn bench() -> tempfile::TempDir {
 }
 
 #[test]
-fn no_output_replaces_an_input() {
+fn no_output_replaces_a_file() {
     let directory = bench();
     let at = directory.path();
     let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fixtures/foam.5hz.bin");
     fs::copy(fixture, at.join("press.bin")).unwrap();
-    std::os::unix::fs::symlink("d.npz", at.join("link")).unwrap();
-    let files = ["d.npz", "m.onnx", "press.bin"];
-    let all = || files.map(|name| fs::read(at.join(name)).unwrap());
-    let before = all();
+    fs::create_dir(at.join("run")).unwrap();
+    fs::copy(at.join("m.onnx"), at.join("run/hrn.onnx")).unwrap();
+    fs::write(at.join("taken"), "somebody's").unwrap();
+    fs::write(at.join("taken-1"), "somebody's").unwrap();
+    std::os::unix::fs::symlink("nowhere", at.join("link")).unwrap();
+    let files = || {
+        let entries = fs::read_dir(at).unwrap().map(|entry| entry.unwrap().path());
+        let files = entries.filter(|path| path.is_file());
+        let mut files: Vec<_> = files.map(|path| (fs::read(&path).unwrap(), path)).collect();
+        files.sort();
+        files
+    };
+    let before = files();
+    let sensors = "simulate --sequences --materials broad --sensors broad --presses 1 --objects 1";
+    for (arguments, taken) in [
+        ("evaluate --model m.onnx --data d.npz --verdicts", "d.npz"),
+        ("evaluate --model m.onnx --data d.npz --verdicts", "m.onnx"),
+        ("evaluate --model m.onnx --data d.npz --features", "taken"),
+        ("adopt m.onnx --data d.npz --out", "./d.npz"),
+        ("export run --out", "taken"),
+        ("report run --out", "taken"),
+        ("simulate --presses 1 --out", "taken"),
+        ("simulate --presses 1 --out", "link"),
+        ("simulate --presses 1 --out new --sheet", "taken"),
+        (
+            "simulate --sequences --presses 1 --objects 1 --out",
+            "taken",
+        ),
+    ] {
+        let expected = format!("{taken}: a file or link is there already: name another one");
+        refused(at, &format!("{arguments} {taken}"), 74, &expected);
+        assert!(before == files(), "{arguments}");
+    }
+    // One of several files is there, and not the first.
+    let shards = format!("{sensors} --shards 2 --out taken");
+    refused(at, &shards, 74, "taken-1: a file or link is there already");
     for (arguments, option) in [
-        (
-            "evaluate --model m.onnx --data d.npz --verdicts d.npz",
-            "--verdicts",
-        ),
-        (
-            "evaluate --model m.onnx --data d.npz --verdicts m.onnx",
-            "--verdicts",
-        ),
-        (
-            "evaluate --model m.onnx --data link --verdicts d.npz",
-            "--verdicts",
-        ),
-        ("adopt m.onnx --data d.npz --out ./d.npz", "--out"),
         ("collect --level 1 --out press.bin press.bin", "--out"),
         ("simulate --out new --sheet new", "--sheet"),
     ] {
-        let expected = format!("{option}: ");
-        refused(at, arguments, 2, &expected);
-        assert!(before == all(), "{arguments}");
-        assert!(!at.join("new").exists());
+        refused(at, arguments, 2, &format!("{option}: "));
     }
+    assert!(before == files());
 }
 
 #[test]
@@ -232,7 +249,12 @@ fn options_that_change_nothing_or_break_a_run_are_wrong_usage() {
         .output()
         .unwrap();
     assert_eq!(output.status.code(), Some(66), "{output:?}");
-    // The output is a file.
+    // The output is a new file.
     let arguments = "adopt m.onnx --data d.npz --out /dev/stdout";
-    refused(at, arguments, 74, "/dev/stdout: found no file");
+    refused(
+        at,
+        arguments,
+        74,
+        "/dev/stdout: a file or link is there already",
+    );
 }

@@ -61,7 +61,7 @@ pub(super) enum Command {
     Report {
         /// Directory of the run or the comparison
         directory: PathBuf,
-        /// Page to write; an existing file is replaced
+        /// New file for the page
         #[arg(long, value_name = "R.html")]
         out: PathBuf,
     },
@@ -69,7 +69,7 @@ pub(super) enum Command {
     Export {
         /// Directory of the run
         run: PathBuf,
-        /// Model file to write; an existing file is replaced
+        /// New file for the model
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
@@ -94,7 +94,7 @@ const MOST: i64 = DatasetSettings::MOST as i64;
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Simulate {
-    /// Data set to write; an existing file is replaced
+    /// New file for the data set
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
     /// Seed of everything random
@@ -150,7 +150,7 @@ pub(super) struct Simulate {
     /// Put all eight named materials into the test split
     #[arg(long, hide_short_help = true, conflicts_with = "swapped_levels")]
     pub(super) all_test: bool,
-    /// Also draw samples of every material and a press of every level
+    /// Also draw samples of every material and a press of every level, to this new file
     #[arg(long, value_name = "S.png")]
     pub(super) sheet: Option<PathBuf>,
     /// Whole presses over time, with the arm's positions, in place of one frame a press
@@ -469,7 +469,7 @@ pub(super) struct Evaluate {
     /// Shore hardness.
     #[arg(long, value_name = "V.csv")]
     pub(super) verdicts: Option<PathBuf>,
-    /// Also write the input `features` of every press of the data, as CSV; an existing file is replaced
+    /// Also write the input `features` of every press of the data to this new file, as CSV
     #[arg(long, hide_short_help = true, value_name = "F.csv")]
     pub(super) features: Option<PathBuf>,
     /// Print JSON
@@ -484,7 +484,7 @@ pub(super) struct Adopt {
     /// The data set that it learnt from
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
-    /// Model file to write; an existing file is replaced
+    /// New file for the model
     #[arg(long, value_name = "H.onnx")]
     pub(super) out: PathBuf,
     /// How it was made, in a few words [default: adopted from MODEL]

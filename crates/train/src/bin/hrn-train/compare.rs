@@ -9,7 +9,7 @@ use hrn_train::methods::Method;
 
 use super::arguments::Compare;
 use super::failure::{Unreadable, WrongUsage};
-use super::files::{load, write};
+use super::files::{check_new, load, write};
 
 pub(super) fn compare(arguments: Compare) -> anyhow::Result<String> {
     if arguments.course {
@@ -59,6 +59,7 @@ pub(super) fn report_of(directory: &Path, out: &Path) -> anyhow::Result<String> 
         path: directory.to_owned(),
         source,
     })?;
+    check_new(out)?;
     write(out, report::of(directory)?.as_bytes())?;
     Ok(format!("{}\n", out.display()))
 }

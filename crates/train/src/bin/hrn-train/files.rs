@@ -1,13 +1,13 @@
 //! Files named on the command line.
 
 use std::fs::File;
-use std::io::{self, Read as _};
+use std::io::{self, Read as _, Write as _};
 use std::path::Path;
 
 use anyhow::Context as _;
+use hardnessd_core::part::Part;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Hrn, MAX_FILE_BYTES};
-use hrn_train::run::disk::write_whole;
 
 use super::failure::{Unreadable, WrongUsage};
 
@@ -46,14 +46,20 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, Unreadable> {
     })
 }
 
-/// Writes a file at once and as a whole. If it replaces a file, stderr says so.
+/// Refuses an output that is there already or cannot be made, before the work for it.
+pub(super) fn check_new(path: &Path) -> anyhow::Result<()> {
+    let begun = Part::new(path).map(drop);
+    begun.with_context(|| path.display().to_string())
+}
+
+/// Writes a new file as a whole.
 pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let is_replaced = path.is_file();
-    write_whole(path, bytes)?;
-    if is_replaced {
-        hardnessd_core::say!("{}: replaced the earlier file", path.display());
-    }
-    Ok(())
+    let write = || {
+        let part = Part::new(path)?;
+        part.as_file().write_all(bytes)?;
+        part.finish()
+    };
+    write().with_context(|| path.display().to_string())
 }
 
 pub(super) fn load(path: &Path) -> anyhow::Result<Hrn> {

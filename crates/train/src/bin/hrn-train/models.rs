@@ -18,19 +18,13 @@ use hrn_train::model::review::{self, Format, Review};
 use super::account;
 use super::arguments::{Adopt, Evaluate};
 use super::failure::{NoRun, exit_code};
-use super::files::{apart, load, load_with_bytes, read, write};
+use super::files::{check_new, load, load_with_bytes, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
-    let inputs = [&arguments.model, &arguments.data];
-    for (option, path) in [
-        ("--verdicts", &arguments.verdicts),
-        ("--features", &arguments.features),
-    ] {
-        if let Some(path) = path {
-            apart(option, path, inputs.map(PathBuf::as_path))?;
-        }
-    }
     let hrn = load(&arguments.model)?;
+    let outputs = [&arguments.verdicts, &arguments.features];
+    let outputs = outputs.into_iter().flatten();
+    outputs.map(PathBuf::as_path).try_for_each(check_new)?;
     if Courses::is_at(&arguments.data)? {
         return evaluate_courses(arguments, &hrn);
     }
@@ -156,8 +150,8 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
 }
 
 pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
-    apart("--out", &arguments.out, [arguments.data.as_path()])?;
     let bytes = read(&arguments.model)?;
+    check_new(&arguments.out)?;
     let dataset = courses::single_frames(&arguments.data)?;
     let name = arguments.model.file_name().unwrap_or_default();
     let stated = Stated {

@@ -13,7 +13,7 @@ use hrn_train::judge::sheet;
 
 use super::arguments::Simulate;
 use super::failure::{NoObjects, OtherMaterials};
-use super::files::{apart, write};
+use super::files::{apart, check_new, write};
 
 /// The settings of the simulation.
 fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMaterials> {
@@ -69,10 +69,12 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     }
     if let Some(sheet) = &arguments.sheet {
         apart("--sheet", sheet, [arguments.out.as_path()])?;
+        check_new(sheet)?;
     }
     if arguments.sequences {
         return simulate_courses(arguments, settings);
     }
+    check_new(&arguments.out)?;
     let begun = Instant::now();
     let samples = simulated::simulate(&settings, jobs(arguments));
     let seconds = begun.elapsed().as_secs_f64();
@@ -88,7 +90,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         }
         None => None,
     };
-    // The data set comes first, so that a picture that cannot be written does not lose it.
+    // The data set comes first, so that a full disk costs the picture.
     write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
     if let Some((path, picture)) = sheet {
         write(path, &picture)?;
@@ -122,10 +124,16 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
         sensors: None,
     };
     let Some(designs) = asked.sensors else {
+        check_new(&arguments.out)?;
         return write_courses(arguments, &settings, &arguments.out);
     };
     let usual = BroadSensors::default();
     let shards = asked.shards.unwrap_or(usual.shards);
+    let out = |shard| match shards {
+        1 => arguments.out.clone(),
+        _ => numbered(&arguments.out, shard),
+    };
+    (0..shards).try_for_each(|shard| check_new(&out(shard)))?;
     let mut said = String::new();
     for shard in 0..shards {
         let sensors = BroadSensors {
@@ -140,12 +148,7 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
             sensors: Some(sensors),
             ..settings
         };
-        let out = if shards > 1 {
-            numbered(&arguments.out, shard)
-        } else {
-            arguments.out.clone()
-        };
-        said += &write_courses(arguments, &settings, &out)?;
+        said += &write_courses(arguments, &settings, &out(shard))?;
     }
     Ok(said)
 }
