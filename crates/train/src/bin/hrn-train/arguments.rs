@@ -463,7 +463,7 @@ pub(super) struct Evaluate {
     /// objects are not judged
     #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) labelled: usize,
-    /// Also write every verdict as a line of CSV; an existing file is replaced
+    /// Also write every verdict to this new file, as a line of CSV
     ///
     /// The columns are object, level, the verdict's level, probabilities and Shore hardness with its interval, true
     /// Shore hardness.
