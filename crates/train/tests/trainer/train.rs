@@ -229,13 +229,13 @@ fn a_run_learns_and_leaves_what_it_promises() {
     assert!(inspected.contains(&line), "{inspected}");
 }
 
-/// Starts or resumes a run, and sends `signal` once there are `count` checkpoints of `stage`,
-/// wherever the run is by then. Returns the exit code, if there is one, and the line of
+/// Starts or resumes a run, and sends `signal` once `stage` has a checkpoint of at least `steps`
+/// steps, wherever the run is by then. Returns the exit code, if there is one, and the line of
 /// stderr about the interruption. A line of progress may follow it.
 fn interrupted(
     trial: &Trial,
     seed: &'static str,
-    (stage, count): (&str, usize),
+    (stage, steps): (&str, u64),
     signal: Signal,
 ) -> (Option<i32>, String) {
     let mut process = Command::new(env!("CARGO_BIN_EXE_hrn-train"))
@@ -244,14 +244,9 @@ fn interrupted(
         .stderr(std::process::Stdio::piped())
         .spawn()
         .unwrap();
-    let there = || {
-        trial
-            .checkpoints()
-            .iter()
-            .filter(|name| name.starts_with(stage))
-            .count()
-    };
-    while there() < count {
+    let awaited = format!("{stage}-{steps:010}");
+    let is_there = |name: &String| name.starts_with(stage) && *name >= awaited;
+    while !trial.checkpoints().iter().any(is_there) {
         let ended = process.try_wait().unwrap();
         assert!(ended.is_none(), "ended before it could be interrupted");
         std::thread::yield_now();
@@ -273,7 +268,8 @@ fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
         ("interrupted", Signal::INT, Some(130)),
     ] {
         let trial = Trial::new(name);
-        let (ended, said) = interrupted(&trial, "2", ("hrn", 2), signal);
+        // After two epochs.
+        let (ended, said) = interrupted(&trial, "2", ("hrn", 16), signal);
         assert_eq!(ended, code, "{name}");
         if code.is_some() {
             assert!(
@@ -294,8 +290,8 @@ fn the_whole_method_killed_in_any_stage_resumes_bit_for_bit_and_shares_its_stage
     whole.train("6", &[]);
     let killed = Trial::of("ours", "killed method", GAN_SETTINGS);
     // The third checkpoint of USTGAN holds the weights that were best after two epochs.
-    for (stage, count) in [("ustgan", 3), ("stgan2", 1), ("pretraining", 1)] {
-        interrupted(&killed, "6", (stage, count), Signal::KILL);
+    for (stage, steps) in [("ustgan", 6), ("stgan2", 1), ("pretraining", 1)] {
+        interrupted(&killed, "6", (stage, steps), Signal::KILL);
         assert!(!killed.out.join("hrn.onnx").exists(), "{stage}");
     }
     killed.train("6", &["--resume"]);
