@@ -3,8 +3,8 @@
 pub mod optimiser;
 pub mod learner;
 pub mod temperature;
-pub mod fit;
 pub mod epochs;
+pub mod fit;
 pub mod conformal;
 pub mod frame;
 pub mod course;

@@ -247,12 +247,13 @@ impl Task<'_> {
         let stage = epochs::Stage {
             name: self.stage,
             origin: self.origin(&initial),
+            generated: false,
             train: &lots.tickets(),
             settings: &settings,
             seed: self.seed,
         };
         let parts = bins::parts(self.borders, self.levels, self.device);
-        let weights = epochs::run(&stage, initial, run, self.device, |learner, batch| {
+        let weights = epochs::run(&stage, initial, run, self.device, None, |learner, batch| {
             Ok(self.step(learner, &lots, (&standard, &parts), batch))
         })?;
         Ok((weights, standard))

@@ -1,6 +1,6 @@
-//! The epochs of a network that is trained in one stage: the order of the samples, the rate of each
-//! step, checks, metrics and checkpoints. An interrupted run resumes from its checkpoint with
-//! bit-identical results.
+//! The epochs of a recogniser: the order of the samples, the rate of each step, validation, checks,
+//! metrics and checkpoints. An interrupted run resumes from its checkpoint with bit-identical
+//! results.
 
 use std::time::Instant;
 
@@ -12,16 +12,23 @@ use crate::run::Run;
 use crate::run::checkpoint::{Checkpoint, Progress};
 use crate::run::history::Row;
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
-use crate::settings::Training;
+use crate::settings::{Keep, Training, Validation};
 use hardnessd_simulator::random::Stream;
+
+/// The name under which a checkpoint holds the weights of the least validation loss.
+const BEST: &str = "best";
 
 /// The description of a training stage.
 #[derive(Debug)]
 pub struct Stage<'a> {
     /// The name of the stage in its checkpoints and in `metrics.csv`.
     pub name: &'static str,
-    /// A hash of everything that determines the weights. A checkpoint of another origin is refused.
+    /// A hash of everything that determines the weights. A checkpoint of another origin is refused,
+    /// except where the samples are generated.
     pub origin: String,
+    /// Whether a GAN generated the samples. They may then differ in their last bits on another
+    /// device or with more threads, and the run continues from its weights all the same.
+    pub generated: bool,
     /// Samples to learn from.
     pub train: &'a [usize],
     /// Settings of the training.
@@ -41,9 +48,12 @@ pub struct Batch<'a> {
     pub rate: f64,
 }
 
+/// How weights are judged on held-out samples: their loss and accuracy.
+pub type Judge<'a> = &'a dyn Fn(&Weights) -> (f64, f64);
+
 /// Trains `initial`, or continues from the stage's last checkpoint in `run`. `step` takes a step
 /// and returns the batch's mean loss and how many of its samples were judged correctly before the
-/// step.
+/// step. Returns the last weights, or those that `validation` found best.
 ///
 /// # Errors
 ///
@@ -54,6 +64,7 @@ pub fn run(
     initial: Weights,
     run: &Run,
     device: &Device,
+    validation: Option<(Validation, Judge)>,
     mut step: impl FnMut(&mut Learner, Batch) -> anyhow::Result<(f64, f64)>,
 ) -> anyhow::Result<Weights> {
     let Training {
@@ -67,14 +78,17 @@ pub fn run(
     let (name, origin) = (stage.name, &stage.origin);
     let fresh = Learner::fresh(initial, optimiser, averaging);
     let kept = run.latest(name, origin, epochs, &fresh.lists(""), device)?;
-    let (mut progress, mut learner) = match kept {
+    let (mut progress, mut learner, mut best) = match kept {
         Some(checkpoint) => {
-            run.check_origin(name, &checkpoint, origin)?;
+            if !stage.generated {
+                run.check_origin(name, &checkpoint, origin)?;
+            }
             let steps = checkpoint.progress.step;
             let learner = Learner::resumed(&checkpoint, "", steps, optimiser, averaging)?;
-            (checkpoint.progress, learner)
+            let best = checkpoint.list(BEST).ok().cloned();
+            (checkpoint.progress, learner, best)
         }
-        None => (Progress::default(), fresh),
+        None => (Progress::default(), fresh, None),
     };
     let count = stage.train.len();
     let steps = u64::from(epochs) * count.div_ceil(batch) as u64;
@@ -101,30 +115,50 @@ pub fn run(
         }
         progress.epoch += 1;
         let Progress { epoch, step, .. } = progress;
+        let due = |every: u32| epoch == epochs || epoch.is_multiple_of(every);
         let loss = loss_sum / count as f64;
         ensure_finite(name, epoch, "loss", loss)?;
         ensure_finite_weights(name, epoch, &learner.weights)?;
         let accuracy = right / count as f64;
+        let mut message = format!("loss {loss:.4}, accuracy {:.1} %", 100.0 * accuracy);
+        let mut judged = None;
+        if let Some((settings, judge)) = validation
+            && due(settings.every_epochs)
+        {
+            let weights = learner.evaluated();
+            let (loss, accuracy) = judge(&weights);
+            ensure_finite(name, epoch, "validation loss", loss)?;
+            let better = progress.best_loss.is_none_or(|best| loss < best);
+            if settings.keep == Keep::Best && better {
+                progress.best_loss = Some(loss);
+                best = Some(weights);
+            }
+            let percent = 100.0 * accuracy;
+            message += &format!("; validation loss {loss:.4}, accuracy {percent:.1} %");
+            judged = Some((loss, accuracy));
+        }
         metrics.add(&Row {
             step,
             epoch,
             loss,
             learning_rate: rate,
             accuracy: Some(accuracy),
+            validation: judged,
             seconds: begun.elapsed().as_secs_f64(),
             ..Row::default()
         })?;
-        let message = format!("loss {loss:.4}, accuracy {:.1} %", 100.0 * accuracy);
         report(&bar, name, epoch, epochs, message);
-        if epoch == epochs || epoch.is_multiple_of(checkpoint_every_epochs) {
+        if due(checkpoint_every_epochs) {
+            let mut lists = learner.lists("");
+            lists.extend(best.iter().map(|list| (BEST.to_owned(), list.clone())));
             let checkpoint = Checkpoint {
                 origin: origin.clone(),
                 progress,
-                lists: learner.lists(""),
+                lists,
             };
             run.checkpoints.save(name, &checkpoint)?;
         }
     }
     bar.finish_and_clear();
-    Ok(learner.evaluated())
+    Ok(best.unwrap_or_else(|| learner.evaluated()))
 }

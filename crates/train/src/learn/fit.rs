@@ -1,26 +1,23 @@
 //! The supervised training loop: Eq. (9) minimised over labelled frames.
 //!
 //! In: a data set, which of its samples to learn from and which to validate on, and initial
-//! weights. Out: weights, the statistics of their batch normalisation, and a temperature. The run's
-//! directory receives metrics and checkpoints on the way. An interrupted run resumes from its
-//! checkpoint with bit-identical results. The test split never enters here.
-
-use std::time::Instant;
+//! weights. Out: weights, the statistics of their batch normalisation, and a temperature. The test
+//! split never enters here.
 
 use burn::tensor::{Device, Tensor};
 
 use crate::data::augment;
 use crate::data::dataset::{self, Dataset};
+use crate::learn::epochs::{self, Batch, Judge};
 use crate::learn::learner::Learner;
 use crate::learn::temperature::{self, LevelAndLogits};
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::network::{Normalisation, Statistics, Weights, numbers};
 use crate::run::Run;
-use crate::run::checkpoint::{Checkpoint, Origin, Progress};
-use crate::run::history::Row;
-use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
-use crate::settings::{Keep, Training, Validation};
+use crate::run::checkpoint::Origin;
+use crate::run::progress::ensure_finite;
+use crate::settings::{Training, Validation};
 use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
@@ -87,80 +84,21 @@ impl Trained {
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
 /// this, or the loss, a weight or a logit of the trained network is no longer finite.
 pub fn fit(task: &Task, initial: Weights, run: &Run) -> anyhow::Result<Trained> {
-    let Training { batch, epochs, .. } = *task.settings;
-    let (validation_samples, validation_settings) = task.validation;
-    let steps_an_epoch = task.train.len().div_ceil(batch) as u64;
-    let steps = u64::from(epochs) * steps_an_epoch;
-    let origin = task.origin(&initial);
-    let fresh = State::fresh(initial, task.settings);
-    let lists = fresh.learner.lists("");
-    let mut state = match run.latest(task.stage, &origin, epochs, &lists, task.device)? {
-        Some(checkpoint) => {
-            // Generated frames have no source file, and may differ in their last bits on another
-            // device or with more threads. The run then continues from its weights all the same.
-            if !task.dataset.sources.is_empty() {
-                run.check_origin(task.stage, &checkpoint, &origin)?;
-            }
-            State::resumed(&checkpoint, task.settings)?
-        }
-        None => fresh,
+    let (held_out, validation) = task.validation;
+    let stage = epochs::Stage {
+        name: task.stage,
+        origin: task.origin(&initial),
+        // Generated frames have no source file.
+        generated: task.dataset.sources.is_empty(),
+        train: task.train,
+        settings: task.settings,
+        seed: task.seed,
     };
-    let mut metrics = run.metrics.open(task.stage, state.progress.step)?;
-    let bar = progress_bar(task.stage, steps, state.progress.step);
-    let begun = Instant::now();
-
-    while state.progress.epoch < epochs {
-        let (mut loss_sum, mut right, mut rate) = (0.0, 0, 0.0);
-        for indices in task.epoch_order(state.progress.epoch).chunks(batch) {
-            rate = task.settings.optimiser.rate_at(state.progress.step, steps);
-            let learnt = state.step(task, indices, rate);
-            loss_sum += learnt.0 * indices.len() as f64;
-            right += learnt.1;
-            bar.inc(1);
-        }
-        state.progress.epoch += 1;
-        let Progress { epoch, step, .. } = state.progress;
-        let last = epoch == epochs;
-        let due = |every: u32| last || epoch.is_multiple_of(every);
-
-        let loss = loss_sum / task.train.len() as f64;
-        ensure_finite(task.stage, epoch, "loss", loss)?;
-        ensure_finite_weights(task.stage, epoch, &state.learner.weights)?;
-        let mut validation = None;
-        if !validation_samples.is_empty() && due(validation_settings.every_epochs) {
-            let judged = state.validate(task);
-            ensure_finite(task.stage, epoch, "validation loss", judged.0)?;
-            validation = Some(judged);
-        }
-        let seconds = begun.elapsed().as_secs_f64();
-        metrics.add(&Row {
-            step,
-            epoch,
-            loss,
-            learning_rate: rate,
-            accuracy: Some(right as f64 / task.train.len() as f64),
-            validation,
-            seconds,
-            adversarial: None,
-        })?;
-        let mut message = format!("loss {loss:.4}");
-        if let Some((loss, accuracy)) = validation {
-            let accuracy = accuracy * 100.0;
-            message += &format!(", validation loss {loss:.4}, accuracy {accuracy:.1} %");
-        }
-        report(&bar, task.stage, epoch, epochs, message);
-        if due(task.settings.checkpoint_every_epochs) {
-            run.checkpoints
-                .save(task.stage, &state.checkpoint(&origin))?;
-        }
-    }
-    bar.finish_and_clear();
-
-    let weights = match validation_settings.keep {
-        Keep::Best => state.best.unwrap_or_else(|| state.learner.evaluated()),
-        Keep::Last => state.learner.evaluated(),
-    };
-    let mut trained = task.finished(weights, epochs)?;
+    let judge: Judge = &|weights| task.validated(weights);
+    let validation = (!held_out.is_empty()).then_some((validation, judge));
+    let learn = |learner: &mut Learner, batch: Batch| Ok(task.step(learner, batch));
+    let weights = epochs::run(&stage, initial, run, task.device, validation, learn)?;
+    let mut trained = task.finished(weights, task.settings.epochs)?;
     trained.temperature = task.fitted_temperature(&trained).unwrap_or(1.0);
     Ok(trained)
 }
@@ -186,92 +124,6 @@ fn levels() -> usize {
     dataset::levels().len()
 }
 
-/// Everything that changes from step to step.
-#[derive(Debug)]
-struct State {
-    progress: Progress,
-    learner: Learner,
-    /// The weights of the least validation loss, if the settings keep them.
-    best: Option<Weights>,
-}
-
-impl State {
-    fn fresh(weights: Weights, settings: &Training) -> Self {
-        Self {
-            progress: Progress::default(),
-            learner: Learner::fresh(weights, settings.optimiser, settings.averaging),
-            best: None,
-        }
-    }
-
-    fn resumed(checkpoint: &Checkpoint, settings: &Training) -> anyhow::Result<Self> {
-        let Training {
-            optimiser,
-            averaging,
-            ..
-        } = *settings;
-        Ok(Self {
-            progress: checkpoint.progress,
-            learner: Learner::resumed(
-                checkpoint,
-                "",
-                checkpoint.progress.step,
-                optimiser,
-                averaging,
-            )?,
-            best: checkpoint.list("best").ok().cloned(),
-        })
-    }
-
-    fn checkpoint(&self, origin: &str) -> Checkpoint {
-        let mut lists = self.learner.lists("");
-        lists.extend(
-            self.best
-                .iter()
-                .map(|list| ("best".to_owned(), list.clone())),
-        );
-        Checkpoint {
-            origin: origin.to_owned(),
-            progress: self.progress,
-            lists,
-        }
-    }
-
-    /// Takes a step on the samples `indices`. Returns the batch's mean loss, and how many of the
-    /// samples were judged correctly before the step.
-    fn step(&mut self, task: &Task, indices: &[usize], rate: f64) -> (f64, usize) {
-        let number = self.progress.step;
-        let (images, targets) = (task.images(indices, number), task.targets(indices));
-        let (loss, judged) = step(&mut self.learner, images, targets, rate);
-        self.progress.step += 1;
-        let right = indices
-            .iter()
-            .zip(judged.chunks(levels()))
-            .filter(|(index, logits)| argmax(logits).0 == task.level(**index))
-            .count();
-        (loss, right)
-    }
-
-    /// Computes loss and accuracy on the validation samples, and keeps the weights if they are the
-    /// best.
-    fn validate(&mut self, task: &Task) -> (f64, f64) {
-        let trained = task.with_statistics(self.learner.evaluated());
-        let (samples, settings) = task.validation;
-        let judged = task.judge(&trained, samples);
-        let loss = temperature::mean_loss(&judged, 1.0);
-        let right = judged
-            .iter()
-            .filter(|(level, logits)| argmax(logits).0 == *level)
-            .count();
-        let better = self.progress.best_loss.is_none_or(|best| loss < best);
-        if settings.keep == Keep::Best && better {
-            self.progress.best_loss = Some(loss);
-            self.best = Some(trained.weights);
-        }
-        (loss, right as f64 / judged.len() as f64)
-    }
-}
-
 impl Task<'_> {
     fn origin(&self, initial: &Weights) -> String {
         let settings = (self.settings, self.validation.1, self.scale);
@@ -282,11 +134,31 @@ impl Task<'_> {
             .finish()
     }
 
-    /// The training samples in the order of epoch `epoch`.
-    fn epoch_order(&self, epoch: u32) -> Vec<usize> {
-        let mut order = self.train.to_vec();
-        self.stream("order").child(epoch.into()).shuffle(&mut order);
-        order
+    /// Takes a step. Returns the batch's mean loss, and how many of its samples were judged
+    /// correctly before the step.
+    fn step(&self, learner: &mut Learner, batch: Batch) -> (f64, f64) {
+        let images = self.images(batch.samples, batch.step);
+        let targets = self.targets(batch.samples);
+        let (loss, judged) = step(learner, images, targets, batch.rate);
+        let right = batch
+            .samples
+            .iter()
+            .zip(judged.chunks(levels()))
+            .filter(|(index, logits)| argmax(logits).0 == self.level(**index))
+            .count();
+        (loss, right as f64)
+    }
+
+    /// Loss and accuracy of `weights` on the validation samples.
+    fn validated(&self, weights: &Weights) -> (f64, f64) {
+        let (samples, _) = self.validation;
+        let judged = self.judge(&self.with_statistics(weights.clone()), samples);
+        let right = judged
+            .iter()
+            .filter(|(level, logits)| argmax(logits).0 == *level)
+            .count();
+        let loss = temperature::mean_loss(&judged, 1.0);
+        (loss, right as f64 / judged.len() as f64)
     }
 
     fn stream(&self, name: &str) -> Stream {

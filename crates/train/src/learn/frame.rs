@@ -105,6 +105,7 @@ pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
             .numbers(standard.numbers())
             .weights(&initial)
             .finish(),
+        generated: false,
         train: task.train,
         settings: task.settings,
         seed: task.seed,
@@ -116,7 +117,7 @@ pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
         task.settings.level_balance.unwrap_or(LEVEL_BALANCE) as f32,
         task.device,
     );
-    let weights = epochs::run(&stage, initial, run, task.device, |learner, batch| {
+    let weights = epochs::run(&stage, initial, run, task.device, None, |learner, batch| {
         task.step(learner, &plan, (&standard, &level_weights), batch)
     })?;
     let trained = Trained {
