@@ -9,6 +9,7 @@ pub mod frame;
 pub mod colour;
 pub mod wording;
 pub mod exit;
+pub mod range;
 pub mod part;
 pub mod npy;
 pub mod wire;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-pub use self::settings::{SPEEDS_MM_S, Settings, SettingsError};
+pub use self::settings::{SPEEDS_MM_S, Settings};
 
 /// The position of the arm at one moment.
 ///

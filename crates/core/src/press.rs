@@ -16,7 +16,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use self::course::HeldFrames;
-pub use self::settings::{Settings, SettingsError, Thresholds};
+pub use self::settings::{Settings, Thresholds};
 pub use self::settling::first_settled;
 use self::settling::{Load, Settling};
 pub use self::thin::thinned;

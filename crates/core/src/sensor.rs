@@ -4,12 +4,12 @@
 //! In: a [`Description`] from a configuration or a recording. Out: a [`Sensor`]. Every value of a
 //! [`Sensor`] is in its range, and the values fit each other, so no other module checks them again.
 
-use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use crate::press::Thresholds;
+use crate::range::{self, OutOfRange, within};
 use crate::wire::{self, Layout};
 use crate::{motion, press, tare};
 
@@ -78,32 +78,12 @@ pub enum SensorError {
     /// The name cannot be part of a topic, a file name or a log line.
     #[error("name: found {0:?}, expected a letter a to z, then letters a to z, digits or _")]
     Name(String),
-    /// The name is too long for a topic, a file name or a log line.
-    #[error("name: found {found} characters, expected at most {MOST_NAME_CHARS}")]
-    LongName {
-        /// The length of the name in characters.
-        found: usize,
-    },
-    /// The frame rate is outside [`FRAME_RATES_HZ`].
-    #[error(
-        "frame_rate_hz: found {0:?}, expected {least} to {most} frames a second",
-        least = FRAME_RATES_HZ.0,
-        most = FRAME_RATES_HZ.1
-    )]
-    FrameRate(f64),
-    /// The stale time is too short for any sensor, or too long for any user.
-    #[error(
-        "stale_after_ms: found {0:?}, expected {least} to {most} milliseconds",
-        least = STALE_AFTER_MS.0,
-        most = STALE_AFTER_MS.1
-    )]
-    StaleAfter(f64),
+    /// A number is out of its range.
+    #[error(transparent)]
+    Range(#[from] OutOfRange),
     /// The layout of a frame is unusable.
     #[error("frame.{0}")]
     Frame(#[from] wire::LayoutError),
-    /// The time between requests is too short or too long for any sensor.
-    #[error("frame.request_ms: found {0}, expected 1 to 3600000 milliseconds")]
-    RequestTime(u32),
     /// A time between requests, and no request.
     #[error("frame.request_ms: found a value, expected none without frame.request")]
     NoRequest,
@@ -112,19 +92,10 @@ pub enum SensorError {
     Calibration(#[from] tare::SettingsError),
     /// The settings of presses are unusable.
     #[error("press.{0}")]
-    Press(#[from] press::SettingsError),
+    Press(OutOfRange),
     /// The settings of the arm are unusable.
     #[error("arm.{0}")]
-    Arm(#[from] motion::SettingsError),
-    /// The least confidence is not within 0 to 1.
-    #[error("min_confidence: found {0:?}, expected 0 to 1")]
-    MinConfidence(f32),
-    /// The least force is negative or not finite.
-    #[error("min_force_n: found {0:?}, expected newtons, 0 or more")]
-    MinForce(f64),
-    /// The confidence of early verdicts is not within 0 to 1.
-    #[error("early_confidence: found {0:?}, expected 0 to 1")]
-    EarlyConfidence(f32),
+    Arm(OutOfRange),
 }
 
 /// The frame rate of the paper's sensor.
@@ -139,7 +110,7 @@ pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
 const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
 
 /// The accepted times between requests, up to an hour.
-const REQUEST_MS: RangeInclusive<u32> = 1..=3_600_000;
+const REQUEST_MS: (u32, u32) = (1, 3_600_000);
 
 /// The longest name. A name is part of topics, of file names and of each line of the log.
 const MOST_NAME_CHARS: usize = 64;
@@ -202,38 +173,43 @@ impl Sensor {
         } = &description;
         let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
         let found = name.chars().count();
-        if found > MOST_NAME_CHARS {
-            return Err(SensorError::LongName { found });
-        }
+        range::check(
+            "name",
+            format_args!("{found} characters"),
+            found <= MOST_NAME_CHARS,
+            format_args!("at most {MOST_NAME_CHARS}"),
+        )?;
         if !(name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)) {
             return Err(SensorError::Name(name.clone()));
         }
-        if !(FRAME_RATES_HZ.0..=FRAME_RATES_HZ.1).contains(frame_rate_hz) {
-            return Err(SensorError::FrameRate(*frame_rate_hz));
-        }
+        within(
+            "frame_rate_hz",
+            *frame_rate_hz,
+            FRAME_RATES_HZ,
+            "frames a second",
+        )?;
         let stale_after = match *stale_after_ms {
             None => LEAST_STALE_AFTER.max(late(*frame_rate_hz)),
-            Some(ms) if (STALE_AFTER_MS.0..=STALE_AFTER_MS.1).contains(&ms) => of_ms(ms),
-            Some(ms) => return Err(SensorError::StaleAfter(ms)),
+            Some(ms) => {
+                within("stale_after_ms", ms, STALE_AFTER_MS, "milliseconds")?;
+                of_ms(ms)
+            }
         };
         let layout = Layout::new(frame)?;
-        match frame.request_ms {
-            Some(_) if frame.request.is_none() => return Err(SensorError::NoRequest),
-            Some(ms) if !REQUEST_MS.contains(&ms) => return Err(SensorError::RequestTime(ms)),
-            _ => {}
+        if let Some(ms) = frame.request_ms {
+            if frame.request.is_none() {
+                return Err(SensorError::NoRequest);
+            }
+            within("frame.request_ms", ms, REQUEST_MS, "milliseconds")?;
         }
         calibration.check(layout.array())?;
-        let thresholds = press.check(layout.array(), calibration.pitch_mm)?;
-        arm.check()?;
-        if !(0.0..=1.0).contains(min_confidence) {
-            return Err(SensorError::MinConfidence(*min_confidence));
-        }
-        if !(min_force_n.is_finite() && *min_force_n >= 0.0) {
-            return Err(SensorError::MinForce(*min_force_n));
-        }
-        if !(0.0..=1.0).contains(early_confidence) {
-            return Err(SensorError::EarlyConfidence(*early_confidence));
-        }
+        let thresholds = press.check(layout.array(), calibration.pitch_mm);
+        let thresholds = thresholds.map_err(SensorError::Press)?;
+        arm.check().map_err(SensorError::Arm)?;
+        within("min_confidence", *min_confidence, (0.0, 1.0), "")?;
+        let fits = (0.0..=f64::MAX).contains(min_force_n);
+        range::check("min_force_n", min_force_n, fits, "newtons, 0 or more")?;
+        within("early_confidence", *early_confidence, (0.0, 1.0), "")?;
         Ok(Self {
             layout,
             thresholds,

@@ -218,11 +218,13 @@ fn of_gains(file: &Path, source: &NpyError) -> String {
 fn table_of(sensor: &str, problem: &SensorError) -> String {
     match problem {
         SensorError::Press(_) => String::new(),
-        SensorError::MinConfidence(_)
-        | SensorError::MinForce(_)
-        | SensorError::EarlyConfidence(_) => "model.".to_owned(),
         // The name cannot be used, so it cannot identify the table.
-        SensorError::Name(_) | SensorError::LongName { .. } => "sensor.".to_owned(),
+        SensorError::Name(_) => "sensor.".to_owned(),
+        SensorError::Range(found) => match found.key {
+            "name" => "sensor.".to_owned(),
+            "min_confidence" | "min_force_n" | "early_confidence" => "model.".to_owned(),
+            _ => format!("sensor[{sensor:?}]."),
+        },
         _ => format!("sensor[{sensor:?}]."),
     }
 }

@@ -9,6 +9,7 @@ use super::cable::{self, OfCable};
 use super::taxels::{Change, OfTaxels, Region};
 use super::times::{Frames, Span};
 use hardnessd_core::frame::Array;
+use hardnessd_core::range::{self, OutOfRange};
 use hardnessd_core::wording;
 use hardnessd_simulator::FULL_SCALE_COUNTS;
 
@@ -99,51 +100,12 @@ pub enum Problem {
 /// A value that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Unfit {
-    /// The moment is before the first frame, or not a number.
-    #[error("at_s: found {0}, expected seconds from 0")]
-    Moment(f64),
+    /// A value is out of its range.
+    #[error(transparent)]
+    Range(#[from] OutOfRange),
     /// The key belongs to other kinds of faults.
     #[error("{0}: this kind of fault does not have it")]
     Misplaced(&'static str),
-    /// More bytes or bits than the limit.
-    #[error("{key}: found {found}, expected at most {MOST_STRUCK}")]
-    TooMany {
-        /// The key.
-        key: &'static str,
-        /// The value in the script.
-        found: usize,
-    },
-    /// The time is not a number of seconds above 0.
-    #[error("for_s: found {0}, expected seconds above 0")]
-    Span(f64),
-    /// The stall holds back too many frames.
-    #[error("for_s: found {0}, expected at most {LONGEST_STALL_S} for a stall")]
-    Stall(f64),
-    /// A number outside its range.
-    #[error("{key}: found {found}, expected {least} to {most}")]
-    Range {
-        /// The key.
-        key: &'static str,
-        /// The value in the script.
-        found: f64,
-        /// The least possible value.
-        least: f64,
-        /// The greatest possible value.
-        most: f64,
-    },
-    /// The force is not above 0.
-    #[error("newtons: found {0}, expected more than 0")]
-    NoForce(f64),
-    /// The rows or columns are not two numbers of the array, in order.
-    #[error("{key}: found {found:?}, expected [first, last] of 0 to {}", sides - 1)]
-    Side {
-        /// The key.
-        key: &'static str,
-        /// The numbers in the script.
-        found: Vec<usize>,
-        /// The number of rows, or of columns.
-        sides: usize,
-    },
     /// The fault needs a key and does not have it.
     #[error("{key}: this kind of fault needs it, {form}")]
     Needed {
@@ -257,9 +219,9 @@ pub(super) fn parse(text: &str) -> Result<Faults, Problem> {
 impl Table {
     /// Adds the fault to the others.
     fn add_to(&self, faults: &mut Faults) -> Result<(), Unfit> {
-        if !(self.at_s.is_finite() && self.at_s >= 0.0) {
-            return Err(Unfit::Moment(self.at_s));
-        }
+        let fits = self.at_s.is_finite() && self.at_s >= 0.0;
+        let at_s = format_args!("{}", self.at_s);
+        range::check("at_s", at_s, fits, "seconds from 0")?;
         if let Some(key) = self.misplaced() {
             return Err(Unfit::Misplaced(key));
         }
@@ -275,10 +237,11 @@ impl Table {
             }
             Kind::Stall => {
                 let fault = self.of_cable(cable::Kind::Stall)?;
-                match self.for_s {
-                    Some(for_s) if for_s > LONGEST_STALL_S => return Err(Unfit::Stall(for_s)),
-                    _ => faults.cable.push(fault),
-                }
+                let for_s = self.for_s.unwrap_or_default();
+                let expected = format_args!("at most {LONGEST_STALL_S} for a stall");
+                let fits = for_s <= LONGEST_STALL_S;
+                range::check("for_s", format_args!("{for_s}"), fits, expected)?;
+                faults.cable.push(fault);
             }
             Kind::WrongBaud => {
                 let form = "the reader's baud rate over the sensor's";
@@ -314,9 +277,7 @@ impl Table {
             Kind::Contact => {
                 let range = (0.0, MOST_NEWTONS);
                 let newtons = number("newtons", self.newtons, range, "for each taxel")?;
-                if newtons == 0.0 {
-                    return Err(Unfit::NoForce(newtons));
-                }
+                range::check("newtons", 0, newtons != 0.0, "more than 0")?;
                 faults
                     .taxels
                     .push(self.of_some(Change::Contact { newtons })?);
@@ -357,11 +318,10 @@ impl Table {
 
     /// The time of the fault, which does not end without `for_s`.
     fn span(&self) -> Result<Span, Unfit> {
-        let to_s = match self.for_s {
-            Some(for_s) if for_s.is_finite() && for_s > 0.0 => self.at_s + for_s,
-            Some(for_s) => return Err(Unfit::Span(for_s)),
-            None => f64::INFINITY,
-        };
+        let for_s = self.for_s.unwrap_or(f64::INFINITY);
+        let fits = self.for_s.is_none_or(f64::is_finite) && for_s > 0.0;
+        range::check("for_s", format_args!("{for_s}"), fits, "seconds above 0")?;
+        let to_s = self.at_s + for_s;
         let from_s = self.at_s;
         Ok(Span { from_s, to_s })
     }
@@ -407,10 +367,10 @@ impl Table {
 
 /// How many bytes or bits of a frame a fault strikes.
 fn struck(key: &'static str, given: Option<usize>) -> Result<usize, Unfit> {
-    match given.unwrap_or(1) {
-        found if found > MOST_STRUCK => Err(Unfit::TooMany { key, found }),
-        number => Ok(number),
-    }
+    let found = given.unwrap_or(1);
+    let expected = format_args!("at most {MOST_STRUCK}");
+    range::check(key, found, found <= MOST_STRUCK, expected)?;
+    Ok(found)
 }
 
 /// A number that the fault needs.
@@ -421,15 +381,10 @@ fn number(
     form: &'static str,
 ) -> Result<f64, Unfit> {
     let found = given.ok_or(Unfit::Needed { key, form })?;
-    if (least..=most).contains(&found) {
-        return Ok(found);
-    }
-    Err(Unfit::Range {
-        key,
-        found,
-        least,
-        most,
-    })
+    let fits = (least..=most).contains(&found);
+    let expected = format_args!("{least} to {most}");
+    range::check(key, format_args!("{found}"), fits, expected)?;
+    Ok(found)
 }
 
 /// The first and the last row or column. The parser would drop the rest of a list longer than a
@@ -438,11 +393,10 @@ fn side(key: &'static str, given: Option<&[usize]>, sides: usize) -> Result<[usi
     match given {
         None => Ok([0, sides - 1]),
         Some(&[first, last]) if first <= last && last < sides => Ok([first, last]),
-        Some(found) => Err(Unfit::Side {
-            key,
-            found: found.to_vec(),
-            sides,
-        }),
+        Some(found) => {
+            let expected = format_args!("[first, last] of 0 to {}", sides - 1);
+            Err(OutOfRange::new(key, found, expected).into())
+        }
     }
 }
 

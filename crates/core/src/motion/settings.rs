@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::range::{OutOfRange, within};
+
 /// The `[sensor.arm]` table.
 ///
 /// # Example
@@ -37,46 +39,24 @@ const STIFFNESSES_N_PER_MM: (f64, f64) = (0.001, 100_000.0);
 /// byte.
 pub(super) const DELAYS_MS: (f64, f64) = (-1000.0, 1000.0);
 
-/// An unusable value of [`Settings`].
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{key}: found {found:?}, expected {least} to {most} {unit}")]
-pub struct SettingsError {
-    key: &'static str,
-    found: f64,
-    least: f64,
-    most: f64,
-    unit: &'static str,
-}
-
 impl Settings {
     /// Checks every value.
     ///
     /// # Errors
     ///
     /// Returns an error if a stiffness, speed or delay is out of its range.
-    pub fn check(&self) -> Result<(), SettingsError> {
-        for (key, found, (least, most), unit) in [
-            (
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        if let Some(stiffness) = self.stiffness_n_per_mm {
+            within(
                 "stiffness_n_per_mm",
-                self.stiffness_n_per_mm,
+                stiffness,
                 STIFFNESSES_N_PER_MM,
                 "N/mm",
-            ),
-            ("speed_mm_s", self.speed_mm_s, SPEEDS_MM_S, "mm/s"),
-            ("delay_ms", Some(self.delay_ms), DELAYS_MS, "ms"),
-        ] {
-            if let Some(found) = found
-                && !(least..=most).contains(&found)
-            {
-                return Err(SettingsError {
-                    key,
-                    found,
-                    least,
-                    most,
-                    unit,
-                });
-            }
+            )?;
         }
-        Ok(())
+        if let Some(speed) = self.speed_mm_s {
+            within("speed_mm_s", speed, SPEEDS_MM_S, "mm/s")?;
+        }
+        within("delay_ms", self.delay_ms, DELAYS_MS, "ms")
     }
 }

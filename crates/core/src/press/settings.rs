@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::frame::{Array, Pitch};
+use crate::range::{self, OutOfRange, positive, within};
 use crate::wording::as_written;
 
 /// The `[press]` table. A key that is `None` depends on the size of a taxel: see [`Thresholds`].
@@ -20,7 +21,7 @@ use crate::wording::as_written;
 /// let settings = Settings { begin_area_taxels: Some(3), end_area_taxels: Some(4), ..Settings::default() };
 /// let error = settings.check(Array::JX255N, Pitch::JX255N).unwrap_err();
 /// assert_eq!(error.to_string(), "end_area_taxels: found 4, expected 1 to 3");
-/// # Ok::<(), hardnessd_core::press::SettingsError>(())
+/// # Ok::<(), hardnessd_core::range::OutOfRange>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -61,43 +62,6 @@ impl Default for Settings {
     }
 }
 
-/// An unusable value of [`Settings`].
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum SettingsError {
-    /// The value is not positive, or too large.
-    #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
-    NotPositive {
-        /// The key of the value.
-        key: &'static str,
-        /// The configured value.
-        found: f64,
-        /// The largest allowed value.
-        max: f64,
-    },
-    /// The value is negative or too large.
-    #[error("{key}: found {found:?}, expected 0 or more and at most {max}")]
-    Negative {
-        /// The key of the value.
-        key: &'static str,
-        /// The configured value.
-        found: f64,
-        /// The largest allowed value.
-        max: f64,
-    },
-    /// The count is out of its range.
-    #[error("{key}: found {found}, expected {least} to {most}")]
-    Count {
-        /// The key of the value.
-        key: &'static str,
-        /// The configured value.
-        found: u64,
-        /// The smallest allowed value.
-        least: u64,
-        /// The largest allowed value.
-        most: u64,
-    },
-}
-
 /// The longest duration and the largest force that settings may have.
 const LARGEST: f64 = 1e6;
 
@@ -108,62 +72,24 @@ impl Settings {
     ///
     /// Returns an error if a force or duration is not finite or out of range, an area is 0 or above
     /// the number of taxels, the end area is above the begin area, or a count of frames is 0.
-    pub fn check(&self, array: Array, pitch: Pitch) -> Result<Thresholds, SettingsError> {
+    pub fn check(&self, array: Array, pitch: Pitch) -> Result<Thresholds, OutOfRange> {
         let thresholds = self.thresholds(array, pitch);
-        for (key, found) in [
-            (
-                "contact_threshold_n",
-                as_written(thresholds.contact_threshold_n),
-            ),
-            ("max_seconds", self.max_seconds),
-        ] {
-            if !(found > 0.0 && found <= LARGEST) {
-                return Err(SettingsError::NotPositive {
-                    key,
-                    found,
-                    max: LARGEST,
-                });
-            }
-        }
+        let threshold_n = as_written(thresholds.contact_threshold_n);
+        positive("contact_threshold_n", threshold_n, LARGEST)?;
+        positive("max_seconds", self.max_seconds, LARGEST)?;
         for (key, found) in [
             ("early_settle_s", self.early_settle_s),
             ("early_min_force_n", self.early_min_force_n),
         ] {
-            if !(0.0..=LARGEST).contains(&found) {
-                return Err(SettingsError::Negative {
-                    key,
-                    found,
-                    max: LARGEST,
-                });
-            }
+            let fits = (0.0..=LARGEST).contains(&found);
+            let expected = format_args!("0 or more and at most {LARGEST}");
+            range::check(key, found, fits, expected)?;
         }
-        for (key, found, most) in [
-            (
-                "begin_area_taxels",
-                u64::from(thresholds.begin_area_taxels),
-                array.taxels() as u64,
-            ),
-            (
-                "end_area_taxels",
-                u64::from(thresholds.end_area_taxels),
-                thresholds.begin_area_taxels.into(),
-            ),
-            (
-                "end_frames",
-                u64::from(self.end_frames),
-                u64::from(u32::MAX),
-            ),
-            ("min_frames", self.min_frames, u64::MAX),
-        ] {
-            if !(1..=most).contains(&found) {
-                return Err(SettingsError::Count {
-                    key,
-                    found,
-                    least: 1,
-                    most,
-                });
-            }
-        }
+        let (begin, end) = (thresholds.begin_area_taxels, thresholds.end_area_taxels);
+        within("begin_area_taxels", begin, (1, array.taxels() as u32), "")?;
+        within("end_area_taxels", end, (1, begin), "")?;
+        within("end_frames", self.end_frames, (1, u32::MAX), "")?;
+        within("min_frames", self.min_frames, (1, u64::MAX), "")?;
         Ok(thresholds)
     }
 

@@ -6,6 +6,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{Array, Pitch};
+use crate::range::{OutOfRange, positive, within};
 use crate::wording::as_written;
 
 /// The force of one count of the JX255N: 8 bits are 10.2 N.
@@ -96,22 +97,9 @@ impl Default for Settings {
 /// An unusable value of [`Settings`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
-    /// The value is not positive, or is larger than for any film.
-    #[error("{key}: found {found:?}, expected a number above 0 and at most {max}")]
-    NotPositive {
-        /// The key of the value.
-        key: &'static str,
-        /// The configured value.
-        found: f64,
-        /// The largest allowed value.
-        max: f64,
-    },
-    /// The exponent is outside [`EXPONENTS`].
-    #[error("exponent: found {found:?}, expected {least} to {most}", least = EXPONENTS.0, most = EXPONENTS.1)]
-    Exponent {
-        /// The configured value.
-        found: f64,
-    },
+    /// A number is out of its range.
+    #[error(transparent)]
+    Range(#[from] OutOfRange),
     /// The file of the gains has not been read.
     #[error("gains: found the path of a file, expected its numbers")]
     GainsUnread,
@@ -138,14 +126,6 @@ pub enum SettingsError {
         row: usize,
         /// The column of the taxel.
         col: usize,
-    },
-    /// The sum of counts cannot hold this many frames.
-    #[error("tare_frames: found {found}, expected 0 to {max}")]
-    TareFrames {
-        /// The configured value.
-        found: u32,
-        /// The largest allowed value.
-        max: u32,
     },
     /// A dead taxel is outside the array.
     #[error(
@@ -186,33 +166,20 @@ impl Settings {
     /// beyond any film, if `exponent` is out of its range, if `gains` have another shape or are out
     /// of their range, if `tare_frames` is above 65,536, or if a dead taxel lies outside `array`.
     pub fn check(&self, array: Array) -> Result<(), SettingsError> {
-        for (key, found, max) in [
-            (
-                "newtons_per_count",
-                as_written(self.newtons_per_count),
-                MOST_NEWTONS_PER_COUNT,
-            ),
-            ("pitch_mm", self.pitch_mm.rows_mm, MOST_PITCH_MM),
-            ("pitch_mm", self.pitch_mm.cols_mm, MOST_PITCH_MM),
-            ("tare_max_n", as_written(self.tare_max_n), MOST_TARE_N),
-        ] {
-            if !(found > 0.0 && found <= max) {
-                return Err(SettingsError::NotPositive { key, found, max });
-            }
-        }
-        let exponent = as_written(self.exponent);
-        if !(EXPONENTS.0..=EXPONENTS.1).contains(&exponent) {
-            return Err(SettingsError::Exponent { found: exponent });
-        }
+        let newtons_per_count = as_written(self.newtons_per_count);
+        positive(
+            "newtons_per_count",
+            newtons_per_count,
+            MOST_NEWTONS_PER_COUNT,
+        )?;
+        positive("pitch_mm", self.pitch_mm.rows_mm, MOST_PITCH_MM)?;
+        positive("pitch_mm", self.pitch_mm.cols_mm, MOST_PITCH_MM)?;
+        positive("tare_max_n", as_written(self.tare_max_n), MOST_TARE_N)?;
+        within("exponent", as_written(self.exponent), EXPONENTS, "")?;
         if let Some(gains) = &self.gains {
             check_gains(gains, array)?;
         }
-        if self.tare_frames > MOST_TARE_FRAMES {
-            return Err(SettingsError::TareFrames {
-                found: self.tare_frames,
-                max: MOST_TARE_FRAMES,
-            });
-        }
+        within("tare_frames", self.tare_frames, (0, MOST_TARE_FRAMES), "")?;
         match self
             .dead_taxels
             .iter()

@@ -14,6 +14,7 @@ use super::checksum::{Checksum, ChecksumOver};
 use super::preset::Keys;
 use super::scan::{Context, Scan};
 use super::settings::{Cell, FooterBytes, LayoutError, LengthField, Packets};
+use crate::range::{self, OutOfRange};
 
 /// The most bytes that a layout can skip before or after the cells: as many as the cells of a large
 /// array, which a board may send beside the one that is read.
@@ -65,10 +66,12 @@ impl Fixed {
         is_skippable("header_bytes", keys.header_bytes)?;
         let cells = keys.rows * keys.cols;
         let count = keys.packets.map_or(1, |packets| packets.count);
-        if !(1..=255).contains(&count) || !cells.is_multiple_of(count) {
-            let found = count;
-            return Err(LayoutError::PacketCount { found, cells });
-        }
+        range::check(
+            "packets.count",
+            count,
+            (1..=255).contains(&count) && cells.is_multiple_of(count),
+            format_args!("1 to 255 that divides the {cells} cells evenly"),
+        )?;
         let cell_bytes = cells / count * keys.cell.bytes();
         let (length, max): (Vec<u8>, usize) = match keys.length {
             LengthField::None => (Vec::new(), usize::MAX),
@@ -76,12 +79,12 @@ impl Fixed {
             LengthField::U16le => ((cell_bytes as u16).to_le_bytes().to_vec(), 0xFFFF),
             LengthField::U16be => ((cell_bytes as u16).to_be_bytes().to_vec(), 0xFFFF),
         };
-        if cell_bytes > max {
-            return Err(LayoutError::LengthField {
-                found: cell_bytes,
-                max,
-            });
-        }
+        range::check(
+            "length",
+            format_args!("{cell_bytes} payload bytes"),
+            cell_bytes <= max,
+            format_args!("at most {max} for this field"),
+        )?;
         let mark = [keys.sync.as_slice(), &length].concat();
         let footers = footers(&keys.footer_bytes, count)?;
         let numbers = match keys.packets {
@@ -346,12 +349,10 @@ fn pairs(bytes: &[u8]) -> impl Iterator<Item = [u8; 2]> {
     bytes.chunks_exact(2).map(|pair| [pair[0], pair[1]])
 }
 
-fn is_skippable(key: &'static str, found: usize) -> Result<(), LayoutError> {
-    let max = MOST_SKIPPED_BYTES;
-    if found > max {
-        return Err(LayoutError::Skipped { key, found, max });
-    }
-    Ok(())
+fn is_skippable(key: &'static str, bytes: usize) -> Result<(), OutOfRange> {
+    let found = format_args!("{bytes} bytes");
+    let expected = format_args!("0 to {MOST_SKIPPED_BYTES}");
+    range::check(key, found, bytes <= MOST_SKIPPED_BYTES, expected)
 }
 
 /// The footer bytes of each packet.
@@ -360,10 +361,12 @@ fn footers(footer_bytes: &FooterBytes, packets: usize) -> Result<Vec<usize>, Lay
         FooterBytes::Each(bytes) => vec![*bytes; packets],
         FooterBytes::Of(list) => list.clone(),
     };
-    if footers.len() != packets {
-        let found = footers.len();
-        return Err(LayoutError::FooterBytes { found, packets });
-    }
+    range::check(
+        "footer_bytes",
+        format_args!("{} numbers", footers.len()),
+        footers.len() == packets,
+        format_args!("one for each packet ({packets})"),
+    )?;
     for &bytes in &footers {
         is_skippable("footer_bytes", bytes)?;
     }
@@ -372,17 +375,19 @@ fn footers(footer_bytes: &FooterBytes, packets: usize) -> Result<Vec<usize>, Lay
 
 /// The numbers of the packets.
 fn numbers(packets: Packets, header_bytes: usize) -> Result<impl Iterator<Item = u8>, LayoutError> {
-    if packets.number_at >= header_bytes {
-        return Err(LayoutError::PacketNumberAt {
-            found: packets.number_at,
-            header_bytes,
-        });
-    }
+    range::check(
+        "packets.number_at",
+        packets.number_at,
+        packets.number_at < header_bytes,
+        format_args!("a byte of the header (header_bytes: {header_bytes})"),
+    )?;
     let max = 256 - packets.count;
-    if usize::from(packets.first) > max {
-        let found = packets.first;
-        return Err(LayoutError::PacketFirst { found, max });
-    }
+    range::check(
+        "packets.first",
+        packets.first,
+        usize::from(packets.first) <= max,
+        format_args!("at most {max}: a packet's number is one byte"),
+    )?;
     Ok((packets.first..=u8::MAX).take(packets.count))
 }
 

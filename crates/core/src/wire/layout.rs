@@ -7,6 +7,7 @@ use super::settings::{LayoutError, Order, Settings};
 use super::text::FrameEnd;
 use super::{fixed, zero_run};
 use crate::frame::{Array, MOST_SIDE, RawFrame};
+use crate::range::within;
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -34,7 +35,8 @@ enum Framing {
 /// assert_eq!(bytes.len(), layout.max_frame_bytes());
 ///
 /// let settings = Settings { rows: Some(65), ..Settings::default() };
-/// assert!(matches!(Layout::new(&settings), Err(LayoutError::Size { key: "rows", .. })));
+/// let error = Layout::new(&settings).unwrap_err();
+/// assert_eq!(error.to_string(), "rows: found 65, expected 1 to 64");
 /// # Ok::<(), LayoutError>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -55,10 +57,7 @@ impl Layout {
     pub fn new(settings: &Settings) -> Result<Self, LayoutError> {
         let keys = Keys::with(settings);
         for (key, found) in [("rows", keys.rows), ("cols", keys.cols)] {
-            let max = MOST_SIDE;
-            if !(1..=max).contains(&found) {
-                return Err(LayoutError::Size { key, found, max });
-            }
+            within(key, found, (1, MOST_SIDE), "")?;
         }
         let array = Array {
             rows: keys.rows,
@@ -83,12 +82,7 @@ impl Layout {
             }
         };
         let mask = settings.mask.unwrap_or(all_ones);
-        if mask == 0 || mask > all_ones {
-            return Err(LayoutError::Mask {
-                found: mask,
-                max: all_ones,
-            });
-        }
+        within("mask", mask, (1, all_ones), "for this cell")?;
         let order = settings.order.unwrap_or(Order::RowMajor);
         let invert = settings.invert.unwrap_or(false);
         let largest_cell = largest.unwrap_or(all_ones).min(mask);

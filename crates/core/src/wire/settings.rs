@@ -5,6 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::checksum::{Checksum, ChecksumOver};
+use crate::range::OutOfRange;
 
 /// Ready-made layouts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -222,38 +223,15 @@ pub enum Order {
 /// The reason why a `[sensor.frame]` table is unusable. Each message names its key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LayoutError {
-    /// The array is too large, or empty.
-    #[error("{key}: found {found}, expected 1 to {max}")]
-    Size {
-        /// `rows` or `cols`.
-        key: &'static str,
-        /// The configured value.
-        found: usize,
-        /// The longest side.
-        max: usize,
-    },
+    /// A number is out of its range.
+    #[error(transparent)]
+    Range(#[from] OutOfRange),
     /// The layout has neither `sync` nor `tail`.
     #[error("sync: found neither sync nor tail, expected at least one to find frames by")]
     Unmarked,
     /// The layout has a length field, but no sync to find it by.
     #[error("length: found a length field without sync, expected sync before it")]
     LengthWithoutSync,
-    /// The cells are too many for the length field.
-    #[error("length: found {found} payload bytes, expected at most {max} for this field")]
-    LengthField {
-        /// The number of bytes of the cells.
-        found: usize,
-        /// The largest value of the field.
-        max: usize,
-    },
-    /// The mask has bits that the cell lacks.
-    #[error("mask: found {found}, expected 1 to {max} for this cell")]
-    Mask {
-        /// The configured value.
-        found: u16,
-        /// The value of a cell with all ones.
-        max: u16,
-    },
     /// The frames of the preset have no such part.
     #[error("{key}: found a value, expected none: frames of preset {preset} have no such part")]
     Unused {
@@ -262,53 +240,7 @@ pub enum LayoutError {
         /// The preset.
         preset: Preset,
     },
-    /// Too many bytes are skipped.
-    #[error("{key}: found {found} bytes, expected 0 to {max}")]
-    Skipped {
-        /// `header_bytes` or `footer_bytes`.
-        key: &'static str,
-        /// The configured value.
-        found: usize,
-        /// The most bytes that can be skipped.
-        max: usize,
-    },
-    /// The list of `footer_bytes` is longer or shorter than the packets of a frame.
-    #[error("footer_bytes: found {found} numbers, expected one for each packet ({packets})")]
-    FooterBytes {
-        /// The number of configured values.
-        found: usize,
-        /// The number of packets.
-        packets: usize,
-    },
     /// The packets cannot be found, because they have no `sync`.
     #[error("packets: found no sync, expected the one that each packet begins with")]
     PacketsWithoutSync,
-    /// The cells are not an equal share for each packet.
-    #[error(
-        "packets.count: found {found}, expected 1 to 255 that divides the {cells} cells evenly"
-    )]
-    PacketCount {
-        /// The configured value.
-        found: usize,
-        /// The number of cells.
-        cells: usize,
-    },
-    /// The packet's number is not in the header.
-    #[error(
-        "packets.number_at: found {found}, expected a byte of the header (header_bytes: {header_bytes})"
-    )]
-    PacketNumberAt {
-        /// The configured value.
-        found: usize,
-        /// The configured number of header bytes.
-        header_bytes: usize,
-    },
-    /// The last packet's number does not fit into a byte.
-    #[error("packets.first: found {found}, expected at most {max}: a packet's number is one byte")]
-    PacketFirst {
-        /// The configured value.
-        found: u8,
-        /// The largest value at which the last packet's number fits.
-        max: usize,
-    },
 }
