@@ -50,6 +50,8 @@ fn follow(guide: &str) {
     let text = text.replace("8255", &free()).replace("8256", &free());
     // This machine may be busier than the reader's.
     let text = text.replace("sleep 1\n", "sleep 3\n");
+    // A reader presses by hand. The simulated sensor is pressed sooner.
+    let text = text.replace("--timeout 20 >presses", "--timeout 8 >presses");
     let place = tempfile::tempdir().unwrap();
     for file in ["clients/python/hardnessd.py", "examples/gentle_press.py"] {
         let file = root().join(file);

@@ -7,7 +7,7 @@
 
 pub mod course_model;
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use serde_json::Value;
@@ -22,7 +22,8 @@ use crate::verdict::{BUILT_IN_HRN, Hrn};
 
 /// The built-in model.
 pub fn hrn() -> Arc<Hrn> {
-    Arc::new(Hrn::load(BUILT_IN_HRN).unwrap())
+    static HRN: LazyLock<Arc<Hrn>> = LazyLock::new(|| Arc::new(Hrn::load(BUILT_IN_HRN).unwrap()));
+    Arc::clone(&HRN)
 }
 
 /// A sensor with a gain for each taxel and a baseline that follows drift.

@@ -9,6 +9,7 @@ mod arrays;
 use crate::event::{LinkState, Note, Rejection};
 use crate::frame::Array;
 use crate::sensor::Description;
+use crate::test_support;
 use crate::verdict::BUILT_IN_HRN;
 use crate::wire::Preset;
 
@@ -25,7 +26,7 @@ fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
         ..Description::default()
     };
     change(&mut described);
-    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
+    let hrn = test_support::hrn();
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
 }
 

@@ -334,7 +334,7 @@ fn a_long_press_is_thinned() {
 fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
     let found = |told: &[Point], arm_n_per_mm| {
         let mut pipeline = tared(&[], |d| d.arm.stiffness_n_per_mm = arm_n_per_mm);
-        pipeline.hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
+        pipeline.hrn = test_support::hrn();
         pipeline.tell(told).unwrap();
         let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
         let mut events = Vec::new();
