@@ -77,6 +77,11 @@ impl Listener for Tcp {
 fn behave(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)?;
     sockopt::set_socket_send_buffer_size(stream, SEND_BUFFER_BYTES)?;
+    keep_alive(stream)
+}
+
+/// Has the system notice within a minute that the other end of a connection is gone.
+pub(crate) fn keep_alive(stream: &TcpStream) -> io::Result<()> {
     sockopt::set_socket_keepalive(stream, true)?;
     sockopt::set_tcp_keepidle(stream, KEEPALIVE)?;
     sockopt::set_tcp_keepintvl(stream, KEEPALIVE_PAUSE)?;

@@ -10,10 +10,8 @@ use std::io::{self, ErrorKind};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use clap::Args as ClapArgs;
-use rustix::net::sockopt;
 use tokio::io::{AsyncRead, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream, tcp, unix};
 
@@ -192,14 +190,6 @@ async fn find(name: &str) -> Result<Connection, Error> {
     Err(denied.unwrap_or_else(|| Error::Nowhere { places: tried() }))
 }
 
-/// Lets the system notice within a minute that the robot is gone, as the daemon does for its clients.
-fn keep_alive(stream: &TcpStream) -> io::Result<()> {
-    sockopt::set_socket_keepalive(stream, true)?;
-    sockopt::set_tcp_keepidle(stream, Duration::from_secs(30))?;
-    sockopt::set_tcp_keepintvl(stream, Duration::from_secs(10))?;
-    Ok(sockopt::set_tcp_keepcnt(stream, 3)?)
-}
-
 /// Connects to one of the addresses of a name. A lookup may take long.
 async fn connect(name: String) -> io::Result<TcpStream> {
     let found = apart::start("lookup", move || name.to_socket_addrs())?;
@@ -215,7 +205,7 @@ impl Connection {
                 (Box::new(input) as Box<_>, Output::Unix(output))
             }),
             Address::Tcp(address) => connect(address.clone()).await.and_then(|stream| {
-                keep_alive(&stream)?;
+                crate::daemon::tcp::keep_alive(&stream)?;
                 let (input, output) = stream.into_split();
                 Ok((Box::new(input) as Box<_>, Output::Tcp(output)))
             }),
