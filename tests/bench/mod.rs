@@ -7,6 +7,9 @@
     reason = "every test file is a crate of its own and uses a part of this"
 )]
 
+#[path = "../../src/tools/pty/pair.rs"]
+pub mod pair;
+
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};

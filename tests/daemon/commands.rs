@@ -5,8 +5,8 @@ use std::io::Read;
 use std::os::unix::fs::symlink;
 use std::process::{Command, Output, Stdio};
 
+use crate::bench::pair::Pair;
 use crate::bench::{BINARY, Bench, Process, hardnessd};
-use crate::pair::Pair;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 

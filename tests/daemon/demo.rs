@@ -7,8 +7,8 @@ use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
+use crate::bench::pair::Pair;
 use crate::bench::{BINARY, Bench, Daemon, Process};
-use crate::pair::Pair;
 use rustix::process::Signal;
 use serde_json::Value;
 

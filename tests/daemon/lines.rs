@@ -10,8 +10,8 @@ use std::time::Duration;
 use rustix::termios::{InputModes, LocalModes, OptionalActions, tcgetattr, tcsetattr};
 use serde_json::{Value, json};
 
+use crate::bench::pair::Pair;
 use crate::bench::{Bench, Daemon, PATIENCE, Subscriber, hardnessd, wait_for};
-use crate::pair::Pair;
 
 /// The bytes of a frame of the JX255N.
 const FRAME: usize = 790;

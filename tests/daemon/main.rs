@@ -6,9 +6,6 @@
 
 #[path = "../bench/mod.rs"]
 mod bench;
-#[path = "../../src/tools/pty/pair.rs"]
-#[allow(dead_code, reason = "nobody here asks where the device is")]
-mod pair;
 
 mod arm;
 mod calibrate;

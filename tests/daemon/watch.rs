@@ -11,8 +11,8 @@ use std::process::{Command, Stdio};
 use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
+use crate::bench::pair::Pair;
 use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
-use crate::pair::Pair;
 use rustix::process::Signal;
 use rustix::termios::{LocalModes, Winsize};
 

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 use hardnessd_core::verdict::{Hrn, ModelFrame};
 use hardnessd_simulator::Split;
@@ -10,12 +10,7 @@ use hrn_train::data::dataset::{self, Dataset, Sample};
 use prost::Message;
 use tract_onnx::pb;
 
-fn hrn_train(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(arguments)
-        .output()
-        .unwrap()
-}
+use crate::hrn_train;
 
 /// What `adopt` says of a foreign model.
 fn adopt(foreign: &str, data: &str, out: &Path) -> Output {

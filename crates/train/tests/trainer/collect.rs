@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::Labels;
@@ -15,6 +15,8 @@ use hrn_train::data::dataset::{self, Dataset, Kind, Sample, meta};
 use hrn_train::data::simulated;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
+
+use crate::hrn_train;
 
 /// Raw bytes of presses, which have no labels.
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fixtures/foam.5hz.bin");
@@ -60,13 +62,6 @@ impl Desk {
         let (bytes, _) = of_a_labelled_press(&labels, change, None, true);
         self.write(name, bytes)
     }
-}
-
-fn hrn_train(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(arguments)
-        .output()
-        .unwrap()
 }
 
 fn collect(out: &Path, arguments: &[&str]) -> Output {

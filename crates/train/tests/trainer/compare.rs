@@ -2,7 +2,7 @@
 //! do not repeat.
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -10,32 +10,7 @@ use hrn_train::data::dataset::{self, Dataset};
 use hrn_train::judge::paper;
 use serde_json::Value;
 
-fn hrn_train(arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_hrn-train"));
-    command.args(arguments);
-    command
-}
-
-fn succeed(arguments: &[&str]) -> Output {
-    let output = hrn_train(arguments).output().unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {errors}");
-    output
-}
-
-/// A directory for the whole process, with a small data set.
-fn data() -> &'static (tempfile::TempDir, PathBuf) {
-    static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
-    DATA.get_or_init(|| {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("tiny.npz");
-        let out = path.to_str().unwrap();
-        let size = ["--objects", "4", "--test-objects", "1", "--presses", "10"];
-        let rest = ["--lowest-force", "5", "--shapes", "paper", "--out", out];
-        succeed(&[&["simulate", "--seed", "5"][..], &size, &rest].concat());
-        (directory, path)
-    })
-}
+use crate::{data, hrn_train, succeed, succeeded, trainer};
 
 /// A comparison in its own directory.
 struct Comparison {
@@ -55,7 +30,7 @@ impl Comparison {
     }
 
     fn command_of(&self, seeds: &str) -> Command {
-        let mut command = hrn_train(&["compare", "--profile", "smoke", "--seeds", seeds]);
+        let mut command = trainer(&["compare", "--profile", "smoke", "--seeds", seeds]);
         command.args(["--methods", self.methods]).args(self.more);
         command
             .arg("--data")
@@ -191,7 +166,7 @@ fn results_have_the_documented_fields_and_agree_with_evaluate() {
         "--data",
         data().1.to_str().unwrap(),
     ]);
-    let mut evaluated: Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let mut evaluated: Value = serde_json::from_str(&evaluated).unwrap();
     // `evaluate` also has what does not concern the levels.
     for more in ["beyond_neighbour", "shore", "sets"] {
         assert!(evaluated.as_object_mut().unwrap().remove(more).is_some());
@@ -458,7 +433,7 @@ fn data_that_will_not_do_is_refused_before_anything_is_made() {
         ("missing.npz", &[], 66, "DIR/missing.npz: No such file"),
     ] {
         let out = path("will not do");
-        let mut command = hrn_train(&["compare", "--profile", "smoke", "--methods", "features"]);
+        let mut command = trainer(&["compare", "--profile", "smoke", "--methods", "features"]);
         command.args(more).arg("--data").arg(path(name));
         let output = command.arg("--out").arg(&out).output().unwrap();
         let error = String::from_utf8_lossy(&output.stderr);
@@ -482,7 +457,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     let file = std::fs::File::create(&path).unwrap();
     dataset::write(file, &samples, &serde_json::json!({"pitch_mm": 2.0})).unwrap();
     // The warning comes before anything is made. Making the directory fails here.
-    let mut command = hrn_train(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
+    let mut command = trainer(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
     let output = command.arg("--data").arg(&path).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(74), "{said}");
@@ -497,7 +472,8 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     // Evaluating a model gives the same warning.
     let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/hrn.onnx");
     let data = path.to_str().unwrap();
-    let output = succeed(&["evaluate", "--model", model, "--data", data]);
+    let output = hrn_train(&["evaluate", "--model", model, "--data", data]);
+    succeeded(&output);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("object 0 is in both splits"), "{said}");
 }
@@ -624,7 +600,7 @@ fn a_report_needs_no_network_and_has_all_its_sections() {
 
     let missing = data().0.path().join("nowhere");
     let output = hrn_train(&["report", missing.to_str().unwrap(), "--out", "/dev/null"]);
-    assert_eq!({ output }.output().unwrap().status.code(), Some(66));
+    assert_eq!(output.status.code(), Some(66));
 }
 
 /// Checks that a page loads nothing, and links only to its own sections, which are `sections`.

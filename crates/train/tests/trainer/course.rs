@@ -2,7 +2,6 @@
 //! judges whole presses with its file.
 
 use std::path::Path;
-use std::process::{Command, Output};
 
 use hardnessd_core::verdict::{Checks, Course, Format, Hrn, ReferenceKinds, References};
 use hardnessd_simulator::{
@@ -14,20 +13,7 @@ use hrn_train::learn::course;
 use hrn_train::model::course::course_of;
 use serde_json::Value;
 
-fn hrn_train(directory: &Path, arguments: &str) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(arguments.split_whitespace())
-        .current_dir(directory)
-        .output()
-        .expect("cargo built the binary")
-}
-
-fn succeed(directory: &Path, arguments: &str) -> String {
-    let output = hrn_train(directory, arguments);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments}: {errors}");
-    String::from_utf8(output.stdout).unwrap()
-}
+use crate::{hrn_train_in, succeed_in};
 
 const SETTINGS: &str = "
     [training]
@@ -57,13 +43,13 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     std::fs::write(at.join("half.toml"), held_out).unwrap();
     let simulate = "simulate --sequences --materials broad --shapes wide --objects 5 --test-objects 2 \
                     --presses 3 --fps 5..20 --seed 3 --out d.npz";
-    succeed(at, simulate);
+    succeed_in(at, simulate);
     let train = "train --method course --data d.npz --config half.toml --seed 1";
-    let said = succeed(at, &format!("{train} --out whole"));
+    let said = succeed_in(at, &format!("{train} --out whole"));
     assert!(said.contains("Shore OO"), "{said}");
 
     // A run without its end and its last checkpoint continues to the same file.
-    succeed(at, &format!("{train} --out cut"));
+    succeed_in(at, &format!("{train} --out cut"));
     let checkpoints = at.join("cut/checkpoints");
     let mut names: Vec<_> = std::fs::read_dir(&checkpoints)
         .unwrap()
@@ -72,7 +58,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     names.sort();
     std::fs::remove_file(names.last().unwrap()).unwrap();
     std::fs::remove_file(at.join("cut/hrn.onnx")).unwrap();
-    succeed(at, &format!("{train} --out cut --resume"));
+    succeed_in(at, &format!("{train} --out cut --resume"));
     let [whole, cut] =
         ["whole", "cut"].map(|run| std::fs::read(at.join(run).join("hrn.onnx")).unwrap());
     assert!(whole == cut, "the resumed run has another model");
@@ -104,7 +90,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     for other in [long, fast, soft] {
         assert!(!range.holds(&other), "{other:?}");
     }
-    let inspected = succeed(at, "inspect whole/hrn.onnx");
+    let inspected = succeed_in(at, "inspect whole/hrn.onnx");
     assert!(inspected.contains(" mm/s in training\n"), "{inspected}");
     let told = hrn.judge_course(&course).unwrap();
     assert!(told.shore.is_some() && told.levels.is_some());
@@ -116,7 +102,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     let untold = hrn.judge_course(&course).unwrap();
     assert_ne!(told.probabilities, untold.probabilities);
 
-    let json = succeed(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
+    let json = succeed_in(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
     let evaluation: Value = serde_json::from_str(&json).unwrap();
     let told: Value =
         serde_json::from_slice(&std::fs::read(at.join("whole/evaluation.json")).unwrap()).unwrap();
@@ -124,7 +110,7 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     let rmse = |evaluation: &Value| evaluation["shore"]["rmse"].as_f64().unwrap() as f32;
     assert!(rmse(&evaluation) < spread_of_shore(&courses), "{json}");
     // A model of one frame judges each press's best frame of the same file.
-    let json = succeed(
+    let json = succeed_in(
         at,
         "evaluate --model ../../models/hrn.onnx --data d.npz --json"
             .replace("../..", concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
@@ -148,7 +134,7 @@ fn compare(at: &Path, told: &Value) {
         "compare --course --data d.npz --test d.npz --model whole/hrn.onnx {} --out c",
         models.display()
     );
-    let table = succeed(at, &command);
+    let table = succeed_in(at, &command);
     let json = std::fs::read(at.join("c/course.json")).unwrap();
     let rows: Vec<Value> = serde_json::from_slice(&json).unwrap();
     let name = |row: &Value| row["name"].as_str().unwrap().to_owned();
@@ -191,11 +177,15 @@ fn compare(at: &Path, told: &Value) {
 
     for (model, code) in [("missing.onnx", 66), ("d.npz", 78)] {
         let command = format!("compare --course --data d.npz --test d.npz --model {model} --out c");
-        assert_eq!(hrn_train(at, &command).status.code(), Some(code), "{model}");
+        assert_eq!(
+            hrn_train_in(at, &command).status.code(),
+            Some(code),
+            "{model}"
+        );
     }
-    let output = hrn_train(at, "compare --course --data d.npz --out c");
+    let output = hrn_train_in(at, "compare --course --data d.npz --out c");
     assert_eq!(output.status.code(), Some(2));
-    let output = hrn_train(at, "compare --data d.npz d.npz --out c");
+    let output = hrn_train_in(at, "compare --data d.npz d.npz --out c");
     assert_eq!(output.status.code(), Some(2));
 }
 
@@ -207,9 +197,9 @@ fn a_model_that_never_knew_the_arm_states_no_range_of_it() {
     std::fs::write(at.join("settings.toml"), unknown).unwrap();
     let simulate = "simulate --sequences --materials broad --objects 3 --test-objects 1 --presses 2 --fps 10 \
                     --speed 8 --arm 10 --seed 4 --out d.npz";
-    succeed(at, simulate);
+    succeed_in(at, simulate);
     let train = "train --method course --data d.npz --config settings.toml --out one";
-    let output = hrn_train(at, train);
+    let output = hrn_train_in(at, train);
     assert!(output.status.success(), "{output:?}");
     // Two of the twelve objects are held out: too few for any promise of 90 %.
     let errors = String::from_utf8(output.stderr).unwrap();
@@ -229,7 +219,7 @@ fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
     let directory = tempfile::tempdir().unwrap();
     let at = directory.path();
     let simulate = "simulate --sequences --materials broad --objects 4 --test-objects 2 --presses 3 --out d.npz";
-    succeed(at, simulate);
+    succeed_in(at, simulate);
     let courses = Courses::read(&at.join("d.npz")).unwrap();
     let dataset = single_frames(&at.join("d.npz")).unwrap();
     assert_eq!(dataset.samples.len(), courses.presses.len());
@@ -244,7 +234,7 @@ fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
 fn levels_weigh_as_the_network_says_unless_the_settings_do() {
     let directory = tempfile::tempdir().unwrap();
     let at = directory.path();
-    succeed(
+    succeed_in(
         at,
         "simulate --sequences --materials broad --shapes matched --objects 5 --test-objects 0 --presses 2 \
          --fps 5..20 --seed 4 --out d.npz",
@@ -255,7 +245,7 @@ fn levels_weigh_as_the_network_says_unless_the_settings_do() {
             let text = format!("[training]\nepochs = 1\n{}", line.unwrap_or_default());
             std::fs::write(at.join("settings.toml"), text).unwrap();
             let out = format!("{method}-{}", balance.unwrap_or("own"));
-            succeed(
+            succeed_in(
                 at,
                 &format!("train --method {method} --data d.npz --config settings.toml --out {out}"),
             );
@@ -271,11 +261,11 @@ fn levels_weigh_as_the_network_says_unless_the_settings_do() {
 fn what_does_not_go_together_is_wrong_usage() {
     let directory = tempfile::tempdir().unwrap();
     let at = directory.path();
-    let output = hrn_train(at, "compare --data d.npz --out c --methods course");
+    let output = hrn_train_in(at, "compare --data d.npz --out c --methods course");
     assert_eq!(output.status.code(), Some(2));
     let simulate = "simulate --objects 1 --test-objects 1 --presses 2 --out frames.npz";
-    succeed(at, simulate);
-    let output = hrn_train(at, "train --method course --data frames.npz --out r");
+    succeed_in(at, simulate);
+    let output = hrn_train_in(at, "train --method course --data frames.npz --out r");
     assert_eq!(output.status.code(), Some(1));
     let errors = String::from_utf8(output.stderr).unwrap();
     assert!(
@@ -291,8 +281,8 @@ fn a_course_model_takes_the_references_of_each_sensor() {
     std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
     let simulate = "simulate --sequences --sensors broad --materials broad --objects 6 --test-objects 2 \
                     --covers 2 --test-covers 1 --electronics 2 --presses 2 --seed 11 --out d.npz";
-    succeed(at, simulate);
-    succeed(
+    succeed_in(at, simulate);
+    succeed_in(
         at,
         "train --method course --data d.npz --config settings.toml --out run",
     );
@@ -323,7 +313,7 @@ fn a_course_model_takes_the_references_of_each_sensor() {
 
     let accuracy = |given: &str| {
         let evaluate = format!("evaluate --model run/hrn.onnx --data d.npz --json {given}");
-        let evaluation: Value = serde_json::from_str(&succeed(at, &evaluate)).unwrap();
+        let evaluation: Value = serde_json::from_str(&succeed_in(at, &evaluate)).unwrap();
         evaluation["n"].as_u64().unwrap()
     };
     let all = accuracy("");

@@ -4,6 +4,10 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
 mod adopt;
 mod collect;
 mod compare;
@@ -12,3 +16,54 @@ mod doors;
 mod strangers;
 mod train;
 mod property;
+
+/// The trainer with these arguments.
+fn trainer(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_hrn-train"));
+    command.args(arguments);
+    command
+}
+
+fn hrn_train(arguments: &[&str]) -> Output {
+    let mut trainer = trainer(arguments);
+    trainer.output().expect("cargo built the binary")
+}
+
+/// What the trainer says on stdout. It must succeed.
+#[track_caller]
+fn succeed(arguments: &[&str]) -> String {
+    succeeded(&hrn_train(arguments))
+}
+
+/// Arguments of one line, for files in `directory`.
+fn hrn_train_in(directory: &Path, arguments: &str) -> Output {
+    let arguments: Vec<&str> = arguments.split_whitespace().collect();
+    let mut trainer = trainer(&arguments);
+    let output = trainer.current_dir(directory).output();
+    output.expect("cargo built the binary")
+}
+
+#[track_caller]
+fn succeed_in(directory: &Path, arguments: &str) -> String {
+    succeeded(&hrn_train_in(directory, arguments))
+}
+
+#[track_caller]
+fn succeeded(output: &Output) -> String {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// A directory for the whole process, with a small data set of rigid and soft objects.
+fn data() -> &'static (tempfile::TempDir, PathBuf) {
+    static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    DATA.get_or_init(|| {
+        let directory = tempfile::tempdir().unwrap();
+        let simulate = "simulate --seed 5 --objects 4 --test-objects 1 --presses 10 \
+                        --lowest-force 5 --shapes paper --out tiny.npz";
+        succeed_in(directory.path(), simulate);
+        let path = directory.path().join("tiny.npz");
+        (directory, path)
+    })
+}

@@ -5,7 +5,7 @@ use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt as _;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Command;
 
 use burn::tensor::Device;
 use hardnessd_core::verdict::BUILT_IN_HRN;
@@ -14,23 +14,11 @@ use hrn_train::data::simulated;
 use hrn_train::run::checkpoint::Checkpoint;
 use serde_json::{Value, json};
 
-fn hrn_train(at: &Path, arguments: &str) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(arguments.split_whitespace())
-        .current_dir(at)
-        .output()
-        .expect("cargo built the binary")
-}
-
-fn succeed(at: &Path, arguments: &str) {
-    let output = hrn_train(at, arguments);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments}: {errors}");
-}
+use crate::{hrn_train_in, succeed_in};
 
 /// The last line of stderr says `expected`, and the exit code is `code`.
 fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
-    let output = hrn_train(at, arguments);
+    let output = hrn_train_in(at, arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(code), "{arguments}: {errors}");
     let last = errors.lines().last().unwrap_or_default();
@@ -41,7 +29,7 @@ fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
 fn bench() -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     let simulate = "simulate --objects 2 --test-objects 1 --presses 6 --out d.npz";
-    succeed(directory.path(), simulate);
+    succeed_in(directory.path(), simulate);
     fs::write(directory.path().join("m.onnx"), BUILT_IN_HRN).unwrap();
     directory
 }
@@ -133,7 +121,7 @@ fn a_directory_with_a_strange_name_does_not_end_a_comparison() {
         fs::create_dir_all(&strange).unwrap();
         fs::write(strange.join("hrn.onnx"), "somebody's").unwrap();
     }
-    succeed(
+    succeed_in(
         at,
         "compare --methods features --profile smoke --data d.npz --out cmp --plan",
     );
@@ -183,7 +171,7 @@ fn a_checkpoint_of_another_network_is_refused_or_left_alone() {
     let directory = bench();
     let at = directory.path();
     let train = "train --method hrn15 --profile smoke --data d.npz --labels 24 --out";
-    succeed(at, &format!("{train} run"));
+    succeed_in(at, &format!("{train} run"));
     let model = fs::read(at.join("run/hrn.onnx")).unwrap();
     let paths: Vec<_> = fs::read_dir(at.join("run/checkpoints"))
         .unwrap()
@@ -205,7 +193,7 @@ fn a_checkpoint_of_another_network_is_refused_or_left_alone() {
         let expected = format!("array `{name}/");
         refused(at, &format!("{train} run --resume"), 1, &expected);
         // A run that may take its stages from this one trains them itself.
-        succeed(at, &format!("{train} new --from run"));
+        succeed_in(at, &format!("{train} new --from run"));
         assert!(fs::read(at.join("new/hrn.onnx")).unwrap() == model);
         fs::remove_dir_all(at.join("new")).unwrap();
     }
@@ -215,7 +203,7 @@ fn a_checkpoint_of_another_network_is_refused_or_left_alone() {
 fn options_that_change_nothing_or_break_a_run_are_wrong_usage() {
     let directory = bench();
     let at = directory.path();
-    succeed(
+    succeed_in(
         at,
         "simulate --sequences --objects 1 --test-objects 1 --presses 1 --out s.npz",
     );

@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::sync::OnceLock;
 use std::time::Duration;
 
 use hardnessd_core::verdict::Hrn;
@@ -13,47 +12,7 @@ use hrn_train::data::dataset::{self, Dataset};
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-fn hrn_train(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_hrn-train"))
-        .args(arguments)
-        .output()
-        .expect("cargo built the binary")
-}
-
-fn succeed(arguments: &[&str]) -> String {
-    let output = hrn_train(arguments);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {errors}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// A directory for the whole process, with a small data set of rigid and soft objects.
-fn data() -> &'static (tempfile::TempDir, PathBuf) {
-    static DATA: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
-    DATA.get_or_init(|| {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("tiny.npz");
-        let out = path.to_str().unwrap();
-        succeed(&[
-            "simulate",
-            "--out",
-            out,
-            "--seed",
-            "5",
-            "--objects",
-            "4",
-            "--test-objects",
-            "1",
-            "--presses",
-            "10",
-            "--lowest-force",
-            "5",
-            "--shapes",
-            "paper",
-        ]);
-        (directory, path)
-    })
-}
+use crate::{data, hrn_train, succeed};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
@@ -106,12 +65,13 @@ impl Trial {
     fn of(method: &'static str, name: &str, settings: &str) -> Self {
         let directory = data().0.path();
         // Tests run in parallel, so each has its own file, and none reads a half-written one.
-        let config = directory.join(format!("{name}.toml"));
+        let out = directory.join(format!("trial {name}"));
+        let config = directory.join(format!("trial {name}.toml"));
         std::fs::write(&config, settings).unwrap();
         Self {
             method,
             data: data().1.clone(),
-            out: directory.join(name),
+            out,
             config,
         }
     }
