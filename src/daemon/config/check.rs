@@ -13,29 +13,32 @@ use hardnessd_core::wording;
 /// Checks a configuration whose paths are already resolved, and returns its sensors. `path` is only
 /// for messages.
 pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
-    let value = |key: String, found: String, expected| Error::Value {
-        path: path.to_owned(),
-        key,
-        found,
-        expected,
-    };
     let publish = &config.publish;
     check_built(publish, path)?;
-    check_robot(&config.robot, &value)?;
+    check_robot(&config.robot, path)?;
     let sensors = check_sensors(config, path)?;
-    check_model(&config.model, &value)?;
+    check_model(&config.model, path)?;
     check_unix(&publish.unix, path)?;
     if let Some(record) = &config.record {
-        check_record(record, &value)?;
+        check_record(record, path)?;
     }
     if let Some(zenoh) = &publish.zenoh {
-        check_zenoh(zenoh, &config.robot, &value)?;
+        check_zenoh(zenoh, &config.robot, path)?;
     }
     if let Some(ros2) = &publish.ros2 {
         check_ros2(ros2, &config.sensors, path)?;
     }
     check_listeners(config, path)?;
     Ok(sensors)
+}
+
+fn value(path: &Path, key: impl Into<String>, found: String, expected: &'static str) -> Error {
+    Error::Value {
+        path: path.to_owned(),
+        key: key.into(),
+        found,
+        expected,
+    }
 }
 
 fn clash(path: &Path, key: impl Into<String>, problem: String) -> Error {
@@ -67,18 +70,15 @@ fn check_built(publish: &Publish, path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-fn check_robot(
-    robot: &str,
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
+fn check_robot(robot: &str, path: &Path) -> Result<(), Error> {
     let chars = robot.chars().count();
     if chars > MOST_ROBOT_CHARS {
         let found = format!("{chars} characters");
-        return Err(value("robot".to_owned(), found, "a name of at most 255"));
+        return Err(value(path, "robot", found, "a name of at most 255"));
     }
     if robot.is_empty() || !wording::is_plain(robot) {
         let expected = "a name without control or bidirectional characters";
-        return Err(value("robot".to_owned(), format!("{robot:?}"), expected));
+        return Err(value(path, "robot", format!("{robot:?}"), expected));
     }
     Ok(())
 }
@@ -94,12 +94,8 @@ fn check_sensors(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
     }
     let count = config.sensors.len();
     if count > MOST_SENSORS {
-        return Err(Error::Value {
-            path: path.to_owned(),
-            key: "sensor".to_owned(),
-            found: format!("{count} tables"),
-            expected: "at most 1000",
-        });
+        let found = format!("{count} tables");
+        return Err(value(path, "sensor", found, "at most 1000"));
     }
     let mut sensors = Vec::with_capacity(count);
     let mut taken = Taken::default();
@@ -120,12 +116,8 @@ const MOST_CLIENTS: usize = 1_000_000;
 
 fn check_unix(unix: &Unix, path: &Path) -> Result<(), Error> {
     if !(1..=MOST_CLIENTS).contains(&unix.max_clients) {
-        return Err(Error::Value {
-            path: path.to_owned(),
-            key: "publish.unix.max_clients".to_owned(),
-            found: unix.max_clients.to_string(),
-            expected: "1 to 1000000",
-        });
+        let (key, found) = ("publish.unix.max_clients", unix.max_clients.to_string());
+        return Err(value(path, key, found, "1 to 1000000"));
     }
     if unix.enabled && unix.control_path() == unix.path() {
         let problem = format!(
@@ -137,10 +129,7 @@ fn check_unix(unix: &Unix, path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-fn check_record(
-    record: &Record,
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
+fn check_record(record: &Record, path: &Path) -> Result<(), Error> {
     for (key, found, least) in [
         ("record.rotate_mb", record.rotate_mb, 1),
         ("record.rotate_s", record.rotate_s, 1),
@@ -148,7 +137,7 @@ fn check_record(
     ] {
         if !(least..=MOST).contains(&found) {
             let expected = "1 to 1000000000 (keep_free_mb also 0)";
-            return Err(value(key.to_owned(), found.to_string(), expected));
+            return Err(value(path, key, found.to_string(), expected));
         }
     }
     Ok(())
@@ -183,11 +172,7 @@ fn check_listeners(config: &Config, path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-fn check_zenoh(
-    zenoh: &Zenoh,
-    robot: &str,
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
+fn check_zenoh(zenoh: &Zenoh, robot: &str, path: &Path) -> Result<(), Error> {
     // These characters have a meaning in zenoh's key expressions. The log and `fleet` show a site.
     let is_key = |key: &str| {
         !key.split('/').any(str::is_empty)
@@ -197,14 +182,16 @@ fn check_zenoh(
     let site = zenoh.site(robot);
     if !is_key(site) {
         return Err(value(
-            "publish.zenoh.site".to_owned(),
+            path,
+            "publish.zenoh.site",
             format!("{site:?} (by default the robot's name)"),
             "parts of a key, without * $ ? #, control or bidirectional characters",
         ));
     }
     if let Some(motion) = zenoh.motion.as_ref().filter(|motion| !is_key(motion)) {
         return Err(value(
-            "publish.zenoh.motion".to_owned(),
+            path,
+            "publish.zenoh.motion",
             format!("{motion:?}"),
             "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters",
         ));
@@ -213,23 +200,13 @@ fn check_zenoh(
 }
 
 fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), Error> {
-    let value = |key: String, found: String, expected| Error::Value {
-        path: path.to_owned(),
-        key,
-        found,
-        expected,
-    };
     let found = match ros2.chosen_domain_id() {
         Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
         Ok(_) => None,
         Err(found) => Some(found.to_string()),
     };
     if let Some(found) = found {
-        return Err(value(
-            "publish.ros2.domain_id".to_owned(),
-            found,
-            "0 to 232",
-        ));
+        return Err(value(path, "publish.ros2.domain_id", found, "0 to 232"));
     }
     let token = |token: &str| {
         token.starts_with(|first: char| first.is_ascii_alphabetic())
@@ -240,7 +217,8 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
     let tokens = namespace.strip_prefix('/');
     if !tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token)) {
         return Err(value(
-            "publish.ros2.namespace".to_owned(),
+            path,
+            "publish.ros2.namespace",
             format!("{namespace:?}"),
             "a namespace of ROS such as \"/arm_7\"",
         ));
@@ -248,7 +226,8 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
     for (sensor, topic) in &ros2.motion {
         if !sensors.iter().any(|known| known.name == *sensor) {
             return Err(value(
-                "publish.ros2.motion".to_owned(),
+                path,
+                "publish.ros2.motion",
                 format!("{sensor:?}"),
                 "the name of a [[sensor]] before each topic",
             ));
@@ -256,6 +235,7 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
         let tokens = topic.strip_prefix('/');
         if !tokens.is_some_and(|tokens| tokens.split('/').all(token)) {
             return Err(value(
+                path,
                 format!("publish.ros2.motion.{sensor}"),
                 format!("{topic:?}"),
                 "a topic of ROS such as \"/arm_7/approach\"",
@@ -321,17 +301,11 @@ impl<'a> Taken<'a> {
     }
 }
 
-fn check_model(
-    model: &Model,
-    value: &impl Fn(String, String, &'static str) -> Error,
-) -> Result<(), Error> {
+fn check_model(model: &Model, path: &Path) -> Result<(), Error> {
     match &model.sha256 {
         Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
-            Err(value(
-                "model.sha256".to_owned(),
-                format!("{hash:?}"),
-                "64 hex digits",
-            ))
+            let found = format!("{hash:?}");
+            Err(value(path, "model.sha256", found, "64 hex digits"))
         }
         _ => Ok(()),
     }
