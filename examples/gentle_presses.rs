@@ -175,7 +175,9 @@ fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, early: Option<Ear
             released_s = time_s;
         }
         let at_ns = (1e9 * time_s) as i64;
-        pipeline.tell(&[Point { at_ns, mm }]).expect("time goes on");
+        pipeline
+            .add_positions(&[Point { at_ns, mm }])
+            .expect("time goes on");
         bytes.clear();
         layout.encode(&rig.read(), &mut bytes);
         let arrived_s = time_s + delay_s;

@@ -41,7 +41,7 @@ fn main() -> ExitCode {
     {
         Ok(runtime) => runtime,
         Err(error) => {
-            hardnessd_core::say!("hardnessd: no runtime: {error}");
+            hardnessd_core::stderr_line!("hardnessd: no runtime: {error}");
             return ExitCode::from(exit::IO);
         }
     };
@@ -54,7 +54,7 @@ fn main() -> ExitCode {
     let signals = match signals {
         Ok(signals) => signals,
         Err(error) => {
-            hardnessd_core::say!("hardnessd: no signals: {error}");
+            hardnessd_core::stderr_line!("hardnessd: no signals: {error}");
             return ExitCode::from(exit::IO);
         }
     };
@@ -72,7 +72,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            hardnessd_core::say!("hardnessd: {}", error.line());
+            hardnessd_core::stderr_line!("hardnessd: {}", error.line());
             ExitCode::from(error.code())
         }
     }

@@ -75,13 +75,13 @@ pub fn usage(error: &clap::Error) -> ExitCode {
         return ExitCode::from(exit::USAGE);
     }
     if error.use_stderr() {
-        hardnessd_core::say!("hardnessd: {}", wording::of_usage(&error.to_string()));
+        hardnessd_core::stderr_line!("hardnessd: {}", wording::of_usage(&error.to_string()));
         return ExitCode::from(exit::USAGE);
     }
     match print(error.to_string().as_bytes()) {
         Ok(_) => ExitCode::SUCCESS,
         Err(failure) => {
-            hardnessd_core::say!("hardnessd: stdout: {failure}");
+            hardnessd_core::stderr_line!("hardnessd: stdout: {failure}");
             ExitCode::from(exit::IO)
         }
     }

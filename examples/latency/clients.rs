@@ -22,7 +22,7 @@ pub(crate) const FORCES: &str = "\"newtons\":[";
 
 /// The record of all clients.
 #[derive(Default)]
-pub(crate) struct Heard {
+pub(crate) struct Received {
     /// The number of clients that are connected and have an answer.
     ready: AtomicUsize,
     /// Events sent from this moment on are measured. 0: nothing is measured yet.
@@ -31,7 +31,7 @@ pub(crate) struct Heard {
     late: Mutex<Vec<f32>>,
 }
 
-impl Heard {
+impl Received {
     /// Measures the events that are sent from now on.
     pub(crate) fn begin(&self) {
         self.since_ns.store(now_ns(), Relaxed);
@@ -80,9 +80,9 @@ impl fmt::Display for Figures {
 }
 
 /// Waits until all clients are connected.
-pub(crate) fn wait(heard: &Heard, clients: usize) -> Result<(), Failure> {
+pub(crate) fn wait(received: &Received, clients: usize) -> Result<(), Failure> {
     let start = Instant::now();
-    while heard.ready.load(Relaxed) < clients {
+    while received.ready.load(Relaxed) < clients {
         if start.elapsed() > PATIENCE {
             return Err("the server does not answer all clients".into());
         }
@@ -96,7 +96,7 @@ pub(crate) fn listen(
     args: &Args,
     place: &Place,
     sent: &Arc<Sent>,
-    heard: &Arc<Heard>,
+    received: &Arc<Received>,
 ) -> Option<String> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -109,17 +109,17 @@ pub(crate) fn listen(
         let mut clients = JoinSet::new();
         for _ in 0..args.clients {
             let (args, place) = (args.clone(), place.clone());
-            let (sent, heard) = (Arc::clone(sent), Arc::clone(heard));
+            let (sent, received) = (Arc::clone(sent), Arc::clone(received));
             clients.spawn(async move {
                 let start = Instant::now();
                 loop {
                     let done = match &place {
                         Place::Unix(path) => match UnixStream::connect(path).await {
-                            Ok(stream) => client(&args, stream, &sent, &heard).await,
+                            Ok(stream) => client(&args, stream, &sent, &received).await,
                             Err(error) => Err(error),
                         },
                         Place::Tcp(port) => match TcpStream::connect(("127.0.0.1", *port)).await {
-                            Ok(stream) => client(&args, stream, &sent, &heard).await,
+                            Ok(stream) => client(&args, stream, &sent, &received).await,
                             Err(error) => Err(error),
                         },
                     };
@@ -151,7 +151,7 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
     args: &Args,
     mut stream: S,
     sent: &Sent,
-    heard: &Heard,
+    received: &Received,
 ) -> io::Result<()> {
     let request: &[u8] = match (args.server, args.event) {
         (Kind::Gpsd, _) => b"?WATCH={\"enable\":true,\"json\":true};\n",
@@ -168,7 +168,7 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
         let now = now_ns();
         if !is_ready {
             is_ready = true;
-            heard.ready.fetch_add(1, Relaxed);
+            received.ready.fetch_add(1, Relaxed);
         }
         let mut rest = unread.as_slice();
         while let Some(end) = rest.iter().position(|&byte| byte == b'\n') {
@@ -177,7 +177,7 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
                 _ => sent_at(args.event, &rest[..end], sent),
             };
             if let Some(sent) = sent {
-                heard.add(sent, now);
+                received.add(sent, now);
             }
             rest = &rest[end + 1..];
         }

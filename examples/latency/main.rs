@@ -128,17 +128,17 @@ fn measure(args: &Args) -> Result<(), Failure> {
     let length = WARM + Duration::from_secs_f64(args.seconds);
     let sensors = Sensors::plug(args, length)?;
     let server = Server::start(args, &sensors.devices())?;
-    let (heard, sent) = (Arc::new(clients::Heard::default()), sensors.sent());
+    let (received, sent) = (Arc::new(clients::Received::default()), sensors.sent());
     let listeners = thread::spawn({
         let (args, place) = (args.clone(), server.place());
-        let (sent, heard) = (Arc::clone(&sent), Arc::clone(&heard));
-        move || clients::listen(&args, &place, &sent, &heard)
+        let (sent, received) = (Arc::clone(&sent), Arc::clone(&received));
+        move || clients::listen(&args, &place, &sent, &received)
     });
-    clients::wait(&heard, args.clients)?;
+    clients::wait(&received, args.clients)?;
     server.opens(args.sensors)?;
     let player = thread::spawn(move || sensors.play(length));
     thread::sleep(WARM);
-    heard.begin();
+    received.begin();
     let (before, start) = (server.processor_time()?, Instant::now());
     while args.reload && !player.is_finished() {
         server.reload();
@@ -154,7 +154,7 @@ fn measure(args: &Args) -> Result<(), Failure> {
     let longest = server.longest_work(args.server)?;
     drop(server);
     let problems = listeners.join().map_err(|_| "the clients stopped")?;
-    let figures = heard.figures(args, &sent);
+    let figures = received.figures(args, &sent);
     let frames = args.sensors as f64 * args.rate * taken.as_secs_f64();
     println!(
         "{:?} sensors {} side {} rate {} clients {} {:?} scheduling {:?} s {:.0}: {figures}; \

@@ -28,7 +28,7 @@ pub(crate) fn usage(daemon: &Child) -> Result<[u64; 3], Failure> {
 }
 
 /// Compares the presses sent with those that a subscriber read, press by press.
-pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_told: bool) -> Vec<String> {
+pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_complete: bool) -> Vec<String> {
     let mut problems = Vec::new();
     let (mut judged, mut lost) = (0, 0);
     for (sensor, (player, ends)) in sent.iter().zip(ends).enumerate() {
@@ -50,7 +50,7 @@ pub(crate) fn account(sent: &[Player], ends: &[Vec<String>], is_told: bool) -> V
             lost += u64::from(!is_judged);
         }
     }
-    if is_told {
+    if is_complete {
         println!(
             "presses: {} = {judged} with a verdict + {lost} lost with the link",
             judged + lost

@@ -23,7 +23,7 @@ pub(crate) struct Link {
 
 /// The record of a subscriber.
 #[derive(Default)]
-pub(crate) struct Heard {
+pub(crate) struct Received {
     pub(crate) events: u64,
     /// For each sensor and press, how the press ended. Empty if it has not ended.
     pub(crate) ends: Vec<Vec<String>>,
@@ -31,14 +31,16 @@ pub(crate) struct Heard {
 }
 
 /// Reads to the end. The numbers of events and of presses must be consecutive.
-pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard, Failure> {
-    let mut heard = Heard::default();
-    heard.ends.resize(links.len(), Vec::new());
+pub(crate) fn receive(connection: UnixStream, links: &[Arc<Link>]) -> Result<Received, Failure> {
+    let mut received = Received::default();
+    received.ends.resize(links.len(), Vec::new());
     let mut last = None;
     for line in BufReader::new(connection).lines() {
         let event: Value = serde_json::from_str(&line?)?;
         if event["type"] == "gap" {
-            heard.problems.push(format!("a gap after event {last:?}"));
+            received
+                .problems
+                .push(format!("a gap after event {last:?}"));
         }
         let name = event["sensor"]
             .as_str()
@@ -57,19 +59,21 @@ pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard,
             continue;
         };
         if last.is_some_and(|last| seq != last + 1) {
-            heard.problems.push(format!("event {seq} after {last:?}"));
+            received
+                .problems
+                .push(format!("event {seq} after {last:?}"));
         }
         last = Some(seq);
-        heard.events += u64::from(event["type"] != "hello");
+        received.events += u64::from(event["type"] != "hello");
         let Some(sensor) = sensor else {
             continue;
         };
-        let ends = &mut heard.ends[sensor];
+        let ends = &mut received.ends[sensor];
         let press = event["press"].as_u64().unwrap_or_default() as usize;
         match (event["type"].as_str(), event["state"].as_str()) {
             (Some("press"), Some("begin")) => {
                 if press != ends.len() + 1 {
-                    heard
+                    received
                         .problems
                         .push(format!("s{sensor}: press {press} after {}", ends.len()));
                 }
@@ -88,7 +92,7 @@ pub(crate) fn hear(connection: UnixStream, links: &[Arc<Link>]) -> Result<Heard,
             _ => {}
         }
     }
-    Ok(heard)
+    Ok(received)
 }
 
 /// Again and again, connects, listens for a moment and disconnects.

@@ -37,7 +37,7 @@ use hardnessd_core::recording::Reader;
 use hardnessd_core::trial;
 use hardnessd_simulator::random::Stream;
 use line::Line;
-use listener::{Heard, Link, come_and_go, hear};
+use listener::{Link, Received, come_and_go, receive};
 use player::{FAULTS, Player, library};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::signal::unix::{SignalKind, signal};
@@ -269,14 +269,14 @@ fn attend(
         problems.push(format!("the daemon ended with {ended}"));
     }
     for (number, listener) in audience.listening.into_iter().enumerate() {
-        let heard = listener.join().map_err(|_| "a subscriber panicked")??;
+        let received = listener.join().map_err(|_| "a subscriber panicked")??;
         if number == 0 {
             println!(
                 "{} sensors for {:.1} minutes, {} events",
-                args.sensors, args.minutes, heard.events
+                args.sensors, args.minutes, received.events
             );
         }
-        judge(number, &heard, &played.sent, &mut problems);
+        judge(number, &received, &played.sent, &mut problems);
     }
     played.print();
     problems.extend(growth(&played.usages));
@@ -298,7 +298,7 @@ fn await_start(daemon: &mut Child, socket: &Path) -> Result<(), Failure> {
 /// The subscribers of the daemon.
 struct Audience {
     /// Subscribers that read everything until the daemon ends.
-    listening: Vec<JoinHandle<Result<Heard, Failure>>>,
+    listening: Vec<JoinHandle<Result<Received, Failure>>>,
     /// Subscribers that come and go.
     guests: Vec<JoinHandle<Result<(), Failure>>>,
     /// Tells the guests to come no more.
@@ -323,7 +323,7 @@ impl Audience {
                 })
                 .collect();
             let connection = UnixStream::connect(socket)?;
-            listening.push(thread::spawn(move || hear(connection, &links)));
+            listening.push(thread::spawn(move || receive(connection, &links)));
         }
         let over = Arc::new(AtomicBool::new(false));
         let mut guests = Vec::new();
@@ -432,14 +432,14 @@ fn remove_old(directory: &Path) -> io::Result<u64> {
 }
 
 /// Adds the problems of one subscriber to `problems`.
-fn judge(number: usize, heard: &Heard, sent: &[Player], problems: &mut Vec<String>) {
+fn judge(number: usize, received: &Received, sent: &[Player], problems: &mut Vec<String>) {
     problems.extend(
-        heard
+        received
             .problems
             .iter()
             .map(|problem| format!("subscriber {number}: {problem}")),
     );
-    for problem in account(sent, &heard.ends, number == 0) {
+    for problem in account(sent, &received.ends, number == 0) {
         // All subscribers report the same problem, so keep it once.
         if !problems.contains(&problem) {
             problems.push(problem);

@@ -65,7 +65,7 @@ pub(crate) trait Stream: Send + 'static {
     fn split(self, runtime: &Handle) -> io::Result<(Self::Input, Self::Output)>;
 
     /// Sends a line if there is room for it, without waiting.
-    fn say(self, line: &[u8]) -> io::Result<()>;
+    fn write_line(self, line: &[u8]) -> io::Result<()>;
 }
 
 /// The writing direction.
@@ -84,7 +84,7 @@ impl Stream for UnixStream {
         Ok(UnixStream::from_std(stream)?.into_split())
     }
 
-    fn say(self, line: &[u8]) -> io::Result<()> {
+    fn write_line(self, line: &[u8]) -> io::Result<()> {
         // Write directly, because the runtime does not know yet that the stream is writable.
         io::Write::write_all(&mut self.into_std()?, line)
     }
@@ -100,7 +100,7 @@ impl Stream for TcpStream {
         Ok(TcpStream::from_std(stream)?.into_split())
     }
 
-    fn say(self, line: &[u8]) -> io::Result<()> {
+    fn write_line(self, line: &[u8]) -> io::Result<()> {
         io::Write::write_all(&mut self.into_std()?, line)
     }
 }
@@ -152,7 +152,7 @@ impl Service {
         match change {
             Change::Tare { sensor } => {
                 let (reply, outcome) = oneshot::channel();
-                tell(sensors, key, &sensor, Command::Tare(reply)).await?;
+                pass_on(sensors, key, &sensor, Command::Tare(reply)).await?;
                 let tared = outcome.await.map_err(stopping)??;
                 Ok(Done {
                     tare: Some(tared),
@@ -162,7 +162,7 @@ impl Service {
             Change::Context { sensor, context } => {
                 let (reply, held) = oneshot::channel();
                 let command = Command::Context(context, reply);
-                tell(sensors, "context.sensor", &sensor, command).await?;
+                pass_on(sensors, "context.sensor", &sensor, command).await?;
                 held.await.map_err(stopping)?;
                 Ok(Done::default())
             }
@@ -172,7 +172,7 @@ impl Service {
             }
             Change::Blackbox { sensor } => {
                 let (reply, written) = oneshot::channel();
-                tell(sensors, key, &sensor, Command::Blackbox(reply)).await?;
+                pass_on(sensors, key, &sensor, Command::Blackbox(reply)).await?;
                 let path = written.await.map_err(|_| Refused::Busy)??;
                 Ok(Done {
                     blackbox: Some(path.display().to_string()),
@@ -199,7 +199,7 @@ impl<S: Stream> Serve<S> for Service {
             "too many subscribers ({found}): try later, or raise max_clients in the configuration"
         );
         // If the line cannot be sent, the client still sees the connection end.
-        let _ = stream.say(Reply::Error { message, id: None }.to_line().as_bytes());
+        let _ = stream.write_line(Reply::Error { message, id: None }.to_line().as_bytes());
     }
 }
 
@@ -308,7 +308,7 @@ async fn read<I: AsyncRead + Unpin>(
             return Ok(());
         };
         let line = tokio::select! {
-            heard = lines.next() => match heard? {
+            line = lines.next() => match line? {
                 LineRead::Line(line) => line,
                 LineRead::TooLong => {
                     place.send(Asked::TooLong);
@@ -470,7 +470,7 @@ impl<O: Output> Writer<O> {
 }
 
 /// Passes a command on to the sensor called `name`. `key` is the request's key for that name.
-async fn tell(
+async fn pass_on(
     sensors: &Sensors,
     key: &'static str,
     name: &str,
@@ -502,7 +502,7 @@ pub(super) async fn move_arm(
     let placed = motion::placed(points, crate::daemon::now())?;
     let (reply, taken) = oneshot::channel();
     let command = Command::Motion(placed, reply);
-    tell(sensors, "motion.sensor", sensor, command).await?;
+    pass_on(sensors, "motion.sensor", sensor, command).await?;
     taken.await.map_err(|_| Refused::Stopping("motion"))??;
     Ok(())
 }

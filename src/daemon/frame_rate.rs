@@ -19,7 +19,7 @@ pub(super) struct FrameRate {
     last: Option<Duration>,
     frames: u32,
     span: Duration,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl FrameRate {
@@ -33,11 +33,11 @@ impl FrameRate {
         configured_hz: f64,
         slow_hz: Option<f64>,
     ) -> Option<f64> {
-        if self.is_told || frames == 0 {
+        if self.is_reported || frames == 0 {
             return None;
         }
         if slow_hz.is_some() {
-            self.is_told = true;
+            self.is_reported = true;
             return slow_hz;
         }
         let pause = self.last.replace(now).map(|last| now.saturating_sub(last));
@@ -54,8 +54,8 @@ impl FrameRate {
         let measured_hz = f64::from(self.frames) / self.span.as_secs_f64();
         (self.frames, self.span) = (0, Duration::ZERO);
         let ratio = measured_hz / configured_hz;
-        self.is_told = !(1.0 / FACTOR..FACTOR).contains(&ratio);
-        self.is_told.then_some(measured_hz)
+        self.is_reported = !(1.0 / FACTOR..FACTOR).contains(&ratio);
+        self.is_reported.then_some(measured_hz)
     }
 }
 
@@ -63,9 +63,9 @@ impl FrameRate {
 mod tests {
     use super::*;
 
-    /// The rates that are told while 500 frames come at `real_hz`, `at_once` at a time, with a pause of
+    /// The rates that are reported while 500 frames come at `real_hz`, `at_once` at a time, with a pause of
     /// 5 s after every 20.
-    fn told(real_hz: f64, at_once: u32, configured_hz: f64) -> Vec<f64> {
+    fn reported(real_hz: f64, at_once: u32, configured_hz: f64) -> Vec<f64> {
         let mut frame_rate = FrameRate::default();
         let mut now = Duration::ZERO;
         let chunks = (0..500 / at_once).filter_map(|number| {
@@ -81,20 +81,20 @@ mod tests {
     #[test]
     fn another_rate_is_told_once_and_a_pause_is_no_rate() {
         for (real_hz, at_once) in [(5.0, 1), (20.0, 1), (20.0, 4), (100.0, 1), (100.0, 2)] {
-            assert!(told(real_hz, at_once, real_hz).is_empty(), "{real_hz}");
+            assert!(reported(real_hz, at_once, real_hz).is_empty(), "{real_hz}");
             assert!(
-                told(real_hz, at_once, 1.3 * real_hz).is_empty(),
+                reported(real_hz, at_once, 1.3 * real_hz).is_empty(),
                 "{real_hz}"
             );
             for configured_hz in [0.5 * real_hz, 4.0 * real_hz] {
-                let told = told(real_hz, at_once, configured_hz);
-                assert_eq!(told.len(), 1, "{real_hz} for {configured_hz}");
-                assert!((told[0] / real_hz - 1.0).abs() < 0.01, "{told:?}");
+                let reported = reported(real_hz, at_once, configured_hz);
+                assert_eq!(reported.len(), 1, "{real_hz} for {configured_hz}");
+                assert!((reported[0] / real_hz - 1.0).abs() < 0.01, "{reported:?}");
             }
         }
-        // A sensor that is known to be slow is told at once.
+        // A sensor that is known to be slow is reported at once.
         let mut frame_rate = FrameRate::default();
-        let mut told = || frame_rate.differs(1, Duration::ZERO, 100.0, Some(10.0));
-        assert_eq!([told(), told()], [Some(10.0), None]);
+        let mut reported = || frame_rate.differs(1, Duration::ZERO, 100.0, Some(10.0));
+        assert_eq!([reported(), reported()], [Some(10.0), None]);
     }
 }

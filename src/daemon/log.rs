@@ -385,10 +385,10 @@ mod tests {
             ("hardnessd=debug=info", "hardnessd=debug=info"),
             ("info,hardnessd[press]=debug", "hardnessd[press]=debug"),
         ] {
-            let said = filter(asked, "info").unwrap_err().to_string();
+            let message = filter(asked, "info").unwrap_err().to_string();
             assert!(
-                said.starts_with(&format!("RUST_LOG: found {found:?}, ")),
-                "{said}"
+                message.starts_with(&format!("RUST_LOG: found {found:?}, ")),
+                "{message}"
             );
         }
     }

@@ -179,7 +179,7 @@ struct Jobs {
 
 impl Jobs {
     /// Sends a job. Returns `false` if there was no room for it.
-    fn tell(&self, job: Job) -> bool {
+    fn send(&self, job: Job) -> bool {
         match self.sender.try_send(job) {
             Ok(()) => true,
             // The recording has ended, which is reported elsewhere.
@@ -344,7 +344,7 @@ impl SensorRecorder {
         match &self.active {
             Some(active) => {
                 let sensor = active.index;
-                active.jobs.tell(Job::Blackbox { sensor, reply });
+                active.jobs.send(Job::Blackbox { sensor, reply });
             }
             None => {
                 let _ = reply.send(Err(NoBlackbox::NotKept));
@@ -363,7 +363,7 @@ impl Active {
             return;
         }
         self.bytes += entry.weight();
-        self.tell(at, entry);
+        self.queue(at, entry);
     }
 
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
@@ -377,17 +377,17 @@ impl Active {
         let share = damaged as f64 / (whole + damaged).max(1) as f64;
         if self.noted.is_some() && damaged >= DAMAGED_FRAMES && share > DAMAGED_SHARE {
             let sensor = self.index;
-            self.jobs.tell(Job::Damage { sensor });
+            self.jobs.send(Job::Damage { sensor });
         }
         self.counted = counts;
         (self.noted, self.bytes) = (Some(at.mono), 0);
         let state = State::of(pipeline, self.labels.clone());
-        self.tell(at, Entry::State(Box::new(state)));
+        self.queue(at, Entry::State(Box::new(state)));
     }
 
-    fn tell(&mut self, at: Stamp, entry: Entry) {
+    fn queue(&mut self, at: Stamp, entry: Entry) {
         let sensor = self.index;
-        if !self.jobs.tell(Job::Entry { sensor, at, entry }) {
+        if !self.jobs.send(Job::Entry { sensor, at, entry }) {
             self.noted = None;
         }
     }
@@ -403,7 +403,7 @@ impl EventRecorder {
         if let Some((jobs, frames)) = &self.0
             && (*frames || event.kind() != Kind::Frame)
         {
-            jobs.tell(Job::Event(Box::new(event.clone())));
+            jobs.send(Job::Event(Box::new(event.clone())));
         }
     }
 }

@@ -149,7 +149,7 @@ impl Ros2 {
         let runtime = Builder::new_current_thread().build()?;
         for (sensor, topic) in &settings.motion {
             let positions = subscription(&mut node, topic)?;
-            runtime.spawn(hear(sensor.clone(), positions, door.clone()));
+            runtime.spawn(take_positions(sensor.clone(), positions, door.clone()));
         }
         let ros2 = Self {
             robot,
@@ -222,19 +222,19 @@ impl Ros2 {
 }
 
 /// Reads positions of the arm of `sensor`, forever.
-async fn hear(sensor: String, positions: Subscription<tools::PointStamped>, door: Door) {
+async fn take_positions(sensor: String, positions: Subscription<tools::PointStamped>, door: Door) {
     loop {
-        let told = match positions.async_take().await {
+        let taken = match positions.async_take().await {
             Ok((position, _)) => position.position(),
             Err(error) => {
                 warn!(sensor, %error, "found no position on ros2");
                 continue;
             }
         };
-        match told.and_then(|(at, mm)| ReportedPoint::at_time(at, mm)) {
-            Some(told) => door.put(Positions {
+        match taken.and_then(|(at, mm)| ReportedPoint::at_time(at, mm)) {
+            Some(point) => door.put(Positions {
                 sensor: sensor.clone(),
-                points: vec![told],
+                points: vec![point],
             }),
             None => warn!(
                 sensor,

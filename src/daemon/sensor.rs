@@ -161,7 +161,7 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Motion(placed, reply)) => {
-                    let taken = hear(&mut pipeline, &mut recorder, &mut calendar, &placed);
+                    let taken = take_positions(&mut pipeline, &mut recorder, &mut calendar, &placed);
                     // The client may have gone.
                     let _ = reply.send(taken);
                     continue;
@@ -239,7 +239,7 @@ fn take(
 
 /// Records positions of the arm and passes them on to the pipeline. If this machine's calendar
 /// clock was set since the last positions with calendar times, the pipeline learns that first.
-fn hear(
+fn take_positions(
     pipeline: &mut Pipeline,
     recorder: &mut SensorRecorder,
     calendar: &mut Calendar,
@@ -256,7 +256,7 @@ fn hear(
     }
     let input = Input::Motion(placed.points.as_slice().into());
     recorder.note(pipeline, &input, super::now());
-    pipeline.tell(&placed.points)
+    pipeline.add_positions(&placed.points)
 }
 
 /// Answers the client that requested a tare, when the outcome is known.
@@ -323,12 +323,12 @@ mod tests {
             };
             let line = json!({"motion": {"sensor": "forearm", "at": [[moment, 0.02 * ms as f64]]}});
             let request = parse(line.to_string().as_bytes()).request;
-            let Ok(Request::Change(Change::Motion(told))) = request else {
+            let Ok(Request::Change(Change::Motion(motion))) = request else {
                 panic!("{request:?}");
             };
-            let placed = motion::placed(&told.points, now).unwrap();
+            let placed = motion::placed(&motion.points, now).unwrap();
             // Points after a step back are taken in too.
-            let _ = hear(&mut pipeline, &mut recorder, &mut calendar, &placed);
+            let _ = take_positions(&mut pipeline, &mut recorder, &mut calendar, &placed);
             if ms % 200 != 0 {
                 continue;
             }
@@ -366,9 +366,9 @@ mod tests {
             (true, 200, true),
         ] {
             for (ms, approach_mm) in approaches(by_calendar, set_ms) {
-                let told = format!("{approach_mm:?} at {ms} ms, set by {set_ms} ms");
+                let case = format!("{approach_mm:?} at {ms} ms, set by {set_ms} ms");
                 match ms {
-                    2_000..3_000 if is_unknown => assert_eq!(approach_mm, None, "{told}"),
+                    2_000..3_000 if is_unknown => assert_eq!(approach_mm, None, "{case}"),
                     // The first position after the begin may come later.
                     4_000..4_400 if set_ms != 0 => {}
                     _ => {
@@ -376,8 +376,8 @@ mod tests {
                         let way_mm = 0.02 * (ms - begin) as f64;
                         // The newest position may be as old as the setting is large.
                         let lag_mm = 0.02 * set_ms.unsigned_abs() as f64;
-                        let found = approach_mm.expect(&told);
-                        assert!((found - way_mm).abs() <= lag_mm + 1e-6, "{told}");
+                        let found = approach_mm.expect(&case);
+                        assert!((found - way_mm).abs() <= lag_mm + 1e-6, "{case}");
                     }
                 }
             }

@@ -23,20 +23,20 @@ pub(crate) fn sockets() -> io::Result<Vec<UnixListener>> {
 
 /// Notifies systemd that the daemon serves: sockets answer, and ports are being opened.
 pub(crate) fn ready() {
-    tell(&[NotifyState::Ready]);
+    notify(&[NotifyState::Ready]);
 }
 
 /// Notifies systemd that the configuration is being read again, until [`ready`] is called.
 pub(crate) fn reloading() {
     match NotifyState::monotonic_usec_now() {
-        Ok(now) => tell(&[NotifyState::Reloading, now]),
-        Err(_) => tell(&[NotifyState::Reloading]),
+        Ok(now) => notify(&[NotifyState::Reloading, now]),
+        Err(_) => notify(&[NotifyState::Reloading]),
     }
 }
 
 /// Notifies systemd that the daemon is about to end.
 pub(crate) fn stopping() {
-    tell(&[NotifyState::Stopping]);
+    notify(&[NotifyState::Stopping]);
 }
 
 /// Feeds the watchdog, because every sensor's task has answered. The state of the hardware does not
@@ -47,7 +47,7 @@ pub(crate) fn alive(statuses: &[Status]) {
         .filter(|status| status.state == LinkState::Live)
         .count();
     let line = format!("{live} of {} sensors live", statuses.len());
-    tell(&[NotifyState::Watchdog, NotifyState::Status(&line)]);
+    notify(&[NotifyState::Watchdog, NotifyState::Status(&line)]);
 }
 
 /// How often [`alive`] is due: twice as often as the watchdog demands, or every 10 s without a
@@ -57,7 +57,7 @@ pub(crate) fn heartbeat() -> Duration {
     sd_notify::watchdog_enabled().map_or(AT_LEISURE, |timeout| timeout / 2)
 }
 
-fn tell(state: &[NotifyState]) {
+fn notify(state: &[NotifyState]) {
     if let Err(error) = sd_notify::notify(state) {
         tracing::debug!(%error, "service manager cannot be told");
     }

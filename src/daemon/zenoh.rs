@@ -143,7 +143,7 @@ impl Zenoh {
         let motion = settings.motion.as_ref().map(|key| {
             let subscriber = session.declare_subscriber(key.clone());
             subscriber
-                .callback(move |sample| hear(&sample, &door))
+                .callback(move |sample| take_positions(&sample, &door))
                 .wait()
         });
         let alive = session
@@ -226,7 +226,7 @@ const LONGEST_VALUE_BYTES: usize = 64 * 1024;
 
 /// Takes positions of the arm, in the same line as on the control socket. No other request is
 /// accepted.
-fn hear(sample: &Sample, door: &Door) {
+fn take_positions(sample: &Sample, door: &Door) {
     let key = sample.key_expr();
     let bytes = sample.payload().to_bytes();
     if bytes.len() > LONGEST_VALUE_BYTES {

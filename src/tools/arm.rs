@@ -165,7 +165,7 @@ impl Arm {
             let now = Instant::now();
             self.state.send_modify(|state| state.leg.stop(now));
             if let Err(error) = served {
-                hardnessd_core::say!("warning: --arm: {error}");
+                hardnessd_core::stderr_line!("warning: --arm: {error}");
                 tokio::time::sleep(SCAN).await;
             }
         }

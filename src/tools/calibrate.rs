@@ -239,7 +239,7 @@ pub async fn run(
             let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?;
             let error = fit.error();
             if error > DOUBTFUL_ERROR {
-                hardnessd_core::say!(
+                hardnessd_core::stderr_line!(
                     "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
                      the zero was taken? If so, leave out the weight with the greatest error",
                     100.0 * error
@@ -251,7 +251,7 @@ pub async fn run(
             let (full, presses): (Vec<Press>, _) =
                 presses.into_iter().partition(|press| press.saturated);
             if !full.is_empty() {
-                hardnessd_core::say!(
+                hardnessd_core::stderr_line!(
                     "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
                     full.len()
                 );
@@ -285,8 +285,8 @@ async fn live(
     shutdown: impl Future<Output = ()>,
 ) -> Result<Option<Vec<Press>>, Error> {
     let hrn = setup.hrn.clone();
-    let say_next = |seen| say_next(args, seen);
-    let recorded = live::record(setup, sensor.name(), args.wanted(), say_next, shutdown);
+    let print_next = |seen| print_next(args, seen);
+    let recorded = live::record(setup, sensor.name(), args.wanted(), print_next, shutdown);
     let Some(recorded) = recorded.await? else {
         return Ok(None);
     };
@@ -355,25 +355,27 @@ fn plain(press: &Press) -> taxels::Plain {
 }
 
 /// Says on stderr what to do next, after `seen` presses.
-fn say_next(args: &Args, seen: u64) {
+fn print_next(args: &Args, seen: u64) {
     match args.what {
-        What::Arm if seen == 0 => hardnessd_core::say!(
+        What::Arm if seen == 0 => hardnessd_core::stderr_line!(
             "press something rigid {} times, while the robot tells where its arm is",
             args.wanted()
         ),
-        What::Taxels if seen == 0 => hardnessd_core::say!(
+        What::Taxels if seen == 0 => hardnessd_core::stderr_line!(
             "press something wide and soft {} times, each time at another place, up to the edges; or press \
              the whole array evenly",
             args.wanted()
         ),
-        What::Arm | What::Taxels => hardnessd_core::say!("press {seen} of {}", args.wanted()),
+        What::Arm | What::Taxels => {
+            hardnessd_core::stderr_line!("press {seen} of {}", args.wanted());
+        }
         What::Force => match args.newtons.get(seen as usize) {
             Some(newtons) => {
-                hardnessd_core::say!(
+                hardnessd_core::stderr_line!(
                     "put {newtons} N on the sensor, wait until it rests, and take it off"
                 );
             }
-            None => hardnessd_core::say!("done"),
+            None => hardnessd_core::stderr_line!("done"),
         },
     }
 }

@@ -96,7 +96,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
     }
     lines += &model(&setup);
     for key in setup.without_effect() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: {}: {key}: changes no verdict, because the model {}",
             path.display(),
             setup.model_needs()
@@ -142,7 +142,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         if let Some(listen) = listen {
             lines += &format!("{way}{listen}\n");
             if !listen.ip().is_loopback() {
-                hardnessd_core::say!(
+                hardnessd_core::stderr_line!(
                     "warning: {}: {key}: {listen} is open to anyone who can reach this machine; \
                      a loopback address, such as 127.0.0.1, is not",
                     path.display()
@@ -171,7 +171,7 @@ fn warn_of_permissions(key: &str, socket: &Path, path: &Path) {
         return;
     };
     if rustix::fs::access(directory, Access::WRITE_OK).is_err() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: {}: {key}: you may not write to {}, but the user who runs the daemon must",
             path.display(),
             directory.display()
@@ -191,7 +191,7 @@ fn warn_of_pitch(sensor: &SensorTable, card: &Card, path: &Path) {
     } else {
         "forces are shared out over the model's taxels, and the model was not trained on such a pitch"
     };
-    hardnessd_core::say!(
+    hardnessd_core::stderr_line!(
         "warning: {}: sensor.calibration.pitch_mm of {:?}: found {}, expected the model's {:?}: \
          {effect}",
         path.display(),
@@ -220,7 +220,7 @@ fn networks(setup: &Setup, path: &Path) -> String {
             parsed.map_or(true, |address| !address.ip().is_loopback())
         };
         for endpoint in zenoh.listen.iter().filter(open) {
-            hardnessd_core::say!(
+            hardnessd_core::stderr_line!(
                 "warning: {}: publish.zenoh.listen: {endpoint:?} is open to anyone who can reach it; \
                  a loopback address, such as 127.0.0.1, is not",
                 path.display()
@@ -263,7 +263,7 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
             return Err(error);
         }
         // Frames of some layouts vary in length, and a port that is not there may turn out to be USB CDC.
-        hardnessd_core::say!("warning: {error}");
+        hardnessd_core::stderr_line!("warning: {error}");
     }
     let array = layout.array();
     let frame_bytes = if shortest == longest {

@@ -87,7 +87,7 @@ impl Configuration {
         // If a file exists but cannot be read, that is an error, not a reason to try the next path.
         let there = |path: &&str| Path::new(path).symlink_metadata().is_ok();
         let found = PLACES.into_iter().find(there).ok_or(Missing)?;
-        hardnessd_core::say!("hardnessd: configuration {found}");
+        hardnessd_core::stderr_line!("hardnessd: configuration {found}");
         Ok(PathBuf::from(found))
     }
 }

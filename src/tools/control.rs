@@ -115,7 +115,7 @@ pub async fn run(command: Command) -> Result<(), Error> {
         let message = answer["message"].as_str().unwrap_or_default();
         return Err(Error::Refused(wording::escaped(message)));
     }
-    let line = said(&answer) + "\n";
+    let line = in_words(&answer) + "\n";
     super::print(line.as_bytes()).map_err(Error::Print)?;
     Ok(())
 }
@@ -133,7 +133,7 @@ async fn answer(daemon: &mut Connection) -> Result<Value, Error> {
 }
 
 /// The answer in plain words.
-fn said(answer: &Value) -> String {
+fn in_words(answer: &Value) -> String {
     if let Some(path) = answer["blackbox"].as_str() {
         return format!("written to {}", wording::escaped(path));
     }

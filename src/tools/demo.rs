@@ -174,10 +174,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         Path::new("demo"),
     )?)?;
     if let Some(address) = daemon.http_address() {
-        hardnessd_core::say!("live page: http://{address}/");
+        hardnessd_core::stderr_line!("live page: http://{address}/");
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
-    hardnessd_core::say!("socket: {} ({listen})", socket.display());
+    hardnessd_core::stderr_line!("socket: {} ({listen})", socket.display());
     let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(

@@ -114,8 +114,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
             lines.push(format!("{port}: {fault}"));
         }
     }
-    let told: String = lines.iter().map(|line| escaped(line) + "\n").collect();
-    super::print(told.as_bytes()).map_err(Error::Print)?;
+    let printed: String = lines.iter().map(|line| escaped(line) + "\n").collect();
+    super::print(printed.as_bytes()).map_err(Error::Print)?;
     match found {
         0 => Ok(()),
         found => Err(Error::Faults { found }),

@@ -133,7 +133,9 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         }
         if dropped != session.dropped() {
             dropped = session.dropped();
-            hardnessd_core::say!("hardnessd: {dropped} messages came too fast and were dropped");
+            hardnessd_core::stderr_line!(
+                "hardnessd: {dropped} messages came too fast and were dropped"
+            );
         }
         // The rest is printed when the reader has taken this.
         if printing.is_some() || !(args.json || is_over || end.is_none()) {

@@ -259,12 +259,12 @@ pub async fn run(
             return Err(Error::Unnamed);
         };
         let wanted = args.presses;
-        let say_next = |seen: u64| match seen {
-            0 => hardnessd_core::say!("press it {wanted} times, harder each time"),
-            _ => hardnessd_core::say!("press {seen} of {wanted}"),
+        let print_next = |seen: u64| match seen {
+            0 => hardnessd_core::stderr_line!("press it {wanted} times, harder each time"),
+            _ => hardnessd_core::stderr_line!("press {seen} of {wanted}"),
         };
         let hrn = setup.hrn.clone();
-        let made = live::record(setup, sensor.name(), wanted, say_next, shutdown).await?;
+        let made = live::record(setup, sensor.name(), wanted, print_next, shutdown).await?;
         let Some(file) = made else {
             return Ok(());
         };

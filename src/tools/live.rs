@@ -54,7 +54,7 @@ pub(super) async fn record(
     mut setup: Setup,
     sensor: &str,
     wanted: u64,
-    say_next: impl Fn(u64),
+    print_next: impl Fn(u64),
     shutdown: impl Future<Output = ()>,
 ) -> Result<Option<File>, Error> {
     setup.sensors.retain(|one| one.name() == sensor);
@@ -72,15 +72,15 @@ pub(super) async fn record(
     let labels = Labels::new();
     let sockets = Sockets::Configured;
     let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
-    hardnessd_core::say!("leave the sensor free until its zero is taken");
+    hardnessd_core::stderr_line!("leave the sensor free until its zero is taken");
     let enough = async {
         // The presses at the last prompt.
-        let mut said = None;
-        while said < Some(wanted) && counted.changed().await.is_ok() {
+        let mut shown = None;
+        while shown < Some(wanted) && counted.changed().await.is_ok() {
             let Progress { tared, presses, .. } = *counted.borrow_and_update();
-            if tared > 0 && said != Some(presses) {
-                said = Some(presses);
-                say_next(presses);
+            if tared > 0 && shown != Some(presses) {
+                shown = Some(presses);
+                print_next(presses);
             }
         }
         tokio::time::sleep(LAST_POSITIONS).await;

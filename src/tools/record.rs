@@ -210,23 +210,23 @@ pub async fn run(
         part::remove(&path, &own);
         return recorded;
     }
-    let seen = said_frames(frames);
+    let seen = frames_in_words(frames);
     if io::stderr().is_terminal() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "recorded {seen}, {}: {}",
-            said_presses(presses),
-            said(&path)
+            presses_in_words(presses),
+            shown(&path)
         );
     }
     if recorded.is_ok() && presses == 0 {
-        let path = said(&path);
+        let path = shown(&path);
         if frames > 0 && tared == 0 {
-            hardnessd_core::say!(
+            hardnessd_core::stderr_line!(
                 "warning: {path}: no press in {seen}, because the zero was not taken: leave the sensor free at \
                  the start, and record longer"
             );
         } else {
-            hardnessd_core::say!(
+            hardnessd_core::stderr_line!(
                 "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
                  is press.contact_threshold_n low enough?"
             );
@@ -285,15 +285,15 @@ fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, Port) {
     (sensor.name.clone(), sensor.port.clone())
 }
 
-fn said(path: &Path) -> String {
+fn shown(path: &Path) -> String {
     escaped(&path.display().to_string())
 }
 
-fn said_frames(frames: u64) -> String {
+fn frames_in_words(frames: u64) -> String {
     format!("{frames} frame{}", if frames == 1 { "" } else { "s" })
 }
 
-fn said_presses(presses: u64) -> String {
+fn presses_in_words(presses: u64) -> String {
     format!("{presses} press{}", if presses == 1 { "" } else { "es" })
 }
 
@@ -319,9 +319,9 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
         let Progress {
             frames, presses, ..
         } = *counted.borrow();
-        let (frames, presses) = (said_frames(frames), said_presses(presses));
+        let (frames, presses) = (frames_in_words(frames), presses_in_words(presses));
         let seconds = start.elapsed().as_secs();
-        let path = said(path);
+        let path = shown(path);
         // If the terminal has gone, its signal ends the recording.
         let _ = write!(
             stderr,
@@ -341,8 +341,8 @@ fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Erro
             .parse()
             .is_ok_and(|found: u8| found == 0 || levels.iter().any(|level| level.level == found))
     };
-    let mut said = labels.iter().filter(|(key, _)| key == "level");
-    match said.find(|(_, found)| !is_level(found)) {
+    let mut labelled = labels.iter().filter(|(key, _)| key == "level");
+    match labelled.find(|(_, found)| !is_level(found)) {
         None => Ok(()),
         Some((_, found)) => Err(Error::Level {
             found: found.clone(),

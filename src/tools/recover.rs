@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> Result<(), Error> {
         });
     }
     part.finish().map_err(|error| unwritten(error.into()))?;
-    hardnessd_core::say!("{}", account(&recovered));
+    hardnessd_core::stderr_line!("{}", account(&recovered));
     match recovered.unread.len() {
         0 => Ok(()),
         chunks => Err(Error::Unread {

@@ -246,7 +246,7 @@ fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Re
         return Ok(());
     }
     if let Some(model) = playback.other_model() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: {}: recorded with model {}, played with another",
             path.display(),
             model.get(..12).unwrap_or(model)
@@ -372,16 +372,16 @@ pub(super) fn feed(
             return Ok(Some(end));
         }
         let (frames, _) = pipeline.frame_counts();
-        let told_until = time_of(frames, frame_rate_hz)
+        let until_ns = time_of(frames, frame_rate_hz)
             .saturating_add(AHEAD)
             .as_nanos();
-        let told = motion
+        let count = motion
             .iter()
-            .position(|point| i128::from(point.at_ns) > told_until as i128);
-        let told: Vec<Point> = motion.drain(..told.unwrap_or(motion.len())).collect();
+            .position(|point| i128::from(point.at_ns) > until_ns as i128);
+        let points: Vec<Point> = motion.drain(..count.unwrap_or(motion.len())).collect();
         // An error means that the time of a point went back. The approach of its press is then
         // unknown.
-        let _ = pipeline.tell(&told);
+        let _ = pipeline.add_positions(&points);
         // The pipeline takes its times from the recording and does not use this one.
         let events = pipeline.push(&chunk[..read], now());
         warn(pipeline.unjudged());
@@ -420,7 +420,7 @@ fn warn(unjudged: Vec<Unjudged>) {
     } in unjudged
     {
         let phase = hardnessd_core::event::name(&phase);
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}"
         );
     }

@@ -39,7 +39,7 @@ impl Robot {
     pub(crate) async fn run(self) {
         let mut complained = false;
         loop {
-            let complaint = match self.tell().await {
+            let complaint = match self.send().await {
                 Err(Ended::Refused(message)) => Some(message),
                 Err(Ended::Absent(error)) => Some(format!(
                     "{}: no daemon takes positions there yet, and they are sent as soon as one does",
@@ -48,7 +48,7 @@ impl Robot {
                 Ok(()) | Err(Ended::Gone) => None,
             };
             if let Some(complaint) = complaint.filter(|_| !complained) {
-                hardnessd_core::say!("warning: {}: {complaint}", self.socket.display());
+                hardnessd_core::stderr_line!("warning: {}: {complaint}", self.socket.display());
                 complained = true;
             }
             tokio::time::sleep(RETRY).await;
@@ -56,7 +56,7 @@ impl Robot {
     }
 
     /// Sends positions to one daemon until the daemon ends or refuses them.
-    async fn tell(&self) -> Result<(), Ended> {
+    async fn send(&self) -> Result<(), Ended> {
         let daemon = UnixStream::connect(&self.socket).await;
         let (input, mut output) = daemon.map_err(Ended::Absent)?.into_split();
         let mut lines = BufReader::new(input).lines();

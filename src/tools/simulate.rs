@@ -193,7 +193,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     }
     let (baud, warning) = baud(&args, &layout)?;
     if let Some(warning) = warning {
-        hardnessd_core::say!("{warning}");
+        hardnessd_core::stderr_line!("{warning}");
     }
     let what = args
         .link
@@ -226,8 +226,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let serving = maybe::wait(arm.map(Arm::serve));
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
-        let told = super::print_apart(line.into_bytes());
-        tokio::try_join!(told, player.play(frames, start)).map(|_| ())
+        let printed = super::print_apart(line.into_bytes());
+        tokio::try_join!(printed, player.play(frames, start)).map(|_| ())
     };
     tokio::select! {
         played = play => played.map_err(failed),
@@ -412,7 +412,7 @@ mod tests {
     #[test]
     fn the_shortest_frame_chooses_the_rate_and_the_longest_one_warns() {
         // Texts of 784 values are 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
-        for (arguments, expected, said) in [
+        for (arguments, expected, message) in [
             ("", Some(115_200), ""),
             ("--fps 20", Some(230_400), "played at 230400"),
             ("--preset ascii", Some(115_200), "warning"),
@@ -435,8 +435,8 @@ mod tests {
                 Err(error) => (None, error.to_string()),
             };
             assert_eq!(found, expected, "{arguments}");
-            assert_eq!(warning.is_empty(), said.is_empty(), "{warning}");
-            assert!(warning.contains(said), "{said:?} not in {warning:?}");
+            assert_eq!(warning.is_empty(), message.is_empty(), "{warning}");
+            assert!(warning.contains(message), "{message:?} not in {warning:?}");
         }
     }
 }

@@ -176,11 +176,11 @@ pub async fn run(args: Args) -> Result<(), Error> {
         None => None,
     };
     // This runs on another thread, because the file may be a pipe and many bytes take long.
-    let told = apart::start("sniff", move || match listened {
-        Some(bytes) => tell(&args, &bytes),
-        None => read(&args.source()).and_then(|bytes| tell(&args, &bytes)),
+    let proposed = apart::start("sniff", move || match listened {
+        Some(bytes) => propose(&args, &bytes),
+        None => read(&args.source()).and_then(|bytes| propose(&args, &bytes)),
     })?;
-    told.await.expect("a proposal is made without a panic")
+    proposed.await.expect("a proposal is made without a panic")
 }
 
 impl Args {
@@ -193,7 +193,7 @@ impl Args {
 }
 
 /// Prints or writes the layout that explains `bytes`.
-fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
+fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     let path = &args.source();
     let Args {
         rows, cols, cell, ..
@@ -236,7 +236,7 @@ fn tell(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     } else {
         "set its port and frame_rate_hz, which a file does not say"
     };
-    hardnessd_core::say!("wrote {}: {next}", escaped(&out.display().to_string()));
+    hardnessd_core::stderr_line!("wrote {}: {next}", escaped(&out.display().to_string()));
     Ok(())
 }
 
@@ -322,7 +322,9 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
             match link.turn().await {
                 Turn::Opened => {
                     let port = escaped(&port.to_string());
-                    hardnessd_core::say!("listening at {port} for {seconds} s: press the sensor");
+                    hardnessd_core::stderr_line!(
+                        "listening at {port} for {seconds} s: press the sensor"
+                    );
                 }
                 Turn::Bytes(read) => bytes.extend_from_slice(read),
                 Turn::Restored(_) | Turn::Stranger(_) => {}
@@ -354,9 +356,9 @@ fn options(shown: &Shown) -> String {
 
 /// Shows the strongest press as an array would have it.
 fn show(shown: &Shown) {
-    hardnessd_core::say!("{}:", options(shown));
+    hardnessd_core::stderr_line!("{}:", options(shown));
     for line in draw(&shown.picture, shown.array.cols) {
-        hardnessd_core::say!("    |{line}|");
+        hardnessd_core::stderr_line!("    |{line}|");
     }
 }
 
@@ -376,11 +378,11 @@ fn toml(path: &Path, bytes: usize, found: &Found) -> String {
     remark(&match (next, found.lead()) {
         (Some(next), Some(lead)) => format!(
             "{}: its picture is {} times as likely as the next, {}",
-            said(best),
+            array_in_words(best),
             lead.min(1e6).round(),
-            said(next)
+            array_in_words(next)
         ),
-        _ => format!("{}: no other array makes a picture", said(best)),
+        _ => format!("{}: no other array makes a picture", array_in_words(best)),
     });
     for words in proposal.remarks.iter().chain(&proposal.doubt) {
         remark(words);
@@ -390,7 +392,7 @@ fn toml(path: &Path, bytes: usize, found: &Found) -> String {
         + &toml::to_string(&proposal.settings).expect("settings are keys and plain values")
 }
 
-fn said(shown: &Shown) -> String {
+fn array_in_words(shown: &Shown) -> String {
     match shown.cell {
         Some(cell) => format!("{} {}", shown.array, name(cell)),
         None => shown.array.to_string(),

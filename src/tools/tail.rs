@@ -170,7 +170,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "hardnessd: events of {}",
             wording::escaped(&address.to_string())
         );

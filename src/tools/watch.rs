@@ -83,7 +83,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         && let Ok(connection) = args.source.connect().await
     {
         let address = connection.address().to_string();
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "hardnessd: watching {}",
             hardnessd_core::wording::escaped(&address)
         );
@@ -110,15 +110,15 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
                 let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
                 drawn.map_err(Error::Terminal)?;
             }
-            _ = questions.tick() => daemon.say(r#"{"get":"status"}"#),
-            heard = daemon.next() => match heard {
+            _ = questions.tick() => daemon.send(r#"{"get":"status"}"#),
+            received = daemon.next() => match received {
                 Ok(FromDaemon::Connection(address)) => {
                     let clock = Clock::of(&address);
                     view.wait(address.to_string(), clock, now().mono);
                 }
                 Ok(FromDaemon::Line(line)) => {
-                    if let Some(request) = view.hear(&line, now()) {
-                        daemon.say(&request);
+                    if let Some(request) = view.take_line(&line, now()) {
+                        daemon.send(&request);
                     }
                 }
                 Err(loss) => view.lose(loss),
@@ -210,7 +210,7 @@ impl Daemon {
     }
 
     /// Sends a request.
-    fn say(&self, request: &str) {
+    fn send(&self, request: &str) {
         if let State::Connected(connection) = &self.state {
             connection.try_send(request);
         }

@@ -161,7 +161,7 @@ pub struct Daemon {
     pub process: Process,
     log: mpsc::Receiver<String>,
     /// The log lines read so far.
-    pub heard: Vec<String>,
+    pub logged_lines: Vec<String>,
 }
 
 impl Daemon {
@@ -193,7 +193,7 @@ impl Daemon {
         let mut daemon = Self {
             process,
             log,
-            heard: Vec::new(),
+            logged_lines: Vec::new(),
         };
         daemon.logged("started");
         daemon
@@ -203,7 +203,7 @@ impl Daemon {
     pub fn address(&mut self, way: &str) -> SocketAddr {
         let part = format!("way=\"{way}\"");
         // All addresses are logged before "started".
-        let line = self.heard.iter().find(|line| line.contains(&part));
+        let line = self.logged_lines.iter().find(|line| line.contains(&part));
         let line = line.unwrap();
         let (_, address) = line.split_once("address=").unwrap();
         address.trim().parse().unwrap()
@@ -222,17 +222,17 @@ impl Daemon {
 
     /// The whole log, once the daemon has ended.
     pub fn whole_log(&mut self) -> String {
-        self.heard.extend(self.log.iter());
-        self.heard.join("\n")
+        self.logged_lines.extend(self.log.iter());
+        self.logged_lines.join("\n")
     }
 
     /// Waits for a log line that contains `part`.
     pub fn logged(&mut self, part: &str) -> String {
         loop {
             let line = self.log.recv_timeout(PATIENCE).unwrap_or_else(|_| {
-                panic!("{part:?} was not logged, but {:#?}", self.heard);
+                panic!("{part:?} was not logged, but {:#?}", self.logged_lines);
             });
-            self.heard.push(line.clone());
+            self.logged_lines.push(line.clone());
             if line.contains(part) {
                 return line;
             }
@@ -276,7 +276,7 @@ impl Subscriber {
 
     /// Sends a line and waits for the answer.
     pub fn ask(&mut self, line: &str) -> Value {
-        self.say(line);
+        self.send_line(line);
         loop {
             let answer = self.next().unwrap();
             if ["ok", "error"].contains(&answer["type"].as_str().unwrap()) {
@@ -285,7 +285,7 @@ impl Subscriber {
         }
     }
 
-    pub fn say(&mut self, line: &str) {
+    pub fn send_line(&mut self, line: &str) {
         self.lines
             .get_mut()
             .write_all(format!("{line}\n").as_bytes())

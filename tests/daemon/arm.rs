@@ -165,9 +165,9 @@ fn an_arm_stops_without_its_controller_and_at_a_force_and_refuses_what_it_cannot
 
     let arm = bench.path("arm.sock");
     let again = hardnessd(&["simulate", "--arm", arm.to_str().unwrap()]);
-    let said = String::from_utf8(again.stderr).unwrap();
-    assert_eq!(again.status.code(), Some(74), "{said}");
-    assert!(said.contains("in use by another process"), "{said}");
+    let message = String::from_utf8(again.stderr).unwrap();
+    assert_eq!(again.status.code(), Some(74), "{message}");
+    assert!(message.contains("in use by another process"), "{message}");
     simulator.signal(Signal::TERM);
     assert_eq!(simulator.exit_code(), Some(0));
     assert!(!arm.exists());

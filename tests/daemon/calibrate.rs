@@ -165,8 +165,11 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
     fs::write(&calibrated, format!("{table}[sensor.calibration]\n{lines}")).unwrap();
     let _sensor = bench.sensor(&[]);
     let checked = hardnessd(&["check", "--config", &calibrated]);
-    let told = String::from_utf8(checked.stdout).unwrap();
-    assert!(told.contains("whatever the baud rate, gains 0."), "{told}");
+    let printed = String::from_utf8(checked.stdout).unwrap();
+    assert!(
+        printed.contains("whatever the baud rate, gains 0."),
+        "{printed}"
+    );
     let recording = path("gains.mcap");
     let record = [
         "record",
@@ -242,8 +245,8 @@ fn presses_of_a_recording_say_the_gains_and_a_recording_holds_them() {
         .unwrap();
     assert!(output.status.success(), "{output:?}");
     assert_eq!(fs::read(&out).unwrap(), gains);
-    let said = String::from_utf8(output.stdout).unwrap();
-    let theirs = fs::read_to_string(said.lines().next().unwrap());
+    let message = String::from_utf8(output.stdout).unwrap();
+    let theirs = fs::read_to_string(message.lines().next().unwrap());
     assert_eq!(theirs.unwrap(), "theirs\n");
 }
 

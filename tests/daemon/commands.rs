@@ -27,12 +27,12 @@ fn a_recording_without_a_press_is_warned_of() {
         command.arg("--out").arg(&out).args(more).output().unwrap()
     };
     let Output { status, stderr, .. } = record(&["--seconds", "1.5"]);
-    let said = text(&stderr);
-    assert_eq!(status.code(), Some(0), "{said}");
-    let warning = said.lines().find(|line| line.starts_with("warning: "));
+    let message = text(&stderr);
+    assert_eq!(status.code(), Some(0), "{message}");
+    let warning = message.lines().find(|line| line.starts_with("warning: "));
     assert!(
         warning.is_some_and(|line| line.contains("no press in ")),
-        "{said}"
+        "{message}"
     );
     assert!(out.exists());
 }
@@ -52,18 +52,18 @@ fn whoever_holds_the_port_is_named_and_what_to_do() {
         .arg("--out")
         .arg(&out);
     let Output { status, stderr, .. } = command.output().unwrap();
-    let said = text(&stderr);
-    assert_eq!(status.code(), Some(69), "{said}");
-    let said = said
+    let message = text(&stderr);
+    assert_eq!(status.code(), Some(69), "{message}");
+    let message = message
         .lines()
         .find(|line| line.starts_with("hardnessd: "))
         .unwrap();
     let process = format!("held by process {}, the daemon", daemon.process.0.id());
     assert!(
-        said.contains(&process)
-            && said.contains("(hardnessd run; its scheduling is ordinary")
-            && said.contains("systemctl stop hardnessd"),
-        "{said}"
+        message.contains(&process)
+            && message.contains("(hardnessd run; its scheduling is ordinary")
+            && message.contains("systemctl stop hardnessd"),
+        "{message}"
     );
     assert!(!out.exists());
 }
@@ -75,14 +75,14 @@ fn check_warns_of_a_pitch_that_the_model_does_not_know() {
     let small = "[[sensor]]\nport = \"port\"\n[sensor.calibration]\npitch_mm = [3.5, 9.0]\n";
     fs::write(&config, small).unwrap();
     let Output { status, stderr, .. } = hardnessd(&["check", "--config", config.to_str().unwrap()]);
-    let said = text(&stderr);
-    assert_eq!(status.code(), Some(0), "{said}");
+    let message = text(&stderr);
+    assert_eq!(status.code(), Some(0), "{message}");
     assert!(
-        said.contains("found [3.5, 9.0], expected the model's 3.5")
-            && said.contains("was not trained on such a pitch"),
-        "{said}"
+        message.contains("found [3.5, 9.0], expected the model's 3.5")
+            && message.contains("was not trained on such a pitch"),
+        "{message}"
     );
-    assert!(said.contains("not trained"), "{said}");
+    assert!(message.contains("not trained"), "{message}");
 }
 
 #[test]
@@ -103,9 +103,9 @@ fn check_names_what_the_model_needs_and_what_changes_no_verdict_of_it() {
         fs::write(&config, format!("{sensor}{model}")).unwrap();
         let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
         assert!(text(&output.stdout).contains(needs), "{output:?}");
-        let said = text(&output.stderr);
-        let warned = said.contains("sensor.arm of \"sensor\": changes no verdict");
-        assert_eq!(warned, ignored, "{said}");
+        let message = text(&output.stderr);
+        let warned = message.contains("sensor.arm of \"sensor\": changes no verdict");
+        assert_eq!(warned, ignored, "{message}");
     }
 }
 
@@ -214,11 +214,11 @@ fn the_control_socket_has_commands_of_its_own() {
         } = command.output().unwrap();
         (status.code().unwrap(), text(&stdout), text(&stderr))
     };
-    let (code, _, said) = control(&["tare", "forearm"]);
-    assert_eq!((code, said.lines().count()), (1, 1), "{said}");
-    assert!(said.contains("not live"), "{said}");
-    let (code, _, said) = control(&["tare", "wrist"]);
-    assert!(code == 1 && said.contains("forearm"), "{said}");
+    let (code, _, message) = control(&["tare", "forearm"]);
+    assert_eq!((code, message.lines().count()), (1, 1), "{message}");
+    assert!(message.contains("not live"), "{message}");
+    let (code, _, message) = control(&["tare", "wrist"]);
+    assert!(code == 1 && message.contains("forearm"), "{message}");
 
     let sets = ["context", "forearm", "tag=pick-17", "speed_mm_s=5.5"];
     assert_eq!(control(&sets), (0, "done\n".to_owned(), String::new()));
@@ -232,13 +232,13 @@ fn the_control_socket_has_commands_of_its_own() {
     assert_eq!(control(&["context", "forearm"]).0, 0);
     let judged = subscriber.until(&json!({"phase": "final"}));
     assert_eq!(judged["context"], Value::Null);
-    let (code, tared, said) = control(&["tare", "forearm"]);
+    let (code, tared, message) = control(&["tare", "forearm"]);
     assert!(
         code == 0 && tared.starts_with("tared: the mean offset was 0.00"),
-        "{said}"
+        "{message}"
     );
-    let (code, _, said) = control(&["blackbox", "forearm"]);
-    assert!(code == 1 && said.contains("[record]"), "{said}");
+    let (code, _, message) = control(&["blackbox", "forearm"]);
+    assert!(code == 1 && message.contains("[record]"), "{message}");
 
     // The socket of events changes nothing.
     let mut command = Command::new(BINARY);

@@ -77,7 +77,7 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     ] {
         assert!(line.contains(field), "{field} not in {line}");
     }
-    subscriber.say(r#"{"get":"last","id":1}"#);
+    subscriber.send_line(r#"{"get":"last","id":1}"#);
     assert_eq!(subscriber.until(&json!({"phase": "final"})), verdict);
     subscriber.until(&json!({"type": "ok", "id": 1}));
 }
@@ -87,7 +87,7 @@ fn an_unplugged_sensor_is_lost_at_once_and_goes_on_counting_when_it_is_back() {
     let bench = Bench::new();
     let _daemon = bench.daemon();
     let mut subscriber = bench.subscriber();
-    subscriber.say(r#"{"subscribe":["status","press","frame"]}"#);
+    subscriber.send_line(r#"{"subscribe":["status","press","frame"]}"#);
     let mut delays = Vec::new();
     let mut frames = 0;
     let mut presses = 0;
@@ -132,7 +132,7 @@ fn stale_after(key: &str) -> Duration {
     fs::write(&config, text).unwrap();
     let _daemon = Daemon::start(&config);
     let mut subscriber = bench.subscriber();
-    subscriber.say(r#"{"subscribe":["status","frame"]}"#);
+    subscriber.send_line(r#"{"subscribe":["status","frame"]}"#);
     let _sensor = bench.sensor(&["--faults", script.to_str().unwrap()]);
     let mut last_frame = None;
     let mut silences = Vec::new();
@@ -309,14 +309,14 @@ fn a_line_that_repeats_without_end_is_left_out_and_counted() {
     daemon.process.signal(Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
     let log = daemon.whole_log();
-    let said = |part: &str| log.lines().filter(|line| line.contains(part)).count() as u64;
+    let printed = |part: &str| log.lines().filter(|line| line.contains(part)).count() as u64;
     let left_out: u64 = log
         .lines()
         .filter_map(|line| line.split_once("left_out=")?.1.split(' ').next())
         .map(|count| count.parse::<u64>().unwrap())
         .sum();
     // A line with `left_out` also contains the text of the line that it counts.
-    let written = said("tare refused") - said("left_out=");
+    let written = printed("tare refused") - printed("left_out=");
     assert_eq!(written + left_out, TARES, "{written} written");
     assert!(written < TARES / 10, "{written} written");
     assert!(
@@ -370,11 +370,11 @@ fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
     second.process.signal(Signal::TERM);
     second.logged("stopping");
     let lines = second
-        .heard
+        .logged_lines
         .iter()
         .filter(|line| line.contains("held by another"))
         .count();
-    assert_eq!(lines, 1, "{:#?}", second.heard);
+    assert_eq!(lines, 1, "{:#?}", second.logged_lines);
 }
 
 #[test]
@@ -383,18 +383,18 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
     let config = bench.configure("hardnessd.toml", "events.sock", "max_clients = 3\n");
     let _daemon = Daemon::start(&config);
     let mut first = bench.subscriber();
-    first.say(r#"{"subscribe":["hardness"]}"#);
+    first.send_line(r#"{"subscribe":["hardness"]}"#);
     first.until(&json!({"type": "ok"}));
     for line in [
         r#"{"subscribe":["touch"],"id":7}"#,
         r#"{"tare":"forearm","id":7}"#,
     ] {
-        first.say(line);
+        first.send_line(line);
         assert_eq!(first.next().unwrap()["type"], "error");
     }
-    first.say("\u{0}\u{1}{{{");
+    first.send_line("\u{0}\u{1}{{{");
     assert_eq!(first.next().unwrap()["id"], Value::Null);
-    first.say(r#"{"get":"status","id":{"mine":1}}"#);
+    first.send_line(r#"{"get":"status","id":{"mine":1}}"#);
     assert_eq!(first.next().unwrap()["state"], "connecting");
     assert_eq!(
         first.next().unwrap(),
@@ -403,7 +403,7 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
 
     let mut long = bench.subscriber();
     long.until(&json!({"type": "status"}));
-    long.say(&"x".repeat(70_000));
+    long.send_line(&"x".repeat(70_000));
     // A status about the unopened port may come first.
     long.until(&json!({"type": "error"}));
     // The connection is closed, perhaps with a reset, because the daemon never read the last bytes.
@@ -426,7 +426,7 @@ fn a_subscriber_is_told_what_is_wrong_and_harms_nobody() {
         let mut fourth = bench.subscriber();
         fourth.next().is_some_and(|line| line["type"] == "error") && fourth.next().is_none()
     });
-    first.say(r#"{"get":"last"}"#);
+    first.send_line(r#"{"get":"last"}"#);
     assert_eq!(first.next().unwrap(), json!({"type": "ok"}));
 }
 
@@ -435,7 +435,7 @@ fn the_service_manager_hears_of_readiness_life_and_stopping_without_any_hardware
     let bench = Bench::new();
     let manager = UnixDatagram::bind(bench.path("notify")).unwrap();
     manager.set_read_timeout(Some(PATIENCE)).unwrap();
-    let told = |state: &str| {
+    let notified = |state: &str| {
         let mut message = [0; 1024];
         loop {
             let length = manager.recv(&mut message).unwrap();
@@ -455,13 +455,13 @@ fn the_service_manager_hears_of_readiness_life_and_stopping_without_any_hardware
         .env("NOTIFY_SOCKET", bench.path("notify"))
         .env("WATCHDOG_USEC", "200000");
     let mut daemon = Process(command.spawn().unwrap());
-    told("READY=1");
+    notified("READY=1");
     assert_eq!(bench.subscriber().next().unwrap()["type"], "hello");
     for _ in 0..3 {
-        told("WATCHDOG=1");
+        notified("WATCHDOG=1");
     }
     daemon.signal(Signal::TERM);
-    told("STOPPING=1");
+    notified("STOPPING=1");
     assert_eq!(daemon.exit_code(), Some(0));
 }
 
@@ -789,10 +789,13 @@ fn a_signal_ends_recover_while_it_waits_for_a_writer() {
     }
     process.signal(Signal::TERM);
     assert_eq!(process.exit_code(), Some(143));
-    let mut heard = String::new();
+    let mut logged_lines = String::new();
     let mut stderr = process.0.stderr.take().unwrap();
-    stderr.read_to_string(&mut heard).unwrap();
-    assert_eq!(heard, "hardnessd: interrupted before it had finished\n");
+    stderr.read_to_string(&mut logged_lines).unwrap();
+    assert_eq!(
+        logged_lines,
+        "hardnessd: interrupted before it had finished\n"
+    );
 }
 
 #[test]
@@ -806,7 +809,7 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
     let new = new.to_str().unwrap();
     let model = bench.configure("model.toml", "x.sock", "[model]\npath = \"fifo\"\n");
     let unfinished = "hardnessd: interrupted before it had finished\n";
-    for (arguments, code, said) in [
+    for (arguments, code, printed) in [
         (&["run", "--config", fifo][..], 0, ""),
         (&["run", "--config", model.to_str().unwrap()], 0, ""),
         (&["record", "--config", fifo, "--out", new], 0, ""),
@@ -820,10 +823,10 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
         let _writer = fs::File::options().write(true).open(fifo).unwrap();
         process.signal(Signal::TERM);
         assert_eq!(process.exit_code(), Some(code), "{arguments:?}");
-        let mut heard = String::new();
+        let mut logged_lines = String::new();
         let mut stderr = process.0.stderr.take().unwrap();
-        stderr.read_to_string(&mut heard).unwrap();
-        assert_eq!(heard, said, "{arguments:?}");
+        stderr.read_to_string(&mut logged_lines).unwrap();
+        assert_eq!(logged_lines, printed, "{arguments:?}");
     }
 }
 

@@ -129,34 +129,35 @@ fn tail(runtime: &Path, arguments: &[&str]) -> (Option<i32>, Value, String) {
 fn a_running_demo_is_found_and_a_daemon_goes_before_it() {
     let bench = Bench::new();
     let runtime = bench.path("");
-    let (code, _, said) = tail(&runtime, &[]);
+    let (code, _, message) = tail(&runtime, &[]);
     assert_eq!(code, Some(69));
     assert!(
-        said.contains("hardnessd demo") && said.contains("--socket"),
-        "{said}"
+        message.contains("hardnessd demo") && message.contains("--socket"),
+        "{message}"
     );
     let mut demo = program(&runtime);
     demo.args(["demo", "--json"])
         .stdout(Stdio::null())
         .stderr(Stdio::piped());
     let mut demo = Process(demo.spawn().unwrap());
-    let mut told = BufReader::new(demo.0.stderr.take().unwrap()).lines();
+    let mut printed = BufReader::new(demo.0.stderr.take().unwrap()).lines();
     assert!(
-        told.next()
+        printed
+            .next()
             .unwrap()
             .unwrap()
             .starts_with("live page: http://")
     );
-    let socket = told.next().unwrap().unwrap();
+    let socket = printed.next().unwrap().unwrap();
     let socket = socket.strip_prefix("socket: ").unwrap();
     let socket = socket.split(' ').next().unwrap();
-    let (code, event, said) = tail(&runtime, &[]);
+    let (code, event, message) = tail(&runtime, &[]);
     assert_eq!(
         (code, &event["sensor"]),
         (Some(0), &"demo".into()),
-        "{said}"
+        "{message}"
     );
-    assert_eq!(said, format!("hardnessd: events of {socket}\n"));
+    assert_eq!(message, format!("hardnessd: events of {socket}\n"));
     let own = runtime.join("hardnessd/events.sock");
     let config = bench.configure(
         "own.toml",
@@ -164,22 +165,22 @@ fn a_running_demo_is_found_and_a_daemon_goes_before_it() {
         "[publish.tcp]\nlisten = \"127.0.0.1:0\"\n",
     );
     let mut daemon = Daemon::start(&config);
-    let (code, event, said) = tail(&runtime, &[]);
+    let (code, event, message) = tail(&runtime, &[]);
     assert_eq!(
         (code, &event["sensor"]),
         (Some(0), &"forearm".into()),
-        "{said}"
+        "{message}"
     );
-    assert_eq!(said, format!("hardnessd: events of {}\n", own.display()));
+    assert_eq!(message, format!("hardnessd: events of {}\n", own.display()));
     // A socket that is named is used without a message.
-    let (_, event, said) = tail(&runtime, &["--socket", socket]);
-    assert_eq!((&event["sensor"], said.as_str()), (&"demo".into(), ""));
+    let (_, event, message) = tail(&runtime, &["--socket", socket]);
+    assert_eq!((&event["sensor"], message.as_str()), (&"demo".into(), ""));
     let address = daemon.address("tcp").to_string();
-    let (code, event, said) = tail(&runtime, &["--connect", &address]);
+    let (code, event, message) = tail(&runtime, &["--connect", &address]);
     assert_eq!(
         (code, &event["sensor"]),
         (Some(0), &"forearm".into()),
-        "{said}"
+        "{message}"
     );
     demo.signal(Signal::TERM);
     assert_eq!(demo.exit_code(), Some(0));
@@ -195,10 +196,10 @@ fn a_server_that_sends_no_newline_is_left_with_one_line() {
         let (mut stream, _) = listener.accept().unwrap();
         while stream.write_all(&[b'x'; 65536]).is_ok() {}
     });
-    let (code, _, said) = tail(&bench.path(""), &["--socket", socket.to_str().unwrap()]);
-    assert_eq!(code, Some(69), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
-    assert!(said.contains("longer than 1048576 bytes"), "{said}");
+    let (code, _, message) = tail(&bench.path(""), &["--socket", socket.to_str().unwrap()]);
+    assert_eq!(code, Some(69), "{message}");
+    assert_eq!(message.lines().count(), 1, "{message}");
+    assert!(message.contains("longer than 1048576 bytes"), "{message}");
     server.join().unwrap();
 }
 
@@ -216,17 +217,17 @@ fn a_configuration_is_looked_for_where_none_is_named() {
         (status.code(), text(&stdout), text(&stderr))
     };
     if !Path::new("/etc/hardnessd.toml").exists() {
-        let (code, _, said) = check();
+        let (code, _, message) = check();
         assert_eq!(code, Some(66));
         assert!(
-            said.contains("--config") && said.lines().count() == 1,
-            "{said}"
+            message.contains("--config") && message.lines().count() == 1,
+            "{message}"
         );
     }
     let config = "robot = \"here\"\n[[sensor]]\nport = \"port\"\n";
     fs::write(here.join("hardnessd.toml"), config).unwrap();
-    let (code, told, said) = check();
-    assert_eq!(code, Some(0), "{said}");
-    assert_eq!(said, "hardnessd: configuration ./hardnessd.toml\n");
-    assert!(told.starts_with("robot here\n"), "{told}");
+    let (code, printed, message) = check();
+    assert_eq!(code, Some(0), "{message}");
+    assert_eq!(message, "hardnessd: configuration ./hardnessd.toml\n");
+    assert!(printed.starts_with("robot here\n"), "{printed}");
 }

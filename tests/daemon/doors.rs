@@ -43,8 +43,8 @@ fn damaged(bytes: &[u8], damage: Damage) -> Vec<u8> {
 /// The seconds for changes to the kept bytes. `HARDNESSD_DOORS_SECONDS` sets another number, for CI
 /// and for longer searches.
 fn seconds() -> u64 {
-    let told = std::env::var("HARDNESSD_DOORS_SECONDS").ok();
-    told.map_or(3, |told| told.parse().expect("seconds"))
+    let given = std::env::var("HARDNESSD_DOORS_SECONDS").ok();
+    given.map_or(3, |given| given.parse().expect("seconds"))
 }
 
 /// The bytes that the fuzzer kept for a door, and a whole recording.

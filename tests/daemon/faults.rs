@@ -248,7 +248,7 @@ fn touch(frame: u32, frames: u32) -> String {
 
 /// The status as an answer.
 fn status(subscriber: &mut Subscriber) -> Value {
-    subscriber.say(r#"{"get":"status"}"#);
+    subscriber.send_line(r#"{"get":"status"}"#);
     // Only the status of an event has a number, and this one is an answer.
     subscriber.until(&json!({"type": "status", "seq": null}))
 }
@@ -442,7 +442,7 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
     let mut played = Played::start("", &script);
     played
         .subscriber
-        .say(r#"{"subscribe":["status","press","hardness","frame"]}"#);
+        .send_line(r#"{"subscribe":["status","press","hardness","frame"]}"#);
     let begin = played.sees(&json!({"type": "press", "state": "begin"}));
     let last = begin["frame"].as_u64().unwrap() + 4;
     let last = played.sees(&json!({"type": "frame", "frame": last}));
@@ -601,14 +601,14 @@ fn drift_is_no_press_below_the_threshold_and_above_it_one_that_ends_by_the_clock
 fn pressed_while_it_tares_a_sensor_says_so_and_tares_when_it_is_released() {
     let script = [touch(0, READY), touch(READY + 50, 10)];
     let mut played = Played::start("", &script);
-    let told = played.sees(&json!({"type": "status", "reason": "tare: contact"}));
+    let seen = played.sees(&json!({"type": "status", "reason": "tare: contact"}));
     assert_eq!(
-        (&told["state"], &told["frames"]),
+        (&seen["state"], &seen["frames"]),
         (&json!("live"), &json!(5))
     );
-    let told = played.subscriber.next().unwrap();
+    let seen = played.subscriber.next().unwrap();
     assert_eq!(
-        (&told["type"], &told["state"], &told["reason"]),
+        (&seen["type"], &seen["state"], &seen["reason"]),
         (&json!("status"), &json!("live"), &json!(null)),
         "and no press before it"
     );
@@ -698,14 +698,14 @@ fn a_daemon_killed_a_hundred_times_starts_each_time_and_its_recordings_can_be_sa
         let good = bench.path("good.mcap");
         let [from, to] = [damaged, &good].map(|path| path.to_str().unwrap());
         let output = hardnessd(&["recover", from, "--out", to]);
-        let said = String::from_utf8(output.stderr).unwrap();
+        let message = String::from_utf8(output.stderr).unwrap();
         if !output.status.success() {
             // Less than a second may be lost, so a recording of less than a second may be lost
             // completely.
-            assert!(lived < Duration::from_secs(1), "{lived:?}: {said}");
+            assert!(lived < Duration::from_secs(1), "{lived:?}: {message}");
             assert!(
-                said.contains("no chunk of messages in it is whole"),
-                "{said}"
+                message.contains("no chunk of messages in it is whole"),
+                "{message}"
             );
             continue;
         }

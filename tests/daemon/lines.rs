@@ -52,7 +52,7 @@ fn configure(bench: &Bench, port: &str, more: &str) -> PathBuf {
 
 /// The current status of the sensor.
 fn status(subscriber: &mut Subscriber) -> Value {
-    subscriber.say("{\"get\":\"status\"}");
+    subscriber.send_line("{\"get\":\"status\"}");
     let mut status = Value::Null;
     loop {
         let line = subscriber.next().unwrap();
@@ -337,7 +337,7 @@ fn the_tools_take_an_address_in_place_of_a_port() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = format!("tcp://{}", listener.local_addr().unwrap());
     let bytes = frames.concat();
-    let heard = format!("# {port}: {} bytes\n", bytes.len());
+    let logged_lines = format!("# {port}: {} bytes\n", bytes.len());
     let sensor = std::thread::spawn(move || {
         let mut peer = accept(&listener);
         peer.write_all(&bytes).unwrap();
@@ -345,7 +345,7 @@ fn the_tools_take_an_address_in_place_of_a_port() {
     let sniffed = hardnessd(&["sniff", "--port", &port, "--seconds", "20"]);
     sensor.join().unwrap();
     let stdout = String::from_utf8(sniffed.stdout).unwrap();
-    assert!(stdout.starts_with(&heard), "{stdout}");
+    assert!(stdout.starts_with(&logged_lines), "{stdout}");
     // Nobody listens any more.
     let config = configure(&bench, &port, "");
     let out = bench.path("out.mcap");

@@ -49,17 +49,17 @@ fn positions_are_checked_counted_and_recorded() {
         .subscriber()
         .until(&json!({"type": "status", "state": "live"}));
     let mut control = Subscriber::connect(&bench.path("control.sock"));
-    let mut tell = |sensor: &str, at: Value| {
+    let mut send_positions = |sensor: &str, at: Value| {
         control.ask(&json!({"motion": {"sensor": sensor, "at": at}, "id": 7}).to_string())
     };
     let now = mono_ns();
     let ok = json!({"type": "ok", "id": 7});
     assert_eq!(
-        tell("forearm", json!([[now - 2_000_000, 3.5], [now, 3.75]])),
+        send_positions("forearm", json!([[now - 2_000_000, 3.5], [now, 3.75]])),
         ok
     );
     let wall = jiff::Timestamp::now().to_string();
-    assert_eq!(tell("forearm", json!([[wall, 4]])), ok);
+    assert_eq!(send_positions("forearm", json!([[wall, 4]])), ok);
 
     let refused = |answer: Value, expected: &str| {
         assert_eq!(
@@ -70,15 +70,24 @@ fn positions_are_checked_counted_and_recorded() {
         assert!(message.starts_with(expected), "{message}");
     };
     refused(
-        tell("foot", json!([[now, 1]])),
+        send_positions("foot", json!([[now, 1]])),
         "motion.sensor: found \"foot\"",
     );
-    refused(tell("forearm", json!([])), "motion.at: found 0 points");
+    refused(
+        send_positions("forearm", json!([])),
+        "motion.at: found 0 points",
+    );
     let old = json!([[now, 1], [now - 61_000_000_000, 1]]);
-    refused(tell("forearm", old), "motion.at[1]: found a moment 61");
+    refused(
+        send_positions("forearm", old),
+        "motion.at[1]: found a moment 61",
+    );
     // The points are taken nevertheless, because the robot may have set its clock back.
     let back = json!([[mono_ns(), 4.5], [now, 5]]);
-    refused(tell("forearm", back), "motion.at[1]: found a step of");
+    refused(
+        send_positions("forearm", back),
+        "motion.at[1]: found a step of",
+    );
     let mut events = bench.subscriber();
     let point = json!({"motion": {"sensor": "forearm", "at": [[now, 1]]}});
     let answer = events.ask(&point.to_string());
@@ -182,8 +191,8 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         // On hard plastic, nearly all of the way is the arm's own. The second press is on a yoga
         // mat.
         let stiffness = verdict["stiffness_n_per_mm"].as_f64();
-        let is_told = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
-        assert!(finals.is_empty() || is_told, "{verdict}");
+        let is_known = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
+        assert!(finals.is_empty() || is_known, "{verdict}");
         let shore = |key: &str| verdict["shore"][key].as_f64().unwrap();
         assert!(
             (shore("high") - shore("value") - 10.0).abs() < 0.01,

@@ -356,8 +356,11 @@ fn the_user_chooses_between_two_pictures() {
     assert_eq!((code, toml.as_str()), (1, ""), "{stderr}");
     let drawn = stderr.lines().filter(|line| line.trim().starts_with('|'));
     assert!(drawn.clone().any(|line| line.contains('@')), "{stderr}");
-    let said = stderr.lines().last().unwrap();
-    assert!(said.contains("not sure: choose with `--rows "), "{stderr}");
+    let message = stderr.lines().last().unwrap();
+    assert!(
+        message.contains("not sure: choose with `--rows "),
+        "{stderr}"
+    );
     let known = ["--rows", "12", "--cols", "8", "--cell", "u8"];
     let (code, toml, stderr) = run(&[&["sniff", &path], &known[..]].concat());
     assert_eq!(code, 0, "{stderr}");

@@ -217,18 +217,20 @@ fn served() -> &'static Served {
 /// The next question after the lines is answered too. Only a line that is too long ends the
 /// connection.
 pub fn lines(bytes: &[u8]) {
-    let (socket, said) = match bytes.split_first() {
-        Some((first, said)) if first % 2 == 1 => ("control.sock", said),
-        Some((_, said)) => ("events.sock", said),
+    let (socket, message) = match bytes.split_first() {
+        Some((first, message)) if first % 2 == 1 => ("control.sock", message),
+        Some((_, message)) => ("events.sock", message),
         None => return,
     };
     let mut stream = UnixStream::connect(served().directory.join(socket)).expect("a daemon");
     stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
     let last = b"\n{\"get\":\"status\",\"id\":\"the last question\"}\n";
-    let longest = said.split(|&byte| byte == b'\n').map(<[u8]>::len).max();
+    let longest = message.split(|&byte| byte == b'\n').map(<[u8]>::len).max();
     let is_too_long = longest > Some(LONGEST_LINE_BYTES);
     let mut writer = stream.try_clone().expect("another handle");
-    let sent = writer.write_all(said).and_then(|()| writer.write_all(last));
+    let sent = writer
+        .write_all(message)
+        .and_then(|()| writer.write_all(last));
     assert!(is_too_long || sent.is_ok(), "{sent:?}");
     let mut answers = BufReader::new(&mut stream);
     let mut line = String::new();
@@ -398,9 +400,9 @@ pub fn motion(bytes: &[u8]) {
         let begin = moment(&several[0]);
         let mut moments: Vec<Duration> = several.iter().map(moment).collect();
         moments.sort();
-        if let Some(told) = track.approach(begin, &moments, 1.5) {
-            assert_eq!(told.len(), moments.len());
-            assert!(told.iter().flatten().all(|mm| mm.is_finite()), "{told:?}");
+        if let Some(ways) = track.approach(begin, &moments, 1.5) {
+            assert_eq!(ways.len(), moments.len());
+            assert!(ways.iter().flatten().all(|mm| mm.is_finite()), "{ways:?}");
         }
         track.judged(moments[moments.len() - 1], 1.5);
     }

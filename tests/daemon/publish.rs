@@ -181,7 +181,7 @@ fn tail_gives_a_script_the_events_it_counts_or_an_exit_code() {
 #[test]
 fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol() {
     let bench = Bench::new();
-    let says_first = |line: &'static str| {
+    let first_line = |line: &'static str| {
         let path = bench.path("events.sock");
         let _ = fs::remove_file(&path);
         let listener = UnixListener::bind(&path).unwrap();
@@ -211,7 +211,7 @@ fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol()
             ["a web server answers", "[publish.tcp]"],
         ),
     ] {
-        let stderr = says_first(line);
+        let stderr = first_line(line);
         for part in parts {
             assert!(stderr.contains(part), "{part:?} not in {stderr}");
         }
@@ -235,7 +235,7 @@ fn ok_comes_before_all_that_since_asks_for() {
         let mut subscriber = bench.subscriber();
         assert_eq!(subscriber.next().unwrap()["type"], "hello");
         assert_eq!(subscriber.next().unwrap()["state"], "lost");
-        subscriber.say(&subscription.to_string());
+        subscriber.send_line(&subscription.to_string());
         assert_eq!(subscriber.next().unwrap(), json!({"type": "ok"}));
         let held = subscriber.next().unwrap();
         let expected = if held["type"] == "gap" { "lost" } else { "seq" };
@@ -245,7 +245,7 @@ fn ok_comes_before_all_that_since_asks_for() {
         assert_eq!(subscriber.ask(r#"{"get":"status"}"#)["type"], "ok");
     }
     let mut again = bench.subscriber();
-    again.say(&json!({"subscribe": ["status"], "since": format!("{run}:1")}).to_string());
+    again.send_line(&json!({"subscribe": ["status"], "since": format!("{run}:1")}).to_string());
     again.until(&json!({"type": "ok"}));
     assert_eq!(again.until(&json!({"seq": last}))["state"], "lost");
     let _sensor = bench.sensor(&["--presses", "1"]);
@@ -325,7 +325,7 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
         let mut binary = connect();
         let noise: Vec<u8> = (0..4096_u32).map(|i| (i * 167 % 251) as u8).collect();
         binary.lines.get_mut().write_all(&noise).unwrap();
-        binary.say("");
+        binary.send_line("");
         binary.until(&json!({"type": "error"}));
         assert_eq!(
             binary.ask(r#"{"get":"last","id":"still"}"#)["type"],
@@ -364,7 +364,7 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
         // This subscriber asks many questions and never reads an answer.
         let mut deaf = connect();
         for _ in 0..200 {
-            deaf.say(r#"{"get":"status"}"#);
+            deaf.send_line(r#"{"get":"status"}"#);
         }
         kept.extend([half, deaf]);
     }
@@ -418,7 +418,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     let _wrist = bench.sensor_at("port-2", 20, &["--seed", "2"]);
     let mut subscriber = bench.subscriber();
     assert_eq!(subscriber.next().unwrap()["sensors"][1]["name"], "wrist");
-    subscriber.say(r#"{"subscribe":["status","press","hardness","frame"]}"#);
+    subscriber.send_line(r#"{"subscribe":["status","press","hardness","frame"]}"#);
     for sensor in ["forearm", "wrist"] {
         subscriber.until(&json!({"type": "hardness", "phase": "final", "sensor": sensor}));
     }
@@ -590,7 +590,7 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
             assert!(!numbers.is_empty());
         }
     }
-    let mut told = Vec::new();
+    let mut gaps_sent = Vec::new();
     for woken in woken {
         let (mut marks, gaps) = woken.join().unwrap();
         let is_newer = |mark: &Mark| !reference.contains(mark);
@@ -604,10 +604,10 @@ fn fifty_subscribers_miss_nothing_beside_one_that_never_reads() {
         assert_eq!(missing as u64, lost);
         let back = place(marks.last().unwrap()) - place(&marks[at]) + 1;
         assert_eq!(marks.len() - at, back, "after the gap it misses nothing");
-        told.push(lost);
+        gaps_sent.push(lost);
     }
     println!(
-        "{frames} frames to each of 50 readers; gaps told {told:?}; resident {alone_kb} kB alone, \
+        "{frames} frames to each of 50 readers; gaps told {gaps_sent:?}; resident {alone_kb} kB alone, \
          {crowded_kb} kB with 53 subscribers"
     );
     assert!(frames > 2500, "{frames} frames in 36 s");

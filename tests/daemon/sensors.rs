@@ -85,7 +85,7 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
     for name in ["palm", "wrist"] {
         assert_eq!(later.next().unwrap()["sensor"], name);
     }
-    later.say("{\"get\":\"last\"}");
+    later.send_line("{\"get\":\"last\"}");
     while let Some(line) = later.next() {
         assert_ne!(line["sensor"], "elbow", "{line}");
         if line["type"] == "ok" {

@@ -90,7 +90,7 @@ fn a_reload_without_a_thread_or_a_process_is_refused_and_the_next_one_is_not() {
         );
     }
     let fault = |line: &&String| line.contains("panicked") || line.contains("without a result");
-    assert_eq!(daemon.heard.iter().find(fault), None);
+    assert_eq!(daemon.logged_lines.iter().find(fault), None);
     user.limit(&daemon.process, None);
     daemon.process.signal(Signal::HUP);
     daemon.logged("reloaded");
@@ -124,12 +124,12 @@ fn a_command_without_a_thread_ends_with_one_line() {
             .args(arguments)
             .output()
             .unwrap();
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
-        assert_eq!(said.lines().count(), 1, "{arguments:?}: {said}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {message}");
+        assert_eq!(message.lines().count(), 1, "{arguments:?}: {message}");
         assert!(
-            said.contains("temporarily unavailable"),
-            "{arguments:?}: {said}"
+            message.contains("temporarily unavailable"),
+            "{arguments:?}: {message}"
         );
     };
     for arguments in [

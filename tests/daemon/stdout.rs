@@ -91,20 +91,20 @@ fn a_tail_that_nobody_reads_is_over_in_its_time() {
     let child = command.arg(socket).stderr(Stdio::piped()).spawn();
     let mut tail = Process(child.unwrap());
     assert_eq!(tail.exit_code(), Some(1));
-    let mut said = String::new();
+    let mut message = String::new();
     let mut stderr = tail.0.stderr.take().unwrap();
-    stderr.read_to_string(&mut said).unwrap();
-    assert!(said.contains("timed out after 0.5 s"), "{said}");
+    stderr.read_to_string(&mut message).unwrap();
+    assert!(message.contains("timed out after 0.5 s"), "{message}");
 }
 
 #[test]
 fn a_demonstration_that_nobody_reads_goes_on_and_ends_at_a_signal() {
     let (mut command, _reader) = unread(&["demo"]);
     let mut demo = Process(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut said = String::new();
+    let mut message = String::new();
     let mut stderr = BufReader::new(demo.0.stderr.take().unwrap());
-    stderr.read_line(&mut said).unwrap();
-    let (_, address) = said.trim().split_once("http://").unwrap();
+    stderr.read_line(&mut message).unwrap();
+    let (_, address) = message.trim().split_once("http://").unwrap();
     let address = address.trim_end_matches('/');
     let frames = || {
         let mut page = TcpStream::connect(address).unwrap();

@@ -9,16 +9,16 @@ use crate::bench::{BINARY, Bench, PATIENCE, Process};
 use rustix::process::Signal;
 
 /// Waits for a line that has all these parts.
-fn says(lines: &Receiver<String>, parts: &[&str]) -> String {
-    let mut heard = Vec::new();
+fn sees(lines: &Receiver<String>, parts: &[&str]) -> String {
+    let mut logged = Vec::new();
     loop {
         let line = lines
             .recv_timeout(PATIENCE)
-            .unwrap_or_else(|_| panic!("{parts:?} is not said, but {heard:#?}"));
+            .unwrap_or_else(|_| panic!("{parts:?} is not said, but {logged:#?}"));
         if parts.iter().all(|part| line.contains(part)) {
             return line;
         }
-        heard.push(line);
+        logged.push(line);
     }
 }
 
@@ -44,21 +44,21 @@ fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the
             }
         }
     });
-    says(&lines, &["nothing is known until it is back"]);
+    sees(&lines, &["nothing is known until it is back"]);
     let daemon = bench.daemon();
     let _sensor = bench.sensor(&[]);
-    says(&lines, &["\"forearm\" is \"live\""]);
-    let verdict = says(
+    sees(&lines, &["\"forearm\" is \"live\""]);
+    let verdict = sees(
         &lines,
         &["\"forearm\" press 1 (\"final\"): \"", "\" at ", " %"],
     );
     assert!(!verdict.contains("null"), "{verdict}");
     daemon.process.signal(Signal::TERM);
-    says(&lines, &["nothing is known until it is back"]);
+    sees(&lines, &["nothing is known until it is back"]);
     drop(daemon);
     let _daemon = bench.daemon();
     // A new run begins: its held events are new, and a gap of unknown length is printed.
-    says(&lines, &["missed null events"]);
-    says(&lines, &["\"forearm\" is \"live\""]);
-    says(&lines, &["\"forearm\" press 1 (\"final\"): "]);
+    sees(&lines, &["missed null events"]);
+    sees(&lines, &["\"forearm\" is \"live\""]);
+    sees(&lines, &["\"forearm\" press 1 (\"final\"): "]);
 }

@@ -27,8 +27,8 @@ fn succeed(bench: &Bench, arguments: &str) -> String {
 /// What a refused command says, and its exit code.
 fn refused(bench: &Bench, arguments: &str) -> (String, i32) {
     let output = run(bench, arguments);
-    let said = String::from_utf8(output.stderr).unwrap();
-    (said, output.status.code().unwrap())
+    let message = String::from_utf8(output.stderr).unwrap();
+    (message, output.status.code().unwrap())
 }
 
 /// The final verdicts of a replay.
@@ -167,12 +167,12 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
             74,
         ),
     ] {
-        let (said, found) = refused(&bench, &format!("{identify} {arguments}"));
-        assert!(said.contains(expected), "{arguments}: {said}");
+        let (message, found) = refused(&bench, &format!("{identify} {arguments}"));
+        assert!(message.contains(expected), "{arguments}: {message}");
         assert_eq!(
-            (said.lines().count(), found),
+            (message.lines().count(), found),
             (1, code),
-            "{arguments}: {said}"
+            "{arguments}: {message}"
         );
     }
     assert_eq!(fs::read(bench.path("r.npz")).unwrap(), before);
@@ -180,10 +180,10 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
 
     // The daemon says which file and why.
     fs::write(bench.path("r.npz"), "no references").unwrap();
-    let (said, code) = refused(&bench, "check --config hardnessd.toml");
+    let (message, code) = refused(&bench, "check --config hardnessd.toml");
     assert!(
-        said.contains("sensor.references of \"forearm\"") && said.contains("no .npz file"),
-        "{said}"
+        message.contains("sensor.references of \"forearm\"") && message.contains("no .npz file"),
+        "{message}"
     );
     assert_eq!(code, 78);
 }
@@ -228,10 +228,10 @@ fn a_pipe_is_no_file_of_references() {
             .spawn();
         let mut identify = Process(child.unwrap());
         assert_eq!(identify.exit_code(), Some(74));
-        let mut said = String::new();
+        let mut message = String::new();
         let mut stderr = identify.0.stderr.take().unwrap();
-        stderr.read_to_string(&mut said).unwrap();
-        assert!(said.contains(expected), "{said}");
+        stderr.read_to_string(&mut message).unwrap();
+        assert!(message.contains(expected), "{message}");
     }
 }
 
@@ -290,18 +290,18 @@ fn levels_of_ones_own_replace_those_of_the_model() {
         "{SENSOR}[[level]]\nlabel = \"a\"\nshore = [0, 60]\n[[level]]\nlabel = \"b\"\nshore = [50, 100]\n"
     );
     fs::write(bench.path("swapped.toml"), swapped).unwrap();
-    let (said, code) = refused(&bench, "check --config swapped.toml");
+    let (message, code) = refused(&bench, "check --config swapped.toml");
     assert!(
-        said.contains("level: found level 2 (50-100), which is not softer"),
-        "{said}"
+        message.contains("level: found level 2 (50-100), which is not softer"),
+        "{message}"
     );
     assert_eq!(code, 78);
     let of_hrn = format!("{SENSOR}{levels}[model]\nbuilt_in = \"hrn\"\n");
     fs::write(bench.path("hrn.toml"), of_hrn).unwrap();
-    let (said, _) = refused(&bench, "check --config hrn.toml");
+    let (message, _) = refused(&bench, "check --config hrn.toml");
     assert!(
-        said.contains("level: found levels, expected none"),
-        "{said}"
+        message.contains("level: found levels, expected none"),
+        "{message}"
     );
 }
 
@@ -322,10 +322,10 @@ fn a_recording_keeps_the_references_that_presses_of_now_gave() {
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(text.contains("rigid flat piece 1"), "{text}");
-    let said = String::from_utf8(output.stderr).unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
     assert!(
-        said.contains("press it 1 times, harder each time"),
-        "{said}"
+        message.contains("press it 1 times, harder each time"),
+        "{message}"
     );
 
     let mut record = Process(

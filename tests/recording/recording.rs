@@ -254,23 +254,23 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
         let config = config.to_str().unwrap();
         let out = out.to_str().unwrap();
         let output = hardnessd(&["record", "--config", config, "--out", out, "--label", level]);
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(2), "{said}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{message}");
         assert!(
-            said.contains("1 (hard), 2 (firm)") && said.lines().count() == 1,
-            "{said}"
+            message.contains("1 (hard), 2 (firm)") && message.lines().count() == 1,
+            "{message}"
         );
     }
     let [at, to] = [&config, &out].map(|path| path.to_str().unwrap());
     let twice = ["--label", "object=1", "--label", "object=2"];
     let twice = [&["record", "--config", at, "--out", to], &twice[..]].concat();
-    let said = String::from_utf8(hardnessd(&twice).stderr).unwrap();
-    assert!(said.contains("--label object: given twice"), "{said}");
+    let message = String::from_utf8(hardnessd(&twice).stderr).unwrap();
+    assert!(message.contains("--label object: given twice"), "{message}");
     // Without anything to record, `record` says so and leaves no file.
     let none = hardnessd(&["record", "--config", at, "--out", to]);
-    let said = String::from_utf8(none.stderr).unwrap();
-    assert_eq!(none.status.code(), Some(69), "{said}");
-    assert!(!said.contains("recorded"), "{said}");
+    let message = String::from_utf8(none.stderr).unwrap();
+    assert_eq!(none.status.code(), Some(69), "{message}");
+    assert!(!message.contains("recorded"), "{message}");
     assert!(!out.exists());
 
     let _sensor = bench.sensor(&[]);
@@ -383,23 +383,23 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     let path = |name: &str| bench.path(name).to_str().unwrap().to_owned();
     let recover = |broken: &str, good: &str| {
         let output = hardnessd(&["recover", &path(broken), "--out", &path(good)]);
-        let said = String::from_utf8(output.stderr).unwrap();
-        (output.status.code().unwrap(), said)
+        let message = String::from_utf8(output.stderr).unwrap();
+        (output.status.code().unwrap(), message)
     };
-    let (code, said) = recover("none.mcap", "good.mcap");
-    assert_eq!(code, 66, "{said}");
+    let (code, message) = recover("none.mcap", "good.mcap");
+    assert_eq!(code, 66, "{message}");
     fs::write(path("noise.mcap"), vec![7; 100_000]).unwrap();
-    let (code, said) = recover("noise.mcap", "good.mcap");
-    assert_eq!(code, 1, "{said}");
+    let (code, message) = recover("noise.mcap", "good.mcap");
+    assert_eq!(code, 1, "{message}");
     assert!(!bench.path("good.mcap").exists());
     let output = Command::new(BINARY)
         .args(["recover", "/dev/stdin", "--out", &path("good.mcap")])
         .stdin(Stdio::piped())
         .output()
         .unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(66), "{said}");
-    assert!(said.contains("/dev/stdin: cannot read: "), "{said}");
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(66), "{message}");
+    assert!(message.contains("/dev/stdin: cannot read: "), "{message}");
 
     let _sensor = bench.sensor(&[]);
     let config = configure(&bench, 20);
@@ -408,11 +408,11 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
         record(&config, &out, &["--seconds", "3"]).exit_code(),
         Some(0)
     );
-    let (code, said) = recover("a.mcap", "whole.mcap");
-    assert_eq!(code, 0, "{said}");
-    assert!(said.contains("lost nothing"), "{said}");
-    let (code, said) = recover("noise.mcap", "whole.mcap");
-    assert_eq!(code, 74, "{said}");
+    let (code, message) = recover("a.mcap", "whole.mcap");
+    assert_eq!(code, 0, "{message}");
+    assert!(message.contains("lost nothing"), "{message}");
+    let (code, message) = recover("noise.mcap", "whole.mcap");
+    assert_eq!(code, 74, "{message}");
     assert_eq!(replay(&bench.path("whole.mcap")), replay(&out));
 
     // A recording that is cut off anywhere is played to its end, and ends with the same last events
@@ -430,9 +430,9 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     ] {
         fs::write(path("cut.mcap"), &whole[..cut]).unwrap();
         let output = hardnessd(&["replay", &path("cut.mcap")]);
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert_eq!(said.lines().count(), 1, "{said}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{message}");
+        assert_eq!(message.lines().count(), 1, "{message}");
         let events = String::from_utf8(output.stdout).unwrap();
         let events: Vec<&str> = events.lines().collect();
         assert_eq!(events.is_empty(), cut <= 100, "{events:?}");
@@ -450,8 +450,8 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 4;
     fs::write(&out, bytes).unwrap();
-    let (code, said) = recover("a.mcap", "good.mcap");
-    assert_eq!(code, 0, "{said}");
+    let (code, message) = recover("a.mcap", "good.mcap");
+    assert_eq!(code, 0, "{message}");
     let left = fs::read_dir(bench.path("")).unwrap();
     let mut names = left.map(|entry| entry.unwrap().file_name().into_string().unwrap());
     assert!(
@@ -497,9 +497,12 @@ fn what_other_programs_recorded_is_no_recording_of_ours() {
     ] {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let output = hardnessd(&arguments);
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert!(said.contains(found) && said.lines().count() == 1, "{said}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{message}");
+        assert!(
+            message.contains(found) && message.lines().count() == 1,
+            "{message}"
+        );
         assert!(!bench.path("good.mcap").exists());
     }
 }
@@ -639,7 +642,7 @@ fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
     let mut daemon = Daemon::start(&config);
     // The message may come before or after the daemon serves.
     if !daemon
-        .heard
+        .logged_lines
         .iter()
         .any(|line| line.contains("recording stopped"))
     {

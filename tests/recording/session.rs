@@ -59,7 +59,7 @@ impl Session {
     }
 
     /// Waits for `part` in the output that was not looked at before. Returns what comes before it.
-    fn says(&mut self, part: &str) -> String {
+    fn sees(&mut self, part: &str) -> String {
         let start = Instant::now();
         loop {
             if let Some(at) = self.written.find(part) {
@@ -102,28 +102,28 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     let _sensor = bench.sensor(&[]);
 
     let mut session = Session::start(&config, &own);
-    session.says("n: it asks for levels");
+    session.sees("n: it asks for levels");
     session.press("n");
-    session.says("object 1: its name: ");
+    session.sees("object 1: its name: ");
     session.answer("");
-    session.says("the name is empty");
+    session.sees("the name is empty");
     session.answer("Yoga mat");
-    session.says("its level, 1 (hard)");
+    session.sees("its level, 1 (hard)");
     session.answer("7");
-    session.says("there is no level");
+    session.sees("there is no level");
     session.answer("Very-Soft");
-    session.says("presses: 1");
+    session.sees("presses: 1");
     session.press("r");
-    session.says("again: Yoga mat");
-    session.says("presses: 2");
+    session.sees("again: Yoga mat");
+    session.sees("presses: 2");
     session.press("\r");
-    session.says("object 2: its name: ");
+    session.sees("object 2: its name: ");
     session.answer("a \"b\", c");
-    session.says("its level");
+    session.sees("its level");
     session.answer("0");
-    session.says("presses: 1");
+    session.sees("presses: 1");
     session.press("q");
-    session.says("recorded 2 objects");
+    session.sees("recorded 2 objects");
     assert_eq!(session.process.exit_code(), Some(0));
 
     let list = fs::read_to_string(own.join("session.csv")).unwrap();
@@ -147,11 +147,11 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
 
     // The next session continues, and a session without a press leaves no file.
     let mut session = Session::start(&config, &own);
-    session.says("n: it asks for levels");
+    session.sees("n: it asks for levels");
     session.press("n");
-    session.says("object 3: its name: ");
+    session.sees("object 3: its name: ");
     session.answer("q");
-    session.says("recorded 0 objects");
+    session.sees("recorded 0 objects");
     assert_eq!(session.process.exit_code(), Some(0));
     assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
 
@@ -160,17 +160,17 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     fs::write(own.join("007-sponge.mcap"), "theirs").unwrap();
     fs::remove_file(own.join("session.csv")).unwrap();
     let mut session = Session::start(&config, &own);
-    session.says("n: it asks for levels");
+    session.sees("n: it asks for levels");
     session.press("n");
-    session.says("object 8: its name: ");
+    session.sees("object 8: its name: ");
     session.answer("foam");
-    session.says("its level");
+    session.sees("its level");
     fs::write(own.join("008-foam.mcap"), "theirs").unwrap();
     session.answer("2");
-    session.says("it is object 9, because another session took a number");
-    session.says("presses: 0");
+    session.sees("it is object 9, because another session took a number");
+    session.sees("presses: 0");
     session.press("q");
-    session.says("recorded 0 objects");
+    session.sees("recorded 0 objects");
     assert_eq!(session.process.exit_code(), Some(0));
     assert!(!own.join("009-foam.mcap").exists());
     for theirs in ["007-sponge.mcap", "008-foam.mcap"] {
@@ -186,28 +186,28 @@ fn a_reading_gives_the_level_and_no_line_of_the_log_cuts_through_a_question() {
     let _sensor = bench.sensor(&[]);
 
     let mut session = Session::record(&config, &["--sockets", "--session", own.to_str().unwrap()]);
-    session.says("y: it asks for readings");
+    session.sees("y: it asks for readings");
     session.press("y");
-    session.says("object 1: its name: ");
+    session.sees("object 1: its name: ");
     session.answer("foam");
-    session.says("its Shore OO reading: ");
+    session.sees("its Shore OO reading: ");
     session.answer("soft");
-    session.says("no level has the Shore OO reading \"soft\"");
+    session.sees("no level has the Shore OO reading \"soft\"");
     session.answer("65.5");
-    session.says("level 2 (firm)");
-    session.says("presses: 0");
+    session.sees("level 2 (firm)");
+    session.sees("presses: 0");
     let mut subscriber = bench.subscriber();
-    session.says("presses: 1");
+    session.sees("presses: 1");
     subscriber.until(&serde_json::json!({"type": "press", "state": "begin", "press": 2}));
     // The recording ends in the middle of a press, and the log warns of that.
     session.press("\r");
-    let before = session.says("object 2: its name: ");
+    let before = session.sees("object 2: its name: ");
     assert!(before.contains("aborted"), "{before:?}");
     session.answer("sponge");
-    let between = session.says("its Shore OO reading: ");
+    let between = session.sees("its Shore OO reading: ");
     assert!(!between.contains("WARN"), "{between:?}");
     session.answer("q");
-    session.says("recorded 1 object in");
+    session.sees("recorded 1 object in");
     assert_eq!(session.process.exit_code(), Some(0));
     let list = fs::read_to_string(own.join("session.csv")).unwrap();
     assert!(list.contains("\n1,\"foam\",65.5,2,"), "{list}");
@@ -253,8 +253,8 @@ fn assert_collects(bench: &Bench, own: &Path) {
         .args([own.join("001-yoga-mat.mcap"), own.join("002-a--b---c.mcap")])
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&collected.stderr);
-    assert_eq!(collected.status.code(), Some(0), "{said}");
+    let message = String::from_utf8_lossy(&collected.stderr);
+    assert_eq!(collected.status.code(), Some(0), "{message}");
     assert!(out.exists());
 }
 
@@ -267,7 +267,7 @@ fn a_line_of_the_log_is_not_glued_to_the_progress() {
     let mut recording = Session::record(&config, &["--sockets", "--out", out.to_str().unwrap()]);
     // The first line of the progress may come before there is a socket.
     let mut subscriber = bench.subscriber();
-    recording.says(" 1 press (Ctrl-C ends it)");
+    recording.sees(" 1 press (Ctrl-C ends it)");
     loop {
         let event = subscriber.next().unwrap();
         if event["type"] == "press" && event["state"] == "begin" && event["press"] == 2 {
@@ -305,9 +305,12 @@ fn a_session_needs_a_terminal_and_asks_for_its_labels_itself() {
             own.to_str().unwrap(),
         ];
         let output = hardnessd(&[&arguments[..], more].concat());
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(2), "{said}");
-        assert!(said.contains(part) && said.lines().count() == 1, "{said}");
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert!(
+            message.contains(part) && message.lines().count() == 1,
+            "{message}"
+        );
     };
     check(&[], "needs a terminal");
     check(&["--label", "level=2"], "--session asks for it");

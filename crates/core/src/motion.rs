@@ -88,8 +88,8 @@ pub struct StepBack {
 /// let begin = Duration::from_secs(2);
 /// let frames = [begin, Duration::from_millis(2250), Duration::from_secs(6)];
 /// let no_delay = 0.0;
-/// let told = track.approach(begin, &frames[..2], no_delay);
-/// assert_eq!(told, Some(vec![Some(0.0), Some(1.25)]));
+/// let approach = track.approach(begin, &frames[..2], no_delay);
+/// assert_eq!(approach, Some(vec![Some(0.0), Some(1.25)]));
 /// // The last position is of 4.9 s: a second later nobody knows where the arm is.
 /// assert_eq!(track.approach(begin, &frames, no_delay), None);
 /// # Ok::<(), hardnessd_core::motion::StepBack>(())
@@ -102,7 +102,7 @@ pub struct Track {
     /// back, or this machine's calendar clock was set.
     doubts: VecDeque<(i64, i64)>,
     /// The number of points since the start.
-    told: u64,
+    received: u64,
     /// The number of points that came after the verdict that they belong to.
     late: u64,
     /// The last moment of the last press that has a final verdict.
@@ -119,7 +119,7 @@ impl Track {
     pub fn push(&mut self, points: &[Point]) -> Result<(), StepBack> {
         let mut first_back = None;
         for (index, &point) in points.iter().enumerate() {
-            self.told += 1;
+            self.received += 1;
             self.late += u64::from(self.judged_ns.is_some_and(|judged| point.at_ns <= judged));
             if let Some(latest) = self.points.back().map(|point| point.at_ns)
                 && point.at_ns <= latest
@@ -171,11 +171,11 @@ impl Track {
 
     /// The number of points since the start, and the number of points that came too late.
     pub fn counts(&self) -> (u64, u64) {
-        (self.told, self.late)
+        (self.received, self.late)
     }
 
     /// Whether the robot sends positions: whether there are any from the last minute before `now`.
-    pub fn is_told(&self, now: Duration, delay_ms: f64) -> bool {
+    pub fn is_reported(&self, now: Duration, delay_ms: f64) -> bool {
         let oldest = of_arm(now, delay_ms).saturating_sub(HELD_NS);
         self.points.back().is_some_and(|p| p.at_ns >= oldest)
     }
@@ -273,7 +273,7 @@ impl Track {
             && span.is_none_or(|(first, last)| last.at_ns - first.at_ns <= HELD_NS)
             && self.points.len() <= MOST_POINTS
             && self.doubts.len() <= MOST_DOUBTS
-            && self.late <= self.told
+            && self.late <= self.received
     }
 }
 

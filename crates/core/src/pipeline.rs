@@ -18,7 +18,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-pub use self::course::{approach_by_speed, approach_speed_mm_s, says_something};
+pub use self::course::{approach_by_speed, approach_speed_mm_s, is_informative};
 pub use self::events::{FIRST_LOOK, look_after};
 pub use self::input::Input;
 use self::link::Link;
@@ -230,7 +230,7 @@ impl Pipeline {
     /// # Errors
     ///
     /// Returns the errors of [`Track::push`]. The points are taken nevertheless.
-    pub fn tell(&mut self, points: &[Point]) -> Result<(), StepBack> {
+    pub fn add_positions(&mut self, points: &[Point]) -> Result<(), StepBack> {
         self.track.push(points)
     }
 

@@ -376,8 +376,8 @@ mod tests {
             zip.write_all(&header.to_bytes()).unwrap();
             zip.finish().unwrap();
             let error = read(&bytes).unwrap_err().to_string();
-            let told = format!("{array}: found {rows} rows, expected {expected}");
-            assert_eq!(error, told);
+            let expected = format!("{array}: found {rows} rows, expected {expected}");
+            assert_eq!(error, expected);
         }
     }
 }

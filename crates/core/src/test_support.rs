@@ -112,7 +112,7 @@ pub fn of_a_labelled_press(
             mm: 0.25 * step as f64,
         };
         let points: Vec<Point> = (0..40).map(point).collect();
-        pipeline.tell(&points).unwrap();
+        pipeline.add_positions(&points).unwrap();
     }
     pipeline.set_context(context);
     let state = State::of(&pipeline, labels.clone());

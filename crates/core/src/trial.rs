@@ -151,7 +151,7 @@ fn answered(
         .stderr(Stdio::null())
         .spawn()
         .map_err(|error| trial(format!("no process to try it in: {error}")))?;
-    let answer = hear(&mut child, deadline);
+    let answer = read_answer(&mut child, deadline);
     // The child may have answered and still hang.
     let _ = child.kill();
     let ended = child.wait();
@@ -181,7 +181,7 @@ fn in_memory(bytes: &[u8]) -> io::Result<File> {
 }
 
 /// Waits for the child's answer, in this thread: there may be no other. `None` if there is no answer.
-fn hear(child: &mut Child, deadline: Duration) -> Option<Answer> {
+fn read_answer(child: &mut Child, deadline: Duration) -> Option<Answer> {
     let mut stdout = child.stdout.take()?.take(ANSWER_BYTES);
     let end = Instant::now() + deadline;
     let mut line = Vec::new();
@@ -226,7 +226,7 @@ fn why_silent(status: ExitStatus) -> String {
 fn trial() -> ExitCode {
     limit();
     panic::set_hook(Box::new(|info| {
-        say(&Answer::Panicked(one_line(info)));
+        write_answer(&Answer::Panicked(one_line(info)));
     }));
     let mut bytes = Vec::new();
     let read = std::io::stdin()
@@ -239,7 +239,7 @@ fn trial() -> ExitCode {
             Err(error) => Answer::Refused(error.to_string()),
         },
     };
-    say(&answer);
+    write_answer(&answer);
     ExitCode::SUCCESS
 }
 
@@ -292,7 +292,7 @@ fn one_line(info: &PanicHookInfo<'_>) -> String {
         .collect()
 }
 
-fn say(answer: &Answer) {
+fn write_answer(answer: &Answer) {
     // If writing fails, nobody is left to tell.
     let _ = serde_json::to_writer(std::io::stdout(), answer);
 }

@@ -5,16 +5,16 @@ use std::error::Error;
 /// Writes a line to stderr, like `eprintln!`, but goes on if nobody can read it: the disk is full, or the
 /// terminal has gone. `eprintln!` panics then, and a panic ends the process.
 #[macro_export]
-macro_rules! say {
+macro_rules! stderr_line {
     ($($text:tt)*) => {{
         use std::io::Write as _;
         let _ = writeln!(std::io::stderr(), $($text)*);
     }};
 }
 
-/// Like [`say!`], without the end of the line.
+/// Like [`stderr_line!`], without the end of the line.
 #[macro_export]
-macro_rules! say_part {
+macro_rules! stderr_part {
     ($($text:tt)*) => {{
         use std::io::Write as _;
         let _ = write!(std::io::stderr(), $($text)*);
@@ -39,16 +39,16 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
 /// there already.
 fn without_numbers(text: &str) -> String {
     let mut parts = text.split(" (os error ");
-    let mut told = parts.next().unwrap_or_default().to_owned();
+    let mut words = parts.next().unwrap_or_default().to_owned();
     for part in parts {
         match part.split_once(')') {
             Some((number, rest)) if number.bytes().all(|digit| digit.is_ascii_digit()) => {
-                told += rest;
+                words += rest;
             }
-            _ => told = told + " (os error " + part,
+            _ => words = words + " (os error " + part,
         }
     }
-    told
+    words
 }
 
 /// Escapes the hidden characters of each line. Without this, the name of a file could control the
@@ -132,11 +132,11 @@ mod tests {
     #[test]
     fn a_cause_is_told_once() {
         let cause = || io::Error::other("no such file");
-        for told in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
-            assert_eq!(line(&told), "x: cannot read: no such file");
+        for words in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
+            assert_eq!(line(&words), "x: cannot read: no such file");
         }
-        let told = Wrapped::Within(cause());
-        assert_eq!(line(&told), "x: no such file, expected a new file");
+        let words = Wrapped::Within(cause());
+        assert_eq!(line(&words), "x: no such file, expected a new file");
     }
 
     #[test]
@@ -174,9 +174,9 @@ mod tests {
 
     #[test]
     fn an_error_is_one_line_whatever_a_file_is_called() {
-        let told = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
+        let words = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
         assert_eq!(
-            line(&told),
+            line(&words),
             "a\\nb\\u{1b}[2J\\t\u{e9}\\u{202e}: cannot read"
         );
     }

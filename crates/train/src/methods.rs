@@ -309,7 +309,7 @@ fn check_validation(
         return Err(refused(expected).into());
     }
     if held_out.is_empty() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "`validation.share`: {share} of the labelled objects of each level rounds to none: \
              nothing is held out, and no temperature is fitted"
         );

@@ -334,10 +334,10 @@ pub(super) fn draw_mistakes(
     let mut wrong = 0;
     for (&index, row) in indices.iter().zip(probabilities) {
         let sample = &dataset.samples[index];
-        let (said, confidence) = argmax(row);
-        if said + 1 != usize::from(sample.level) {
+        let (judged, confidence) = argmax(row);
+        if judged + 1 != usize::from(sample.level) {
             wrong += 1;
-            let caption = format!("as {}, {:.0} %", said + 1, confidence * 100.0);
+            let caption = format!("as {}, {:.0} %", judged + 1, confidence * 100.0);
             rows[usize::from(sample.level) - 1]
                 .tiles
                 .push((&sample.frame, caption));

@@ -79,19 +79,19 @@ fn frame(sensor: &str, number: u64) -> Event {
 }
 
 impl Hub {
-    fn tell(&mut self, event: Event) {
+    fn publish_now(&mut self, event: Event) {
         self.publish(event, Duration::ZERO);
     }
 
     /// All lines that a subscriber gets now, each as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
     fn drain(&mut self, id: u64) -> Vec<String> {
-        let mut told = Vec::new();
+        let mut drained = Vec::new();
         loop {
             let lines = self.take(id);
             if lines.is_empty() {
-                return told;
+                return drained;
             }
-            told.extend(lines.iter().map(|line| {
+            drained.extend(lines.iter().map(|line| {
                 let event: Value = serde_json::from_str(&line.json).unwrap();
                 let number = match event["type"].as_str().unwrap() {
                     "gap" => &event["lost"],
@@ -127,9 +127,9 @@ fn events_are_numbered_over_all_sensors_and_frames_are_not() {
     let every = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
     hub.subscribe(id, &wanting(&every, Policy::Queue, None))
         .unwrap();
-    hub.tell(status("a"));
-    hub.tell(frame("a", 7));
-    hub.tell(press("b"));
+    hub.publish_now(status("a"));
+    hub.publish_now(frame("a", 7));
+    hub.publish_now(press("b"));
     assert_eq!(hub.drain(id), ["status:1", "frame:7", "press:2"]);
 }
 
@@ -140,9 +140,9 @@ fn a_subscriber_gets_the_kinds_it_asked_for_and_by_default_no_frames() {
     let (presses, _) = hub.join();
     hub.subscribe(presses, &wanting(&[Kind::Press], Policy::Queue, None))
         .unwrap();
-    hub.tell(status("a"));
-    hub.tell(frame("a", 0));
-    hub.tell(press("a"));
+    hub.publish_now(status("a"));
+    hub.publish_now(frame("a", 0));
+    hub.publish_now(press("a"));
     assert_eq!(hub.drain(usual), ["status:1", "press:2"]);
     assert_eq!(hub.drain(presses), ["press:2"]);
 }
@@ -152,16 +152,16 @@ fn a_stalled_subscriber_loses_the_oldest_and_learns_exactly_how_many() {
     let mut hub = hub();
     let (stalled, _) = hub.join();
     let (awake, _) = hub.join();
-    let mut told = Vec::new();
+    let mut drained = Vec::new();
     for _ in 0..3000 {
-        hub.tell(status("a"));
-        told.extend(hub.drain(awake));
+        hub.publish_now(status("a"));
+        drained.extend(hub.drain(awake));
     }
-    assert_eq!(told, numbers("status", 1..=3000));
+    assert_eq!(drained, numbers("status", 1..=3000));
     let mut expected = vec!["gap:1976".to_owned()];
     expected.extend(numbers("status", 1977..=3000));
     assert_eq!(hub.drain(stalled), expected);
-    hub.tell(status("a"));
+    hub.publish_now(status("a"));
     assert_eq!(hub.drain(stalled), ["status:3001"]);
     assert_eq!((hub.tally.gaps, hub.tally.dropped), (1, 1976));
 }
@@ -174,11 +174,11 @@ fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
     hub.subscribe(id, &wanting(&kinds, Policy::Latest, None))
         .unwrap();
     for number in 0..5 {
-        hub.tell(status("a"));
-        hub.tell(frame("a", number));
+        hub.publish_now(status("a"));
+        hub.publish_now(frame("a", number));
     }
-    hub.tell(status("b"));
-    hub.tell(press("a"));
+    hub.publish_now(status("b"));
+    hub.publish_now(press("a"));
     assert_eq!(
         hub.drain(id),
         ["gap:4", "status:5", "frame:4", "status:6", "press:7"]
@@ -193,9 +193,9 @@ fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
     hub.subscribe(id, &wanting(&kinds, Policy::LatestFrames, None))
         .unwrap();
     for number in 0..3 {
-        hub.tell(status("a"));
-        hub.tell(frame("a", number));
-        hub.tell(frame("b", number));
+        hub.publish_now(status("a"));
+        hub.publish_now(frame("a", number));
+        hub.publish_now(frame("b", number));
     }
     assert_eq!(
         hub.drain(id),
@@ -208,16 +208,16 @@ fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
 fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
     let mut hub = hub();
     for _ in 0..10 {
-        hub.tell(press("a"));
+        hub.publish_now(press("a"));
     }
     let (id, _) = hub.join();
-    hub.tell(press("a"));
+    hub.publish_now(press("a"));
     // The default subscription delivered number 11 before the request came.
     assert_eq!(hub.drain(id), ["press:11"]);
-    hub.tell(press("a"));
+    hub.publish_now(press("a"));
     hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
         .unwrap();
-    hub.tell(press("a"));
+    hub.publish_now(press("a"));
     assert_eq!(
         hub.drain(id),
         ["press:8", "press:9", "press:10", "press:12", "press:13"]
@@ -228,8 +228,8 @@ fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
 fn another_subscription_reaches_what_since_asked_for() {
     let mut hub = hub();
     for _ in 0..5 {
-        hub.tell(press("a"));
-        hub.tell(status("a"));
+        hub.publish_now(press("a"));
+        hub.publish_now(status("a"));
     }
     let (id, _) = hub.join();
     hub.subscribe(id, &wanting(&Kinds::NUMBERED, Policy::Queue, Some(0)))
@@ -243,16 +243,16 @@ fn another_subscription_reaches_what_since_asked_for() {
 fn since_older_than_what_is_held_says_how_much_is_gone() {
     let mut hub = hub();
     for _ in 0..HELD + 100 {
-        hub.tell(press("a"));
+        hub.publish_now(press("a"));
     }
     let held = numbers("press", 101..=HELD as u64 + 100);
     let mut check = |kinds: &[Kind], since, lost: &str| {
         let (id, _) = hub.join();
         hub.subscribe(id, &wanting(kinds, Policy::Queue, Some(since)))
             .unwrap();
-        let told = hub.drain(id);
-        assert_eq!(told[0], format!("gap:{lost}"));
-        assert_eq!(told[1..], held);
+        let lines = hub.drain(id);
+        assert_eq!(lines[0], format!("gap:{lost}"));
+        assert_eq!(lines[1..], held);
     };
     check(&Kinds::NUMBERED, 40, "60");
     // The kinds of the 60 events are no longer known.
@@ -263,7 +263,7 @@ fn since_older_than_what_is_held_says_how_much_is_gone() {
 #[test]
 fn since_of_another_run_gives_an_unknown_gap_and_all_that_is_held() {
     let mut hub = hub();
-    hub.tell(press("a"));
+    hub.publish_now(press("a"));
     let (id, _) = hub.join();
     let since = Since {
         run: "0ther".to_owned(),
@@ -290,7 +290,7 @@ fn since_beyond_the_latest_number_is_refused() {
 fn what_is_forgotten_during_a_slow_replay_is_counted() {
     let mut hub = hub();
     for _ in 0..HELD {
-        hub.tell(press("a"));
+        hub.publish_now(press("a"));
     }
     let (id, _) = hub.join();
     hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
@@ -298,12 +298,12 @@ fn what_is_forgotten_during_a_slow_replay_is_counted() {
     let had = hub.take(id).len() as u64;
     assert!((1..1000).contains(&had), "a batch of {had} lines");
     for _ in 0..had + 10 {
-        hub.tell(press("a"));
+        hub.publish_now(press("a"));
     }
-    let told = hub.drain(id);
-    assert_eq!(told[0], "gap:10");
+    let lines = hub.drain(id);
+    assert_eq!(lines[0], "gap:10");
     assert_eq!(
-        told[1..],
+        lines[1..],
         numbers("press", had + 11..=HELD as u64 + had + 10)
     );
 }

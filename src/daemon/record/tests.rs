@@ -35,7 +35,7 @@ fn at(ms: u64) -> Stamp {
 
 /// The count of the recorded inputs, and the numbers of those that follow a gap without a state
 /// between.
-fn told(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
+fn drained(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
     let (mut count, mut bad) = (0, Vec::new());
     let mut next = None;
     for job in inbox {
@@ -68,7 +68,7 @@ fn after_a_gap_comes_a_state() {
     let (sender, inbox) = sync_channel(4);
     let (mut recorder, pipeline) = recorder(sender);
     // The reader takes jobs as fast as they come, so room appears at any moment.
-    let reader = std::thread::spawn(move || told(&inbox));
+    let reader = std::thread::spawn(move || drained(&inbox));
     for number in 0..20_000_u64 {
         let bytes = number.to_le_bytes().to_vec();
         recorder.note(&pipeline, &Input::Bytes(bytes.into()), at(number));

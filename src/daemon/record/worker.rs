@@ -36,7 +36,7 @@ pub(super) struct Worker {
     target: Target,
     about: About,
     dropped: Arc<AtomicU64>,
-    dropped_said: u64,
+    dropped_reported: u64,
     sensors: Vec<Watched>,
     open: Option<Open>,
     /// The time of the next try, if a file should be open and is not.
@@ -84,7 +84,7 @@ impl Worker {
             target,
             about,
             dropped,
-            dropped_said: 0,
+            dropped_reported: 0,
             open: None,
             retry: None,
             paused: false,
@@ -289,7 +289,7 @@ impl Worker {
         let written = self.blackbox(sensor, "asked for");
         match &written {
             Ok(_) => self.sensors[sensor].last_asked = Some(now),
-            Err(reason) => self.say_no_blackbox(sensor, reason),
+            Err(reason) => self.report_no_blackbox(sensor, reason),
         }
         written
     }
@@ -304,11 +304,11 @@ impl Worker {
         }
         self.sensors[sensor].last_fault = Some(now);
         if let Err(reason) = self.blackbox(sensor, fault) {
-            self.say_no_blackbox(sensor, &reason);
+            self.report_no_blackbox(sensor, &reason);
         }
     }
 
-    fn say_no_blackbox(&self, sensor: usize, reason: &NoBlackbox) {
+    fn report_no_blackbox(&self, sensor: usize, reason: &NoBlackbox) {
         let sensor = self.about.sensors[sensor].name();
         warn!(sensor, %reason, "no black box");
     }
@@ -354,10 +354,10 @@ impl Worker {
     /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), Failure> {
         let dropped = self.dropped.load(Ordering::Relaxed);
-        if dropped > self.dropped_said {
-            let count = dropped - self.dropped_said;
+        if dropped > self.dropped_reported {
+            let count = dropped - self.dropped_reported;
             warn!(count, "no room in the recorder's queue: entries dropped");
-            self.dropped_said = dropped;
+            self.dropped_reported = dropped;
         }
         if let Some(open) = &mut self.open {
             open.writer.flush()?;

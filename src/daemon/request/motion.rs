@@ -92,16 +92,16 @@ pub(crate) struct Placed {
 ///
 /// Fails if there are no points or more than [`MOST_POINTS`], or if a point is too far from zero,
 /// more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
-pub(crate) fn placed(told: &[ReportedPoint], now: Stamp) -> Result<Placed, Unusable> {
-    if !(1..=MOST_POINTS).contains(&told.len()) {
-        return Err(Unusable::Count(told.len()));
+pub(crate) fn placed(reported: &[ReportedPoint], now: Stamp) -> Result<Placed, Unusable> {
+    if !(1..=MOST_POINTS).contains(&reported.len()) {
+        return Err(Unusable::Count(reported.len()));
     }
-    let is_converted = told
+    let is_converted = reported
         .iter()
-        .any(|told| matches!(told.at, ReportedTime::Wall(_)));
+        .any(|point| matches!(point.at, ReportedTime::Wall(_)));
     let mono_now = now.mono.as_nanos() as i128;
-    let point = |(index, told): (usize, &ReportedPoint)| {
-        let ReportedPoint { at, mm } = *told;
+    let point = |(index, reported): (usize, &ReportedPoint)| {
+        let ReportedPoint { at, mm } = *reported;
         if mm.is_nan() || mm.abs() > FURTHEST_MM {
             return Err(Unusable::Far { index, mm });
         }
@@ -121,7 +121,7 @@ pub(crate) fn placed(told: &[ReportedPoint], now: Stamp) -> Result<Placed, Unusa
         }
     };
     Ok(Placed {
-        points: told
+        points: reported
             .iter()
             .enumerate()
             .map(point)

@@ -118,13 +118,13 @@ impl Fit {
         let mut different: Vec<f64> = resting.iter().map(|one| one.0).collect();
         different.sort_by(f64::total_cmp);
         different.dedup();
-        let says_power = different.len() >= LEAST_WEIGHTS && heaviest >= LEAST_RATIO * lightest;
+        let shows_power = different.len() >= LEAST_WEIGHTS && heaviest >= LEAST_RATIO * lightest;
         let (least, most) = tare::EXPONENTS;
         let tried =
             (0..=((most - least) / STEP).round() as u32).map(|n| least + f64::from(n) * STEP);
         let errors = tried.map(|exponent| (exponent, scale(&resting, exponent).1));
         let power = errors.min_by(|one, other| one.1.total_cmp(&other.1));
-        let power = power.filter(|_| says_power);
+        let power = power.filter(|_| shows_power);
         let exponent = match power {
             Some((exponent, error))
                 if line_error > LEAST_ERROR && error < MOST_LEFT * line_error =>

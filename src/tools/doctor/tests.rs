@@ -274,9 +274,9 @@ fn what_is_no_serial_port_is_said_to_be_none() {
         (machine.0.path(), "this is a directory"),
         (&machine.path("etc/group"), "this is a regular file"),
     ] {
-        let said = refusal(port).unwrap();
-        assert!(said.starts_with(found), "{said}");
-        assert!(said.contains("not a serial port"), "{said}");
+        let message = refusal(port).unwrap();
+        assert!(message.starts_with(found), "{message}");
+        assert!(message.contains("not a serial port"), "{message}");
     }
     let pty = Pty::open(None).unwrap();
     assert_eq!(refusal(pty.path()), None);

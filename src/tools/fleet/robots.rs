@@ -51,7 +51,7 @@ pub(super) struct Robot {
     /// When its token went.
     pub(super) gone: Option<Stamp>,
     /// The time of the newest word of its token, by CLOCK_MONOTONIC.
-    token_heard: Duration,
+    token_received_at: Duration,
     /// What it last said of itself.
     pub(super) hello: Option<Hello>,
     pub(super) sensors: BTreeMap<String, Sensor>,
@@ -72,13 +72,13 @@ pub(super) struct Robot {
 #[derive(Debug)]
 pub(super) struct Sensor {
     /// When the last word of it came.
-    pub(super) heard: Stamp,
+    pub(super) received_at: Stamp,
     /// JSON, empty before the first.
     pub(super) status: String,
     /// The last final verdict: JSON, empty before the first.
     pub(super) verdict: String,
     /// When that came.
-    pub(super) verdict_heard: Option<Timestamp>,
+    pub(super) verdict_at: Option<Timestamp>,
 }
 
 impl Fleet {
@@ -93,7 +93,7 @@ impl Fleet {
     /// Every token that was there at that time has come. A robot without one is gone.
     fn miss_tokens(&mut self, asked: Stamp) {
         for (site, robot) in &mut self.robots {
-            if robot.is_there && robot.token_heard < asked.mono {
+            if robot.is_there && robot.token_received_at < asked.mono {
                 robot.go(asked);
                 let new = self.new.entry(site.clone()).or_default();
                 new.extend(robot.sensors.keys().cloned());
@@ -116,9 +116,9 @@ impl Fleet {
         let mut about = None;
         match what {
             // It says what was true before something newer came.
-            What::There | What::Came | What::Gone if at.mono < robot.token_heard => return,
+            What::There | What::Came | What::Gone if at.mono < robot.token_received_at => return,
             What::There if robot.is_there => {
-                robot.token_heard = at.mono;
+                robot.token_received_at = at.mono;
                 return;
             }
             What::There | What::Came => robot.come(at),
@@ -129,10 +129,10 @@ impl Fleet {
                 robot.settle_run(None);
             }
             What::Asked => return,
-            What::Event(heard) => {
-                robot.count(&heard);
-                about = Some(heard.sensor.clone());
-                if !robot.sensors.contains_key(&heard.sensor) {
+            What::Event(incoming) => {
+                robot.count(&incoming);
+                about = Some(incoming.sensor.clone());
+                if !robot.sensors.contains_key(&incoming.sensor) {
                     let is_full = robot.sensors.len() == MOST_SENSORS_A_ROBOT;
                     if is_full || self.sensors == MOST_SENSORS {
                         self.left_out += 1;
@@ -140,7 +140,7 @@ impl Fleet {
                     }
                     self.sensors += 1;
                 }
-                robot.hear(heard, at);
+                robot.take_event(incoming, at);
             }
         }
         let new = self.new.entry(site).or_default();
@@ -196,14 +196,14 @@ impl Fleet {
 
 impl Robot {
     fn come(&mut self, at: Stamp) {
-        (self.is_there, self.gone, self.token_heard) = (true, None, at.mono);
+        (self.is_there, self.gone, self.token_received_at) = (true, None, at.mono);
         // Until its hello comes, it may be in another run.
         self.waiting.get_or_insert_default();
         self.claimed = None;
     }
 
     fn go(&mut self, at: Stamp) {
-        (self.is_there, self.token_heard) = (false, at.mono);
+        (self.is_there, self.token_received_at) = (false, at.mono);
         self.gone.get_or_insert(at);
     }
 
@@ -246,17 +246,17 @@ impl Robot {
         self.received += u64::from(numbers.come(number));
     }
 
-    fn count(&mut self, heard: &FleetEvent) {
-        let Some(number) = heard.seq else {
+    fn count(&mut self, incoming: &FleetEvent) {
+        let Some(number) = incoming.seq else {
             return;
         };
         // An answer repeats an event of any age. It is counted if the event itself did not come.
-        if heard.is_answer && self.numbers.is_none() {
+        if incoming.is_answer && self.numbers.is_none() {
             return;
         }
         let numbers = self.numbers.as_ref();
         let is_odd = numbers.is_some_and(|numbers| numbers.is_long_past(number));
-        if is_odd && !heard.is_answer {
+        if is_odd && !incoming.is_answer {
             self.waiting.get_or_insert_default();
         }
         match &mut self.waiting {
@@ -269,29 +269,32 @@ impl Robot {
         }
     }
 
-    fn hear(&mut self, heard: FleetEvent, at: Stamp) {
-        let sensor = self.sensors.entry(heard.sensor).or_insert_with(|| Sensor {
-            heard: at,
-            status: String::new(),
-            verdict: String::new(),
-            verdict_heard: None,
-        });
+    fn take_event(&mut self, incoming: FleetEvent, at: Stamp) {
+        let sensor = self
+            .sensors
+            .entry(incoming.sensor)
+            .or_insert_with(|| Sensor {
+                received_at: at,
+                status: String::new(),
+                verdict: String::new(),
+                verdict_at: None,
+            });
         // An event is never older than an answer. An answer may come from a storage, and repeat what was
         // true long ago.
-        let is_older = |known: &str| heard.is_answer && is_older(&heard.text, known);
-        match heard.kind {
+        let is_older = |known: &str| incoming.is_answer && is_older(&incoming.text, known);
+        match incoming.kind {
             Kind::Status if is_older(&sensor.status) => return,
-            Kind::Status => sensor.status = heard.text,
-            Kind::Hardness if heard.is_final && !is_older(&sensor.verdict) => {
+            Kind::Status => sensor.status = incoming.text,
+            Kind::Hardness if incoming.is_final && !is_older(&sensor.verdict) => {
                 // The time at which a verdict first came stays.
-                if !heard.is_answer || heard.text != sensor.verdict {
-                    sensor.verdict_heard = Some(at.wall);
+                if !incoming.is_answer || incoming.text != sensor.verdict {
+                    sensor.verdict_at = Some(at.wall);
                 }
-                sensor.verdict = heard.text;
+                sensor.verdict = incoming.text;
             }
             Kind::Hardness | Kind::Press | Kind::Frame => {}
         }
-        sensor.heard = at;
+        sensor.received_at = at;
     }
 
     fn settle(&mut self, now: Stamp) -> bool {
@@ -322,7 +325,7 @@ impl Robot {
         if self.gone.is_some() {
             return "gone".to_owned();
         }
-        if now.mono.saturating_sub(sensor.heard.mono) > SILENT {
+        if now.mono.saturating_sub(sensor.received_at.mono) > SILENT {
             return "no answer".to_owned();
         }
         let status = read(&sensor.status);

@@ -358,8 +358,8 @@ fn site(key: &str) -> Option<&str> {
 fn take(sample: &Sample, outlet: &Outlet, is_answer: bool) {
     let key = sample.key_expr().as_str();
     let bytes = sample.payload().to_bytes();
-    if let Some((site, heard)) = event(key, &bytes, is_answer) {
-        outlet.put(site, What::Event(heard));
+    if let Some((site, incoming)) = event(key, &bytes, is_answer) {
+        outlet.put(site, What::Event(incoming));
     } else if let Some((site, hello)) = hello(key, &bytes).filter(|_| is_answer) {
         outlet.put(site, What::Hello(hello));
     }
@@ -394,7 +394,7 @@ fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, Fl
         true => serde_json::from_slice::<Value>(bytes).ok()?.to_string(),
         false => String::new(),
     };
-    let heard = FleetEvent {
+    let incoming = FleetEvent {
         kind,
         sensor: sensor.to_owned(),
         seq: said.seq,
@@ -402,7 +402,7 @@ fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, Fl
         is_answer,
         text,
     };
-    Some((site, heard))
+    Some((site, incoming))
 }
 
 /// The `hello` in an answer at `tactile/SITE`.
@@ -485,12 +485,15 @@ mod tests {
     fn an_event_is_taken_only_from_its_own_key() {
         let verdict = br#"{"type":"hardness","phase":"final",
             "sensor":"palm","seq":7,"label":"firm"}"#;
-        let (site, heard) = event("tactile/hall/3/palm/hardness", verdict, false).unwrap();
+        let (site, incoming) = event("tactile/hall/3/palm/hardness", verdict, false).unwrap();
         assert_eq!(
-            (site, &*heard.sensor, heard.seq),
+            (site, &*incoming.sensor, incoming.seq),
             ("hall/3", "palm", Some(7))
         );
-        assert!(heard.is_final && !heard.text.contains('\n'), "{heard:?}");
+        assert!(
+            incoming.is_final && !incoming.text.contains('\n'),
+            "{incoming:?}"
+        );
         for key in [
             "tactile/hall/3/thumb/hardness",
             "tactile/hall/3/palm/status",

@@ -55,10 +55,10 @@ fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Stamp) -> S
         "restarts": robot.restarts,
         "sensor": of.map(|(name, _)| name),
         "state": sensor.map(|sensor| robot.state(sensor, now)),
-        "heard": sensor.map(|sensor| sensor.heard.wall),
+        "heard": sensor.map(|sensor| sensor.received_at.wall),
         "status": json(|sensor| &sensor.status),
         "verdict_age_s": time(&verdict).map(|then| aged(now, then)),
-        "verdict_heard": sensor.and_then(|sensor| sensor.verdict_heard),
+        "verdict_heard": sensor.and_then(|sensor| sensor.verdict_at),
         "verdict": verdict,
     });
     let mut shown = String::new();
@@ -129,7 +129,7 @@ fn row(site: &str, robot: &Robot, name: &str, sensor: &Sensor, now: Stamp) -> [S
             Some(gone) => format!("gone {}", age(since(now, gone))),
             None => shown(&state),
         },
-        age(since(now, sensor.heard)),
+        age(since(now, sensor.received_at)),
         rate.map_or_else(String::new, |hz| format!("{hz:.1}")),
         damaged.map_or_else(String::new, |damaged| damaged.to_string()),
         judged(&verdict, robot),
@@ -422,18 +422,18 @@ hall/3  palm    live   2 s    20.0      3        #7 fi\u{1b}r\u{202e}m 93 %  12 
     #[test]
     fn an_answer_that_is_older_than_what_is_known_changes_nothing() {
         let mut fleet = fleet();
-        let said = |state: &str, second: u64, seq: Option<u64>| {
+        let with_status = |state: &str, second: u64, seq: Option<u64>| {
             json!({"type": "status", "sensor": "palm", "state": state, "seq": seq,
                 "time": at(second).wall.to_string()})
         };
-        learn(&mut fleet, event(&said("stale", 20, Some(9))), 20);
-        learn(&mut fleet, event(&said("live", 10, None)), 40);
+        learn(&mut fleet, event(&with_status("stale", 20, Some(9))), 20);
+        learn(&mut fleet, event(&with_status("live", 10, None)), 40);
         let line = one_line(&mut fleet, 40);
         assert_eq!(
             (&line["state"], &line["heard"]),
             (&json!("stale"), &json!(at(20).wall.to_string()))
         );
-        learn(&mut fleet, event(&said("stale", 20, None)), 41);
+        learn(&mut fleet, event(&with_status("stale", 20, None)), 41);
         assert_eq!(one_line(&mut fleet, 41)["heard"], at(41).wall.to_string());
     }
 

@@ -13,7 +13,7 @@ use std::time::Duration;
 use rustix::termios::{LocalModes, OptionalActions, Termios};
 use tokio::sync::{mpsc, watch};
 
-use super::{Error, clear, levels, record, said};
+use super::{Error, clear, levels, record, shown};
 use crate::apart::NoThread;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
@@ -140,14 +140,14 @@ impl User<'_> {
         usable: impl Fn(&str) -> Result<T, Unusable>,
     ) -> Option<T> {
         loop {
-            say(&format!("{question}: "));
+            print(&format!("{question}: "));
             let answer = self.line().await?;
             if answer == "q" {
                 return None;
             }
             match usable(&answer) {
                 Ok(answer) => return Some(answer),
-                Err(problem) => say(&format!("{problem}\n")),
+                Err(problem) => print(&format!("{problem}\n")),
             }
         }
     }
@@ -199,7 +199,7 @@ pub(super) async fn run(
     fs::create_dir_all(directory).map_err(|source| listed(directory, source))?;
     let mut list = List::open(directory)?;
     let mut user = User::at_terminal(shutdown)?;
-    say("One recording for each object. `q` ends the session.\n");
+    print("One recording for each object. `q` ends the session.\n");
     let levels = setup.hrn.card().levels.clone();
     let has_limits = levels
         .iter()
@@ -215,7 +215,7 @@ pub(super) async fn run(
     {
         let place = list.take(&object.name)?;
         if place.number != expected {
-            say(&format!(
+            print(&format!(
                 "it is object {}, because another session took a number\n",
                 place.number
             ));
@@ -228,8 +228,8 @@ pub(super) async fn run(
         log.flush();
         asked = asked.filter(|_| is_next);
     }
-    let directory = said(directory);
-    say(&format!(
+    let directory = shown(directory);
+    print(&format!(
         "\nrecorded {} object{} in this session; next: hrn-train collect --out D.npz {directory}/*.mcap\n",
         list.added,
         if list.added == 1 { "" } else { "s" },
@@ -239,7 +239,7 @@ pub(super) async fn run(
 
 /// Whether the levels come from a durometer. `None` if the user quits.
 async fn ask_for_durometer(user: &mut User<'_>) -> Option<bool> {
-    say("\nDo you have a Shore OO durometer? y: it asks for readings, n: it asks for levels ");
+    print("\nDo you have a Shore OO durometer? y: it asks for readings, n: it asks for levels ");
     let _keys = Keys::begin();
     loop {
         let answer = match user.key().await? {
@@ -248,7 +248,7 @@ async fn ask_for_durometer(user: &mut User<'_>) -> Option<bool> {
             'q' => None,
             _ => continue,
         };
-        say("\n");
+        print("\n");
         return answer;
     }
 }
@@ -276,7 +276,7 @@ async fn ask_for_object(
                 Ok((reading.to_owned(), level))
             })
             .await?;
-        say(&format!("level {} ({})\n", level.level, level.label));
+        print(&format!("level {} ({})\n", level.level, level.label));
         (Some(shore), level.level)
     } else {
         let question = format!(
@@ -351,7 +351,7 @@ async fn record_object(
     let shore = object.shore.clone();
     labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
     loop {
-        say("do not touch the sensor until the zero is taken\n");
+        print("do not touch the sensor until the zero is taken\n");
         let mut next = Next::KeepAndQuit;
         let (progress, mut counted) = watch::channel(Progress::default());
         let recorded = {
@@ -382,8 +382,8 @@ async fn record_object(
         match next {
             _ if is_kept => return Ok(matches!(next, Next::Keep)),
             Next::KeepAndQuit => return Ok(false),
-            Next::Redo => say(&format!("again: {}\n", said(Path::new(&object.name)))),
-            Next::Keep => say("no press was recorded: again\n"),
+            Next::Redo => print(&format!("again: {}\n", shown(Path::new(&object.name)))),
+            Next::Keep => print("no press was recorded: again\n"),
         }
         // The file stays, because it keeps the number from other sessions.
         let emptied = file.set_len(0).and_then(|()| (&file).rewind());
@@ -408,7 +408,7 @@ async fn wait_for_user(user: &mut User<'_>, counted: &mut watch::Receiver<Progre
         } else {
             format!("presses: {presses}; Enter: next object, r: redo this one, q: quit")
         };
-        say(&format!("\r\x1b[K{line} "));
+        print(&format!("\r\x1b[K{line} "));
         tokio::select! {
             key = user.key() => match key {
                 Some('\n') => return Next::Keep,
@@ -423,7 +423,7 @@ async fn wait_for_user(user: &mut User<'_>, counted: &mut watch::Receiver<Progre
 
 /// Writes to the terminal. Errors are ignored: if the terminal has gone, its signal ends the
 /// session.
-fn say(text: &str) {
+fn print(text: &str) {
     let mut stderr = io::stderr();
     let _ = stderr.write_all(text.as_bytes());
     let _ = stderr.flush();

@@ -61,7 +61,7 @@ fn glove(bytes: &[u8]) -> Option<Found> {
     };
     let array = Layout::new(&settings).ok()?.array();
     let proposal = Proposal::decoded(settings, bytes)?;
-    Some(Found::said(array, Some(Cell::U8), proposal))
+    Some(Found::stated(array, Some(Cell::U8), proposal))
 }
 
 /// Of several failures, the one with the highest rank says most.

@@ -109,7 +109,7 @@ impl Found {
     }
 
     /// A layout whose array the bytes say.
-    pub(super) fn said(array: Array, cell: Option<Cell>, proposal: Proposal) -> Self {
+    pub(super) fn stated(array: Array, cell: Option<Cell>, proposal: Proposal) -> Self {
         let best = Shown {
             array,
             cell,

@@ -132,18 +132,21 @@ fn the_toml_has_the_fewest_keys_and_says_what_is_left_open() {
         ..Settings::default()
     };
     let (_, bytes) = played(&Layout::new(&settings).unwrap());
-    let said = words(&find(&bytes, Known::default()).unwrap());
-    assert!(said.starts_with("# x\\n[y].bin: 1 bytes\n"), "{said}");
-    assert!(said.contains("\n# 28x28 u8: its picture is "), "{said}");
+    let message = words(&find(&bytes, Known::default()).unwrap());
+    assert!(message.starts_with("# x\\n[y].bin: 1 bytes\n"), "{message}");
+    assert!(
+        message.contains("\n# 28x28 u8: its picture is "),
+        "{message}"
+    );
     let end = "[sensor.frame]\npreset = \"jx255n\"\nsync = \"A5 5A\"\n";
-    assert!(said.ends_with(end), "{said}");
-    assert!(!said.contains("switched on"), "{said}");
+    assert!(message.ends_with(end), "{message}");
+    assert!(!message.contains("switched on"), "{message}");
     // Without a checksum, a header and a tail look the same in the middle of a stream.
     let (_, bytes) = played(&Layout::new(&preset(Preset::JqTail)).unwrap());
-    let said = words(&find(&bytes[300..], Known::default()).unwrap());
+    let message = words(&find(&bytes[300..], Known::default()).unwrap());
     assert!(
-        said.contains("switched on") && said.ends_with("preset = \"jq\"\n"),
-        "{said}"
+        message.contains("switched on") && message.ends_with("preset = \"jq\"\n"),
+        "{message}"
     );
 }
 
@@ -157,14 +160,14 @@ fn a_clock_after_the_cells_is_said_and_skipped() {
         let end = bytes.len();
         bytes[end - 4..].copy_from_slice(&(32 * time).to_le_bytes());
     }
-    let said = words(&find(&bytes, Known::default()).unwrap());
+    let message = words(&find(&bytes, Known::default()).unwrap());
     assert!(
-        said.contains(" grows by about 32 a frame: a clock"),
-        "{said}"
+        message.contains(" grows by about 32 a frame: a clock"),
+        "{message}"
     );
     assert!(
-        said.ends_with("[sensor.frame]\npreset = \"m1616\"\n"),
-        "{said}"
+        message.ends_with("[sensor.frame]\npreset = \"m1616\"\n"),
+        "{message}"
     );
 }
 
@@ -195,8 +198,11 @@ fn what_the_user_knows_decides() {
 fn each_failure_has_its_own_message() {
     let check = |bytes: &[u8], part: &str| {
         let failure = find(bytes, Known::default()).unwrap_err();
-        let said = failure.to_string();
-        assert!(said.contains(part) && !said.contains('\n'), "{said}");
+        let message = failure.to_string();
+        assert!(
+            message.contains(part) && !message.contains('\n'),
+            "{message}"
+        );
     };
     check(b"", "nothing arrives");
     check(

@@ -159,7 +159,7 @@ fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
         .then(|| sized(Preset::Ascii, array, bytes))
         .flatten();
     let no_array = || Failure::Text("its blocks of lines are not frames of one array".to_owned());
-    Ok(Found::said(array, None, proposal.ok_or_else(no_array)?))
+    Ok(Found::stated(array, None, proposal.ok_or_else(no_array)?))
 }
 
 /// The number of lines after which a line is like this one, if that is more than one.

@@ -41,19 +41,19 @@ fn at(ms: u64) -> Stamp {
 }
 
 /// A view that has received `events` without delay, each at its time in ms.
-fn told(events: &[(u64, Value)]) -> View {
+fn view_of(events: &[(u64, Value)]) -> View {
     let mut view = View::new();
     for (ms, event) in events {
-        hear(&mut view, *ms, event.clone());
+        take_event(&mut view, *ms, event.clone());
     }
     view
 }
 
-fn hear(view: &mut View, ms: u64, mut event: Value) {
+fn take_event(view: &mut View, ms: u64, mut event: Value) {
     if event["sensor"].is_string() && event["time"].is_null() {
         event["time"] = json!(at(ms).wall.to_string());
     }
-    view.hear(&event.to_string(), at(ms));
+    view.take_line(&event.to_string(), at(ms));
 }
 
 fn hello(run: &str, sensors: &[&str]) -> Value {
@@ -89,7 +89,7 @@ fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
 
 /// A view of one sensor that is live and has been pressed.
 fn pressed_sensor() -> View {
-    told(&[
+    view_of(&[
         (0, hello("a", &["forearm"])),
         (0, status("forearm", "live")),
         (
@@ -123,13 +123,13 @@ fn shown(view: &View, ms: u64, size: (u16, u16), look: Look) -> String {
 
 #[test]
 fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
-    let mut view = told(&[
+    let mut view = view_of(&[
         (0, hello("a", &["forearm"])),
         (0, status("forearm", "live")),
     ]);
     let mut late = frame("forearm", 1.0, 5);
     late["time"] = json!(at(1_000).wall.to_string());
-    hear(&mut view, 3_500, late);
+    take_event(&mut view, 3_500, late);
     let frame = view.sensor().unwrap().frame.as_ref().unwrap();
     assert_eq!(frame.at, at(1_000).mono);
     let text = shown(&view, 3_600, (80, 24), PLAIN);
@@ -149,7 +149,7 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
         assert!(silent.contains("no answer for 3.1 s"), "{silent}");
         let mut other = hello("b", &["forearm"]);
         other["protocol"] = json!(2);
-        hear(&mut view, 4_000, other);
+        take_event(&mut view, 4_000, other);
         let refused = text(&view, 4_100);
         for part in ["NO DAEMON", "found protocol 2, expected 1"] {
             assert!(refused.contains(part), "{refused}");
@@ -171,7 +171,7 @@ fn what_is_not_live_is_not_shown_as_present() {
     }
     let lost = |state: &str, word: &str| {
         let mut view = pressed_sensor();
-        hear(&mut view, 2_000, status("forearm", state));
+        take_event(&mut view, 2_000, status("forearm", state));
         (view, word.to_owned())
     };
     let mut gone = pressed_sensor();
@@ -212,12 +212,12 @@ fn what_is_not_live_is_not_shown_as_present() {
 
 #[test]
 fn a_curve_has_holes_where_there_was_no_frame() {
-    let mut view = told(&[
+    let mut view = view_of(&[
         (0, hello("a", &["forearm"])),
         (0, status("forearm", "live")),
     ]);
     for (ms, newtons) in [(5_050, 1.0), (10_050, 2.0), (10_150, 3.0)] {
-        hear(&mut view, ms, frame("forearm", newtons, 1));
+        take_event(&mut view, ms, frame("forearm", newtons, 1));
     }
     let sensor = view.sensor().unwrap();
     // The spans are one second long, up to 30 s. A frame is current for 2.5 periods of 0.2 s.
@@ -238,12 +238,12 @@ fn a_curve_has_holes_where_there_was_no_frame() {
 
 #[test]
 fn a_bar_is_as_high_as_its_share_of_the_highest() {
-    let mut view = told(&[
+    let mut view = view_of(&[
         (0, hello("a", &["forearm"])),
         (0, status("forearm", "live")),
     ]);
     for (ms, newtons) in [(10_000, 2.0), (20_000, 1.25), (29_950, 0.5)] {
-        hear(&mut view, ms, frame("forearm", newtons, 1));
+        take_event(&mut view, ms, frame("forearm", newtons, 1));
     }
     // The bars of the force from left to right, each with its symbols from the lowest row to the
     // highest.
@@ -284,10 +284,10 @@ fn a_bar_is_as_high_as_its_share_of_the_highest() {
 #[test]
 fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
     let mut view = pressed_sensor();
-    hear(&mut view, 9_000, verdict(4, None, Some("low_force")));
+    take_event(&mut view, 9_000, verdict(4, None, Some("low_force")));
     // `get last` repeats the verdict after a break.
-    hear(&mut view, 9_100, verdict(4, None, Some("low_force")));
-    hear(&mut view, 9_100, status("forearm", "live"));
+    take_event(&mut view, 9_100, verdict(4, None, Some("low_force")));
+    take_event(&mut view, 9_100, status("forearm", "live"));
     let text = shown(&view, 10_200, (80, 24), PLAIN);
     let lines: Vec<&str> = text
         .lines()
@@ -311,7 +311,7 @@ fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
 
 #[test]
 fn every_sensor_has_its_link_in_view_and_its_picture_by_a_key() {
-    let mut view = told(&[
+    let mut view = view_of(&[
         (0, hello("a", &["forearm", "wrist", "palm"])),
         (0, status("forearm", "live")),
         (0, status("wrist", "lost")),
@@ -345,10 +345,10 @@ fn another_run_begins_from_nothing_and_the_same_goes_on() {
         text.contains("NO DAEMON") && text.contains("no such file"),
         "{text}"
     );
-    hear(&mut view, 500, hello("a", &["forearm"]));
+    take_event(&mut view, 500, hello("a", &["forearm"]));
     assert_eq!(view.sensor().unwrap().verdicts.len(), 1);
     view.lose(Loss::Closed);
-    hear(&mut view, 600, hello("b", &["wrist", "forearm"]));
+    take_event(&mut view, 600, hello("b", &["wrist", "forearm"]));
     assert_eq!(
         (view.sensors.len(), view.chosen),
         (2, 1),
@@ -362,7 +362,7 @@ fn another_run_begins_from_nothing_and_the_same_goes_on() {
 #[test]
 fn a_daemon_without_room_is_quoted() {
     let mut view = View::new();
-    hear(
+    take_event(
         &mut view,
         0,
         json!({"type": "error", "message": "too many subscribers (256)"}),
@@ -378,11 +378,11 @@ fn a_daemon_without_room_is_quoted() {
 #[test]
 fn missed_events_are_counted_until_their_number_is_unknown() {
     let mut view = pressed_sensor();
-    hear(&mut view, 300, json!({"type": "gap", "lost": 4}));
-    hear(&mut view, 300, json!({"type": "gap", "lost": 3}));
+    take_event(&mut view, 300, json!({"type": "gap", "lost": 4}));
+    take_event(&mut view, 300, json!({"type": "gap", "lost": 3}));
     assert_eq!(view.missed, Some(7));
-    hear(&mut view, 300, json!({"type": "gap", "lost": null}));
-    hear(&mut view, 300, json!({"type": "gap", "lost": 1}));
+    take_event(&mut view, 300, json!({"type": "gap", "lost": null}));
+    take_event(&mut view, 300, json!({"type": "gap", "lost": 1}));
     assert_eq!(view.missed, None);
 }
 
@@ -394,19 +394,19 @@ fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_writt
     assert!(text.contains("@@@@@@@@"), "{text}");
     let mut named = hello("a", &["forearm"]);
     named["robot"] = json!("b\u{e4}r-7");
-    let named = told(&[(0, named)]);
+    let named = view_of(&[(0, named)]);
     assert!(shown(&named, 0, (80, 24), PLAIN).starts_with("b?r-7 "));
     assert!(shown(&named, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
     let mut turned = hello("a", &["forearm"]);
     turned["robot"] = json!("b\u{202e}r-7");
-    let turned = told(&[(0, turned)]);
+    let turned = view_of(&[(0, turned)]);
     assert!(shown(&turned, 0, (80, 24), COLOURS).starts_with("br-7 "));
 }
 
 #[test]
 fn every_size_is_drawn_and_says_what_holds() {
     let mut view = pressed_sensor();
-    hear(&mut view, 2_000, status("forearm", "stale"));
+    take_event(&mut view, 2_000, status("forearm", "stale"));
     for width in 1..=130 {
         for height in 1..=50 {
             for look in [COLOURS, PLAIN] {
@@ -428,7 +428,7 @@ fn a_small_array_is_drawn_alone() {
     hello["sensors"][0]["cols"] = json!(6);
     let mut newtons = vec![0.0; 24];
     newtons[23] = 1.0;
-    let view = told(&[
+    let view = view_of(&[
         (0, hello),
         (0, status("forearm", "live")),
         (
@@ -508,9 +508,9 @@ fn a_panic_gives_the_terminal_back() {
     let length = rustix::io::read(&master, &mut written).unwrap();
     let written = String::from_utf8_lossy(&written[..length]);
     let given_back = written.find("\x1b[?1049l").unwrap();
-    let told = written.find("on purpose").unwrap();
+    let view_of = written.find("on purpose").unwrap();
     assert!(
-        given_back < told,
+        given_back < view_of,
         "the message vanishes with the screen: {written:?}"
     );
     let modes = rustix::termios::tcgetattr(&device).unwrap();
@@ -524,9 +524,9 @@ fn a_panic_gives_the_terminal_back() {
 #[test]
 fn a_soft_touch_is_seen_after_a_hard_one() {
     let mut view = pressed_sensor();
-    hear(&mut view, 200, frame("forearm", 4.6, 3));
+    take_event(&mut view, 200, frame("forearm", 4.6, 3));
     // The force is little more than the usual contact threshold.
-    hear(&mut view, 300, frame("forearm", 0.08, 12));
+    take_event(&mut view, 300, frame("forearm", 0.08, 12));
     let text = shown(&view, 400, (80, 24), PLAIN);
     assert!(text.contains("::::::::::::"), "{text}");
 }
@@ -535,7 +535,7 @@ fn a_soft_touch_is_seen_after_a_hard_one() {
 fn curves_begin_with_what_was_before_the_connection() {
     let history = json!({"type": "history", "sensor": "forearm", "time": null,
         "points": [[2.0, 10.0, 20], [1.0, 5.0, 9], [0.0, 8.0, 15]]});
-    let view = told(&[
+    let view = view_of(&[
         (0, hello("a", &["forearm"])),
         (0, status("forearm", "live")),
         (9_000, frame("forearm", 1.5, 8)),
@@ -552,7 +552,7 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
     let mut view = View::new();
     let mut first = hello("a", &["forearm"]);
     first["seq"] = json!(40);
-    let asked = view.hear(&first.to_string(), at(0)).unwrap();
+    let asked = view.take_line(&first.to_string(), at(0)).unwrap();
     let asked: Vec<Value> = asked
         .lines()
         .map(|line| serde_json::from_str(line).unwrap())
@@ -581,7 +581,7 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
         numbered(press(9, "end"), 37),
         numbered(verdict(9, Some(2), None), 38),
     ] {
-        hear(&mut view, 100, event);
+        take_event(&mut view, 100, event);
     }
     let sensor = view.sensor().unwrap();
     let presses: Vec<u64> = sensor.verdicts.iter().map(|one| one.press).collect();
@@ -589,10 +589,10 @@ fn what_was_before_is_asked_for_and_stands_in_order() {
     assert_eq!(sensor.press.as_ref().unwrap().state, "end");
     assert_eq!(view.missed, Some(0), "nobody was there to miss it");
     // After that, a gap counts as missed. After a break, the view asks from its last event on.
-    hear(&mut view, 200, numbered(press(10, "begin"), 41));
-    hear(&mut view, 200, json!({"type": "gap", "lost": 2}));
+    take_event(&mut view, 200, numbered(press(10, "begin"), 41));
+    take_event(&mut view, 200, json!({"type": "gap", "lost": 2}));
     assert_eq!(view.missed, Some(2));
-    let asked = view.hear(&first.to_string(), at(300)).unwrap();
+    let asked = view.take_line(&first.to_string(), at(300)).unwrap();
     assert!(asked.contains("\"since\":\"a:41\""), "{asked}");
 }
 
@@ -602,7 +602,7 @@ fn lost_says_unplugged_where_it_is() {
         let mut view = pressed_sensor();
         let mut status = status("forearm", "lost");
         status["reason"] = json!(reason);
-        hear(&mut view, 1_000, status);
+        take_event(&mut view, 1_000, status);
         shown(&view, 1_100, (120, 24), PLAIN)
     };
     for reason in [
@@ -658,14 +658,14 @@ fn a_large_terminal_is_used() {
 fn a_frame_of_a_machine_with_another_clock_is_new() {
     let mut view = View::new();
     view.wait("robot:8255".to_owned(), Clock::Theirs, at(0).mono);
-    hear(&mut view, 0, hello("a", &["forearm"]));
-    hear(&mut view, 0, status("forearm", "live"));
+    take_event(&mut view, 0, hello("a", &["forearm"]));
+    take_event(&mut view, 0, status("forearm", "live"));
     // The other clock is an hour behind. The frames take 10 and 30 ms.
     for (ms, delay) in [(200, 10), (400, 30)] {
         let mut event = frame("forearm", 1.0, 5);
         let there = at(ms - delay).wall - jiff::SignedDuration::from_hours(1);
         event["time"] = json!(there.to_string());
-        hear(&mut view, ms, event);
+        take_event(&mut view, ms, event);
     }
     let frame = view.sensor().unwrap().frame.as_ref().unwrap();
     assert_eq!(frame.at, at(380).mono);
@@ -673,7 +673,7 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
 
 #[test]
 fn force_stands_against_approach_where_the_robot_tells_it() {
-    let mut view = told(&[
+    let mut view = view_of(&[
         (0, hello("r", &["forearm"])),
         (0, status("forearm", "live")),
     ]);
@@ -684,29 +684,29 @@ fn force_stands_against_approach_where_the_robot_tells_it() {
         event
     };
     let size = (100, 40);
-    hear(&mut view, 200, at_mm(0.5, json!(null)));
+    take_event(&mut view, 200, at_mm(0.5, json!(null)));
     assert!(!shown(&view, 200, size, COLOURS).contains("approach"));
-    hear(&mut view, 400, at_mm(0.5, json!(0.0)));
-    hear(&mut view, 400, press("begin"));
-    hear(&mut view, 600, at_mm(1.0, json!(1.2)));
-    hear(&mut view, 800, at_mm(2.0, json!(2.4)));
-    hear(&mut view, 900, press("end"));
+    take_event(&mut view, 400, at_mm(0.5, json!(0.0)));
+    take_event(&mut view, 400, press("begin"));
+    take_event(&mut view, 600, at_mm(1.0, json!(1.2)));
+    take_event(&mut view, 800, at_mm(2.0, json!(2.4)));
+    take_event(&mut view, 900, press("end"));
     let expected = "force against approach  to 2.4 mm, to 18 N";
     let text = shown(&view, 900, size, COLOURS);
     assert!(text.contains(expected), "{text}");
     // The curve of the last press stays until another press begins.
-    hear(&mut view, 3000, at_mm(0.5, json!(null)));
+    take_event(&mut view, 3000, at_mm(0.5, json!(null)));
     assert!(shown(&view, 3000, size, PLAIN).contains(expected));
-    hear(&mut view, 3200, at_mm(0.1, json!(0.0)));
-    hear(&mut view, 3200, press("begin"));
-    hear(&mut view, 3400, at_mm(0.2, json!(0.5)));
+    take_event(&mut view, 3200, at_mm(0.1, json!(0.0)));
+    take_event(&mut view, 3200, press("begin"));
+    take_event(&mut view, 3400, at_mm(0.2, json!(0.5)));
     assert!(shown(&view, 3400, size, PLAIN).contains("to 0.5 mm, to 2 N"));
-    hear(&mut view, 3500, press("end"));
+    take_event(&mut view, 3500, press("end"));
     // Usually, the approach of a press's first frame is not known yet.
-    hear(&mut view, 5000, at_mm(0.1, json!(null)));
-    hear(&mut view, 5000, press("begin"));
-    hear(&mut view, 5200, at_mm(0.1, json!(0.2)));
-    hear(&mut view, 5400, at_mm(0.1, json!(0.3)));
+    take_event(&mut view, 5000, at_mm(0.1, json!(null)));
+    take_event(&mut view, 5000, press("begin"));
+    take_event(&mut view, 5200, at_mm(0.1, json!(0.2)));
+    take_event(&mut view, 5400, at_mm(0.1, json!(0.3)));
     let text = shown(&view, 5400, size, PLAIN);
     assert!(text.contains("to 0.3 mm, to 1 N"), "{text}");
     every_size_of(&view);

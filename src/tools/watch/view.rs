@@ -37,7 +37,7 @@ pub(super) struct View {
     pub(super) address: String,
     daemon: Daemon,
     /// The moment of the daemon's last line, or of the connection.
-    heard: Duration,
+    last_line: Duration,
     /// The number of events that the daemon dropped. `None` if unknown.
     pub(super) missed: Option<u64>,
     /// The number of the last event of this run that was received.
@@ -138,7 +138,7 @@ impl View {
             chosen: 0,
             address: String::new(),
             daemon: Daemon::Absent("connecting".to_owned()),
-            heard: Duration::ZERO,
+            last_line: Duration::ZERO,
             missed: Some(0),
             seq: 0,
             catching_up: None,
@@ -149,9 +149,9 @@ impl View {
 
     /// Takes in a line of the daemon, read at `now`. Ignores an unknown line. The caller must send
     /// the returned requests to the daemon.
-    pub(super) fn hear(&mut self, line: &str, now: Stamp) -> Option<String> {
+    pub(super) fn take_line(&mut self, line: &str, now: Stamp) -> Option<String> {
         let event = serde_json::from_str::<Value>(line).ok()?;
-        self.heard = now.mono;
+        self.last_line = now.mono;
         match text(&event, "type").as_str() {
             "hello" => return self.meet(&event),
             "gap" if self.catching_up.is_some() => self.catching_up = None,
@@ -172,7 +172,7 @@ impl View {
                 let at = self.moment(&event, kind, now);
                 let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
                 if let Some(sensor) = self.sensors.iter_mut().find(|one| one.name == name) {
-                    sensor.hear(kind, &event, at, labels);
+                    sensor.take_event(kind, &event, at, labels);
                 }
             }
         }
@@ -197,7 +197,7 @@ impl View {
     /// Takes in that something at `address` has accepted the connection at `now`. It has as long to
     /// send `hello` as a daemon has to answer.
     pub(super) fn wait(&mut self, address: String, clock: Clock, now: Duration) {
-        self.heard = now;
+        self.last_line = now;
         self.address = address;
         (self.clock, self.behind) = (clock, None);
         self.daemon = Daemon::Unknown(self.absence().to_owned());
@@ -290,7 +290,7 @@ impl View {
 
     /// The state that holds for all sensors because of the daemon, with its reason.
     pub(super) fn trouble(&self, now: Duration) -> Option<(Link, String)> {
-        let silence = now.saturating_sub(self.heard);
+        let silence = now.saturating_sub(self.last_line);
         match &self.daemon {
             Daemon::Absent(reason) => Some((Link::NoDaemon, reason.clone())),
             Daemon::Unknown(_) | Daemon::Met if silence > SILENCE => {

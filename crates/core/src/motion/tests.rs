@@ -54,11 +54,11 @@ fn a_delay_looks_that_much_earlier() {
     }
     track.push(&points).unwrap();
     let moments = [at(900), at(1000), at(1100), at(1200)];
-    let told = |delay_ms| track.approach(at(900), &moments, delay_ms).unwrap();
-    let values = |told: Vec<Option<f64>>| told.into_iter().map(|mm| mm.unwrap().round());
-    assert!(values(told(0.0)).eq([0.0, 1.0, 1.0, 1.0]));
-    assert!(values(told(100.0)).eq([0.0, 1.0, 2.0, 2.0]));
-    assert!(values(told(-100.0)).eq([0.0, 0.0, 0.0, 0.0]));
+    let reported = |delay_ms| track.approach(at(900), &moments, delay_ms).unwrap();
+    let values = |reported: Vec<Option<f64>>| reported.into_iter().map(|mm| mm.unwrap().round());
+    assert!(values(reported(0.0)).eq([0.0, 1.0, 1.0, 1.0]));
+    assert!(values(reported(100.0)).eq([0.0, 1.0, 2.0, 2.0]));
+    assert!(values(reported(-100.0)).eq([0.0, 0.0, 0.0, 0.0]));
 }
 
 #[test]
@@ -153,9 +153,9 @@ fn a_minute_is_held() {
     track.push(&steady(0, 61_000, 50)).unwrap();
     assert_eq!(track.approach(at(900), &[at(1200)], 0.0), None);
     assert!(track.approach(at(1100), &[at(1200)], 0.0).is_some());
-    assert!(track.is_told(at(120_000), 0.0));
-    assert!(!track.is_told(at(121_001), 0.0));
-    assert!(!Track::default().is_told(at(0), 0.0));
+    assert!(track.is_reported(at(120_000), 0.0));
+    assert!(!track.is_reported(at(121_001), 0.0));
+    assert!(!Track::default().is_reported(at(0), 0.0));
 }
 
 #[test]
@@ -187,7 +187,7 @@ fn a_point_after_its_final_verdict_is_late() {
 }
 
 /// Positions as a robot may send them: mostly in order, with gaps, jumps and steps back.
-fn told() -> impl Strategy<Value = Vec<Point>> {
+fn reported() -> impl Strategy<Value = Vec<Point>> {
     let step = prop_oneof![
         8 => 1..100_i64,
         1 => 200..400_i64,
@@ -208,7 +208,7 @@ fn told() -> impl Strategy<Value = Vec<Point>> {
 proptest! {
     #[test]
     fn whatever_is_told_the_approach_is_between_told_positions_or_unknown(
-        points in told(),
+        points in reported(),
         cuts in prop::collection::vec(0..200_usize, 0..8),
         begin in 0..6000_u64,
         frames in prop::collection::vec(1..300_u64, 1..40),
@@ -231,10 +231,10 @@ proptest! {
         }
         prop_assert_eq!(&whole, &cut);
 
-        let told = whole.approach(at(begin), &moments, 0.0);
+        let reported = whole.approach(at(begin), &moments, 0.0);
         // A recording, which holds fewer points, gives the same answer.
-        prop_assert_eq!(&whole.since(at(begin)).approach(at(begin), &moments, 0.0), &told);
-        let Some(told) = told else { return Ok(()) };
+        prop_assert_eq!(&whole.since(at(begin)).approach(at(begin), &moments, 0.0), &reported);
+        let Some(reported) = reported else { return Ok(()) };
         let last = moments[moments.len() - 1].as_nanos() as i64;
         let near = |ns: i64| points.iter().any(|p| (p.at_ns - ns).abs() <= LONGEST_GAP_NS);
         prop_assert!(near(begin as i64 * MS) && near(last));
@@ -248,10 +248,10 @@ proptest! {
         let (low, high) = points.iter().fold((f64::MAX, f64::MIN), |(low, high), p| {
             (low.min(p.mm), high.max(p.mm))
         });
-        prop_assert_eq!(told[0], Some(0.0));
-        for (moment, mm) in moments.iter().zip(&told) {
-            let is_told = whole.points.back().is_some_and(|p| p.at_ns >= moment.as_nanos() as i64);
-            prop_assert_eq!(mm.is_some(), is_told);
+        prop_assert_eq!(reported[0], Some(0.0));
+        for (moment, mm) in moments.iter().zip(&reported) {
+            let is_reported = whole.points.back().is_some_and(|p| p.at_ns >= moment.as_nanos() as i64);
+            prop_assert_eq!(mm.is_some(), is_reported);
             prop_assert!(mm.is_none_or(|mm| mm.abs() <= high - low + 1e-9));
         }
     }

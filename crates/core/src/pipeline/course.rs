@@ -47,7 +47,7 @@ impl<'a> PressWithApproach<'a> {
 
     /// Forgets an approach that says nothing.
     fn or_nothing(mut self) -> Self {
-        if !says_something(&self.approach_mm, self.best) {
+        if !is_informative(&self.approach_mm, self.best) {
             self.approach_mm.fill(None);
             self.rests_on = event::ApproachSource::None;
         }
@@ -134,7 +134,7 @@ fn held(forces_n: &[f64]) -> usize {
 
 /// Whether an approach is known at two frames up to the best one, or up to the second frame if the
 /// first is the best. It is 0 at the first frame, so it says nothing if it is known there alone.
-pub fn says_something(approach_mm: &[Option<f64>], best: usize) -> bool {
+pub fn is_informative(approach_mm: &[Option<f64>], best: usize) -> bool {
     let places = best.max(1) + 1;
     approach_mm.iter().take(places).flatten().count() >= 2
 }
@@ -160,9 +160,10 @@ pub fn approach_speed_mm_s(
     context: Option<&serde_json::Value>,
     arm: &motion::Settings,
 ) -> Option<f64> {
-    let said = context.and_then(|context| context.get("speed_mm_s")?.as_f64());
+    let message = context.and_then(|context| context.get("speed_mm_s")?.as_f64());
     let (least, most) = SPEEDS_MM_S;
-    said.or(arm.speed_mm_s)
+    message
+        .or(arm.speed_mm_s)
         .filter(|speed| (least..=most).contains(speed))
 }
 
@@ -192,7 +193,7 @@ impl Pipeline {
         let moments = known.moments();
         let (begin, last) = (moments[0], moments[moments.len() - 1]);
         let delay_ms = self.sensor.description().arm.delay_ms;
-        if self.track.is_told(last, delay_ms) {
+        if self.track.is_reported(last, delay_ms) {
             if let Some(approach_mm) = self.track.approach(begin, &moments, delay_ms) {
                 known.approach_mm = approach_mm;
                 known.rests_on = event::ApproachSource::Positions;

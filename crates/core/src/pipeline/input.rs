@@ -83,7 +83,7 @@ impl Input<'_> {
 
 impl Pipeline {
     /// Takes an input that came at `at`, and returns its events. A refused tare and a step back in
-    /// time are not reported: see [`Pipeline::retare`] and [`Pipeline::tell`].
+    /// time are not reported: see [`Pipeline::retare`] and [`Pipeline::add_positions`].
     pub fn take(&mut self, input: Input<'_>, at: Stamp) -> Vec<Event> {
         match input {
             Input::Opened => return self.opened(at),
@@ -99,7 +99,7 @@ impl Pipeline {
             Input::Context(context) => self.set_context(context),
             // Points after a step back are taken in too.
             Input::Motion(points) => {
-                let _ = self.tell(&points);
+                let _ = self.add_positions(&points);
             }
             Input::ClockSet(until_ns) => self.clock_set(until_ns),
         }

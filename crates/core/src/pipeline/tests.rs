@@ -166,15 +166,18 @@ fn a_press_that_timed_out_is_no_reason_against_a_tare() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
     let drift = raw(784 - 400, 3);
-    let told = play(&mut pipeline, 5, &vec![drift.clone(); 160]);
-    assert!(told.contains(&"End 1 (timeout)".to_owned()), "{told:?}");
+    let published = play(&mut pipeline, 5, &vec![drift.clone(); 160]);
+    assert!(
+        published.contains(&"End 1 (timeout)".to_owned()),
+        "{published:?}"
+    );
     assert_eq!(pipeline.retare(), Ok(()));
     play(&mut pipeline, 165, &vec![drift.clone(); 5]);
     assert!(matches!(pipeline.retared(), Some(Ok(_))));
     let mut pressed = drift.clone();
     pressed.counts[400..409].fill(53);
-    let told = play(&mut pipeline, 170, &[drift.clone(), drift, pressed]);
-    assert_eq!(told, ["Begin 2"], "the baseline is the drift's");
+    let published = play(&mut pipeline, 170, &[drift.clone(), drift, pressed]);
+    assert_eq!(published, ["Begin 2"], "the baseline is the drift's");
 }
 
 #[test]
@@ -238,18 +241,18 @@ fn the_context_stays_until_it_changes() {
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
     let context = serde_json::json!({"tag": "pick-17"});
     pipeline.set_context(Some(context.clone()));
-    let mut told = Vec::new();
+    let mut published = Vec::new();
     for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
         let bytes = bytes(&pipeline, &raw);
         for event in pipeline.push(&bytes, at(number * 200)) {
             match event {
-                Event::Press(press) => told.push(press.context),
-                Event::Hardness(verdict) => told.push(verdict.context),
+                Event::Press(press) => published.push(press.context),
+                Event::Hardness(verdict) => published.push(verdict.context),
                 _ => {}
             }
         }
     }
-    assert_eq!(told, vec![Some(context); 3]);
+    assert_eq!(published, vec![Some(context); 3]);
 }
 
 #[test]
@@ -260,10 +263,10 @@ fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
     let deadline = pipeline.deadline().unwrap();
     assert_eq!(deadline, at(1000).mono + PERIOD.mul_f64(2.5));
     assert!(pipeline.tick(at(1499)).is_empty());
-    let told = pipeline.tick(at(1507));
-    assert_eq!(words(&told), ["Stale (no frame for 500 ms)"]);
-    let Event::Status(status) = &told[0] else {
-        panic!("{told:?}")
+    let published = pipeline.tick(at(1507));
+    assert_eq!(words(&published), ["Stale (no frame for 500 ms)"]);
+    let Event::Status(status) = &published[0] else {
+        panic!("{published:?}")
     };
     assert_eq!(status.time, at(1500).wall, "when it became so");
     assert_eq!(pipeline.deadline(), None);
@@ -294,9 +297,9 @@ fn a_sensor_that_is_steadily_slow_is_late_by_its_own_period() {
         words(&events)
     };
     // Ten frames/s come, for three seconds.
-    let told = play(&mut pipeline, &[[10; 1].as_slice(), &[100; 30]].concat());
+    let published = play(&mut pipeline, &[[10; 1].as_slice(), &[100; 30]].concat());
     let (stale, live) = ("Stale (no frame for 50 ms)", "Live");
-    assert_eq!(told, [live, stale, live, stale, live, stale, live]);
+    assert_eq!(published, [live, stale, live, stale, live, stale, live]);
     assert_eq!(pipeline.slow_rate_hz(), Some(10.0));
     // A silence of two and a half of its own periods is stale, and the sensor is still known after it.
     let own = "Stale (no frame for 250 ms)";
@@ -306,16 +309,16 @@ fn a_sensor_that_is_steadily_slow_is_late_by_its_own_period() {
     assert_eq!(play(&mut pipeline, &[10, 100]), [stale, live]);
     assert_eq!(pipeline.slow_rate_hz(), None);
     // Pauses of different lengths are no rate.
-    let told = play(&mut pipeline, &[100, 200, 100, 300, 100, 200, 400, 100]);
-    assert_eq!(told.len(), 16, "{told:?}");
+    let published = play(&mut pipeline, &[100, 200, 100, 300, 100, 200, 400, 100]);
+    assert_eq!(published.len(), 16, "{published:?}");
     assert_eq!(pipeline.slow_rate_hz(), None);
 }
 
 #[test]
 fn a_port_open_without_frames_is_stale_too() {
     let mut pipeline = pipeline(Preset::Jx255n);
-    let said = pipeline.unavailable("no such device".to_owned(), at(0));
-    assert_eq!(words(&said), ["Connecting (no such device)"]);
+    let message = pipeline.unavailable("no such device".to_owned(), at(0));
+    assert_eq!(words(&message), ["Connecting (no such device)"]);
     assert!(
         pipeline
             .unavailable("no such device".to_owned(), at(100))
@@ -407,8 +410,8 @@ fn a_lost_device_aborts_the_press_and_numbers_go_on() {
             &["Lost (held by another process)"],
         ),
     ] {
-        let said = pipeline.unavailable(reason.to_owned(), at(1400));
-        assert_eq!(words(&said), expected);
+        let message = pipeline.unavailable(reason.to_owned(), at(1400));
+        assert_eq!(words(&message), expected);
     }
     assert!(
         pipeline.opened(at(2000)).is_empty(),
@@ -450,10 +453,10 @@ fn a_lost_device_that_is_open_again_and_sends_no_frame_says_so() {
         );
         let late = at(begin + 800);
         assert_eq!(words(&pipeline.tick(at(begin + 702))), [""; 0]);
-        let said = pipeline.tick(late);
-        assert_eq!(words(&said), [format!("Lost ({expected})")]);
-        let Event::Status(status) = &said[0] else {
-            panic!("{said:?}")
+        let message = pipeline.tick(late);
+        assert_eq!(words(&message), [format!("Lost ({expected})")]);
+        let Event::Status(status) = &message[0] else {
+            panic!("{message:?}")
         };
         assert_eq!(status.time, late.wall);
         assert_eq!(pipeline.deadline(), None);
@@ -728,14 +731,14 @@ fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
         described.calibration.newtons_per_count = 10.0;
     });
     let press = |counts| [raw(9, counts), raw(9, counts), raw(0, 0), raw(0, 0)];
-    let told = play(&mut pipeline, 5, &press(99));
-    assert_eq!(told, ["Begin 1", "End 1", "Final of 5"]);
+    let published = play(&mut pipeline, 5, &press(99));
+    assert_eq!(published, ["Begin 1", "End 1", "Final of 5"]);
     assert!(pipeline.unjudged().is_empty());
-    let told = play(&mut pipeline, 9, &press(101));
-    assert_eq!(told, ["Begin 2", "End 2"]);
-    let told = pipeline.unjudged();
-    let [failed] = &told[..] else {
-        panic!("{told:?}");
+    let published = play(&mut pipeline, 9, &press(101));
+    assert_eq!(published, ["Begin 2", "End 2"]);
+    let published = pipeline.unjudged();
+    let [failed] = &published[..] else {
+        panic!("{published:?}");
     };
     assert_eq!((failed.press, failed.phase), (2, Phase::Final));
     assert!(matches!(failed.error, ModelError::NotFinite { .. }));

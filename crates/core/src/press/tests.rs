@@ -305,10 +305,10 @@ fn what_is_out_of_range_is_told_as_it_was_written() {
         contact_threshold_n: Some(-0.07),
         ..Settings::default()
     };
-    let told = settings.check(Array::JX255N, Pitch::JX255N);
-    let told = told.unwrap_err().to_string();
+    let refusal = settings.check(Array::JX255N, Pitch::JX255N);
+    let refusal = refusal.unwrap_err().to_string();
     assert!(
-        told.starts_with("contact_threshold_n: found -0.07, expected"),
-        "{told}"
+        refusal.starts_with("contact_threshold_n: found -0.07, expected"),
+        "{refusal}"
     );
 }

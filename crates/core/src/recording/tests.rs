@@ -55,8 +55,8 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
         } else {
             0.1 * frame as f64
         };
-        let told = [point(ms.saturating_sub(50), mm), point(ms + 50, mm + 0.05)];
-        story.push((at(ms), Input::Motion(told.to_vec().into())));
+        let points = [point(ms.saturating_sub(50), mm), point(ms + 50, mm + 0.05)];
+        story.push((at(ms), Input::Motion(points.to_vec().into())));
         // The frame arrives in three pieces, as on a serial line.
         for (piece, bytes) in bytes.chunks(300).enumerate() {
             let came = at(ms + 20 * piece as u64 + 3);
@@ -190,7 +190,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     other.description.calibration.gains = None;
     let of_name = "name: found \"\\u{1b}[2J\\n\", expected a letter a to z";
     let of_press = "press.early_settle_s: found -1.0";
-    for (last, told) in [
+    for (last, expected_error) in [
         (state(bad.clone()), of_press),
         (Entry::Settings(Box::new(bad)), of_press),
         (state(nameless), of_name),
@@ -209,8 +209,8 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
         };
         feed(state(good.clone())).unwrap();
         let error = feed(last).unwrap_err().to_string();
-        let told = format!("sensor \"forearm\": {told}");
-        assert!(error.starts_with(&told), "{error}");
+        let expected_error = format!("sensor \"forearm\": {expected_error}");
+        assert!(error.starts_with(&expected_error), "{error}");
     }
 }
 
@@ -277,13 +277,19 @@ fn a_memory_that_no_pipeline_came_to_is_refused() {
         (&pressed, &format!("{near}/contact_area_taxels"), json!(9)),
         (&pressed, &format!("{peak}/moment/frame"), json!(22)),
     ] {
-        let told = fed(state, Some((place, value.clone()))).unwrap_err();
+        let refusal = fed(state, Some((place, value.clone()))).unwrap_err();
         let expected = "sensor \"forearm\": memory: found what no pipeline can have come to";
-        assert!(told.starts_with(expected), "{place} = {value}: {told}");
+        assert!(
+            refusal.starts_with(expected),
+            "{place} = {value}: {refusal}"
+        );
     }
     let wrong = sparse::write(&[0.5, -1.0]);
-    let told = fed(&pressed, Some((&format!("{peak}/frame"), json!(wrong)))).unwrap_err();
-    assert!(told.contains("N at a taxel, expected 0 or more"), "{told}");
+    let refusal = fed(&pressed, Some((&format!("{peak}/frame"), json!(wrong)))).unwrap_err();
+    assert!(
+        refusal.contains("N at a taxel, expected 0 or more"),
+        "{refusal}"
+    );
 }
 
 #[test]

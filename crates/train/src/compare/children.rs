@@ -103,10 +103,10 @@ pub(super) fn run(
             if status.success() && child.job.product.exists() {
                 progress.add(&child.job, seconds);
                 ended(&child.job)?;
-                board.say(&format!("{}: done in {seconds:.0} s", child.job.name));
+                board.print(&format!("{}: done in {seconds:.0} s", child.job.name));
             } else {
                 let reason = last_words(status, &child.job.log);
-                board.say(&format!("{}: failed: {reason}", child.job.name));
+                board.print(&format!("{}: failed: {reason}", child.job.name));
                 failures.push(Failure {
                     name: child.job.name,
                     reason,
@@ -233,7 +233,7 @@ impl Board {
         let total = bars.add(ProgressBar::new(jobs.len() as u64).with_style(style));
         let board = Self { bars, total };
         if !jobs.is_empty() {
-            board.say(&format!("{} runs, {at_once} at a time", jobs.len()));
+            board.print(&format!("{} runs, {at_once} at a time", jobs.len()));
         }
         board
     }
@@ -245,14 +245,14 @@ impl Board {
             .with_style(style)
             .with_prefix(name.to_owned());
         if self.total.is_hidden() {
-            hardnessd_core::say!("{name}: started");
+            hardnessd_core::stderr_line!("{name}: started");
         }
         self.bars.insert_before(&self.total, bar)
     }
 
-    fn say(&self, line: &str) {
+    fn print(&self, line: &str) {
         if self.total.is_hidden() {
-            hardnessd_core::say!("{line}");
+            hardnessd_core::stderr_line!("{line}");
         } else {
             // Only this call prints past the bars. It fails when the terminal is gone, where nobody
             // reads the line.
@@ -268,7 +268,7 @@ impl Board {
         });
         if self.total.is_hidden() && ended {
             let (done, all) = (self.total.position(), self.total.length());
-            hardnessd_core::say!("{done} of {} runs{left}", all.unwrap_or_default());
+            hardnessd_core::stderr_line!("{done} of {} runs{left}", all.unwrap_or_default());
         }
         self.total.set_message(left);
     }

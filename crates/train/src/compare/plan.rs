@@ -252,7 +252,9 @@ impl PlannedRun {
             .unwrap_or_else(|error| Some(format!("{error:#}")));
         if let Some(difference) = &difference {
             let run = self.directory.display();
-            hardnessd_core::say!("{run}: not requested, and left out of the tables; {difference}");
+            hardnessd_core::stderr_line!(
+                "{run}: not requested, and left out of the tables; {difference}"
+            );
         }
         difference.is_none()
     }

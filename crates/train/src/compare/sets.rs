@@ -123,7 +123,7 @@ pub(super) fn check_seed(dataset: &Dataset) -> anyhow::Result<()> {
 pub(super) fn warn_of_pitch(dataset: &Dataset) {
     let pitch_mm = dataset.pitch_mm();
     if pitch_mm != PITCH_MM {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {pitch_mm} mm, expected {PITCH_MM} mm, that of the \
              simulated test objects",
             dataset.path().display()
@@ -219,7 +219,7 @@ fn simulations(profile: Profile) -> [(&'static str, DatasetSettings); 8] {
 fn simulated(directory: &Path, name: &str, settings: &DatasetSettings) -> anyhow::Result<PathBuf> {
     let path = file_of(directory, name, settings)?;
     if !path.exists() {
-        hardnessd_core::say!("simulating {}", path.display());
+        hardnessd_core::stderr_line!("simulating {}", path.display());
         let samples = simulated::simulate(settings, simulated::all_cores());
         write_whole(&path, &simulated::to_bytes(settings, samples)?)?;
     }

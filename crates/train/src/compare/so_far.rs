@@ -100,7 +100,7 @@ pub(super) fn of(
         let frames = course.moments.len();
         let mut next_look = Some(FIRST_LOOK);
         // The probabilities after each number of frames; those at the end are known.
-        let mut said = Vec::with_capacity(frames);
+        let mut of_frames = Vec::with_capacity(frames);
         for count in 1..frames {
             let verdict = hrn.judge_course(&until(&course, count))?;
             let is_ambiguous = verdict.levels.as_ref().is_some_and(|set| set.len() > 1);
@@ -120,12 +120,12 @@ pub(super) fn of(
                 ahead.push(after(frames - 1));
                 before_settled.extend(settled(&course).map(after));
             }
-            said.push(verdict.probabilities);
+            of_frames.push(verdict.probabilities);
         }
-        said.push(last.probabilities.clone());
+        of_frames.push(last.probabilities.clone());
         let judged_after = |frames: usize| Judged {
             level: press.level,
-            probabilities: said[frames - 1].clone(),
+            probabilities: of_frames[frames - 1].clone(),
             object: Some(press.object),
         };
         for (seconds, (going_on, judged)) in SECONDS.into_iter().zip(&mut at) {

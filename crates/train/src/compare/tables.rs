@@ -238,8 +238,8 @@ fn confusions(rows: &[Row]) -> Table {
             let mut cells = vec![title, format!("level {}", truth + 1)];
             cells.extend(counts.iter().map(|&count| number(count, 1)));
             let paper = paper_row(row).map(|paper| paper.confusion[truth]);
-            cells.extend((0..4).map(|said| match paper {
-                Some(counts) => counts[said].to_string(),
+            cells.extend((0..4).map(|judged| match paper {
+                Some(counts) => counts[judged].to_string(),
                 None => "-".to_owned(),
             }));
             table.rows.push(cells);

@@ -72,7 +72,7 @@ pub fn warn_of_other_levels(sources: &[Source]) {
     let ours = levels_of(sources);
     for source in sources {
         if let Some(others) = source.levels.as_ref().filter(|others| **others != ours) {
-            hardnessd_core::say!(
+            hardnessd_core::stderr_line!(
                 "warning: {}: levels: found {}, expected {}, which the model will state",
                 source.name,
                 shown(others),
@@ -195,7 +195,7 @@ pub(super) fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split
 
 /// Prints the warning that `object` of a file has presses in both splits.
 pub(super) fn warn_of_object_in_both_splits(path: &Path, object: u32) {
-    hardnessd_core::say!(
+    hardnessd_core::stderr_line!(
         "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
          of them overrates a model that learnt from the others",
         path.display()

@@ -291,9 +291,13 @@ mod tests {
     #[test]
     fn temperature_can_be_taken_back() {
         // The logits ln 8, 0 and 0 give 2, 1 and 1 of 4 at temperature 3.
-        let said = judged(1, [0.5, 0.25, 0.25, 0.0], 0).before_temperature(3.0);
-        for (found, expected) in said.probabilities.iter().zip([0.8, 0.1, 0.1, 0.0]) {
-            assert!((found - expected).abs() < 1e-6, "{:?}", said.probabilities);
+        let tempered = judged(1, [0.5, 0.25, 0.25, 0.0], 0).before_temperature(3.0);
+        for (found, expected) in tempered.probabilities.iter().zip([0.8, 0.1, 0.1, 0.0]) {
+            assert!(
+                (found - expected).abs() < 1e-6,
+                "{:?}",
+                tempered.probabilities
+            );
         }
     }
 
@@ -311,13 +315,13 @@ mod tests {
             .flat_map(|object| (0..50).map(move |_| object))
             .map(|object| {
                 let level = (object % 4) as u8 + 1;
-                let said = if object / 4 == 0 {
+                let likeliest = if object / 4 == 0 {
                     level % 4
                 } else {
                     level - 1
                 };
                 let mut probabilities = [0.1; 4];
-                probabilities[usize::from(said)] = 0.7;
+                probabilities[usize::from(likeliest)] = 0.7;
                 judged(level, probabilities, object)
             })
             .collect();

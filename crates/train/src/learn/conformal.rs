@@ -28,7 +28,7 @@ pub struct Judged {
     /// Logits, before temperature.
     pub logits: Vec<f32>,
     /// The network's Shore OO: value, low, high, before the interval is widened.
-    pub said: [f32; 3],
+    pub stated: [f32; 3],
 }
 
 /// The calibration computed from the held-out presses.
@@ -73,7 +73,7 @@ impl Calibration {
         let wrong = by_object(wrong);
         let threshold = quantile(&wrong, stream).map_or(0.0, |wrong| -wrong);
         let outside = presses.iter().filter_map(|press| {
-            let [_, low, high] = press.said;
+            let [_, low, high] = press.stated;
             let shore = press.shore?;
             Some((press.object, (low - shore).max(shore - high)))
         });
@@ -187,7 +187,7 @@ mod tests {
             level: (n % 2) as usize,
             shore: (n / 3 < measured).then_some(60.0),
             logits: vec![1.0, 1.0],
-            said: [55.0, 54.0, 56.0],
+            stated: [55.0, 54.0, 56.0],
         };
         (0..3 * objects).map(press).collect()
     }

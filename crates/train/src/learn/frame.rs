@@ -204,20 +204,20 @@ impl Task<'_> {
         };
         let mut stream = self.stream("calibration");
         let frames = self.varied(self.held_out, &mut stream);
-        let said = trained.judge(&frames, plan, self.levels, self.device)?;
+        let stated = trained.judge(&frames, plan, self.levels, self.device)?;
         let samples = self
             .held_out
             .iter()
             .map(|&sample| &self.dataset.samples[sample]);
         let objects = self.dataset.object_numbers(self.held_out);
-        let rows = samples.zip(objects).zip(said);
+        let rows = samples.zip(objects).zip(stated);
         let judged: Vec<Judged> = rows
-            .map(|((sample, object), (logits, said))| Judged {
+            .map(|((sample, object), (logits, stated))| Judged {
                 object,
                 level: usize::from(sample.level) - 1,
                 shore: sample.shore,
                 logits,
-                said,
+                stated,
             })
             .collect();
         Ok(Calibration::of(&judged, &mut stream, self.device))

@@ -72,10 +72,10 @@ pub fn train(
     };
     let trained = course::fit(&task, run)?;
     if let Some(missing) = trained.calibration.missing() {
-        hardnessd_core::say!("{missing}");
+        hardnessd_core::stderr_line!("{missing}");
     }
     if !task.has_shore() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "no labelled training press has a measured Shore hardness: the model learns only how likely \
              each level is, and its Shore hardness says no more"
         );

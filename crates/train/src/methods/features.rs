@@ -43,8 +43,8 @@ pub fn train(
         seconds: begun.elapsed().as_secs_f64(),
         adversarial: None,
     })?;
-    let said: Vec<Vec<f32>> = rows.iter().map(|row| baseline.probabilities(row)).collect();
-    stages::draw_mistakes(run, dataset, ("training", labelled), &said)?;
+    let judged: Vec<Vec<f32>> = rows.iter().map(|row| baseline.probabilities(row)).collect();
+    stages::draw_mistakes(run, dataset, ("training", labelled), &judged)?;
     let (graph, raw_logits) = baseline.graph();
     let recogniser = Recogniser {
         graph,

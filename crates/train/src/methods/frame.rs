@@ -60,11 +60,11 @@ pub fn train(
     let trained = frame::fit(&task, run)?;
     let missing = trained.calibration.missing_interval();
     if !samples.has_shore() {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "no labelled training press has a measured Shore hardness: the model does not give Shore hardness"
         );
     } else if let Some(missing) = missing {
-        hardnessd_core::say!("{missing}");
+        hardnessd_core::stderr_line!("{missing}");
     }
     finish(samples, &trained, description, run, device)
 }
@@ -99,8 +99,8 @@ fn finish(
         .iter()
         .map(|&index| &samples.dataset.samples[index].frame)
         .collect();
-    let said: Vec<Vec<f32>> = probabilities(&frames)?;
-    stages::draw_mistakes(run, samples.dataset, (kind, shown), &said)?;
+    let rows: Vec<Vec<f32>> = probabilities(&frames)?;
+    stages::draw_mistakes(run, samples.dataset, (kind, shown), &rows)?;
     let (graph, raw_logits, shore) = network::graph(
         &trained.weights,
         &trained.standard,

@@ -71,7 +71,7 @@ pub(crate) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
 /// Shows the state of a stage after an epoch: beside the bar on a terminal, as a line elsewhere.
 pub(crate) fn report(bar: &ProgressBar, stage: &str, epoch: u32, epochs: u32, message: String) {
     if bar.is_hidden() {
-        hardnessd_core::say!("{stage}: epoch {epoch} of {epochs}: {message}");
+        hardnessd_core::stderr_line!("{stage}: epoch {epoch} of {epochs}: {message}");
     } else {
         bar.set_message(message);
     }

@@ -231,9 +231,9 @@ fn a_finished_comparison_does_nothing_again() {
         for name in ["hrn.onnx", "evaluation.json", "metrics.csv"] {
             std::fs::copy(from.join(name), to.join(name)).unwrap();
         }
-        let told = std::fs::read_to_string(from.join("settings.toml")).unwrap();
-        let told = told.replacen("features", "ours", 1);
-        std::fs::write(to.join("settings.toml"), told).unwrap();
+        let settings_text = std::fs::read_to_string(from.join("settings.toml")).unwrap();
+        let settings_text = settings_text.replacen("features", "ours", 1);
+        std::fs::write(to.join("settings.toml"), settings_text).unwrap();
     }
     // A comparison with fewer rows keeps the earlier results.
     let less = comparison.command_of("1").output().unwrap();
@@ -248,7 +248,7 @@ fn a_finished_comparison_does_nothing_again() {
     assert_eq!((all.len(), &all[16]["method"]), (17, &Value::from("ours")));
 
     // A run with other settings does not belong to the comparison.
-    let told = comparison.text("runs/features-1/settings.toml");
+    let settings_text = comparison.text("runs/features-1/settings.toml");
     for (from, to, expected) in [
         ("seed = 1\n", "seed = 2\n", "`seed`: found 2, expected 1"),
         ("features", "hrn100", "`method`: found \"hrn100\", expected"),
@@ -269,25 +269,29 @@ fn a_finished_comparison_does_nothing_again() {
         ),
     ] {
         let path = comparison.out.join("runs/features-1/settings.toml");
-        std::fs::write(path, told.replacen(from, to, 1)).unwrap();
+        std::fs::write(path, settings_text.replacen(from, to, 1)).unwrap();
         let output = comparison.command().output().unwrap();
         let error = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{error}");
         assert!(error.contains(expected), "{error}");
         assert_eq!(error.lines().count(), 1, "{error}");
     }
-    std::fs::write(comparison.out.join("runs/features-1/settings.toml"), told).unwrap();
+    std::fs::write(
+        comparison.out.join("runs/features-1/settings.toml"),
+        settings_text,
+    )
+    .unwrap();
 
     // Even if that row is not asked for, such a run is left out.
     let settings = comparison.out.join("runs/features-2/settings.toml");
-    let told = comparison.text("runs/features-2/settings.toml");
-    std::fs::write(&settings, told.replacen("10.2", "9.0", 1)).unwrap();
+    let settings_text = comparison.text("runs/features-2/settings.toml");
+    std::fs::write(&settings, settings_text.replacen("10.2", "9.0", 1)).unwrap();
     let output = comparison.command_of("1").output().unwrap();
     let error = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{error}");
-    let said = "runs/features-2: not requested, and left out of the tables; \
+    let message = "runs/features-2: not requested, and left out of the tables; \
                 `settings.full_scale_n`: found 9.0, expected 10.2";
-    assert!(error.contains(said), "{error}");
+    assert!(error.contains(message), "{error}");
     assert_eq!(comparison.json("results.json").len(), 4);
 }
 
@@ -308,8 +312,8 @@ fn a_run_without_its_model_counts_by_its_results() {
             }
         }
     }
-    let said = comparison.run();
-    assert!(!said.contains("done"), "{said}");
+    let message = comparison.run();
+    assert!(!message.contains("done"), "{message}");
     assert_eq!(comparison.text("results.json"), results);
 
     // If a test set is not among its results, its model is needed.
@@ -327,8 +331,8 @@ fn a_run_without_its_model_counts_by_its_results() {
 
     // A run that is removed altogether is run again.
     std::fs::remove_dir_all(of_run("")).unwrap();
-    let said = comparison.run();
-    assert!(said.contains("features-2: done"), "{said}");
+    let message = comparison.run();
+    assert!(message.contains("features-2: done"), "{message}");
 }
 
 #[test]
@@ -375,10 +379,10 @@ fn a_plan_runs_in_any_shell_and_the_comparison_finds_what_it_made() {
     assert!(parallel.wait().unwrap().success());
 
     let merged = Comparison::new("planned", "features", &["--labels", "8"]);
-    let said = merged.command_of("1").output().unwrap();
-    assert!(said.status.success(), "{said:?}");
-    let said = String::from_utf8(said.stderr).unwrap();
-    assert!(!said.contains("done"), "a run was done again: {said}");
+    let message = merged.command_of("1").output().unwrap();
+    assert!(message.status.success(), "{message:?}");
+    let message = String::from_utf8(message.stderr).unwrap();
+    assert!(!message.contains("done"), "a run was done again: {message}");
     let labels: Vec<Value> = merged
         .json("results.json")
         .iter()
@@ -459,23 +463,23 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     // The warning comes before anything is made. Making the directory fails here.
     let mut command = trainer(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
     let output = command.arg("--data").arg(&path).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(74), "{said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(74), "{message}");
     for expected in [
         "object 0 is in both splits",
         "taxel pitch: found 2 mm, expected 3.5 mm, that of the simulated test objects",
     ] {
         let expected = format!("warning: {}: {expected}", path.display());
-        assert_eq!(said.matches(&expected).count(), 1, "{said}");
+        assert_eq!(message.matches(&expected).count(), 1, "{message}");
     }
-    assert_eq!(said.lines().count(), 3, "{said}");
+    assert_eq!(message.lines().count(), 3, "{message}");
     // Evaluating a model gives the same warning.
     let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/hrn.onnx");
     let data = path.to_str().unwrap();
     let output = hrn_train(&["evaluate", "--model", model, "--data", data]);
     succeeded(&output);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("object 0 is in both splits"), "{said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(message.contains("object 0 is in both splits"), "{message}");
 }
 
 #[test]

@@ -45,8 +45,8 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
                     --presses 3 --fps 5..20 --seed 3 --out d.npz";
     succeed_in(at, simulate);
     let train = "train --method course --data d.npz --config half.toml --seed 1";
-    let said = succeed_in(at, &format!("{train} --out whole"));
-    assert!(said.contains("Shore OO"), "{said}");
+    let message = succeed_in(at, &format!("{train} --out whole"));
+    assert!(message.contains("Shore OO"), "{message}");
 
     // A run without its end and its last checkpoint continues to the same file.
     succeed_in(at, &format!("{train} --out cut"));
@@ -92,21 +92,21 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     }
     let inspected = succeed_in(at, "inspect whole/hrn.onnx");
     assert!(inspected.contains(" mm/s in training\n"), "{inspected}");
-    let told = hrn.judge_course(&course).unwrap();
-    assert!(told.shore.is_some() && told.levels.is_some());
+    let known = hrn.judge_course(&course).unwrap();
+    assert!(known.shore.is_some() && known.levels.is_some());
     course
         .moments
         .iter_mut()
         .for_each(|moment| moment.approach_mm = None);
     course.arm_n_per_mm = 0.0;
-    let untold = hrn.judge_course(&course).unwrap();
-    assert_ne!(told.probabilities, untold.probabilities);
+    let uninformed = hrn.judge_course(&course).unwrap();
+    assert_ne!(known.probabilities, uninformed.probabilities);
 
     let json = succeed_in(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
     let evaluation: Value = serde_json::from_str(&json).unwrap();
-    let told: Value =
+    let known: Value =
         serde_json::from_slice(&std::fs::read(at.join("whole/evaluation.json")).unwrap()).unwrap();
-    assert_eq!(evaluation["accuracy"], told["accuracy"]);
+    assert_eq!(evaluation["accuracy"], known["accuracy"]);
     let rmse = |evaluation: &Value| evaluation["shore"]["rmse"].as_f64().unwrap() as f32;
     assert!(rmse(&evaluation) < spread_of_shore(&courses), "{json}");
     // A model of one frame judges each press's best frame of the same file.
@@ -119,14 +119,14 @@ fn a_course_model_is_trained_resumed_and_judged_by_the_daemon() {
     let evaluation: Value = serde_json::from_str(&json).unwrap();
     assert!(rmse(&evaluation) < spread_of_shore(&courses), "{json}");
     assert_eq!(evaluation["sets"], Value::Null);
-    assert_eq!(evaluation["n"], told["n"]);
+    assert_eq!(evaluation["n"], known["n"]);
 
-    compare(at, &told);
+    compare(at, &known);
 }
 
 /// Compares a model of whole presses, one of a frame, and the controls on the same presses, and
 /// checks the tables.
-fn compare(at: &Path, told: &Value) {
+fn compare(at: &Path, known: &Value) {
     let models = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../..")
         .join("models/hrn.onnx");
@@ -146,7 +146,7 @@ fn compare(at: &Path, told: &Value) {
         row["sets"][0].clone()
     };
     let model = set_of("whole/hrn.onnx");
-    assert_eq!(model["levels"]["accuracy"], told["accuracy"]);
+    assert_eq!(model["levels"]["accuracy"], known["accuracy"]);
     assert_eq!(model["less_first"], Value::Null);
     let less = set_of("Hertz's fit");
     let difference = less["levels"]["accuracy"].as_f64().unwrap()

@@ -213,8 +213,8 @@ fn interrupted(
     }
     rustix::process::kill_process(Pid::from_child(&process), signal).unwrap();
     let output = process.wait_with_output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    let about = said.lines().find(|line| line.starts_with("hrn-train: "));
+    let message = String::from_utf8(output.stderr).unwrap();
+    let about = message.lines().find(|line| line.starts_with("hrn-train: "));
     (output.status.code(), about.unwrap_or_default().to_owned())
 }
 
@@ -229,14 +229,14 @@ fn an_interrupted_run_resumes_to_the_same_weights_bit_for_bit() {
     ] {
         let trial = Trial::new(name);
         // After two epochs.
-        let (ended, said) = interrupted(&trial, "2", ("hrn", 16), signal);
+        let (ended, message) = interrupted(&trial, "2", ("hrn", 16), signal);
         assert_eq!(ended, code, "{name}");
         if code.is_some() {
             assert!(
-                said.starts_with("hrn-train: interrupted; to continue: "),
-                "{said}"
+                message.starts_with("hrn-train: interrupted; to continue: "),
+                "{message}"
             );
-            assert!(said.ends_with(" --resume"), "{said}");
+            assert!(message.ends_with(" --resume"), "{message}");
         }
         assert!(!trial.out.join("hrn.onnx").exists(), "{name}");
         trial.train("2", &["--resume"]);
@@ -438,10 +438,10 @@ fn a_training_that_diverges_ends_where_it_does() {
 #[test]
 fn presses_are_counted_by_level_and_levels_counted_from_0_are_warned_of() {
     let trial = Trial::new("counted");
-    let said = String::from_utf8(trial.output("1", &[]).stderr).unwrap();
+    let message = String::from_utf8(trial.output("1", &[]).stderr).unwrap();
     let counts = "training presses: level 1 40, level 2 40, level 3 40, level 4 40, unlabelled";
-    assert!(said.contains(counts), "{said}");
-    assert!(!said.contains("warning"), "{said}");
+    assert!(message.contains(counts), "{message}");
+    assert!(!message.contains("warning"), "{message}");
 
     let mut dataset = Dataset::read(&data().1).unwrap();
     for sample in &mut dataset.samples {
@@ -455,9 +455,12 @@ fn presses_are_counted_by_level_and_levels_counted_from_0_are_warned_of() {
     let (data, out) = (shifted.to_str().unwrap(), out.to_str().unwrap());
     let arguments = ["train", "--method", "features", "--profile", "smoke"];
     let paths = ["--data", data, "--out", out];
-    let said = hrn_train(&[&arguments[..], &paths].concat()).stderr;
-    let said = String::from_utf8(said).unwrap();
-    assert!(said.contains("were the levels counted from 0?"), "{said}");
+    let message = hrn_train(&[&arguments[..], &paths].concat()).stderr;
+    let message = String::from_utf8(message).unwrap();
+    assert!(
+        message.contains("were the levels counted from 0?"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -545,9 +548,12 @@ fn a_name_does_not_control_the_terminal() {
         run,
     ]);
     let model = directory.path().join("m\u{1b}[2J.onnx");
-    let said = succeed(&["export", run, "--out", model.to_str().unwrap()]);
+    let message = succeed(&["export", run, "--out", model.to_str().unwrap()]);
     let shown = model.to_str().unwrap().replace('\u{1b}', "\\u{1b}");
-    assert!(said.starts_with(&format!("{shown}: sha256 ")), "{said}");
+    assert!(
+        message.starts_with(&format!("{shown}: sha256 ")),
+        "{message}"
+    );
 }
 
 #[test]
@@ -715,8 +721,11 @@ fn broad_data_say_their_levels_and_laws() {
     };
     let all: Vec<f64> = errors.iter().map(|(_, error)| *error).collect();
     let shore = &evaluation["shore"];
-    let told = |key: &str| shore[key].as_f64();
-    assert!((told("rmse").unwrap() - rmse(&all)).abs() < 0.01, "{shore}");
+    let given = |key: &str| shore[key].as_f64();
+    assert!(
+        (given("rmse").unwrap() - rmse(&all)).abs() < 0.01,
+        "{shore}"
+    );
     let is_near = |truth: f64| {
         [50.0, 60.0, 70.0]
             .iter()
@@ -726,8 +735,8 @@ fn broad_data_say_their_levels_and_laws() {
         .iter()
         .filter_map(|(truth, error)| is_near(*truth).then_some(*error))
         .collect();
-    match told("rmse_near_borders") {
-        Some(told) => assert!((told - rmse(&near)).abs() < 0.01, "{shore}"),
+    match given("rmse_near_borders") {
+        Some(given) => assert!((given - rmse(&near)).abs() < 0.01, "{shore}"),
         None => assert!(near.is_empty(), "{shore}"),
     }
     let sheet = directory.path().join("sheet.png");
@@ -756,7 +765,7 @@ fn presses_over_time_are_data_too() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("courses.npz");
     let sheet = directory.path().join("sheet.png");
-    let told = succeed(&[
+    let given = succeed(&[
         "simulate",
         "--sequences",
         "--materials",
@@ -774,10 +783,10 @@ fn presses_over_time_are_data_too() {
         "--sheet",
         sheet.to_str().unwrap(),
     ]);
-    assert!(told.contains("presses, "), "{told}");
+    assert!(given.contains("presses, "), "{given}");
     assert!(std::fs::read(&sheet).unwrap().starts_with(b"\x89PNG"));
     let courses = Courses::read(&path).unwrap();
-    assert!((14..=16).contains(&courses.presses.len()), "{told}");
+    assert!((14..=16).contains(&courses.presses.len()), "{given}");
     for press in 0..courses.presses.len() {
         let times = &courses.time_s[courses.rows(press)];
         let frame_s = times[1] - times[0];
@@ -808,8 +817,8 @@ fn presses_on_many_sensors_are_files_of_whole_sensors() {
         sheet.to_str().unwrap(),
     ];
     let arguments: Vec<&str> = options.split_whitespace().chain(files).collect();
-    let said = succeed(&arguments);
-    assert_eq!(said.lines().count(), 2, "{said}");
+    let message = succeed(&arguments);
+    assert_eq!(message.lines().count(), 2, "{message}");
     assert!(std::fs::read(&sheet).unwrap().starts_with(b"\x89PNG"));
     let (first, second) = (path("w-0.npz"), path("w-1.npz"));
     let bytes = [&first, &second].map(|path| std::fs::read(path).unwrap());
@@ -827,7 +836,7 @@ fn presses_on_many_sensors_are_files_of_whole_sensors() {
     assert_eq!(sensors, [0, 1, 4, 5]);
     let (all, _) = Courses::read_all(&[first, second]).unwrap();
     let references = all.presses.iter().filter(|press| press.reference.is_some());
-    assert!((40..=60).contains(&references.count()), "{said}");
+    assert!((40..=60).contains(&references.count()), "{message}");
 }
 
 #[test]
@@ -1030,7 +1039,7 @@ fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {
     let settings = "[training]\nepochs = 400\nbatch = 16\ncheckpoint_every_epochs = 1\n";
     std::fs::write(path("killed.toml"), settings).unwrap();
     let arguments = |out: &str| {
-        let told = [
+        let given = [
             "train",
             "--method",
             "frame",
@@ -1038,14 +1047,14 @@ fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {
             "--data",
             data.to_str().unwrap(),
         ];
-        let told = told.into_iter().map(str::to_owned);
+        let given = given.into_iter().map(str::to_owned);
         let more = [
             "--config".to_owned(),
             path("killed.toml"),
             "--out".to_owned(),
             path(out),
         ];
-        told.chain(more).collect::<Vec<String>>()
+        given.chain(more).collect::<Vec<String>>()
     };
     let model = |out: &str| std::fs::read(Path::new(&path(out)).join("hrn.onnx")).unwrap();
     let whole: Vec<String> = arguments("never killed");

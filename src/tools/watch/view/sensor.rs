@@ -108,7 +108,13 @@ impl Sensor {
     }
 
     /// Takes in an event. `labels` are those of the model's levels.
-    pub(super) fn hear(&mut self, kind: &str, event: &Value, at: Duration, labels: &[String]) {
+    pub(super) fn take_event(
+        &mut self,
+        kind: &str,
+        event: &Value,
+        at: Duration,
+        labels: &[String],
+    ) {
         match kind {
             "status" => {
                 self.status = Some(Status {

@@ -47,11 +47,11 @@ fn verdicts(events: Vec<Event>) -> Vec<Hardness> {
 
 /// The verdicts on one press. Before each frame, the pipeline gets the positions that `told`
 /// returns for the frame's time in ms.
-fn judged(pipeline: &mut Pipeline, told: impl Fn(i64) -> Vec<Point>) -> Vec<Hardness> {
+fn judged(pipeline: &mut Pipeline, reported: impl Fn(i64) -> Vec<Point>) -> Vec<Hardness> {
     let mut events = Vec::new();
     for (number, raw) in (6..).zip(press()) {
         let at = at(number * 200);
-        let _ = pipeline.tell(&told(at.mono.as_millis() as i64));
+        let _ = pipeline.add_positions(&reported(at.mono.as_millis() as i64));
         let bytes = bytes(pipeline, &raw);
         events.extend(pipeline.push(&bytes, at));
     }
@@ -72,7 +72,7 @@ fn given(verdict: &Hardness) -> [f32; 3] {
 #[test]
 fn positions_reach_the_model_and_the_slope_is_the_objects() {
     let mut pipeline = tared(&[], |_| {});
-    pipeline.tell(&positions(1000, 9000)).unwrap();
+    pipeline.add_positions(&positions(1000, 9000)).unwrap();
     let found = judged(&mut pipeline, |_| Vec::new());
     let [early, last] = &found[..] else {
         panic!("{found:?}");
@@ -93,7 +93,7 @@ fn positions_reach_the_model_and_the_slope_is_the_objects() {
 #[test]
 fn a_delay_shifts_the_approach() {
     let mut pipeline = tared(&[], |described| described.arm.delay_ms = 100.0);
-    pipeline.tell(&positions(1000, 9000)).unwrap();
+    pipeline.add_positions(&positions(1000, 9000)).unwrap();
     let found = judged(&mut pipeline, |_| Vec::new());
     // At the fifth frame the arm has stopped: half a millimetre further than at the fourth.
     assert_eq!(given(&found[1]), [9.5, 5.0, 10.0]);
@@ -102,7 +102,7 @@ fn a_delay_shifts_the_approach() {
 #[test]
 fn an_early_verdict_is_on_the_frames_whose_positions_have_come() {
     let mut pipeline = tared(&[], |_| {});
-    let _ = pipeline.tell(&positions(1000, 1950));
+    let _ = pipeline.add_positions(&positions(1000, 1950));
     let found = judged(&mut pipeline, |now| positions(now - 250, now - 100));
     let [early, last] = &found[..] else {
         panic!("{found:?}");
@@ -138,26 +138,26 @@ fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
 #[test]
 fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
     let late = |pipeline: &mut Pipeline| {
-        let _ = pipeline.tell(&positions(1000, 2500));
+        let _ = pipeline.add_positions(&positions(1000, 2500));
     };
     let jump = |pipeline: &mut Pipeline| {
         let mut points = positions(1000, 9000);
         points[30].mm += 30.0;
-        let _ = pipeline.tell(&points);
+        let _ = pipeline.add_positions(&points);
     };
     // The clock was set by the distance of two points, which nothing else shows.
     let set = |pipeline: &mut Pipeline| {
-        pipeline.tell(&positions(1000, 2500)).unwrap();
+        pipeline.add_positions(&positions(1000, 2500)).unwrap();
         pipeline.clock_set(2_550_000_000);
         let mut shifted = positions(2550, 9000);
         shifted
             .iter_mut()
             .for_each(|point| point.at_ns += 50_000_000);
-        pipeline.tell(&shifted).unwrap();
+        pipeline.add_positions(&shifted).unwrap();
     };
     let speed_beside_positions = |pipeline: &mut Pipeline| {
         pipeline.set_context(Some(json!({"speed_mm_s": 5.0})));
-        let _ = pipeline.tell(&positions(1000, 1500));
+        let _ = pipeline.add_positions(&positions(1000, 1500));
     };
     let prepare: [fn(&mut Pipeline); 5] = [|_| {}, late, jump, set, speed_beside_positions];
     for prepare in prepare {
@@ -177,7 +177,7 @@ fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
 fn positions_after_the_final_verdict_are_counted() {
     let mut pipeline = tared(&[], |_| {});
     judged(&mut pipeline, |_| Vec::new());
-    pipeline.tell(&positions(2000, 4000)).unwrap();
+    pipeline.add_positions(&positions(2000, 4000)).unwrap();
     // The press's last frame in contact came at 3 s.
     assert_eq!(pipeline.motion_counts(), (41, 21));
 }
@@ -187,7 +187,7 @@ fn positions_that_say_nothing_of_the_press_are_no_course() {
     // The first frame comes at 2.2 s and the second at 2.4 s. The sensor is released at 2.6 s.
     let found = |first: RawFrame, until_ms: i64| {
         let mut pipeline = tared(&[], |_| {});
-        let _ = pipeline.tell(&positions(1000, until_ms));
+        let _ = pipeline.add_positions(&positions(1000, until_ms));
         let mut events = Vec::new();
         for (number, raw) in (6..).zip([first, raw(9, 80), raw(0, 0), raw(0, 0)]) {
             let bytes = bytes(&pipeline, &raw);
@@ -228,7 +228,7 @@ fn a_press_unlike_those_of_training_is_noted() {
         let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
         of[key] = json!(range);
         let mut pipeline = tared(&[("hrn.range", of)], |_| {});
-        pipeline.tell(&positions(1000, 9000)).unwrap();
+        pipeline.add_positions(&positions(1000, 9000)).unwrap();
         let found = judged(&mut pipeline, |_| Vec::new());
         let notes: Vec<&[Note]> = found.iter().map(|verdict| &verdict.notes[..]).collect();
         assert_eq!(notes, [early, last], "{key} {range:?}");
@@ -332,10 +332,10 @@ fn a_long_press_is_thinned() {
 
 #[test]
 fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
-    let found = |told: &[Point], arm_n_per_mm| {
+    let found = |reported: &[Point], arm_n_per_mm| {
         let mut pipeline = tared(&[], |d| d.arm.stiffness_n_per_mm = arm_n_per_mm);
         pipeline.hrn = test_support::hrn();
-        pipeline.tell(told).unwrap();
+        pipeline.add_positions(reported).unwrap();
         let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
         let mut events = Vec::new();
         for (number, raw) in (6..).zip(held) {
@@ -353,8 +353,8 @@ fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
         assert_eq!((verdict.course, &verdict.levels), (None, &None));
         assert!(verdict.shore.is_some(), "the built-in model's second head");
     }
-    for (told, arm_n_per_mm) in [(Vec::new(), Some(10.0)), (positions(1000, 9000), None)] {
-        for verdict in found(&told, arm_n_per_mm) {
+    for (reported, arm_n_per_mm) in [(Vec::new(), Some(10.0)), (positions(1000, 9000), None)] {
+        for verdict in found(&reported, arm_n_per_mm) {
             assert_eq!(verdict.stiffness_n_per_mm, None);
         }
     }
@@ -369,12 +369,12 @@ fn a_pipeline_that_recalls_another_in_a_press_gives_its_verdict() {
         for (number, raw) in (6..).zip(press()) {
             let at = at(number * 200);
             let now = at.mono.as_millis() as i64;
-            let told = positions(now - 250, now - 100);
-            let _ = one.tell(&told);
+            let reported = positions(now - 250, now - 100);
+            let _ = one.add_positions(&reported);
             let bytes = bytes(&one, &raw);
             let events = one.push(&bytes, at);
             if let Some(other) = &mut other {
-                let _ = other.tell(&told);
+                let _ = other.add_positions(&reported);
                 assert_eq!(other.push(&bytes, at), events, "{stop} {number}");
             }
             found.extend(verdicts(events));

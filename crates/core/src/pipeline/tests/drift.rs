@@ -35,7 +35,7 @@ fn play_at_2_hz(
     rest_n: impl Fn(u64) -> f64,
     touched: &[usize],
 ) -> (Vec<String>, f64) {
-    let (mut told, mut most_n) = (Vec::new(), 0.0_f64);
+    let (mut published, mut most_n) = (Vec::new(), 0.0_f64);
     for half in 2 * from_s..2 * (from_s + seconds) {
         let rest = rest_n(half / 2) / COUNT_N;
         let mut raw = even(rest.round() as u16);
@@ -52,9 +52,9 @@ fn play_at_2_hz(
                 most_n = most_n.max(loaded.map(|&n| f64::from(n)).sum::<f64>() / 12.0);
             }
         }
-        told.extend(words(&events));
+        published.extend(words(&events));
     }
-    (told, most_n)
+    (published, most_n)
 }
 
 /// A drift of 0.5 N an hour.
@@ -67,17 +67,17 @@ const TOUCHED: [usize; 12] = [400, 401, 402, 403, 428, 429, 430, 431, 456, 457, 
 #[test]
 fn a_baseline_that_follows_keeps_drift_from_being_a_press() {
     let mut fixed = following(false);
-    let (told, most_n) = play_at_2_hz(&mut fixed, 10, HOUR, drift, &[]);
-    assert!(told.contains(&"Begin 1".to_owned()), "{told:?}");
+    let (published, most_n) = play_at_2_hz(&mut fixed, 10, HOUR, drift, &[]);
+    assert!(published.contains(&"Begin 1".to_owned()), "{published:?}");
     assert!(most_n > 0.45, "{most_n}");
 
     let mut pipeline = following(true);
-    let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, drift, &[]);
-    assert_eq!(told, Vec::<String>::new());
+    let (published, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, drift, &[]);
+    assert_eq!(published, Vec::<String>::new());
     assert!(most_n <= COUNT_N, "{most_n}");
     // A press then reads the same as an hour ago, within a count.
-    let (told, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 3, drift, &TOUCHED);
-    assert_eq!(told[0], "Begin 1", "{told:?}");
+    let (published, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 3, drift, &TOUCHED);
+    assert_eq!(published[0], "Begin 1", "{published:?}");
     assert!((most_n - 1.0).abs() <= COUNT_N, "{most_n}");
 }
 
@@ -86,8 +86,11 @@ fn a_press_is_never_followed_however_slow_or_long() {
     // The press is held for an hour, far beyond its timeout. After the timeout it waits for its
     // release.
     let mut pipeline = following(true);
-    let (told, _) = play_at_2_hz(&mut pipeline, 10, HOUR, |_| 0.0, &TOUCHED);
-    assert!(told.contains(&"End 1 (timeout)".to_owned()), "{told:?}");
+    let (published, _) = play_at_2_hz(&mut pipeline, 10, HOUR, |_| 0.0, &TOUCHED);
+    assert!(
+        published.contains(&"End 1 (timeout)".to_owned()),
+        "{published:?}"
+    );
     let (_, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 1, |_| 0.0, &TOUCHED);
     assert!((most_n - 1.0).abs() < 1e-4, "{most_n}");
 
@@ -95,8 +98,8 @@ fn a_press_is_never_followed_however_slow_or_long() {
     // the baseline, which has followed by 0.07 N. From then on the baseline stays.
     let mut pipeline = following(true);
     let slow = |second: u64| 2.0 * (second - 10) as f64 / HOUR as f64;
-    let (told, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, slow, &[]);
-    assert_eq!(told[0], "Begin 1");
+    let (published, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, slow, &[]);
+    assert_eq!(published[0], "Begin 1");
     let lost_n = 2.0 - most_n;
     assert!(
         (0.03..0.11).contains(&lost_n),

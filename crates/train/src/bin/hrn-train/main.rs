@@ -43,7 +43,7 @@ fn main() -> ExitCode {
         _ => None,
     };
     if let Err(error) = signals::end_at_signals(how_to_continue) {
-        hardnessd_core::say!("hrn-train: signals: {error}");
+        hardnessd_core::stderr_line!("hrn-train: signals: {error}");
         return ExitCode::from(exit::IO);
     }
     let done = match arguments.command {
@@ -63,7 +63,7 @@ fn main() -> ExitCode {
     match done.and_then(|account| Ok(print(&account)?)) {
         Ok(_) => ExitCode::SUCCESS,
         Err(error) => {
-            hardnessd_core::say!("hrn-train: {}", wording::line(error.as_ref()));
+            hardnessd_core::stderr_line!("hrn-train: {}", wording::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }
@@ -78,7 +78,7 @@ fn usage(error: &clap::Error) -> ExitCode {
         return ExitCode::from(exit::USAGE);
     }
     if error.use_stderr() {
-        hardnessd_core::say!("hrn-train: {}", wording::of_usage(&error.to_string()));
+        hardnessd_core::stderr_line!("hrn-train: {}", wording::of_usage(&error.to_string()));
         return ExitCode::from(exit::USAGE);
     }
     print(&error.to_string()).map_or(ExitCode::from(exit::IO), |()| ExitCode::SUCCESS)

@@ -37,11 +37,11 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
-    say(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
+    in_words(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
 }
 
 /// Writes the verdicts if that is asked for. Returns the evaluation as text.
-fn say(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
+fn in_words(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
     if let Some(path) = &arguments.verdicts {
         write(path, account::csv(cases).as_bytes())?;
     }
@@ -57,7 +57,7 @@ fn say(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String
 fn warn_of_pitch(data: &Path, pitch_mm: f64, hrn: &Hrn) {
     let (of_model, of_data) = (hrn.card().pitch_mm, pitch_mm as f32);
     if of_model != of_data {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
             data.display()
         );
@@ -82,7 +82,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
     if let Some(path) = &arguments.features {
         write(path, account::features_csv(&courses).as_bytes())?;
     }
-    say(arguments, hrn, &course::cases(&verdicts))
+    in_words(arguments, hrn, &course::cases(&verdicts))
 }
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
@@ -143,7 +143,7 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(exit::CONFIG),
         Err(error) => {
-            hardnessd_core::say!("hrn-train: {}", wording::line(error.as_ref()));
+            hardnessd_core::stderr_line!("hrn-train: {}", wording::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
     }

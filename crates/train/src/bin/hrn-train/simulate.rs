@@ -134,7 +134,7 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
         _ => numbered(&arguments.out, shard),
     };
     (0..shards).try_for_each(|shard| check_new(&out(shard)))?;
-    let mut said = String::new();
+    let mut message = String::new();
     for shard in 0..shards {
         let sensors = BroadSensors {
             designs: designs.into(),
@@ -148,9 +148,9 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
             sensors: Some(sensors),
             ..settings
         };
-        said += &write_courses(arguments, &settings, &out(shard))?;
+        message += &write_courses(arguments, &settings, &out(shard))?;
     }
-    Ok(said)
+    Ok(message)
 }
 
 /// Error of the stiffness that a robot reports, where each sensor has a number.

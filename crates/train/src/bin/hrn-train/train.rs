@@ -53,10 +53,10 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     let run = Run::open(&arguments.out, &description, arguments.resume)?
         .taking_from(arguments.from.clone());
     let presses = task.presses();
-    hardnessd_core::say_part!("{}", wording::lines(&account::of_data(&presses)));
-    hardnessd_core::say_part!("{}", account::of_levels(&presses));
+    hardnessd_core::stderr_part!("{}", wording::lines(&account::of_data(&presses)));
+    hardnessd_core::stderr_part!("{}", account::of_levels(&presses));
     if profile == Profile::Smoke {
-        hardnessd_core::say!(
+        hardnessd_core::stderr_line!(
             "--profile smoke: tries the commands in seconds; too short to learn anything"
         );
     }

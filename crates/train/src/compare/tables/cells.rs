@@ -18,12 +18,14 @@ const FEATURES: &str = "features";
 /// The mean confusion matrix of some evaluations.
 pub(super) fn mean_confusion(evaluations: &[&Evaluation]) -> Vec<Vec<f64>> {
     let levels = evaluations.first().map_or(0, |first| first.confusion.len());
-    let cell = |truth: usize, said: usize| {
-        let counts = evaluations.iter().map(|e| e.confusion[truth][said] as f64);
+    let cell = |truth: usize, judged: usize| {
+        let counts = evaluations
+            .iter()
+            .map(|e| e.confusion[truth][judged] as f64);
         mean(&counts.collect::<Vec<_>>())
     };
     (0..levels)
-        .map(|truth| (0..levels).map(|said| cell(truth, said)).collect())
+        .map(|truth| (0..levels).map(|judged| cell(truth, judged)).collect())
         .collect()
 }
 

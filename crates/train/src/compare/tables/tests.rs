@@ -60,17 +60,17 @@ fn steps_are_means_over_seeds_to_the_nearest_step() {
 
 #[test]
 fn every_revision_that_made_a_run_is_named_once() {
-    let told = provenance(&comparison(&[
+    let written = provenance(&comparison(&[
         (1, "0.1 (aa)"),
         (1, "0.1 (bb)\n0.1 (cc)"),
         (1, "0.1 (aa)"),
     ]));
-    let line = told.lines().next().unwrap();
+    let line = written.lines().next().unwrap();
     let named = "--seeds 3, 0.1 (aa), 0.1 (bb), 0.1 (cc).";
     assert!(line.ends_with(named), "{line}");
-    let told = provenance(&comparison(&[(1, "")]));
+    let written = provenance(&comparison(&[(1, "")]));
     assert!(
-        told.starts_with("Made by hrn-train compare --profile smoke --seeds 1.\n"),
-        "{told}"
+        written.starts_with("Made by hrn-train compare --profile smoke --seeds 1.\n"),
+        "{written}"
     );
 }

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use hardnessd_core::event::{Event, Hardness, Phase, PressState};
 use hardnessd_core::frame::{Array, Frame, Stamp};
 use hardnessd_core::motion::Track;
-use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, says_something};
+use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, is_informative};
 use hardnessd_core::press::thinned;
 use hardnessd_core::recording::{Entry, Found};
 use hardnessd_core::sensor::{Description, Sensor};
@@ -193,7 +193,7 @@ impl Held {
         let arm = &self.sensor.description().arm;
         let (begin, end) = (moments[0], moments[moments.len() - 1]);
         // The approach is what the daemon would give a model: from positions, or else from the speed.
-        let way = if track.is_told(end, arm.delay_ms) {
+        let way = if track.is_reported(end, arm.delay_ms) {
             track.approach(begin, &moments, arm.delay_ms)
         } else {
             self.speed_mm_s.map(|speed_mm_s| {
@@ -202,7 +202,7 @@ impl Held {
                 approach_by_speed(speed_mm_s, &moments, &forces_n)
             })
         };
-        let way = way.filter(|way| says_something(way, best));
+        let way = way.filter(|way| is_informative(way, best));
         let way = way.unwrap_or_else(|| vec![None; moments.len()]);
         let mut before_s = -1.0_f32;
         for place in thinned(pressed.len(), best, MOST_FRAMES) {

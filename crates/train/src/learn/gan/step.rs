@@ -80,7 +80,7 @@ pub fn step(
     // same images.
     let generated = Generated::of(generator, eta, rules.sensing);
 
-    let (tracked, loss) = told_apart(discriminator, batch, &generated, rules);
+    let (tracked, loss) = discrimination(discriminator, batch, &generated, rules);
     let mut gradients = loss.backward();
     discriminator.step(&tracked, &mut gradients, rules.rate);
 
@@ -108,7 +108,7 @@ impl Generated {
 }
 
 /// The tracked weights of the discriminator and its loss. Generated images are constants here.
-fn told_apart(
+fn discrimination(
     discriminator: &Learner,
     batch: &Batch,
     generated: &Generated,
