@@ -136,7 +136,7 @@ def measure(trainer, sensors_program, work):
         model = trainer.learnt(run / "run", *command)
         found[left_out] = {}
         for name, path in tests.items():
-            trainer.evaluated(model, path, *TOLD["2 + 2"], "--verdicts", verdicts)
+            trainer.judged(model, path, verdicts, *TOLD["2 + 2"])
             found[left_out][name] = counts(verdicts, numpy.load(path))
     training.write(HERE / "left_out.json", trainer, {"counts": found})
 
