@@ -135,8 +135,8 @@ def rates_agree(binaries, directory, objects):
         options = [*materials, "--shapes", "wide", "--test-objects", objects, "--presses", "3", "--seed", "78"]
         levels = []
         for rate in ["5", "20", "100"]:
-            data = simulated(binaries, directory, f"at{rate}", *options, "--fps", f"{rate}..{rate}")
-            verdicts = judged(binaries, directory, f"at{rate}")
+            data = simulated(binaries, directory, f"{name}-{rate}", *options, "--fps", f"{rate}..{rate}")
+            verdicts = judged(binaries, directory, f"{name}-{rate}")
             levels.append({
                 (verdict["object"], float(force)): verdict["judged"]
                 for verdict, force in zip(verdicts, data["force"])
