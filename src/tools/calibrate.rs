@@ -11,7 +11,7 @@ mod gather;
 mod taxels;
 
 use std::future::Future;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -262,9 +262,7 @@ pub async fn run(
             let fit = taxels::Fit::of(&plain, array, dead)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
             let (path, part) = out.expect("the gains have a file");
-            let written = part.as_file().write_all(&bytes);
-            let written = written.and_then(|()| part.finish());
-            written.map_err(|source| Error::Out {
+            part.write(&bytes).map_err(|source| Error::Out {
                 path: path.clone(),
                 source,
             })?;

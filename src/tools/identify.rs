@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, BufReader, Read, Write as _};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -494,8 +494,7 @@ fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, 
         return Err(Error::Many { found: all.len() });
     }
     let bytes = references::write(&all).map_err(failed)?;
-    part.as_file().write_all(&bytes).map_err(failed)?;
-    part.finish().map_err(failed)?;
+    part.write(&bytes).map_err(failed)?;
     Ok(all)
 }
 

@@ -23,7 +23,7 @@ mod generator;
 mod tests;
 
 use std::fmt::Write;
-use std::io::{self, BufReader, Read, Write as _};
+use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -222,12 +222,8 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
         args,
         listened_s.map(|s| found.best.proposal.frames as f64 / s),
     ) + &frame;
-    let write = || {
-        let part = Part::new(out)?;
-        part.as_file().write_all(text.as_bytes())?;
-        part.finish()
-    };
-    write().map_err(|source| Error::Write {
+    let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
+    written.map_err(|source| Error::Write {
         path: out.clone(),
         source,
     })?;

@@ -5,7 +5,7 @@
 //! is in the directory, whatever its name, stays as it is.
 
 use std::fs::{self, File, Permissions};
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Write as _};
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
 
@@ -85,6 +85,16 @@ impl Part {
         self.file.as_file()
     }
 
+    /// Writes the bytes of the whole file, and gives it its name.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Part::finish`].
+    pub fn write(self, bytes: &[u8]) -> io::Result<()> {
+        self.as_file().write_all(bytes)?;
+        self.finish()
+    }
+
     /// Gives the file its name.
     ///
     /// # Errors
@@ -157,15 +167,12 @@ fn taken() -> io::Error {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write as _;
     use std::os::unix::fs::symlink;
 
     use super::*;
 
     fn write(part: io::Result<Part>, bytes: &[u8]) -> io::Result<()> {
-        let part = part?;
-        part.as_file().write_all(bytes)?;
-        part.finish()
+        part?.write(bytes)
     }
 
     fn names(directory: &Path) -> Vec<String> {

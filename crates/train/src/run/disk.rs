@@ -1,7 +1,7 @@
 //! Files that are complete at all times, and directories locked for one process.
 
 use std::fs::File;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
@@ -15,12 +15,8 @@ use rustix::fs::FlockOperation;
 ///
 /// Returns the errors of writing. A file that existed before is then unchanged.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let write = || {
-        let part = Part::over(path)?;
-        part.as_file().write_all(bytes)?;
-        part.finish()
-    };
-    write().with_context(|| path.display().to_string())
+    let written = Part::over(path).and_then(|part| part.write(bytes));
+    written.with_context(|| path.display().to_string())
 }
 
 /// Returns an error if a directory has files that a command would replace, but not the one that the

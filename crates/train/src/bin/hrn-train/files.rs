@@ -1,7 +1,7 @@
 //! Files named on the command line.
 
 use std::fs::File;
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::path::Path;
 
 use anyhow::Context as _;
@@ -54,12 +54,8 @@ pub(super) fn check_new(path: &Path) -> anyhow::Result<()> {
 
 /// Writes a new file as a whole.
 pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let write = || {
-        let part = Part::new(path)?;
-        part.as_file().write_all(bytes)?;
-        part.finish()
-    };
-    write().with_context(|| path.display().to_string())
+    let written = Part::new(path).and_then(|part| part.write(bytes));
+    written.with_context(|| path.display().to_string())
 }
 
 pub(super) fn load(path: &Path) -> anyhow::Result<Hrn> {
