@@ -9,14 +9,11 @@ use burn::tensor::Device;
 use crate::learn::learner::Learner;
 use crate::net::network::Weights;
 use crate::run::Run;
-use crate::run::checkpoint::{Checkpoint, Progress};
+use crate::run::checkpoint::{BEST, Checkpoint, Progress};
 use crate::run::history::Row;
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::settings::{Keep, Training, Validation};
 use hardnessd_simulator::random::Stream;
-
-/// The name under which a checkpoint holds the weights of the least validation loss.
-const BEST: &str = "best";
 
 /// The description of a training stage.
 #[derive(Debug)]

@@ -18,7 +18,7 @@ use crate::net::losses::Game;
 use crate::net::network::{self, FEATURES, Weights};
 use crate::net::sensed::Sensor;
 use crate::run::Run;
-use crate::run::checkpoint::{Checkpoint, Origin, Progress};
+use crate::run::checkpoint::{BEST, Checkpoint, Origin, Progress};
 use crate::run::history::{Adversarial, Row};
 use crate::run::progress::{ensure_finite, ensure_finite_weights, progress_bar, report};
 use crate::settings::{GanSettings, Keep};
@@ -181,8 +181,6 @@ struct State {
 
 /// Prefixes of the generator's and the discriminator's lists in a checkpoint.
 const SIDES: [&str; 2] = ["generator ", "discriminator "];
-/// The name of a side's best weights in a checkpoint, after the prefix.
-const BEST: &str = "best";
 
 impl State {
     fn fresh(initial: Gan, settings: &GanSettings, sensor: Sensor) -> Self {

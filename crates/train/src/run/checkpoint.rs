@@ -18,6 +18,9 @@ use crate::data::npz::{Element as _, Writer};
 use crate::net::network::{Weight, Weights, numbers};
 use hardnessd_core::npy::Header;
 
+/// The name of the list of the best weights so far. That of a GAN's side has a prefix.
+pub const BEST: &str = "best";
+
 /// The state from which a stage continues, beside its settings and data.
 #[derive(Debug, Clone)]
 pub struct Checkpoint {
