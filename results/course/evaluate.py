@@ -52,6 +52,16 @@ def verdicts_of(path):
             yield int(row["object"]), int(row["level"]), int(row["judged"]), shares
 
 
+def sensors_of(rows, data):
+    """The sensor of each verdict."""
+    import numpy
+
+    # Objects that serve as references have no verdict.
+    has_verdict = (data["level"] > 0) & numpy.isin(data["object"], [row[0] for row in rows])
+    assert data["object"][has_verdict].tolist() == [row[0] for row in rows]
+    return data["sensor"][has_verdict].tolist()
+
+
 def balanced(counts):
     """The mean over the levels of the share of right presses. `counts` is [..., level, (right, presses)]."""
     return (counts[..., 0] / counts[..., 1]).mean(axis=-1)
@@ -70,10 +80,7 @@ def figures(evaluated, verdicts, data):
     import numpy
 
     rows = list(verdicts_of(verdicts))
-    # Objects that serve as references have no verdict.
-    has_verdict = (data["level"] > 0) & numpy.isin(data["object"], [row[0] for row in rows])
-    assert data["object"][has_verdict].tolist() == [row[0] for row in rows]
-    sensors = data["sensor"][has_verdict].tolist()
+    sensors = sensors_of(rows, data)
     covers = sorted({sensor // ELECTRONICS for sensor in sensors})
     single, together = (numpy.zeros((len(covers), 4, 2)) for _ in range(2))
     of_object = {}

@@ -14,7 +14,6 @@ WORK keeps data sets and runs, so an interrupted call goes on. left_out.json, be
 run and cover: presses, and right ones, of each level.
 """
 
-import csv
 import json
 import math
 import pathlib
@@ -25,7 +24,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 import trainer as training  # noqa: E402
-from evaluate import BOOTSTRAPS, COMMON, ELECTRONICS, SETS, TOLD, balanced  # noqa: E402
+from evaluate import BOOTSTRAPS, COMMON, ELECTRONICS, SETS, TOLD, balanced, sensors_of, verdicts_of  # noqa: E402
 
 TEST_SETS = dict(list(SETS.items())[:2])
 OF_TRAINING = "--sequences --materials broad --test-objects 0 --presses 2 --electronics 4"
@@ -69,7 +68,7 @@ DISTANCES = {
 NOTHING = "nothing"
 
 
-def sensors_of(program, data):
+def described(program, data):
     """The sensors of a simulated data set, by number."""
     settings = json.dumps(json.loads(bytes(data["meta"]))["settings"])
     printed = subprocess.run([program], input=settings, check=True, capture_output=True, text=True).stdout
@@ -92,7 +91,7 @@ def subset(sensors_program, path, out, left_out):
     if not out.exists():
         data = dict(numpy.load(path))
         draws = numpy.random.default_rng(1)
-        of_set = sensors_of(sensors_program, data)
+        of_set = described(sensors_program, data)
         # The sensors of JX255N sets are alike in everything, so these are chosen by chance.
         numbers = chosen(of_set, None if path.stem.startswith("j") else left_out, draws)
         unfinished = out.with_suffix(".part.npz")
@@ -105,15 +104,12 @@ def counts(verdicts, data):
     """[cover, level, (right, presses)] of one run on one test set."""
     import numpy
 
-    with open(verdicts, newline="") as file:
-        rows = [(int(row["object"]), int(row["level"]), row["judged"] == row["level"]) for row in csv.DictReader(file)]
-    has_verdict = (data["level"] > 0) & numpy.isin(data["object"], [row[0] for row in rows])
-    assert data["object"][has_verdict].tolist() == [row[0] for row in rows]
-    covers = data["sensor"][has_verdict] // ELECTRONICS
-    names = sorted(set(covers.tolist()))
+    rows = list(verdicts_of(verdicts))
+    covers = [sensor // ELECTRONICS for sensor in sensors_of(rows, data)]
+    names = sorted(set(covers))
     table = numpy.zeros((len(names), 4, 2), int)
-    for cover, (_, level, right) in zip(covers, rows):
-        table[names.index(cover), level - 1] += [right, 1]
+    for cover, (_, level, named, _) in zip(covers, rows):
+        table[names.index(cover), level - 1] += [named == level, 1]
     return table.tolist()
 
 
