@@ -175,7 +175,7 @@ impl Track {
     }
 
     /// Whether the robot sends positions: whether there are any from the last minute before `now`.
-    pub fn is_reported(&self, now: Duration, delay_ms: f64) -> bool {
+    pub fn has_recent(&self, now: Duration, delay_ms: f64) -> bool {
         let oldest = of_arm(now, delay_ms).saturating_sub(HELD_NS);
         self.points.back().is_some_and(|p| p.at_ns >= oldest)
     }

@@ -39,16 +39,16 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
 /// there already.
 fn without_numbers(text: &str) -> String {
     let mut parts = text.split(" (os error ");
-    let mut words = parts.next().unwrap_or_default().to_owned();
+    let mut kept = parts.next().unwrap_or_default().to_owned();
     for part in parts {
         match part.split_once(')') {
             Some((number, rest)) if number.bytes().all(|digit| digit.is_ascii_digit()) => {
-                words += rest;
+                kept += rest;
             }
-            _ => words = words + " (os error " + part,
+            _ => kept = kept + " (os error " + part,
         }
     }
-    words
+    kept
 }
 
 /// Escapes the hidden characters of each line. Without this, the name of a file could control the
@@ -132,11 +132,11 @@ mod tests {
     #[test]
     fn a_cause_is_told_once() {
         let cause = || io::Error::other("no such file");
-        for words in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
-            assert_eq!(line(&words), "x: cannot read: no such file");
+        for error in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
+            assert_eq!(line(&error), "x: cannot read: no such file");
         }
-        let words = Wrapped::Within(cause());
-        assert_eq!(line(&words), "x: no such file, expected a new file");
+        let error = Wrapped::Within(cause());
+        assert_eq!(line(&error), "x: no such file, expected a new file");
     }
 
     #[test]
@@ -174,9 +174,9 @@ mod tests {
 
     #[test]
     fn an_error_is_one_line_whatever_a_file_is_called() {
-        let words = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
+        let error = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
         assert_eq!(
-            line(&words),
+            line(&error),
             "a\\nb\\u{1b}[2J\\t\u{e9}\\u{202e}: cannot read"
         );
     }

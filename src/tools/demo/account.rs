@@ -64,7 +64,7 @@ impl Account {
         let percent = 100.0 * event["confidence"].as_f64().unwrap_or_default();
         let force_n = event["force_n"].as_f64().unwrap_or_default();
         let level = event["level"].as_u64();
-        let (message, mark) = match level {
+        let (shown, mark) = match level {
             None => (answer, "-"),
             Some(level) => {
                 let is_right = self
@@ -76,12 +76,12 @@ impl Account {
                     &mut self.wrong
                 };
                 *count += 1;
-                let message = format!("{answer} {percent:.0} %");
-                (message, if is_right { "ok" } else { "wrong" })
+                let shown = format!("{answer} {percent:.0} %");
+                (shown, if is_right { "ok" } else { "wrong" })
             }
         };
         let columns = self.answer_columns();
-        format!("press {number:<2} {pressed}  ->  {message:<columns$}  {mark:<5}  {force_n:4.1} N")
+        format!("press {number:<2} {pressed}  ->  {shown:<columns$}  {mark:<5}  {force_n:4.1} N")
     }
 
     /// The columns of the longest answer of one or two neighbouring levels.

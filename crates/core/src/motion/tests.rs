@@ -153,9 +153,9 @@ fn a_minute_is_held() {
     track.push(&steady(0, 61_000, 50)).unwrap();
     assert_eq!(track.approach(at(900), &[at(1200)], 0.0), None);
     assert!(track.approach(at(1100), &[at(1200)], 0.0).is_some());
-    assert!(track.is_reported(at(120_000), 0.0));
-    assert!(!track.is_reported(at(121_001), 0.0));
-    assert!(!Track::default().is_reported(at(0), 0.0));
+    assert!(track.has_recent(at(120_000), 0.0));
+    assert!(!track.has_recent(at(121_001), 0.0));
+    assert!(!Track::default().has_recent(at(0), 0.0));
 }
 
 #[test]

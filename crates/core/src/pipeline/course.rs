@@ -160,9 +160,9 @@ pub fn approach_speed_mm_s(
     context: Option<&serde_json::Value>,
     arm: &motion::Settings,
 ) -> Option<f64> {
-    let message = context.and_then(|context| context.get("speed_mm_s")?.as_f64());
+    let stated = context.and_then(|context| context.get("speed_mm_s")?.as_f64());
     let (least, most) = SPEEDS_MM_S;
-    message
+    stated
         .or(arm.speed_mm_s)
         .filter(|speed| (least..=most).contains(speed))
 }
@@ -193,7 +193,7 @@ impl Pipeline {
         let moments = known.moments();
         let (begin, last) = (moments[0], moments[moments.len() - 1]);
         let delay_ms = self.sensor.description().arm.delay_ms;
-        if self.track.is_reported(last, delay_ms) {
+        if self.track.has_recent(last, delay_ms) {
             if let Some(approach_mm) = self.track.approach(begin, &moments, delay_ms) {
                 known.approach_mm = approach_mm;
                 known.rests_on = event::ApproachSource::Positions;

@@ -204,13 +204,13 @@ impl Task<'_> {
         };
         let mut stream = self.stream("calibration");
         let frames = self.varied(self.held_out, &mut stream);
-        let stated = trained.judge(&frames, plan, self.levels, self.device)?;
+        let judged = trained.judge(&frames, plan, self.levels, self.device)?;
         let samples = self
             .held_out
             .iter()
             .map(|&sample| &self.dataset.samples[sample]);
         let objects = self.dataset.object_numbers(self.held_out);
-        let rows = samples.zip(objects).zip(stated);
+        let rows = samples.zip(objects).zip(judged);
         let judged: Vec<Judged> = rows
             .map(|((sample, object), (logits, stated))| Judged {
                 object,

@@ -721,9 +721,9 @@ fn broad_data_say_their_levels_and_laws() {
     };
     let all: Vec<f64> = errors.iter().map(|(_, error)| *error).collect();
     let shore = &evaluation["shore"];
-    let given = |key: &str| shore[key].as_f64();
+    let figure = |key: &str| shore[key].as_f64();
     assert!(
-        (given("rmse").unwrap() - rmse(&all)).abs() < 0.01,
+        (figure("rmse").unwrap() - rmse(&all)).abs() < 0.01,
         "{shore}"
     );
     let is_near = |truth: f64| {
@@ -735,8 +735,8 @@ fn broad_data_say_their_levels_and_laws() {
         .iter()
         .filter_map(|(truth, error)| is_near(*truth).then_some(*error))
         .collect();
-    match given("rmse_near_borders") {
-        Some(given) => assert!((given - rmse(&near)).abs() < 0.01, "{shore}"),
+    match figure("rmse_near_borders") {
+        Some(near_borders) => assert!((near_borders - rmse(&near)).abs() < 0.01, "{shore}"),
         None => assert!(near.is_empty(), "{shore}"),
     }
     let sheet = directory.path().join("sheet.png");
@@ -765,7 +765,7 @@ fn presses_over_time_are_data_too() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("courses.npz");
     let sheet = directory.path().join("sheet.png");
-    let given = succeed(&[
+    let printed = succeed(&[
         "simulate",
         "--sequences",
         "--materials",
@@ -783,10 +783,10 @@ fn presses_over_time_are_data_too() {
         "--sheet",
         sheet.to_str().unwrap(),
     ]);
-    assert!(given.contains("presses, "), "{given}");
+    assert!(printed.contains("presses, "), "{printed}");
     assert!(std::fs::read(&sheet).unwrap().starts_with(b"\x89PNG"));
     let courses = Courses::read(&path).unwrap();
-    assert!((14..=16).contains(&courses.presses.len()), "{given}");
+    assert!((14..=16).contains(&courses.presses.len()), "{printed}");
     for press in 0..courses.presses.len() {
         let times = &courses.time_s[courses.rows(press)];
         let frame_s = times[1] - times[0];
@@ -1039,7 +1039,7 @@ fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {
     let settings = "[training]\nepochs = 400\nbatch = 16\ncheckpoint_every_epochs = 1\n";
     std::fs::write(path("killed.toml"), settings).unwrap();
     let arguments = |out: &str| {
-        let given = [
+        let arguments = [
             "train",
             "--method",
             "frame",
@@ -1047,14 +1047,14 @@ fn a_training_killed_a_hundred_times_ends_with_the_same_bits() {
             "--data",
             data.to_str().unwrap(),
         ];
-        let given = given.into_iter().map(str::to_owned);
+        let arguments = arguments.into_iter().map(str::to_owned);
         let more = [
             "--config".to_owned(),
             path("killed.toml"),
             "--out".to_owned(),
             path(out),
         ];
-        given.chain(more).collect::<Vec<String>>()
+        arguments.chain(more).collect::<Vec<String>>()
     };
     let model = |out: &str| std::fs::read(Path::new(&path(out)).join("hrn.onnx")).unwrap();
     let whole: Vec<String> = arguments("never killed");

@@ -37,11 +37,11 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
     let indices = dataset.labelled(arguments.split.into())?;
-    in_words(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
+    evaluation_of(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
 }
 
 /// Writes the verdicts if that is asked for. Returns the evaluation as text.
-fn in_words(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
+fn evaluation_of(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
     if let Some(path) = &arguments.verdicts {
         write(path, account::csv(cases).as_bytes())?;
     }
@@ -82,7 +82,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
     if let Some(path) = &arguments.features {
         write(path, account::features_csv(&courses).as_bytes())?;
     }
-    in_words(arguments, hrn, &course::cases(&verdicts))
+    evaluation_of(arguments, hrn, &course::cases(&verdicts))
 }
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {

@@ -193,7 +193,7 @@ impl Held {
         let arm = &self.sensor.description().arm;
         let (begin, end) = (moments[0], moments[moments.len() - 1]);
         // The approach is what the daemon would give a model: from positions, or else from the speed.
-        let way = if track.is_reported(end, arm.delay_ms) {
+        let way = if track.has_recent(end, arm.delay_ms) {
             track.approach(begin, &moments, arm.delay_ms)
         } else {
             self.speed_mm_s.map(|speed_mm_s| {
