@@ -409,9 +409,8 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
 #[test]
 fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     let bench = Bench::new();
-    // A busy machine does not make the wrist stale.
     let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nframe_rate_hz = 20.0\n\
-                stale_after_ms = 5000.0\n[http]\nlisten = \"127.0.0.1:0\"\n";
+                [http]\nlisten = \"127.0.0.1:0\"\n";
     let mut daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", more));
     let http = daemon.address("http");
     let mut forearm = bench.sensor(&[]);
