@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 SENSORS = [1, 8, 64, 500]
 SUBSCRIBERS = [1, 10, 100, 1000]
 LINE = re.compile(
-    r"sensors (\d+) rate 100 clients (\d+) Verdict scheduling (\w+) .*?: (\d+) events, (\d+) lost; "
+    r"sensors (\d+) side 28 rate 100 clients (\d+) Verdict scheduling (\w+) .*?: (\d+) events, (\d+) lost; "
     r"us p50 (\d+) p99 (\d+) .*?processor [\d.]+ us a frame, ([\d.]+) % of a core; anonymous memory (\d+) kB"
 )
 

@@ -5,6 +5,8 @@
 //! The trainer computes them with this code, so both see the same. Logarithms turn the power laws of
 //! contact into sums. What is not known is 0, beside a number that says whether it is known.
 
+use std::ops::Range;
+
 use super::course::{Course, CourseMoment};
 use super::grid::{COLS, ModelFrame, ROWS};
 
@@ -59,8 +61,8 @@ pub type FrameFeatures = [f32; FRAME];
 
 /// The features of a frame on the model's grid.
 pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
+    let Extent { rows, cols, peak } = Extent::of(frame);
     let mut sums = Sums::default();
-    let peak = frame.newtons.iter().copied().fold(0.0, f32::max);
     let mut counts = [0.0_f32; 5];
     let mut shares = [0.0_f32; 3];
     let (mut roughness, mut border) = (0.0, 0.0);
@@ -68,8 +70,9 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
         let newtons = frame.newtons[row * COLS + col];
         if newtons >= CONTACT_N { newtons } else { 0.0 }
     };
-    for row in 0..ROWS {
-        for col in 0..COLS {
+    // A taxel before the contact still borders on it.
+    for row in rows.start.saturating_sub(1)..rows.end {
+        for col in cols.start.saturating_sub(1)..cols.end {
             let newtons = taxel(row, col);
             let below = (row + 1 < ROWS).then(|| taxel(row + 1, col));
             let right = (col + 1 < COLS).then(|| taxel(row, col + 1));
@@ -92,7 +95,7 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
     let (spread, elongation) = sums.of_force.moments();
     let (width, oblong) = sums.of_contact.moments();
     let (force, area) = (sums.of_force.total, sums.of_contact.total);
-    let fourth = sums.fourth(frame);
+    let fourth = sums.fourth(frame, rows, cols);
     let effective = force * force / (sums.squares + TINY);
     let [c02, c05, c1, c2, c4] = counts.map(f32::ln_1p);
     let [half, quarter, most] = shares.map(|count| (count + 0.5).ln());
@@ -139,6 +142,38 @@ pub fn force_n(frame: &FrameFeatures) -> f32 {
     (frame[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
+/// Where the taxels in contact lie, and the greatest force of a taxel. Only they have features, and
+/// they are few: the sums over a press of 48 frames take a fifth of the time that whole frames take.
+struct Extent {
+    rows: Range<usize>,
+    cols: Range<usize>,
+    peak: f32,
+}
+
+impl Extent {
+    fn of(frame: &ModelFrame) -> Self {
+        let mut of_cols = [0.0_f32; COLS];
+        let mut rows = 0..0;
+        for (row, newtons) in frame.newtons.chunks_exact(COLS).enumerate() {
+            for (greatest, &newtons) in of_cols.iter_mut().zip(newtons) {
+                *greatest = greatest.max(newtons);
+            }
+            if newtons.iter().any(|&newtons| newtons >= CONTACT_N) {
+                let first = if rows.is_empty() { row } else { rows.start };
+                rows = first..row + 1;
+            }
+        }
+        let is_in_contact = |newtons: &f32| *newtons >= CONTACT_N;
+        let first = of_cols.iter().position(is_in_contact).unwrap_or(0);
+        let last = of_cols.iter().rposition(is_in_contact);
+        Self {
+            rows,
+            cols: first..last.map_or(0, |last| last + 1),
+            peak: of_cols.into_iter().fold(0.0, f32::max),
+        }
+    }
+}
+
 /// Sums over the taxels in contact, weighted by force, and all alike.
 #[derive(Default)]
 struct Sums {
@@ -154,13 +189,14 @@ impl Sums {
         self.squares += newtons * newtons;
     }
 
-    /// The fourth moment of the force about its centre.
-    fn fourth(&self, frame: &ModelFrame) -> f32 {
+    /// The fourth moment of the force about its centre, of the taxels in these rows and columns.
+    fn fourth(&self, frame: &ModelFrame, rows: Range<usize>, cols: Range<usize>) -> f32 {
         let [centre_row, centre_col] = self.of_force.centre();
         let mut sum = 0.0;
-        for (place, &newtons) in frame.newtons.iter().enumerate() {
+        for (row, col) in rows.flat_map(|row| cols.clone().map(move |col| (row, col))) {
+            let newtons = frame.newtons[row * COLS + col];
             if newtons >= CONTACT_N {
-                let (row, col) = centred(place / COLS, place % COLS);
+                let (row, col) = centred(row, col);
                 let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
                 sum += newtons * square * square;
             }
