@@ -49,7 +49,7 @@ def panel(axes, rows, place, label):
     axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
     axes.set_yticks([0.5, 1, 5, 10, 50, 100], ["0.5", "1", "5", "10", "50", "100"])
     axes.minorticks_off()
-    axes.set_ylim(0.3, 300)
+    axes.set_ylim(0.3, 500)
     axes.set_xlabel(label)
     axes.grid(alpha=0.3)
 
