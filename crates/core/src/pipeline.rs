@@ -4,7 +4,7 @@
 //! over reconnects. It never waits, never logs and never asks the time: [`Pipeline::deadline`] says
 //! when the caller must call [`Pipeline::tick`].
 
-mod course;
+mod approach;
 mod events;
 mod input;
 mod link;
@@ -18,7 +18,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-pub use self::course::{approach_by_speed, approach_speed_mm_s, is_informative};
+pub use self::approach::{approach_by_speed, approach_speed_mm_s, is_informative};
 pub use self::events::{FIRST_LOOK, look_after};
 pub use self::input::Input;
 use self::link::Link;

@@ -3,7 +3,7 @@
 //! In: tared [`Frame`]s with their numbers and arrival times. Out: [`Change`]s. The tracker reads
 //! no clock: the times of the frames decide how long a press lasts.
 
-mod course;
+mod held;
 mod packed;
 mod settings;
 mod settling;
@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use self::course::HeldFrames;
+use self::held::HeldFrames;
 pub use self::settings::{Settings, Thresholds};
 pub use self::settling::first_settled;
 use self::settling::{Load, Settling};

@@ -12,7 +12,6 @@ use serde::{Deserialize, Serialize};
 
 pub use self::world::{BroadSensors, REFERENCES, SensorDesigns, SensorSummary};
 use super::body::{Body, draw_patch};
-use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
@@ -21,6 +20,7 @@ use super::press::{Bench, Cover, Specimen};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
+use super::solved::SolvedPress;
 use super::subject::{Subject, shared_out, units, weights};
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};

@@ -30,7 +30,7 @@ mod settings;
 mod rigid;
 mod subject;
 mod tracked;
-mod course;
+mod solved;
 mod dataset;
 mod courses;
 mod sequence;

@@ -5,12 +5,12 @@
 //! sensor has left it.
 
 use super::body::Body;
-use super::course::{Run, State};
 use super::material::Material;
 use super::motion::Arm;
 use super::press::{Bench, Specimen};
 use super::sensor::{Film, Sensor};
 use super::sequence::{SequenceSettings, presented};
+use super::solved::{Run, State};
 use crate::random::Stream;
 use hardnessd_core::frame::RawFrame;
 
@@ -155,7 +155,7 @@ impl Placed {
 
 #[cfg(test)]
 mod tests {
-    use super::super::course::SolvedPress;
+    use super::super::solved::SolvedPress;
     use super::*;
 
     fn rig(material: Material) -> Rig {

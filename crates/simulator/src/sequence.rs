@@ -6,7 +6,6 @@
 use std::collections::VecDeque;
 
 use super::body::{Body, draw_patch};
-use super::course::SolvedPress;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
@@ -14,6 +13,7 @@ use super::object::{Object, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
 use super::rigid::{self, Reference};
 use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
+use super::solved::SolvedPress;
 use super::tracked::one_press;
 use crate::random::Stream;
 use hardnessd_core::frame::RawFrame;

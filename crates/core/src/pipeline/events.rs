@@ -1,6 +1,6 @@
 //! The press and hardness events of a pipeline.
 
-use super::course::PressWithApproach;
+use super::approach::PressWithApproach;
 use super::objects::object_of;
 use super::{Clock, Pipeline, Unjudged};
 use crate::event::{self, Event, Hardness, Note, Phase, Press, PressState, Rejection};

@@ -3,7 +3,7 @@ use tract_onnx::pb;
 
 use super::*;
 
-mod course;
+mod format_2;
 mod drift;
 mod arrays;
 use crate::event::{LinkState, Note, Rejection};

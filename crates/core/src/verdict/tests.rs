@@ -3,7 +3,7 @@ use tract_onnx::pb;
 
 use super::*;
 
-mod course;
+mod format_2;
 
 fn proto() -> pb::ModelProto {
     pb::ModelProto::decode(BUILT_IN_HRN).unwrap()

@@ -10,13 +10,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::{Deserialize, Serialize};
 
 use super::{CourseSettings, LabelledCourse, Plan, Reading, read_press};
-use crate::course::SolvedPress;
 use crate::material::Split;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
 use crate::rigid::{self, FLAT_MM, Reference, Weight};
 use crate::sensor::{Design, Sensor};
 use crate::settings::DatasetSettings;
+use crate::solved::SolvedPress;
 use crate::subject::{Subject, Unit, shared_out, units};
 use hardnessd_core::frame::Pitch;
 
