@@ -78,7 +78,7 @@ proptest! {
 #[test]
 fn every_property_holds_of_what_the_fuzzer_kept() {
     trial::set_program(env!("CARGO_BIN_EXE_hardnessd").into());
-    for (door, property) in crate::properties::ALL {
+    for (door, property) in super::properties::ALL {
         for bytes in kept(door) {
             property(&bytes);
         }
@@ -91,7 +91,7 @@ fn every_property_holds_of_changes_to_what_the_fuzzer_kept() {
     let end = Instant::now() + Duration::from_secs(seconds());
     let mut tried = 0;
     while Instant::now() < end {
-        for (door, property) in crate::properties::ALL {
+        for (door, property) in super::properties::ALL {
             let kept = kept(door);
             let config = ProptestConfig {
                 cases: 8,

@@ -10,9 +10,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use super::shortage::User;
 use crate::bench::pair::Pair;
 use crate::bench::{Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
-use crate::shortage::User;
 use hardnessd_core::frame::{RawFrame, Stamp};
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};

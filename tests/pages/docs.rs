@@ -3,7 +3,7 @@
 //!
 //! A block whose fence names a source is made from that source: `text hardnessd run -h` from what the
 //! program prints but for the option that every command has, `toml config/hardnessd.toml [press]` from that part of the file. `MAKE_PAGES=1 cargo test
-//! --workspace --test pages blocks` writes them.
+//! --workspace --test program blocks` writes them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -166,7 +166,7 @@ fn blocks_that_are_made_have_what_their_sources_say() {
         let changed = text.lines().zip(made.lines()).find(|(old, new)| old != new);
         assert!(
             text == made,
-            "{name}: MAKE_PAGES=1 cargo test --workspace --test pages blocks ({changed:?})"
+            "{name}: MAKE_PAGES=1 cargo test --workspace --test program blocks ({changed:?})"
         );
     }
 }

@@ -12,9 +12,9 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use super::commands::{Call, blocks, calls, calls_of, names_of};
+use super::docs::has_command;
 use crate::bench::BINARY;
-use crate::commands::{Call, blocks, calls, calls_of, names_of};
-use crate::docs::has_command;
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use hardnessd::tools::args::Args;

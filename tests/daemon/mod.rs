@@ -1,11 +1,4 @@
 //! The real binary on a real pty: the daemon, its outputs and its tools.
-#![allow(
-    clippy::unwrap_used,
-    reason = "clippy knows no helper of a test as a test"
-)]
-
-#[path = "../bench/mod.rs"]
-mod bench;
 
 mod arm;
 mod calibrate;

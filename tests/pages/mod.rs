@@ -1,0 +1,5 @@
+//! The pages say what the programs do.
+mod commands;
+mod docs;
+mod guides;
+mod pages;
