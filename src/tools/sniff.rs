@@ -44,6 +44,7 @@ use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
+use hardnessd_core::tare::NEWTONS_PER_COUNT;
 use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::escaped;
 
@@ -221,7 +222,8 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
     let text = configuration(
         args,
         listened_s.map(|s| found.best.proposal.frames as f64 / s),
-    ) + &frame;
+    ) + &frame
+        + &calibration(found.best.proposal.most_counts);
     let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
     written.map_err(|source| Error::Write {
         path: out.clone(),
@@ -260,6 +262,20 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
         None => text += &format!("# frame_rate_hz = {DEFAULT_FRAME_RATE_HZ:?}\n"),
     }
     text
+}
+
+/// The part below `[sensor.frame]`, for counts that are finer than a byte: with the default newtons, the
+/// noise of such a sensor would pass for a touch. Full scale is as many newtons as that of a byte.
+fn calibration(most_counts: u16) -> String {
+    let full_scale = (u32::from(most_counts) + 1).next_power_of_two() - 1;
+    if full_scale <= u32::from(u8::MAX) {
+        return String::new();
+    }
+    let newtons = NEWTONS_PER_COUNT * f32::from(u8::MAX) / full_scale as f32;
+    format!(
+        "\n[sensor.calibration]\nnewtons_per_count = {newtons:.5}  # a guess from counts up to {most_counts}: \
+         measure it with weights\n"
+    )
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Error> {

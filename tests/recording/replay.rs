@@ -194,6 +194,61 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
     }
 }
 
+/// Lines of a sketch that prints 12 bits of 12x8 taxels, at 20 frames/s: 2 s of rest and three presses, with
+/// noise of up to four counts.
+fn fine_counts() -> String {
+    let mut lines = String::new();
+    let (mut noise, rest) = (1_u32, 40);
+    for frame in 0..rest + 3 * 40 {
+        let press = (frame as f32 - rest as f32) / 40.0;
+        let (row, col) = [(3.0, 2.0), (8.0, 5.0), (5.0, 4.0)][press.max(0.0) as usize];
+        let depth = (std::f32::consts::PI * press.max(0.0).fract()).sin() - 0.2;
+        let taxel = |place: usize| {
+            let (down, along) = ((place / 8) as f32 - row, (place % 8) as f32 - col);
+            let load = 3000.0 * depth.max(0.0) * (-(down * down + along * along) / 4.0).exp();
+            noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (60 + (noise >> 24) % 5 + load as u32).to_string()
+        };
+        lines += &(0..96).map(taxel).collect::<Vec<_>>().join(",");
+        lines += "\n";
+    }
+    lines
+}
+
+#[test]
+fn what_sniff_writes_for_fine_counts_takes_noise_for_no_touch() {
+    let directory = tempfile::tempdir().unwrap();
+    let (bytes, config) = (
+        directory.path().join("s.bin"),
+        directory.path().join("s.toml"),
+    );
+    std::fs::write(&bytes, fine_counts()).unwrap();
+    let sniffed = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+        .arg("sniff")
+        .arg(&bytes)
+        .arg("--out")
+        .arg(&config)
+        .output()
+        .unwrap();
+    assert!(sniffed.status.success(), "{sniffed:?}");
+    let written = std::fs::read_to_string(&config).unwrap();
+    assert!(
+        written.contains("\nnewtons_per_count = 0.00249  # a guess"),
+        "{written}"
+    );
+    let replayed = |config: &str| {
+        std::fs::write(directory.path().join("rate.toml"), config).unwrap();
+        let at = directory.path().join("rate.toml");
+        replay(&bytes, &["--config", at.to_str().unwrap()])
+    };
+    let at_rate = written.replace("# frame_rate_hz = 5.0", "frame_rate_hz = 20.0");
+    let events = replayed(&at_rate);
+    assert_eq!(events.matches("\"state\":\"end\"").count(), 3, "{events}");
+    // The default of a byte takes the noise for a touch, so there is no zero and no press.
+    let without = at_rate.split("\n[sensor.calibration]").next().unwrap();
+    assert!(!replayed(without).contains("\"state\":\"end\""));
+}
+
 /// What came of the presses of a recording.
 #[derive(Debug, Default, PartialEq)]
 struct Outcome {

@@ -23,6 +23,8 @@ pub(super) struct Proposal {
     pub(super) settings: Settings,
     pub(super) frames: u64,
     pub(super) frames_damaged: u64,
+    /// The greatest count of a taxel.
+    pub(super) most_counts: u16,
     /// Share of all bytes that whole frames hold.
     pub(super) share: f64,
     /// What else there is to say.
@@ -46,14 +48,17 @@ impl Proposal {
     /// Decodes `bytes` with the settings. `None` if they find too few frames, or many damaged ones.
     pub(super) fn decoded(settings: Settings, bytes: &[u8]) -> Option<Self> {
         let mut decoder = Decoder::new(Layout::new(&settings).ok()?);
-        let (mut frames, mut frames_damaged) = (0, 0);
+        let (mut frames, mut frames_damaged, mut most_counts) = (0, 0, 0);
         let mut count = |decoder: &mut Decoder| {
             while let Some(item) = decoder.next_frame() {
-                *if item.is_ok() {
-                    &mut frames
-                } else {
-                    &mut frames_damaged
-                } += 1;
+                match item {
+                    Ok(found) => {
+                        frames += 1;
+                        let counts = found.frame.counts.iter().copied();
+                        most_counts = counts.fold(most_counts, u16::max);
+                    }
+                    Err(_) => frames_damaged += 1,
+                }
             }
         };
         for chunk in bytes.chunks(CHUNK_BYTES) {
@@ -68,6 +73,7 @@ impl Proposal {
             settings,
             frames,
             frames_damaged,
+            most_counts,
             share,
             remarks: Vec::new(),
             doubt: None,
