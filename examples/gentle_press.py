@@ -39,7 +39,10 @@ def press(arm, events, sensor, limit_n=15.0, sure=0.0):
     early, greatest_n, loading, goal_mm = None, 0.0, True, 0.0
     start, live = time.monotonic(), False
     for event in events:
-        if event.get("sensor", sensor) != sensor:
+        seconds, ours = time.monotonic() - start, event.get("sensor", sensor) == sensor
+        if seconds > 2 * LONGEST_S or ours and event["type"] == "press" and event["state"] == "aborted":
+            raise RuntimeError(f"no verdict: {sensor} is no sensor, was lost, or the arm touched nothing or too lightly")
+        if not ours:
             continue
         if event["type"] in ("status", "disconnected"):
             live = event.get("state") == "live"
@@ -49,15 +52,12 @@ def press(arm, events, sensor, limit_n=15.0, sure=0.0):
             return early, event, greatest_n
         elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
             early = event
-        seconds = time.monotonic() - start
         loading = loading and not early and greatest_n < limit_n and seconds < LONGEST_S
         # While nothing is known of the sensor, the arm goes back.
         wanted_mm = FAR_MM if loading and live else 0.0
         if wanted_mm != goal_mm:
             goal_mm = wanted_mm
             arm.order(to_mm=goal_mm, speed_mm_s=SPEED_MM_S)
-        if event["type"] == "press" and event["state"] == "aborted" or seconds > 2 * LONGEST_S:
-            raise RuntimeError("no verdict: the arm did not touch the object, or too lightly, or the sensor was lost")
 
 
 def main():

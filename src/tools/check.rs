@@ -279,8 +279,12 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
             sensor.baud
         )
     };
+    let references = sensor.references.as_ref();
+    let references = references.map_or(String::new(), |file| {
+        format!(", references {}", file.display())
+    });
     Ok(format!(
-        "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}{}\n",
+        "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}{}{references}\n",
         sensor.name,
         sensor.port,
         array.rows,

@@ -68,6 +68,30 @@ pub(super) fn obstacle(port: &Port) -> Option<String> {
     fault.map(|fault| fault.to_string())
 }
 
+/// A sensor whose port does not open.
+#[derive(Debug, thiserror::Error)]
+#[error("sensor {sensor:?}: {port}: {obstacle}")]
+pub struct Unavailable {
+    /// The sensor's name.
+    sensor: String,
+    /// The sensor's port, as the configuration gives it.
+    port: Port,
+    /// The fault, and the remedy.
+    obstacle: String,
+}
+
+impl Unavailable {
+    /// `reason` is the system's. It counts where no fault is visible.
+    pub(super) fn new(sensor: String, port: Port, reason: String) -> Self {
+        let obstacle = obstacle(&port).unwrap_or(reason);
+        Self {
+            sensor,
+            port,
+            obstacle,
+        }
+    }
+}
+
 fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }

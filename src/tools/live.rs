@@ -12,10 +12,11 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
+use super::doctor;
 use crate::daemon::config::Setup;
-use crate::daemon::record::Progress;
+use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
-use hardnessd_core::exit::{Coded, IO};
+use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
 use hardnessd_core::recording::Labels;
 
 /// The reason why there is no recording.
@@ -24,6 +25,9 @@ pub enum Error {
     /// The daemon cannot serve, or has stopped.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
+    /// The sensor's port does not open.
+    #[error(transparent)]
+    Unavailable(#[from] doctor::Unavailable),
     /// The temporary file for the recording cannot be used.
     #[error("{path}: {source}")]
     Temporary {
@@ -38,6 +42,7 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Self::Daemon(error) => error.exit_code(),
+            Self::Unavailable(_) => UNAVAILABLE,
             Self::Temporary { .. } => IO,
         }
     }
@@ -59,6 +64,7 @@ pub(super) async fn record(
 ) -> Result<Option<File>, Error> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
+    let port = setup.config.sensors[0].port.clone();
     let path = std::env::temp_dir();
     let temporary = |source| Error::Temporary {
         path: path.clone(),
@@ -93,7 +99,12 @@ pub(super) async fn record(
             () = shutdown => stopped = true,
         }
     };
-    daemon.run(end, None).await?;
+    match daemon.run(end, None).await {
+        Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
+            return Err(doctor::Unavailable::new(sensor, port, reason).into());
+        }
+        recorded => recorded?,
+    }
     if stopped {
         return Ok(None);
     }

@@ -114,15 +114,8 @@ pub enum Error {
         source: io::Error,
     },
     /// A sensor is missing at the start.
-    #[error("sensor {sensor:?}: {port}: {obstacle}")]
-    Unavailable {
-        /// The sensor's name.
-        sensor: String,
-        /// The sensor's port, as the configuration gives it.
-        port: Port,
-        /// The fault, and the remedy.
-        obstacle: String,
-    },
+    #[error(transparent)]
+    Unavailable(#[from] doctor::Unavailable),
     /// The system has no thread for it.
     #[error(transparent)]
     Thread(#[from] NoThread),
@@ -138,7 +131,7 @@ impl Coded for Error {
                 USAGE
             }
             Error::Session { .. } | Error::Create { .. } | Error::Thread(_) => IO,
-            Error::Unavailable { .. } => UNAVAILABLE,
+            Error::Unavailable(_) => UNAVAILABLE,
             Error::Daemon(error) => error.exit_code(),
         }
     }
@@ -270,12 +263,7 @@ async fn record(
     match daemon.run(end, None).await {
         Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
             let port = ports[&sensor].clone();
-            let obstacle = doctor::obstacle(&port).unwrap_or(reason);
-            Err(Error::Unavailable {
-                sensor,
-                port,
-                obstacle,
-            })
+            Err(doctor::Unavailable::new(sensor, port, reason).into())
         }
         recorded => Ok(recorded?),
     }

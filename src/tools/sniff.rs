@@ -229,12 +229,13 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
         path: out.clone(),
         source,
     })?;
+    let out = escaped(&out.display().to_string());
     let next = if args.port.is_some() {
-        "`hardnessd check --config` says what would run"
+        format!("`hardnessd check --config {out}` says what would run")
     } else {
-        "set its port and frame_rate_hz, which a file does not say"
+        "set its port and frame_rate_hz, which a file does not say".to_owned()
     };
-    hardnessd_core::stderr_line!("wrote {}: {next}", escaped(&out.display().to_string()));
+    hardnessd_core::stderr_line!("wrote {out}: {next}");
     Ok(())
 }
 
