@@ -228,9 +228,15 @@ pub(super) async fn run(
         log.flush();
         asked = asked.filter(|_| is_next);
     }
-    let directory = shown(directory);
+    let next = match list.added {
+        0 => String::new(),
+        _ => format!(
+            "; next: hrn-train collect --out D.npz {}/*.mcap",
+            shown(directory)
+        ),
+    };
     print(&format!(
-        "\nrecorded {} object{} in this session; next: hrn-train collect --out D.npz {directory}/*.mcap\n",
+        "\nrecorded {} object{} in this session{next}\n",
         list.added,
         if list.added == 1 { "" } else { "s" },
     ));
