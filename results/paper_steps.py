@@ -19,6 +19,7 @@ METHODS = {
     "nahrn": ("ours without augmentation", 85.7),
     "nihrn": ("ours without USTGAN's start", 90.1),
     "ours": ("the paper's method", 94.4),
+    "ours-steady": ("ours, GAN does not break", None),
     "sgan": ("one GAN, Odena", 86.2),
     "igan": ("one GAN, Salimans", 87.8),
     "hrn50": ("5,000 labels, no GAN", 86.6),
