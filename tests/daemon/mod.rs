@@ -3,7 +3,7 @@
 mod arm;
 mod calibrate;
 mod commands;
-mod daemon;
+mod running;
 mod demo;
 mod doors;
 mod faults;

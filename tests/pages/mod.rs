@@ -1,5 +1,6 @@
 //! The pages say what the programs do.
+
 mod commands;
 mod docs;
 mod guides;
-mod pages;
+mod links;

@@ -1,6 +1,6 @@
 //! Recordings: made by the real binary, replayed, damaged and saved.
 
 mod identify;
-mod recording;
+mod record;
 mod replay;
 mod session;
