@@ -74,7 +74,7 @@ OBJECTS = [  # name, level, number
     for level, name in enumerate(["wood", "rubber", "plasticine", "sponge"], 1)
 ]
 TRAIN, TEST = OBJECTS[:8], OBJECTS[8:]
-PRESSES = 12  # of each object
+PRESSES = 8  # of each object
 
 SIMULATED = '[[sensor]]\nname = "forearm"\nport = "forearm"\nframe_rate_hz = 40\n'
 CONFIGURATION = f'{SENSOR or SIMULATED}\n[publish.unix]\npath = "events.sock"\n'
@@ -88,7 +88,7 @@ def pressed(name, seed):
         input(f"\nLet nothing touch the sensor and press Enter. Then press {name} {PRESSES} times ")
         yield
         return
-    # The simulated robot presses twice as fast as a real one: four minutes in all. Much faster, and a soft material has
+    # The simulated robot presses twice as fast as a real one: three minutes in all. Much faster, and a soft material has
     # no time to creep, so the built-in model takes it for a softer one. Each press is on another piece of the material.
     options = ["--fps", "20", "--speed", "2", "--baud", "230400", "--material", name, "--seed", str(seed)]
     with running("hardnessd", "simulate", "--link", "forearm", *options) as process:

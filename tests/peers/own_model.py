@@ -38,7 +38,7 @@ def main():
         start = time.monotonic()
         done = subprocess.run(
             [sys.executable, EXAMPLE, directory],
-            env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, timeout=900,
+            env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, timeout=400,
         )
         took_s = time.monotonic() - start
         print(done.stdout)

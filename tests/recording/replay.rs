@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use crate::bench::hardnessd;
 use hardnessd_core::test_support::of_a_press;
 use serde_json::Value;
 
@@ -223,13 +224,8 @@ fn what_sniff_writes_for_fine_counts_takes_noise_for_no_touch() {
         directory.path().join("s.toml"),
     );
     std::fs::write(&bytes, fine_counts()).unwrap();
-    let sniffed = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-        .arg("sniff")
-        .arg(&bytes)
-        .arg("--out")
-        .arg(&config)
-        .output()
-        .unwrap();
+    let [from, to] = [&bytes, &config].map(|path| path.to_str().unwrap());
+    let sniffed = hardnessd(&["sniff", from, "--out", to]);
     assert!(sniffed.status.success(), "{sniffed:?}");
     let written = std::fs::read_to_string(&config).unwrap();
     assert!(

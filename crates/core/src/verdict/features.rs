@@ -61,7 +61,7 @@ pub type FrameFeatures = [f32; FRAME];
 
 /// The features of a frame on the model's grid.
 pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
-    let Extent { rows, cols, peak } = Extent::of(frame);
+    let Bounds { rows, cols, peak } = Bounds::of(frame);
     let mut sums = Sums::default();
     let mut counts = [0.0_f32; 5];
     let mut shares = [0.0_f32; 3];
@@ -142,15 +142,15 @@ pub fn force_n(frame: &FrameFeatures) -> f32 {
     (frame[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
-/// Where the taxels in contact lie, and the greatest force of a taxel. Only they have features, and
-/// they are few: the sums over a press of 48 frames take a fifth of the time that whole frames take.
-struct Extent {
+/// The rows and columns of the taxels in contact, and the greatest force of a taxel. No other taxel
+/// adds to a feature, and most frames have few in contact.
+struct Bounds {
     rows: Range<usize>,
     cols: Range<usize>,
     peak: f32,
 }
 
-impl Extent {
+impl Bounds {
     fn of(frame: &ModelFrame) -> Self {
         let mut of_cols = [0.0_f32; COLS];
         let mut rows = 0..0;
