@@ -12,8 +12,9 @@ mod status;
 
 use std::convert::Infallible;
 use std::fmt::Display;
-use std::io::Write as _;
+use std::io::{self, ErrorKind, Write as _};
 use std::net::SocketAddr;
+use std::os::fd::AsFd as _;
 use std::pin::pin;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -33,6 +34,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use rustix::net::sockopt;
 use sha2::{Digest, Sha256};
+use tokio::io::Interest;
 use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tracing::debug;
@@ -180,6 +182,32 @@ fn head_bytes(request: &Request<Incoming>) -> usize {
     target + headers.sum::<usize>()
 }
 
+/// A second handle of the socket of a request's connection. An answer without end watches it.
+#[derive(Debug, Clone)]
+struct Client(Arc<TcpStream>);
+
+impl Client {
+    fn of(stream: &TcpStream) -> io::Result<Self> {
+        let socket = stream.as_fd().try_clone_to_owned()?;
+        Ok(Self(Arc::new(TcpStream::from_std(socket.into())?)))
+    }
+
+    /// Waits until the client has closed its end. hyper does not notice it while bytes of a further
+    /// request wait in its buffer.
+    async fn gone(&self) -> io::Error {
+        loop {
+            match self.0.ready(Interest::READABLE).await {
+                Ok(ready) if ready.is_read_closed() => return ErrorKind::ConnectionAborted.into(),
+                Ok(_) => {}
+                Err(error) => return error,
+            }
+            // These bytes are for hyper. This waits for the next change of the socket.
+            let pass = || Err::<(), _>(ErrorKind::WouldBlock.into());
+            let _ = self.0.try_io(Interest::READABLE, pass);
+        }
+    }
+}
+
 /// An answer with an error code and one line with the reason.
 fn refusal(code: StatusCode, why: impl Display) -> Response {
     (code, format!("{why}\n")).into_response()
@@ -324,14 +352,16 @@ impl Serve<TcpStream> for Http {
     fn serve(&self, stream: TcpStream) -> impl Future<Output = ()> + Send + 'static {
         let http = self.clone();
         async move {
-            let Ok(local) = stream.local_addr() else {
+            let (Ok(local), Ok(client)) = (stream.local_addr(), Client::of(&stream)) else {
                 return;
             };
             // The system closes it then. On failure it stays open.
             let _ = sockopt::set_tcp_user_timeout(&stream, UNREAD_PATIENCE.as_millis() as u32);
             let mut stop = http.stop.clone();
-            let service =
-                service_fn(async |request| Ok::<_, Infallible>(http.respond(request, local).await));
+            let service = service_fn(async |mut request: Request<Incoming>| {
+                request.extensions_mut().insert(client.clone());
+                Ok::<_, Infallible>(http.respond(request, local).await)
+            });
             let mut connection = pin!(
                 http1::Builder::new()
                     .timer(TokioTimer::new())

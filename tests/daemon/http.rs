@@ -3,7 +3,7 @@
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::bench::{Bench, Daemon, PATIENCE, wait_for};
 use serde_json::{Value, json};
@@ -157,6 +157,27 @@ fn requests_given_up_at_once_leave_no_subscriber() {
             let none = "hardnessd_subscribers{robot=\"arm-7\"} 0\n";
             get(address, "/metrics").body.contains(none)
         });
+    }
+}
+
+#[test]
+fn a_client_that_leaves_behind_a_further_request_is_noticed() {
+    let bench = Bench::new();
+    let (_daemon, address) = serving(&bench);
+    for rest in ["GET / HTTP/1.1\r\n", &"x".repeat(200_000)] {
+        let mut stream = TcpStream::connect(address).unwrap();
+        let request = format!("GET /events HTTP/1.1\r\nHost: {address}\r\n\r\n{rest}");
+        stream.write_all(request.as_bytes()).unwrap();
+        let subscribers = |count| {
+            let line = format!("hardnessd_subscribers{{robot=\"arm-7\"}} {count}\n");
+            get(address, "/metrics").body.contains(&line)
+        };
+        wait_for("a subscriber", || subscribers(1));
+        drop(stream);
+        let left = Instant::now();
+        wait_for("the end of all subscribers", || subscribers(0));
+        // A write would find it out at a heartbeat, 15 s after the last event.
+        assert!(left.elapsed() < Duration::from_secs(10));
     }
 }
 

@@ -4,17 +4,18 @@
 //! `Last-Event-ID`, which is the hub's `since`. Frames are sent only on request, and only the
 //! newest of each sensor, because a page shows the present.
 
-use std::convert::Infallible;
+use std::io;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::extract::{Request, State};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
-use futures_util::stream::{self, Stream, StreamExt};
+use futures_util::stream::{self, Stream, TryStreamExt as _};
 use hyper::StatusCode;
 use tokio::sync::{OwnedSemaphorePermit, SemaphorePermit, mpsc, oneshot};
 
-use super::{Sources, full, refusal, reserve};
+use super::{Client, Sources, full, refusal, reserve};
 use crate::daemon::hub::{Ahead, Closed, Line};
 use crate::daemon::request::{Kinds, Policy, Since, Subscription, Unusable};
 use hardnessd_core::event::Kind;
@@ -39,11 +40,12 @@ struct Batch {
 
 impl Batch {
     /// The events. The last one gives the share back.
-    fn events(self) -> impl Stream<Item = Event> {
+    fn events(self) -> impl Stream<Item = io::Result<Event>> {
         let Self { events, bytes } = self;
-        stream::iter(events.into_iter().inspect(move |_| {
+        let events = events.into_iter().inspect(move |_| {
             let _held = &bytes;
-        }))
+        });
+        stream::iter(events.map(Ok))
     }
 }
 
@@ -57,6 +59,7 @@ enum Refused {
 /// Answers a request.
 pub(super) async fn answer(
     State(sources): State<Sources>,
+    Extension(client): Extension<Client>,
     request: Request,
 ) -> Result<Response, Closed> {
     let wanted = match wanted(&request) {
@@ -64,9 +67,15 @@ pub(super) async fn answer(
         Err(unusable) => return Ok(refusal(StatusCode::BAD_REQUEST, unusable)),
     };
     Ok(match open(sources, wanted).await? {
-        Ok(mut batches) => {
-            let batches = stream::poll_fn(move |context| batches.poll_recv(context));
-            let events = batches.flat_map(Batch::events).map(Ok::<_, Infallible>);
+        Ok(batches) => {
+            let batches = stream::unfold((batches, client), async |(mut batches, client)| {
+                let next = tokio::select! {
+                    gone = client.gone() => Err(gone),
+                    batch = batches.recv() => Ok(batch?),
+                };
+                Some((next, (batches, client)))
+            });
+            let events = batches.map_ok(Batch::events).try_flatten();
             let beat = KeepAlive::new().interval(HEARTBEAT);
             // Without it, nginx and its like hold events back.
             let unbuffered = [("x-accel-buffering", "no")];
@@ -217,6 +226,8 @@ mod tests {
     use std::sync::Arc;
 
     use axum::body::Body;
+    use futures_util::StreamExt as _;
+    use tokio::net::{TcpListener, TcpStream};
     use tokio::sync::Semaphore;
 
     use super::*;
@@ -280,9 +291,15 @@ mod tests {
             turns: Arc::new(Semaphore::new(1)),
             text_bytes: Arc::clone(&room),
         };
+        let listener = TcpListener::bind("localhost:0").await.unwrap();
+        let browser = TcpStream::connect(listener.local_addr().unwrap());
+        let client = Client::of(&browser.await.unwrap()).unwrap();
         let ask = async || {
             let request = Request::get("/events").body(Body::empty()).unwrap();
-            answer(State(sources.clone()), request).await.unwrap()
+            let client = Extension(client.clone());
+            answer(State(sources.clone()), client, request)
+                .await
+                .unwrap()
         };
         let mut asleep = Vec::new();
         let full = loop {
