@@ -389,13 +389,15 @@ fn of_files(
     Ok(all)
 }
 
+/// The greatest force of a press, in newtons.
+fn greatest_n(course: &Course) -> f64 {
+    let forces = course.moments.iter().map(|moment| moment.frame.force_n());
+    forces.fold(0.0, f64::max)
+}
+
 /// At most `most` of the presses, evenly up to the hardest: presses of unlike force tell most.
 fn spread(mut courses: Vec<Course>, most: usize) -> Vec<Course> {
-    let greatest = |course: &Course| {
-        let forces = course.moments.iter().map(|moment| moment.frame.force_n());
-        forces.fold(0.0, f64::max)
-    };
-    courses.sort_by(|a, b| greatest(a).total_cmp(&greatest(b)));
+    courses.sort_by(|a, b| greatest_n(a).total_cmp(&greatest_n(b)));
     let (found, wanted) = (courses.len(), most.min(courses.len()));
     let places = (1..=wanted).map(|number| number * found / wanted - 1);
     places.map(|place| courses[place].clone()).collect()
@@ -508,6 +510,11 @@ fn account(out: &str, references: &[ReferencePress]) -> String {
         "presses on  rigid flat piece {flat}, rigid ball {ball}, known hardness {}\n",
         references.len() - flat - ball
     );
+    let forces = references.iter().map(|press| greatest_n(&press.course));
+    let (least, most) = forces.fold((f64::INFINITY, 0.0), |(least, most), force_n| {
+        (force_n.min(least), force_n.max(most))
+    });
+    text += &format!("greatest force of a press  {least:.1} to {most:.1} N\n");
     let without = references.iter().filter(|press| {
         let mut moments = press.course.moments.iter();
         moments.all(|moment| moment.approach_mm.is_none())
@@ -531,9 +538,8 @@ mod tests {
     use super::*;
     use hardnessd_core::verdict::{CourseMoment, ModelFrame, TAXELS};
 
-    #[test]
-    fn the_presses_that_are_taken_differ_in_force() {
-        let press = |newtons: f32| Course {
+    fn press(newtons: f32) -> Course {
+        Course {
             moments: vec![CourseMoment {
                 time_s: 0.0,
                 approach_mm: None,
@@ -542,7 +548,11 @@ mod tests {
                 },
             }],
             arm_n_per_mm: 0.0,
-        };
+        }
+    }
+
+    #[test]
+    fn the_presses_that_are_taken_differ_in_force() {
         let taken = |most| {
             let courses = [5.0, 1.0, 4.0, 2.0, 3.0].map(press).to_vec();
             let taken = spread(courses, most);
@@ -555,6 +565,16 @@ mod tests {
         assert_eq!(taken(2), [2.0, 5.0]);
         assert_eq!(taken(64), [1.0, 2.0, 3.0, 4.0, 5.0]);
         assert_eq!(spread(Vec::new(), 5), []);
+    }
+
+    #[test]
+    fn the_account_shows_the_forces() {
+        let presses = [0.03, 0.01, 0.02].map(|newtons| ReferencePress {
+            piece: Piece::Ball { radius_mm: 10.0 },
+            course: press(newtons),
+        });
+        let text = account("r.npz", &presses);
+        assert!(text.contains("press  7.8 to 23.5 N\n"), "{text}");
     }
 
     #[test]

@@ -223,7 +223,8 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
         args,
         listened_s.map(|s| found.best.proposal.frames as f64 / s),
     ) + &frame
-        + &calibration(found.best.proposal.most_counts);
+        + &calibration(found.best.proposal.most_counts)
+        + PAGE;
     let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
     written.map_err(|source| Error::Write {
         path: out.clone(),
@@ -264,6 +265,9 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
     }
     text
 }
+
+/// The end of a configuration.
+const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for your browser\n";
 
 /// The part below `[sensor.frame]`, for counts that are finer than a byte: with the default newtons, the
 /// noise of such a sensor would pass for a touch. Full scale is as many newtons as that of a byte.

@@ -133,10 +133,9 @@ fn sniff_writes_a_configuration_that_check_takes() {
     assert_eq!(status.code(), Some(0), "{}", text(&stderr));
     assert_eq!(text(&stdout), "");
     let written = fs::read_to_string(&config).unwrap();
-    assert!(
-        written.ends_with("[sensor.frame]\npreset = \"jx255n\"\n"),
-        "{written}"
-    );
+    let end = "[sensor.frame]\npreset = \"jx255n\"\n\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for \
+               your browser\n";
+    assert!(written.ends_with(end), "{written}");
     let Output {
         status,
         stdout,

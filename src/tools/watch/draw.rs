@@ -139,8 +139,13 @@ impl Page<'_> {
         };
         let rest = self.text(row, &hello.robot, self.look.strong());
         let dot = self.look.separator();
+        // Several sensors have tabs.
+        let sensor = match &view.sensors[..] {
+            [only] => format!("{dot}{}", only.name),
+            _ => String::new(),
+        };
         let line = format!(
-            "{dot}hardnessd {}{dot}model {} ({})",
+            "{sensor}{dot}hardnessd {}{dot}model {} ({})",
             hello.version, hello.model, hello.validation
         );
         self.text(rest, &line, self.look.aside());
