@@ -10,6 +10,7 @@
 
 mod period;
 mod columns;
+mod marking;
 mod picture;
 mod checks;
 mod places;

@@ -29,6 +29,8 @@ pub(super) struct Number {
     pub(super) is_big_endian: Option<bool>,
     /// By how much it grows in a frame.
     pub(super) step: u64,
+    /// Whether it has begun again at 0. Then it has no higher bytes.
+    pub(super) wraps: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -36,7 +38,11 @@ pub(super) struct Columns {
     pub(super) kinds: Vec<Kind>,
     /// The most frequent value of each byte.
     pub(super) rest: Vec<u8>,
+    /// The number of frames in which each byte has another value.
+    pub(super) changes: Vec<u32>,
     pub(super) numbers: Vec<Number>,
+    /// Whether most of the bytes that change do so as a checksum does. No array is among them.
+    pub(super) are_random: bool,
 }
 
 /// Two frames that follow each other.
@@ -71,19 +77,22 @@ impl Columns {
         }
         let most = |count: &[u32; 256]| (0..=u8::MAX).max_by_key(|&byte| count[usize::from(byte)]);
         let rest: Vec<u8> = counts.iter().filter_map(most).collect();
+        let others =
+            |(count, &rest): (&[u32; 256], &u8)| frames.len() as u32 - count[usize::from(rest)];
+        let changes: Vec<u32> = counts.iter().zip(&rest).map(others).collect();
         let pairs: Vec<Pair> = frames
             .pairs()
             .map(|(a, b)| (frames.get(a), frames.get(b)))
             .collect();
         let kinds = (0..period).map(|at| {
             let value = rest[at];
-            let others = frames.len() as f64 - f64::from(counts[at][usize::from(value)]);
             // Damage changes a byte in one frame, a press in several.
             let held = pairs
                 .iter()
                 .filter(|(a, b)| a[at] != value && b[at] != value)
                 .count();
-            if held < 2 && others <= (DAMAGED_SHARE * frames.len() as f64).max(1.0) {
+            if held < 2 && f64::from(changes[at]) <= (DAMAGED_SHARE * frames.len() as f64).max(1.0)
+            {
                 Kind::Resting(value)
             } else {
                 Kind::Active
@@ -92,36 +101,44 @@ impl Columns {
         let mut columns = Self {
             kinds: kinds.collect(),
             rest,
+            changes,
             numbers: Vec::new(),
+            are_random: false,
         };
         columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
-        columns.find_marking();
         columns
     }
 
+    /// Finds the numbers. Where two of them overlap, the one that has grown from the fewest bytes is
+    /// right, and then the longest: the other order of some bytes often grows as steadily.
     fn find_numbers(&mut self, pairs: &[Pair]) {
         for bytes in [1, 2, 4] {
-            for at in 0..self.kinds.len() {
-                for is_big_endian in [false, true] {
-                    let Some(number) = self.number(at, bytes, is_big_endian, pairs) else {
-                        continue;
-                    };
-                    self.kinds[number.at..number.at + number.bytes].fill(Kind::Number);
+            let places = 0..self.kinds.len();
+            let both = places.flat_map(|at| [(at, false), (at, true)]);
+            let mut found: Vec<(Number, usize)> = both
+                .filter_map(|(at, is_big_endian)| self.number(at, bytes, is_big_endian, pairs))
+                .collect();
+            found.sort_by_key(|(number, steady)| std::cmp::Reverse((number.bytes, *steady)));
+            for (number, _) in found {
+                let kinds = &mut self.kinds[number.at..number.at + number.bytes];
+                if !kinds.contains(&Kind::Number) {
+                    kinds.fill(Kind::Number);
                     self.numbers.push(number);
                 }
             }
         }
     }
 
-    /// The number at `at`, if these bytes are free and grow steadily.
+    /// The number at `at`, if these bytes are free and grow steadily, and how many pairs have about its
+    /// step.
     fn number(
         &self,
         at: usize,
         bytes: usize,
         is_big_endian: bool,
         pairs: &[Pair],
-    ) -> Option<Number> {
+    ) -> Option<(Number, usize)> {
         let kinds = self.kinds.get(at..at + bytes)?;
         // The lowest byte changes in any case.
         let lowest = if is_big_endian { bytes - 1 } else { 0 };
@@ -134,6 +151,7 @@ impl Columns {
             bytes,
             is_big_endian: (bytes > 1).then_some(is_big_endian),
             step,
+            wraps: false,
         };
         // A higher byte belongs to it if the longer number is as steady.
         while number.bytes < MOST_NUMBER_BYTES {
@@ -153,6 +171,7 @@ impl Columns {
                         bytes,
                         is_big_endian: Some(is_big_endian),
                         step,
+                        wraps: false,
                     };
                     (more >= steady).then_some((longer, more))
                 });
@@ -161,20 +180,34 @@ impl Columns {
                 None => break,
             }
         }
-        Some(number)
+        let bytes = number.at..number.at + number.bytes;
+        let value =
+            |frame: &[u8]| self::number(&frame[bytes.clone()], number.is_big_endian == Some(true));
+        // Damage may make it smaller too, but not by a step.
+        let mask = u64::MAX >> (64 - 8 * number.bytes);
+        number.wraps = pairs.iter().any(|(a, b)| {
+            let (before, after) = (value(a), value(b));
+            after < before && after.wrapping_sub(before) & mask <= 2 * number.step
+        });
+        Some((number, steady))
+    }
+
+    /// How much the taxels of two frames differ.
+    pub(super) fn change(&self, a: &[u8], b: &[u8]) -> u32 {
+        let active = self.kinds.iter().zip(a.iter().zip(b));
+        let changes = active.filter(|(kind, _)| **kind == Kind::Active);
+        changes
+            .map(|(_, (a, b))| u32::from(a.abs_diff(*b).min(32)))
+            .sum()
     }
 
     fn find_restless(&mut self, pairs: &[Pair]) {
         let active: Vec<usize> = (0..self.kinds.len())
             .filter(|&at| self.kinds[at] == Kind::Active)
             .collect();
-        let change = |(a, b): &Pair| -> u32 {
-            let changes = active.iter().map(|&at| a[at].abs_diff(b[at]).min(32));
-            changes.map(u32::from).sum()
-        };
         let mut changed: Vec<(u32, Pair)> = pairs
             .iter()
-            .map(|pair| (change(pair), *pair))
+            .map(|pair| (self.change(pair.0, pair.1), *pair))
             .filter(|(change, _)| *change > 0)
             .collect();
         changed.sort_by_key(|(change, _)| *change);
@@ -192,42 +225,10 @@ impl Columns {
             differences.sum::<f64>() / little.len() as f64 > RESTLESS_DIFFERENCE
         };
         let restless: Vec<usize> = active.iter().copied().filter(is_restless).collect();
+        self.are_random = 2 * restless.len() > active.len();
         if restless.len() <= MOST_RESTLESS.min(active.len() / 2) {
             for at in restless {
                 self.kinds[at] = Kind::Restless;
-            }
-        }
-    }
-
-    /// Tells the constant bytes that no taxel at rest has.
-    fn find_marking(&mut self) {
-        let period = self.kinds.len();
-        let mut constant = [0; 256];
-        for value in self.kinds.iter().filter_map(|kind| kind.constant()) {
-            constant[usize::from(value)] += 1;
-        }
-        let active = (0..period).filter(|&at| self.kinds[at] == Kind::Active);
-        let mut values: Vec<u8> = active.map(|at| self.rest[at]).collect();
-        values.sort_unstable();
-        // A few of these bytes may be a checksum.
-        let few = (values.len() / 8).min(values.len().saturating_sub(1) / 2);
-        let range = values.get(few).zip(values.iter().rev().nth(few));
-        let range = range.map(|(&least, &most)| {
-            let slack = if most > least {
-                (most - least) / 2 + 2
-            } else {
-                0
-            };
-            least.saturating_sub(slack)..=most.saturating_add(slack)
-        });
-        // The high bytes of taxels at rest are often all 0, and never change.
-        let many = (period / 10).max(6);
-        for kind in &mut self.kinds {
-            if let Kind::Resting(value) = *kind
-                && constant[usize::from(value)] < many
-                && !range.as_ref().is_some_and(|range| range.contains(&value))
-            {
-                *kind = Kind::Marking(value);
             }
         }
     }

@@ -21,10 +21,12 @@ const LEAST_SCORE: f64 = 0.5;
 const PRESET: f64 = 1.0;
 /// The longest side that is tried, so that an array that is too large is found.
 const LONGEST_SIDE: usize = 128;
-/// The most arrays whose checksum is looked for.
+/// The most arrays that are decoded.
 const MOST_ARRAYS: usize = 40;
 /// The number of frames that a checksum is tried on.
 const CHECKED: usize = 40;
+/// The share of the packets whose number follows the one before.
+const COUNTING_SHARE: f64 = 0.95;
 /// The logarithm of how much more the low byte of a cell changes from cell to cell than the high one.
 const UNLIKE: f64 = 1.4;
 
@@ -67,7 +69,7 @@ fn glove(bytes: &[u8]) -> Option<Found> {
 /// Of several failures, the one with the highest rank says most.
 fn rank(failure: &Failure) -> usize {
     match failure {
-        Failure::TooLarge(_) => 3,
+        Failure::TooLarge(_) | Failure::Packets { .. } => 3,
         Failure::NoPress(_) => 2,
         Failure::NoArray(_) => 1,
         _ => 0,
@@ -84,6 +86,18 @@ struct Candidate {
     picture: Vec<f32>,
 }
 
+impl Candidate {
+    fn parts<'a>(&'a self, frames: &'a Frames<'a>, columns: &'a Columns) -> Parts<'a> {
+        Parts {
+            frames,
+            columns,
+            place: &self.place,
+            array: self.array,
+            cell: self.cell,
+        }
+    }
+}
+
 fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failure> {
     let period = frames.period();
     // At a wrong distance, hardly a frame begins where the one before it ended.
@@ -91,20 +105,24 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
         return Err(Failure::NotPeriodic(bytes.len()));
     }
     let frames = &frames.followed();
-    let columns = &Columns::new(frames);
+    let mut columns = Columns::new(frames);
+    columns.find_marking(frames);
+    let columns = &columns;
     if !columns.kinds.contains(&Kind::Active) {
         return Err(Failure::NoPress(period));
     }
+    if let Some(packets) = packets(frames, columns) {
+        return Err(packets);
+    }
     let places = places(columns);
-    if places.is_empty() {
+    if places.is_empty() || columns.are_random {
         return Err(Failure::NoArray(period));
     }
     let presses = Presses::of(&columns.activity(frames)).ok_or(Failure::NoPress(period))?;
     let mut candidates = candidates(places, frames, columns, &presses, known);
-    candidates.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
-    candidates.truncate(MOST_ARRAYS);
     check(&mut candidates, frames, columns);
     candidates.sort_by(|a, b| b.score.total().total_cmp(&a.score.total()));
+    candidates.truncate(MOST_ARRAYS);
     let mut shown: Vec<Shown> = Vec::new();
     for candidate in &candidates {
         let Candidate { array, cell, .. } = *candidate;
@@ -119,17 +137,11 @@ fn in_frames(frames: &Frames, bytes: &[u8], known: Known) -> Result<Found, Failu
         }
         let is_other =
             |shown: &Shown| shown.array != array || shown.cell.is_some_and(|other| other != cell);
-        let parts = Parts {
-            frames,
-            columns,
-            place: &candidate.place,
-            array,
-            cell,
-        };
+        let parts = candidate.parts(frames, columns);
         if shown.iter().all(is_other)
             && let Some(mut proposal) = Proposal::of(&parts, bytes)
         {
-            proposal.doubt = doubt(candidate, &candidates);
+            proposal.doubt = doubt(candidate, &candidates, frames, columns);
             let mut score = candidate.score.clone();
             // Boards with the layout of a preset have its array.
             if keys(&proposal.settings) == 1 {
@@ -252,17 +264,55 @@ fn check(candidates: &mut [Candidate], frames: &Frames, columns: &Columns) {
 }
 
 /// Says where else the cells may begin, if that is as likely.
-fn doubt(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
+fn doubt(
+    best: &Candidate,
+    candidates: &[Candidate],
+    frames: &Frames,
+    columns: &Columns,
+) -> Option<String> {
     let other = candidates.iter().find(|other| {
         other.array == best.array
             && other.cell == best.cell
             && other.place.start != best.place.start
             && !best.score.is_surely_more(&other.score)
     })?;
-    let skipped = |candidate: &Candidate| candidate.place.skipped();
-    let ((after, before), (other_after, other_before)) = (skipped(best), skipped(other));
+    let around = |candidate: &Candidate| candidate.parts(frames, columns).around();
+    let ((before, after), (other_before, other_after)) = (around(best)?, around(other)?);
     Some(format!(
-        "not sure where the cells begin: {before} bytes beside the mark are skipped before them and {after} after \
-         them, but it may be {other_before} and {other_after}; press the first taxels and the last to see"
+        "not sure where the cells begin: {before} bytes are between the mark and them and {after} behind them, but it \
+         may be {other_before} and {other_after}; press the first taxels and the last to see"
     ))
+}
+
+/// The packets of a frame, if their number shows: what presses is in the same packet of each frame.
+fn packets(frames: &Frames, columns: &Columns) -> Option<Failure> {
+    let bytes = frames.period();
+    (0..bytes).find_map(|at| {
+        let values = || frames.iter().map(|frame| frame[at]);
+        let (first, last) = (values().min()?, values().max()?);
+        let packets = usize::from(last - first) + 1;
+        if !(2..=MOST_SIDE).contains(&packets) || frames.len() < LEAST_FRAMES * packets {
+            return None;
+        }
+        let next = |value: u8| if value == last { first } else { value + 1 };
+        let pairs = frames.pairs().count();
+        let counting = frames
+            .pairs()
+            .filter(|&(a, b)| frames.get(b)[at] == next(frames.get(a)[at]));
+        let change = |distance: usize| {
+            let changes = frames
+                .at_distance(distance)
+                .map(|(a, b)| columns.change(frames.get(a), frames.get(b)));
+            let changes: Vec<u32> = changes.collect();
+            f64::from(changes.iter().sum::<u32>()) / changes.len() as f64
+        };
+        // A counter may begin again too, but then the frames before and after are alike.
+        (counting.count() as f64 >= COUNTING_SHARE * pairs as f64 && change(packets) < change(1))
+            .then_some(Failure::Packets {
+                bytes,
+                first,
+                last,
+                packets,
+            })
+    })
 }

@@ -48,7 +48,8 @@ pub enum Failure {
     Text(String),
     /// Frames of one length without an array.
     #[error(
-        "{0} bytes recur, but they hold no array with a mark: press the sensor at several places meanwhile"
+        "{0} bytes recur, but they hold no array with a mark: press the sensor at several places meanwhile, and say \
+         --rows, --cols and --cell if you know them"
     )]
     NoArray(usize),
     /// Frames of one length, but nothing presses.
@@ -56,6 +57,21 @@ pub enum Failure {
         "frames of {0} bytes, but nothing presses the sensor: sniff again, and press it at several places"
     )]
     NoPress(usize),
+    /// Each frame comes in several packets.
+    #[error(
+        "{bytes} bytes recur, with a number from {first} to {last} that begins again: a frame comes in {packets} \
+         packets, so write its [sensor.frame.packets]"
+    )]
+    Packets {
+        /// The bytes of a packet.
+        bytes: usize,
+        /// The number of the first packet.
+        first: u8,
+        /// The number of the last packet.
+        last: u8,
+        /// The packets of a frame.
+        packets: usize,
+    },
     /// The array is larger than any that the daemon reads.
     #[error("found an array of about {rows}x{cols} taxels, expected at most 64x64", rows = .0.rows, cols = .0.cols)]
     TooLarge(Array),

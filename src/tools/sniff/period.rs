@@ -179,10 +179,16 @@ impl<'a> Frames<'a> {
 
     /// The pairs of frames that follow each other without a gap.
     pub(super) fn pairs(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        let is_next = |index: &usize| self.starts[index + 1] == self.starts[*index] + self.period;
-        (0..self.len().saturating_sub(1))
-            .filter(is_next)
-            .map(|index| (index, index + 1))
+        self.at_distance(1)
+    }
+
+    /// The pairs of frames with `frames - 1` frames between them and no gap.
+    pub(super) fn at_distance(&self, frames: usize) -> impl Iterator<Item = (usize, usize)> + '_ {
+        let pairs = self.starts.iter().zip(self.starts.iter().skip(frames));
+        pairs
+            .enumerate()
+            .filter(move |(_, (a, b))| **b == **a + frames * self.period)
+            .map(move |(index, _)| (index, index + frames))
     }
 
     /// The turn of the period at which the stream begins, if the first frames begin in step with it.

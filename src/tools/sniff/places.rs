@@ -25,19 +25,25 @@ const MOST_BESIDE: usize = 40;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;
 /// Places that cost this much more than the best one are left out.
-const MOST_COST: f64 = 5.0;
+const MOST_COST: f64 = 6.0;
 /// The most places that are examined further.
-const PLACES: usize = 40;
+const PLACES: usize = 80;
 /// What it costs, as a score, that a cell has a constant value that no taxel at rest has.
 const MARK_IN_CELLS: f64 = 2.0;
 /// What it costs that a cell changes as a checksum does.
 const RESTLESS_CELL: f64 = 0.3;
-/// What a byte beside the cells costs that changes in an unknown way.
-const UNKNOWN: f64 = 1.0;
+/// What it costs that bytes beside the cells change in an unknown way, as taxels do, and each of them.
+const UNKNOWN: f64 = 1.5;
+const UNKNOWN_BYTE: f64 = 0.5;
 /// What it costs that bytes at the cells are left out though they look like cells at rest, and each
 /// of them.
 const SKIPPED: f64 = 1.5;
 const SKIPPED_BYTE: f64 = 0.5;
+/// The most bytes of a mark in a row that look like cells at rest.
+const MOST_RESTING_IN_MARK: usize = 4;
+/// The most such bytes at the cells that are apart from the mark, and what it costs if there are more.
+const MOST_APART: usize = 2;
+const APART: f64 = 1.0;
 /// What is gained by a field with the number of bytes of the cells.
 const LENGTH_FIELD: f64 = 2.0;
 /// What is gained by a checksum.
@@ -80,22 +86,31 @@ impl Place {
         let is_mark = |kind: &Kind| matches!(kind, Kind::Marking(_));
         let is_number = |kind: &Kind| *kind == Kind::Number;
         let is_restless = |kind: &Kind| *kind == Kind::Restless;
-        let marks = here(is_mark);
-        if marks == 0 || here(is_number) < all(is_number) {
+        if here(is_mark) == 0 || here(is_number) < all(is_number) {
             return None;
         }
-        let mut cost = MARK_IN_CELLS * (all(is_mark) - marks) as f64;
+        let mut cost = MARK_IN_CELLS * self.marks_in_cells(columns) as f64;
         cost += RESTLESS_CELL * (all(is_restless) - here(is_restless)) as f64;
         let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
         let unknown = (0..self.beside.len())
             .filter(|at| self.beside[*at] == Kind::Active && !checked.contains(at));
-        cost += UNKNOWN * unknown.count() as f64;
+        match unknown.count() {
+            0 => {}
+            unknown => cost += UNKNOWN + UNKNOWN_BYTE * unknown as f64,
+        }
         let (after, before) = self.skipped();
         if after > 0 && !self.begins_with_number(columns, after) {
             cost += SKIPPED + SKIPPED_BYTE * after as f64;
         }
-        if before > 0 && !self.ends_with_number(columns, before) {
+        if before > 0 && !self.ends_with_number(columns) {
             cost += SKIPPED + SKIPPED_BYTE * before as f64;
+        }
+        cost += SKIPPED_BYTE * self.resting_in_marks(after, before) as f64;
+        let backward: Vec<Kind> = self.beside.iter().rev().copied().collect();
+        for apart in [apart(&self.beside), apart(&backward)] {
+            if apart > MOST_APART && self.length_field().is_none() {
+                cost += APART + SKIPPED_BYTE * apart as f64;
+            }
         }
         if self.length_field().is_some() {
             cost -= LENGTH_FIELD;
@@ -104,6 +119,32 @@ impl Place {
             cost -= CHECKED;
         }
         Some(cost)
+    }
+
+    /// The number of cells that have a constant value that no taxel at rest has: near the border, where
+    /// the mark may be, and elsewhere those with a value of the mark. Others are taxels that never
+    /// change.
+    fn marks_in_cells(&self, columns: &Columns) -> usize {
+        let period = columns.kinds.len();
+        let is_in_mark = |kind: Kind| self.beside.contains(&kind);
+        let cells = (0..self.bytes).map(|at| (at, columns.kinds[(self.start + at) % period]));
+        let marks = cells.filter(|(_, kind)| matches!(kind, Kind::Marking(_)));
+        marks
+            .filter(|&(at, kind)| {
+                at < MOST_BESIDE || at + MOST_BESIDE >= self.bytes || is_in_mark(kind)
+            })
+            .count()
+    }
+
+    /// The number of bytes that look like cells at rest within a mark, beside the `after` and `before`
+    /// bytes at the cells, and are more than a mark has: a taxel that never changes may look like the
+    /// end of a mark.
+    fn resting_in_marks(&self, after: usize, before: usize) -> usize {
+        let within = &self.beside[after..self.beside.len() - before];
+        let is_resting = |kind: &Kind| matches!(kind, Kind::Resting(_));
+        let runs = within.chunk_by(|a, b| is_resting(a) && is_resting(b));
+        let most = runs.map(<[Kind]>::len).max().unwrap_or(0);
+        most.saturating_sub(MOST_RESTING_IN_MARK)
     }
 
     /// The numbers of bytes after the last cell and before the first one that are no part of a mark,
@@ -140,7 +181,7 @@ impl Place {
         self.beside.len() >= 4 && words.all(is_word)
     }
 
-    /// Whether the first `skipped` bytes are the high ones of a number or a sum.
+    /// Whether the first `skipped` bytes are high ones of a number or a sum.
     fn begins_with_number(&self, columns: &Columns, skipped: usize) -> bool {
         if let Some(Check {
             at,
@@ -150,26 +191,47 @@ impl Place {
         {
             return is_whole(at.len() + skipped);
         }
-        let at = (self.start + self.bytes + skipped) % columns.kinds.len();
+        // The next ones may have values that no taxel at rest has.
+        let high = constants(self.beside.iter());
+        let at = (self.start + self.bytes + high) % columns.kinds.len();
         columns.numbers.iter().any(|number| {
-            number.at == at
-                && number.is_big_endian != Some(false)
-                && is_whole(number.bytes + skipped)
+            number.at == at && number.is_big_endian != Some(false) && is_whole(number.bytes + high)
         })
     }
 
-    /// Whether the last `skipped` bytes are the high ones of a number.
-    fn ends_with_number(&self, columns: &Columns, skipped: usize) -> bool {
+    /// Whether the last bytes are the high ones of a number.
+    fn ends_with_number(&self, columns: &Columns) -> bool {
         let period = columns.kinds.len();
+        let high = constants(self.beside.iter().rev());
         columns.numbers.iter().any(|number| {
-            (number.at + number.bytes + skipped) % period == self.start
+            (number.at + number.bytes + high) % period == self.start
+                && !number.wraps
                 && number.is_big_endian != Some(true)
-                && is_whole(number.bytes + skipped)
+                && is_whole(number.bytes + high)
         })
     }
+}
+
+/// The number of constant bytes that these begin with.
+fn constants<'a>(kinds: impl Iterator<Item = &'a Kind>) -> usize {
+    kinds.take_while(|kind| kind.constant().is_some()).count()
 }
 
 /// Whether numbers have so many bytes.
 fn is_whole(bytes: usize) -> bool {
     [2, 3, 4].contains(&bytes)
+}
+
+/// The number of constant bytes that `beside` begins with, if they are apart from the mark and some look
+/// like cells at rest: a taxel that never changes may look like the end of a mark.
+fn apart(beside: &[Kind]) -> usize {
+    let (here, beyond) = beside.split_at(constants(beside.iter()));
+    let is_mark = |kind: &Kind| matches!(kind, Kind::Marking(_));
+    let is_resting = |kind: &Kind| matches!(kind, Kind::Resting(_));
+    let is_mixed = here.iter().any(is_mark) && here.iter().any(is_resting);
+    if is_mixed && beyond.iter().any(is_mark) {
+        here.len()
+    } else {
+        0
+    }
 }

@@ -186,6 +186,12 @@ impl Parts<'_> {
             .min_by_key(keys)
     }
 
+    /// The numbers of bytes between the mark and the cells, and between the cells and the mark.
+    pub(super) fn around(&self) -> Option<(usize, usize)> {
+        let mark = self.mark()?;
+        Some((self.place.beside.len() - mark.end, mark.start))
+    }
+
     /// The place beside the cells at which the stream begins.
     fn beginning(&self) -> Option<usize> {
         let period = self.columns.kinds.len();
