@@ -56,6 +56,14 @@ pub enum Error {
         /// The number of whole messages.
         messages: u64,
     },
+    /// Nothing was saved, because chunks that are not damaged are not read.
+    #[error("{path}: nothing saved: {source}")]
+    NothingRead {
+        /// The path of the damaged file.
+        path: PathBuf,
+        /// The reason why the first of these chunks is not read.
+        source: recording::Error,
+    },
     /// Chunks that are not damaged were left out. The new file has all others.
     #[error("{path}: left out {chunks} chunks that are not damaged: `mcap recover` rewrites them")]
     Unread {
@@ -78,7 +86,10 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Unreadable { .. } => NO_INPUT,
-            Error::Nothing { .. } | Error::Foreign { .. } | Error::Unread { .. } => FAILED,
+            Error::Nothing { .. }
+            | Error::NothingRead { .. }
+            | Error::Foreign { .. }
+            | Error::Unread { .. } => FAILED,
             Error::Broken { .. } | Error::Write { .. } => IO,
         }
     }
@@ -112,9 +123,14 @@ pub fn run(args: &Args) -> Result<(), Error> {
     })?;
     if !has_ours(&recovered) {
         let path = args.broken.clone();
-        return Err(match recovered.messages {
-            0 => Error::Nothing { path, bytes },
-            messages => Error::Foreign { path, messages },
+        let unread = recovered.unread.into_iter().next();
+        return Err(match (unread, recovered.messages) {
+            (Some((_, problem)), _) => Error::NothingRead {
+                path,
+                source: recording::Error::Unread(problem),
+            },
+            (None, 0) => Error::Nothing { path, bytes },
+            (None, messages) => Error::Foreign { path, messages },
         });
     }
     part.finish().map_err(|error| unwritten(error.into()))?;

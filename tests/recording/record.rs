@@ -9,7 +9,7 @@ use crate::bench::{
     BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
 };
 use hardnessd_core::pipeline::Input;
-use hardnessd_core::recording::{Entry, Found, Reader};
+use hardnessd_core::recording::{Entry, Found, MAGIC, Reader};
 use hardnessd_simulator::random::Stream;
 use rustix::process::Signal;
 use serde_json::{Value, json};
@@ -400,6 +400,25 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
     let message = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(66), "{message}");
     assert!(message.contains("/dev/stdin: cannot read: "), "{message}");
+    // The only chunk is not damaged, but too long: two times, the unpacked length, no checksum, and
+    // no packed bytes.
+    let unpacked: u64 = 65 << 20;
+    let chunk = [
+        &[0; 16][..],
+        &unpacked.to_le_bytes(),
+        &[0; 4],
+        b"\x04\0\0\0zstd",
+        &[0; 8],
+    ]
+    .concat();
+    let head = [&[6][..], &(chunk.len() as u64).to_le_bytes()].concat();
+    fs::write(path("long.mcap"), [MAGIC, &head, &chunk].concat()).unwrap();
+    let (code, message) = recover("long.mcap", "good.mcap");
+    assert_eq!(code, 1, "{message}");
+    let reason = "long.mcap: nothing saved: found a chunk of 68157440 bytes, expected at most 67108864: \
+                  `mcap recover` rewrites";
+    assert!(message.contains(reason), "{message}");
+    assert!(!bench.path("good.mcap").exists());
 
     let _sensor = bench.sensor(&[]);
     let config = configure(&bench, 20);

@@ -248,10 +248,11 @@ impl From<mcap::McapError> for Error {
                 found: "no MCAP file".to_owned(),
                 expected: "a recording",
             },
-            mcap::McapError::ChunkTooLarge(bytes) => Error::Unread(format!(
-                "found a chunk of {bytes} bytes, expected at most {}",
-                reader::LONGEST_CHUNK_BYTES
-            )),
+            mcap::McapError::ChunkTooLarge(bytes)
+            | mcap::McapError::RecordTooLarge {
+                opcode: mcap::records::op::CHUNK,
+                len: bytes,
+            } => Error::Unread(reader::too_long(bytes)),
             mcap::McapError::UnsupportedCompression(name) => Error::Unread(format!(
                 "found a chunk packed with {name:?}, expected zstd, lz4 or none"
             )),

@@ -38,6 +38,11 @@ pub(super) const LONGEST_RECORD_BYTES: usize = 32 << 20;
 /// after 1 MiB. Those of other programs may be longer.
 pub(super) const LONGEST_CHUNK_BYTES: usize = 64 << 20;
 
+/// The reason why a chunk of `bytes` bytes is not read.
+pub(super) fn too_long(bytes: u64) -> String {
+    format!("found a chunk of {bytes} bytes, expected at most {LONGEST_CHUNK_BYTES}")
+}
+
 /// The bytes of a chunk's record before its data, without the name of the compression: two times, the
 /// unpacked length, the checksum, the name's length, and the data's length.
 const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
@@ -78,7 +83,8 @@ impl Chunks {
             .with_skip_start_magic(true)
             .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
-            .with_record_length_limit(LONGEST_RECORD_BYTES);
+            // The crate holds the chunk itself to the limit of its records too.
+            .with_record_length_limit(LONGEST_CHUNK_BYTES);
         let mut reader = LinearReader::new_with_options(options);
         let data_at = CHUNK_HEADER_BYTES + header.compression.len() as u64;
         let end = usize::try_from(data_at.saturating_add(header.compressed_size)).ok();
@@ -95,6 +101,10 @@ impl Chunks {
                     reader.notify_read(read);
                 }
                 LinearReadEvent::Record { opcode, data } => {
+                    if data.len() > LONGEST_RECORD_BYTES {
+                        let len = data.len() as u64;
+                        return Err(mcap::McapError::RecordTooLarge { opcode, len }.into());
+                    }
                     let record = parse(opcode, data)?;
                     // Records that are not used take no memory.
                     if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =

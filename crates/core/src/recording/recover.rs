@@ -14,7 +14,7 @@ use mcap::records::{Channel, Record, op};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::{Chunks, LONGEST_CHUNK_BYTES, decoder, parse};
+use super::reader::{Chunks, LONGEST_CHUNK_BYTES, decoder, parse, too_long};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -57,11 +57,11 @@ pub enum RecoverError {
 
 /// The bytes of a record's opcode and length.
 const RECORD_HEAD_BYTES: u64 = 9;
-/// The place in a chunk's record of the chunk's unpacked length: after opcode, length and two
-/// times.
-const UNPACKED_AT: usize = RECORD_HEAD_BYTES as usize + 16;
-/// The place of the name of a chunk's compression: after the unpacked length and the checksum.
-const COMPRESSION_AT: usize = UNPACKED_AT + 12;
+/// The place of a record's length: after its opcode.
+const LENGTH_AT: usize = 1;
+/// The place of the name of a chunk's compression: after opcode, length, two times, the unpacked
+/// length and the checksum.
+const COMPRESSION_AT: usize = RECORD_HEAD_BYTES as usize + 16 + 8 + 4;
 /// The names of the compressions, with their lengths.
 const COMPRESSIONS: [&[u8]; 3] = [b"\x04\0\0\0zstd", b"\x03\0\0\0lz4", b"\0\0\0\0"];
 /// The bytes before a chunk's data: after the longest name and the data's length.
@@ -139,7 +139,13 @@ impl<R: Read + Seek> Scan<R> {
         while self.place < self.length {
             let place = self.place;
             let Some((opcode, end)) = self.record_at(place)? else {
-                self.place = self.skip(place)?;
+                self.place = match self.long_chunk_at(place)? {
+                    Some(length) => {
+                        self.unread.push((place, too_long(length)));
+                        place + RECORD_HEAD_BYTES + length
+                    }
+                    None => self.skip(place)?,
+                };
                 continue;
             };
             let body = self.bytes(place + RECORD_HEAD_BYTES, end)?;
@@ -220,6 +226,14 @@ impl<R: Read + Seek> Scan<R> {
         Ok((known && fits && !hopeless).then_some((opcode, end)))
     }
 
+    /// The length of the chunk at `place`, if there is one that is longer than any that is read.
+    fn long_chunk_at(&mut self, place: u64) -> io::Result<Option<u64>> {
+        let head = self.bytes(place, place + HEAD_BYTES as u64)?;
+        let is_chunk = head.len() == HEAD_BYTES && is_chunk_head(&head, self.length - place);
+        let length = is_chunk.then(|| number(&head, LENGTH_AT));
+        Ok(length.filter(|length| *length > LONGEST_CHUNK_BYTES as u64))
+    }
+
     /// Gives up the bytes at `place`. Returns the place of the next chunk, or the end of the file.
     fn skip(&mut self, place: u64) -> io::Result<u64> {
         let next = self.next_chunk(place + 1)?.unwrap_or(self.length);
@@ -274,20 +288,22 @@ impl<R: Read + Seek> Scan<R> {
 /// Whether these [`HEAD_BYTES`] bytes begin a chunk that ends within `left` bytes. The check compares
 /// its lengths with each other, so the rest of the chunk need not be read.
 fn is_chunk_head(head: &[u8], left: u64) -> bool {
-    let number = |at: usize| {
-        let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
-        bytes.map_or(u64::MAX, u64::from_le_bytes)
-    };
+    let length = number(head, LENGTH_AT);
     let is_of = |compression: &&[u8]| {
-        let length_at = COMPRESSION_AT + compression.len();
-        let data_at = (length_at + 8) as u64;
+        let packed_at = COMPRESSION_AT + compression.len();
+        let data_at = (packed_at + 8) as u64;
         head[COMPRESSION_AT..].starts_with(compression)
-            && number(1).checked_sub(number(length_at)) == Some(data_at - RECORD_HEAD_BYTES)
+            && length.checked_sub(number(head, packed_at)) == Some(data_at - RECORD_HEAD_BYTES)
     };
     head[0] == op::CHUNK
-        && number(1) <= (LONGEST_CHUNK_BYTES as u64).min(left - RECORD_HEAD_BYTES)
-        && number(UNPACKED_AT) <= LONGEST_CHUNK_BYTES as u64
+        && length <= left.saturating_sub(RECORD_HEAD_BYTES)
         && COMPRESSIONS.iter().any(is_of)
+}
+
+/// The number of eight bytes at `at`.
+fn number(head: &[u8], at: usize) -> u64 {
+    let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
+    bytes.map_or(u64::MAX, u64::from_le_bytes)
 }
 
 /// The number of bytes that a record fills by its own lengths. `None` for a record that does not

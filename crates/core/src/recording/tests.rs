@@ -9,6 +9,8 @@ use crate::pipeline::Clock;
 use crate::test_support::{at, hrn, labels, sensor};
 use crate::wire;
 
+mod rewritten;
+
 /// The inputs of a story and their times: two presses of a second and a half, a context, damage, a
 /// tare, a loss and a return.
 fn story() -> Vec<(Stamp, Input<'static>)> {
@@ -474,46 +476,6 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     lie.extend(&file[middle..]);
     let (found, _) = recover(Cursor::new(&lie), Vec::new()).unwrap();
     assert_eq!(found.messages, whole.messages);
-}
-
-#[test]
-fn a_recording_that_another_program_rewrote_is_read_and_recovered() {
-    use mcap::{Compression, WriteOptions};
-    let (file, _) = recorded(10, 7);
-    let events = play(&file);
-    let plain = WriteOptions::new().compression(None);
-    for (name, options) in [
-        ("lz4", plain.clone().compression(Some(Compression::Lz4))),
-        ("not packed", plain.clone()),
-        ("one long chunk", plain.clone().chunk_size(None)),
-        ("no chunks", plain.clone().use_chunks(false)),
-        (
-            "no index",
-            plain
-                .emit_message_indexes(false)
-                .emit_summary_records(false),
-        ),
-    ] {
-        let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
-        let mut metadata = Vec::new();
-        for record in mcap::read::LinearReader::new(&file).unwrap() {
-            if let mcap::records::Record::Metadata(found) = record.unwrap() {
-                metadata.push(found);
-            }
-        }
-        metadata
-            .iter()
-            .for_each(|found| writer.write_metadata(found).unwrap());
-        for message in mcap::MessageStream::new(&file).unwrap() {
-            writer.write(&message.unwrap()).unwrap();
-        }
-        writer.finish().unwrap();
-        let rewritten = writer.into_inner().into_inner();
-        assert_eq!(play(&rewritten), events, "{name}");
-        let (found, good) = recover(Cursor::new(&rewritten), Vec::new()).unwrap();
-        assert!(found.is_whole(), "{name}: {found:?}");
-        assert_eq!(play(&good), events, "{name}");
-    }
 }
 
 #[test]
