@@ -45,7 +45,8 @@ const COMPARE_EVERY: Duration = Duration::from_secs(1);
 /// A change of the port, or bytes from it.
 #[derive(Debug)]
 pub(crate) enum Turn<'a> {
-    /// The port was opened.
+    /// The port was opened, or another sender of datagrams has taken the place of the last one. The
+    /// next bytes do not continue the earlier ones.
     Opened,
     /// The port cannot be opened now, for this reason.
     Unavailable(String),
@@ -125,6 +126,8 @@ struct Open {
     request_at: Option<Instant>,
     /// When the settings of a serial line are compared next.
     compare_at: Option<Instant>,
+    /// The number of bytes of a new sender that the next turn returns.
+    held: Option<usize>,
 }
 
 #[derive(Debug)]
@@ -192,6 +195,9 @@ impl Link {
                     }
                 }
                 State::Open(open) => {
+                    if let Some(read) = open.held.take() {
+                        return Turn::Bytes(&self.buffer[..read]);
+                    }
                     // A sensor may send faster than the daemon reads.
                     busy::rest();
                     let happened = open.wait(&mut self.buffer, self.settings.stale_after).await;
@@ -207,6 +213,11 @@ impl Link {
                                 continue;
                             }
                             return Turn::Bytes(&self.buffer[..read]);
+                        }
+                        Happened::Read(Ok(Datagram::Next(read))) => {
+                            open.line.send(&self.settings.opening());
+                            open.held = (read > 0).then_some(read);
+                            return Turn::Opened;
                         }
                         Happened::Read(Ok(Datagram::Stranger(address))) => {
                             return Turn::Stranger(address);
@@ -273,6 +284,7 @@ impl Open {
             line,
             request_at: settings.request.as_ref().map(|(_, every)| now + *every),
             compare_at: is_tty.then_some(now + COMPARE_EVERY),
+            held: None,
         })
     }
 

@@ -213,6 +213,47 @@ fn datagrams_are_taken_from_one_sender_until_it_is_silent() {
 }
 
 #[test]
+fn half_a_frame_of_a_silent_sender_is_not_joined_to_the_bytes_of_the_next() {
+    let bench = Bench::new();
+    let [first, second] = [(); 2].map(|()| UdpSocket::bind("127.0.0.1:0").unwrap());
+    let address = UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    // Without a checksum, the two halves look like a frame.
+    let frame = "[sensor.frame]\npreset = \"flexitac\"\n";
+    let _daemon = Daemon::start(&configure(&bench, &format!("udp://{address}"), frame));
+    let mut subscriber = bench.subscriber();
+    let [of_first, of_second] = [10, 20].map(|count| [&[0xAA, 0x55][..], &[count; 512]].concat());
+    wait_for("the first frame", || {
+        first.send_to(&of_first, address).unwrap();
+        status(&mut subscriber)["state"] == "live"
+    });
+    first.send_to(&of_first[..300], address).unwrap();
+    wait_for("a stale sensor", || {
+        status(&mut subscriber)["state"] == "stale"
+    });
+    // The half frame came a little later than the frame whose age makes the sensor stale.
+    std::thread::sleep(5 * PERIOD);
+    let before = status(&mut subscriber);
+    assert_eq!(before["bytes_skipped"], 0);
+    second.send_to(&of_second[300..], address).unwrap();
+    for _ in 0..5 {
+        second.send_to(&of_second, address).unwrap();
+        std::thread::sleep(PERIOD);
+    }
+    let expected = before["frames"].as_u64().unwrap() + 5;
+    wait_for("the frames of the second sender", || {
+        status(&mut subscriber)["frames"].as_u64().unwrap() >= expected
+    });
+    std::thread::sleep(5 * PERIOD);
+    let after = status(&mut subscriber);
+    assert_eq!(after["frames"], expected);
+    assert_eq!(after["bytes_skipped"], of_second.len());
+    assert_eq!(after["frames_damaged"], 0);
+}
+
+#[test]
 fn a_sensor_that_answers_is_started_once_and_asked_again_and_again() {
     let bench = Bench::new();
     let frames = frames(&bench);

@@ -50,8 +50,10 @@ fn probe(stream: &TcpStream) -> io::Result<()> {
 pub(super) enum Datagram {
     /// This many bytes came from the sender.
     Bytes(usize),
-    /// A new sender has sent this many bytes.
+    /// The first sender has sent this many bytes.
     First(usize),
+    /// Another sender has taken the place of the last one, and has sent this many bytes.
+    Next(usize),
     /// Another one sends, too. It is reported once.
     Stranger(SocketAddr),
     /// It says nothing.
@@ -105,13 +107,16 @@ impl Udp {
                     false => Datagram::Stranger(address),
                 }
             }
-            _ => {
-                self.sender = Some(Sender {
+            sender => {
+                let last = sender.replace(Sender {
                     address,
                     last: now,
                     reported: false,
                 });
-                Datagram::First(bytes)
+                match last {
+                    None => Datagram::First(bytes),
+                    Some(_) => Datagram::Next(bytes),
+                }
             }
         })
     }
