@@ -30,13 +30,13 @@ pub(super) fn is_text(bytes: &[u8]) -> bool {
 
 /// The array of a text.
 pub(super) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
-    let lines: Vec<Option<Vec<f32>>> = bytes.split(|&byte| byte == b'\n').map(numbers).collect();
-    // A frame in rows ends with a blank line.
-    let blocks: Vec<Vec<&Vec<f32>>> = lines
-        .split(|line| line.as_ref().is_some_and(Vec::is_empty))
-        .map(|block| block.iter().flatten().collect())
+    let lines: Vec<&[u8]> = bytes.split(|&byte| byte == b'\n').collect();
+    // A frame in rows ends with a line without a digit.
+    let blocks: Vec<Vec<Vec<f32>>> = lines
+        .split(|line| !line.iter().any(u8::is_ascii_digit))
+        .map(|block| block.iter().filter_map(|line| numbers(line)).collect())
         .collect();
-    let shape = |block: &Vec<&Vec<f32>>| Some((block.len(), block.last()?.len()));
+    let shape = |block: &Vec<Vec<f32>>| Some((block.len(), block.last()?.len()));
     if let Some(((rows, cols), times)) = most_frequent(blocks.iter().filter_map(shape))
         && rows > 1
         && times >= LEAST_FRAMES
@@ -44,28 +44,21 @@ pub(super) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
         return in_rows(Array { rows, cols }, bytes, known);
     }
     let no_array = |words: &str| Failure::Text(words.to_owned());
-    let of_line = lines
-        .iter()
-        .flatten()
-        .map(Vec::len)
-        .filter(|&count| count > 0);
-    let Some((count, times)) = most_frequent(of_line) else {
+    // Lines without numbers, such as a banner before each frame, count neither for nor against.
+    let lines: Vec<&Vec<f32>> = blocks.iter().flatten().collect();
+    let Some((count, times)) = most_frequent(lines.iter().map(|line| line.len())) else {
         return Err(no_array(
             "no line has only whole numbers of 0 to 65535 at its end",
         ));
     };
-    let frames: Vec<&Vec<f32>> = lines
-        .iter()
-        .flatten()
-        .filter(|line| line.len() == count)
-        .collect();
-    let filled = lines
-        .iter()
-        .filter(|line| line.as_ref().is_none_or(|line| !line.is_empty()))
-        .count();
-    if times < LEAST_FRAMES || (times as f64) < SAME_SHARE * filled as f64 || count < FEWEST_CELLS {
+    let is_same = times as f64 >= SAME_SHARE * lines.len() as f64;
+    if times < LEAST_FRAMES || !is_same || count < FEWEST_CELLS {
         return Err(no_array("lines have different numbers of numbers"));
     }
+    let frames: Vec<&Vec<f32>> = lines
+        .into_iter()
+        .filter(|line| line.len() == count)
+        .collect();
     if let Some(rows) = rows_without_blank(&frames) {
         return Err(no_array(&format!(
             "a frame seems to be {rows} lines of {count} numbers; let the sensor print an empty line after each frame"
@@ -120,7 +113,7 @@ fn unpacked(packed: &[u8]) -> Option<Vec<f32>> {
     Some(cells)
 }
 
-/// The numbers that end a line. `None` if the line ends with something else.
+/// The numbers that end a line. `None` if it has none.
 fn numbers(line: &[u8]) -> Option<Vec<f32>> {
     let is_separator = |byte: &u8| {
         matches!(
@@ -135,8 +128,7 @@ fn numbers(line: &[u8]) -> Option<Vec<f32>> {
         .iter()
         .rposition(Option::is_none)
         .map_or(0, |at| at + 1);
-    (words.is_empty() || from < words.len())
-        .then(|| words[from..].iter().copied().flatten().collect())
+    (from < words.len()).then(|| words[from..].iter().copied().flatten().collect())
 }
 
 fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize)> {
@@ -227,4 +219,64 @@ fn in_order(
         Some(array) => Failure::TooLarge(array),
         None => Failure::Text(format!("{cells} numbers on each line make no array")),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ARRAY: Array = Array { rows: 8, cols: 16 };
+
+    /// The counts of presses at several places.
+    fn frames() -> Vec<Vec<u16>> {
+        let frame = |time: usize| {
+            let (press, phase) = (time / 20, time % 20);
+            let (row, col) = (1 + 3 * press % 6, 1 + 5 * press % 14);
+            let count = |at: usize| {
+                let (down, right) = (at / ARRAY.cols, at % ARRAY.cols);
+                let apart = down.abs_diff(row).pow(2) + right.abs_diff(col).pow(2);
+                let height = if phase < 6 { 0.0 } else { 900.0 };
+                3 + (height * (-(apart as f64) / 3.0).exp()) as u16
+            };
+            (0..ARRAY.taxels()).map(count).collect()
+        };
+        (0..200).map(frame).collect()
+    }
+
+    fn joined(counts: &[u16]) -> String {
+        let counts: Vec<String> = counts.iter().map(u16::to_string).collect();
+        counts.join(" ")
+    }
+
+    fn assert_found(text: &str, preset: Preset) {
+        let found = find(text.as_bytes(), Known::default()).unwrap();
+        let settings = found.best.proposal.settings;
+        assert_eq!(settings.preset, preset, "{}", &text[..40]);
+        assert_eq!(found.best.array, ARRAY, "{}", &text[..40]);
+    }
+
+    #[test]
+    fn lines_are_found_between_banners_with_and_without_numbers() {
+        for banner in [
+            "--- frame N ---\n",
+            "==== FRAME ====\r\n",
+            "boot\n\n- N -\n",
+        ] {
+            let lines = frames().into_iter().enumerate().map(|(number, frame)| {
+                banner.replace('N', &number.to_string()) + &joined(&frame) + "\n"
+            });
+            assert_found(&lines.collect::<String>(), Preset::Csv);
+        }
+    }
+
+    #[test]
+    fn rows_are_found_between_lines_without_a_digit() {
+        for banner in ["", "---", "=== frame ===\r"] {
+            let blocks = frames().into_iter().map(|frame| {
+                let rows: Vec<String> = frame.chunks(ARRAY.cols).map(joined).collect();
+                format!("{banner}\n{}\n", rows.join("\n"))
+            });
+            assert_found(&blocks.collect::<String>(), Preset::Ascii);
+        }
+    }
 }

@@ -113,7 +113,7 @@ impl Keys {
                 ..PLAIN
             },
             Preset::Ascii => Self {
-                kind: Kind::Text(FrameEnd::BlankLine),
+                kind: Kind::Text(FrameEnd::LineWithoutDigit),
                 ..PLAIN
             },
             Preset::Csv => Self {

@@ -24,7 +24,7 @@ pub enum Preset {
     JqU16,
     /// Cells 0..254, `FF`.
     FfTail,
-    /// Rows of decimals; a blank line ends the frame.
+    /// Rows of decimals; a line without a digit, such as a blank one, ends the frame.
     Ascii,
     /// 1..254 is a value, `00 n` is a run of n zeros, `FF` ends the frame.
     ZeroRun,

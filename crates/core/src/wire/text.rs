@@ -1,7 +1,8 @@
 //! Frames as text: decimals, separated by spaces, tabs, commas, semicolons or brackets. Lines end with
 //! LF or CRLF.
 //!
-//! In `ascii` each line is a row, and a blank line ends the frame. In `csv` each line is a frame.
+//! In `ascii` each line is a row, and a line without a digit ends the frame: a blank one, or words
+//! between the frames. In `csv` each line is a frame.
 //! Words before the first cell of a line of `csv` are skipped, and so are lines without a frame.
 
 use super::cells::Cells;
@@ -11,8 +12,8 @@ use crate::frame::{Array, RawFrame};
 /// What ends a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum FrameEnd {
-    /// A blank line, after a line for each row.
-    BlankLine,
+    /// A line without a digit, such as a blank one, after a line for each row.
+    LineWithoutDigit,
     /// The end of the line.
     Line,
 }
@@ -28,7 +29,7 @@ impl FrameEnd {
         let Array { rows, cols } = cells.array;
         let cell = cells.mask.to_string().len() + 2;
         match self {
-            FrameEnd::BlankLine => rows * (cols * cell + 2) + 2,
+            FrameEnd::LineWithoutDigit => rows * (cols * cell + 2) + 2,
             FrameEnd::Line => LEADING_BYTES + rows * cols * cell + 2,
         }
     }
@@ -37,7 +38,7 @@ impl FrameEnd {
     /// after each, and the blank line.
     pub(super) fn min_frame_bytes(self, cells: &Cells) -> usize {
         let blank_line = match self {
-            FrameEnd::BlankLine => 1,
+            FrameEnd::LineWithoutDigit => 1,
             FrameEnd::Line => 0,
         };
         cells.count() * 2 + blank_line
@@ -45,7 +46,7 @@ impl FrameEnd {
 
     pub(super) fn encode(self, cells: impl Iterator<Item = u16>, array: Array, out: &mut Vec<u8>) {
         let (on_line, separator) = match self {
-            FrameEnd::BlankLine => (array.cols, b' '),
+            FrameEnd::LineWithoutDigit => (array.cols, b' '),
             FrameEnd::Line => (array.rows * array.cols, b','),
         };
         for (index, cell) in cells.enumerate() {
@@ -53,14 +54,14 @@ impl FrameEnd {
             let ends_line = (index + 1).is_multiple_of(on_line);
             out.push(if ends_line { b'\n' } else { separator });
         }
-        if self == FrameEnd::BlankLine {
+        if self == FrameEnd::LineWithoutDigit {
             out.push(b'\n');
         }
     }
 
     pub(super) fn scan(self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
         match self {
-            FrameEnd::BlankLine => scan_rows(cells, bytes, context),
+            FrameEnd::LineWithoutDigit => scan_rows(cells, bytes, context),
             FrameEnd::Line => scan_line(cells, bytes, context),
         }
     }
@@ -68,7 +69,7 @@ impl FrameEnd {
 
 fn scan_rows(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
     let Array { rows, cols } = cells.array;
-    let most = FrameEnd::BlankLine.max_frame_bytes(cells);
+    let most = FrameEnd::LineWithoutDigit.max_frame_bytes(cells);
     let mut lines = Lines { bytes, at: 0 };
     // The places where the last `rows` lines began.
     let mut starts = vec![0; rows];
@@ -76,7 +77,7 @@ fn scan_rows(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
     loop {
         let start = lines.at;
         let Some(line) = lines.next() else { break };
-        if !line.iter().all(|byte| matches!(byte, b' ' | b'\t' | b'\r')) {
+        if line.iter().any(u8::is_ascii_digit) {
             starts[count % rows] = start;
             count += 1;
             continue;

@@ -453,6 +453,29 @@ fn ascii_reads_any_separator_and_line_end() {
 }
 
 #[test]
+fn words_between_ascii_frames_end_them_as_a_blank_line_does() {
+    let layout = layout("preset = 'ascii'\nrows = 5\ncols = 7");
+    let sent = frames(&layout, 17, 4);
+    for banner in [
+        "=== frame ===\n",
+        "---\r\n",
+        "[ ]\n",
+        "--- end ---\n\n--- frame ---\n",
+    ] {
+        let mut bytes = banner.as_bytes().to_vec();
+        for frame in &sent {
+            layout.encode(frame, &mut bytes);
+            assert_eq!(bytes.pop(), Some(b'\n'), "the blank line");
+            bytes.extend(banner.as_bytes());
+        }
+        for size in [1, 7, bytes.len()] {
+            let found = decode(&layout, bytes.chunks(size));
+            assert_eq!(found, (sent.clone(), 0), "{banner:?} by {size}");
+        }
+    }
+}
+
+#[test]
 fn zero_run_packs_runs_across_254_zeros() {
     let layout = layout("preset = 'zero-run'");
     let mut raw = RawFrame::default();
@@ -748,6 +771,31 @@ proptest! {
         bytes.extend(noise.as_bytes());
         layout.encode(&sent[1], &mut bytes);
         prop_assert_eq!(decode(&layout, bytes.chunks(chunk)), (sent, 0));
+    }
+
+    #[test]
+    fn any_words_end_an_ascii_frame_in_any_chunks(
+        words in "[^\n0-9]{0,60}",
+        noise in "[ 0-9a-z\n]{0,80}",
+        seed in any::<u64>(),
+        chunk in 1_usize..100,
+    ) {
+        let layout = layout("preset = 'ascii'\nrows = 5\ncols = 7");
+        let sent = frames(&layout, seed, 2);
+        let mut bytes = encode(&layout, &sent[..1]);
+        bytes.pop();
+        bytes.extend(words.as_bytes());
+        bytes.push(b'\n');
+        bytes.extend(noise.as_bytes());
+        bytes.push(b'\n');
+        layout.encode(&sent[1], &mut bytes);
+        let found = decode(&layout, bytes.chunks(chunk));
+        prop_assert_eq!(&found, &decode(&layout, [bytes.as_slice()]));
+        prop_assert_eq!(found.0.last(), Some(&sent[1]));
+        // The longest frame has room for these words.
+        if words.len() <= 40 {
+            prop_assert_eq!(found.0.first(), Some(&sent[0]));
+        }
     }
 
     #[test]
