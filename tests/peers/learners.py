@@ -48,8 +48,8 @@ from sklearn.tree import DecisionTreeClassifier
 
 LABELS = np.array(["hard", "firm", "soft", "very-soft"])
 TOLERANCE = 1e-5
-# Naive Bayes adds the logarithms of 784 densities in f32. onnxruntime itself differs by 3e-5 from scikit-learn.
-ROUNDED = 1e-4
+# Naive Bayes adds 784 logarithms in f32, and their order differs.
+ROUNDED = 3e-5
 
 
 def logistic():
@@ -57,7 +57,7 @@ def logistic():
 
 
 def kinds():
-    """Each kind of classifier by name, with its tolerance."""
+    """Each kind of classifier by name."""
     scaled = StandardScaler
     return {
         "logistic regression": logistic(),
@@ -85,7 +85,7 @@ def kinds():
         "SVC sigmoid": SVC(kernel="sigmoid", probability=True),
         "MLP": make_pipeline(scaled(), MLPClassifier((32,), max_iter=60)),
         "MLP tanh": MLPClassifier((16, 8), activation="tanh", max_iter=60),
-        "Gaussian naive Bayes": GaussianNB(var_smoothing=1e-2),
+        "Gaussian naive Bayes": GaussianNB(),
         "multinomial naive Bayes": MultinomialNB(),
         "complement naive Bayes": ComplementNB(),
         "Bernoulli naive Bayes": BernoulliNB(binarize=0.07),
@@ -141,10 +141,17 @@ def expected(path, frames, order=None):
     return np.array(found)
 
 
-def compare(name, path, data, order=None, tolerance=TOLERANCE):
+def compare(name, path, data, order=None):
     arrays = np.load(data)
     by_split = np.argsort(arrays["split"], kind="stable")
-    difference = np.abs(adopted(path, data) - expected(path, arrays["frames"][by_split], order)).max()
+    wanted, tolerance = expected(path, arrays["frames"][by_split], order), TOLERANCE
+    if "Bayes" in name:
+        tolerance = ROUNDED
+        # The file subtracts logarithms near 6000 in f32, so onnxruntime's probabilities add up to 1 +- 3e-4.
+        sums = wanted.sum(axis=1, keepdims=True)
+        assert np.abs(sums - 1).max() < 3e-4, (name, sums)
+        wanted /= sums
+    difference = np.abs(adopted(path, data) - wanted).max()
     print(f"{name:28} {len(by_split)} frames, {difference:.1e}")
     assert difference < tolerance, (name, difference)
 
@@ -171,8 +178,7 @@ def classifiers(data):
     inputs = arrays["frames"].reshape(-1, 784)[train]
     level = arrays["level"][train].astype(np.int64)
     for name, classifier in kinds().items():
-        tolerance = ROUNDED if "Bayes" in name else TOLERANCE
-        compare(name, export(classifier, inputs, level), data, tolerance=tolerance)
+        compare(name, export(classifier, inputs, level), data)
     compare("levels from 0", export(logistic(), inputs, level - 1), data)
     compare("without ZipMap", export(logistic(), inputs, level, {"zipmap": False}), data)
     for name, classifier in {"texts": logistic(), "texts, trees": DecisionTreeClassifier(max_depth=4)}.items():

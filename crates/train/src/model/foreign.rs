@@ -235,7 +235,11 @@ pub(super) fn mend_nodes(
     let mut sets = proto.opset_import.iter();
     let plain = sets.find(|set| ["", "ai.onnx"].contains(&set.domain.as_str()));
     let opset = plain.map_or(MIN_OPSET, |set| set.version);
-    let replaced = learners::replace(proto.graph.get_or_insert_default(), opset)?;
+    let graph = proto.graph.get_or_insert_default();
+    let replaced = learners::replace(graph, opset)?;
+    if !replaced.is_empty() {
+        keep_needed(graph);
+    }
     let replaced = replaced.into_iter();
     done.extend(replaced.map(|operator| format!("operator {operator}: replaced by plain ones")));
     Ok(())

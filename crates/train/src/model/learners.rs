@@ -28,7 +28,7 @@ pub struct Learner {
 ///
 /// Returns a [`Learner`] for a kind that it cannot replace.
 pub(super) fn replace(graph: &mut pb::GraphProto, opset: i64) -> Result<Vec<String>, Learner> {
-    let mut replaced: Vec<String> = Vec::new();
+    let mut replaced = normalise(graph);
     let mut nodes = Vec::new();
     for mut node in std::mem::take(&mut graph.node) {
         if node.input.is_empty() {
@@ -68,6 +68,54 @@ pub(super) fn replace(graph: &mut pb::GraphProto, opset: i64) -> Result<Vec<Stri
     }
     graph.node = nodes;
     Ok(replaced)
+}
+
+/// Puts a softmax in place of `exp(x - log(sum(exp(x))))`, as naive Bayes computes it. Its `x` are sums
+/// of hundreds of logarithms. What f32 loses of the difference scales all probabilities, so that they
+/// do not add up to 1. Returns the operators that it replaced.
+fn normalise(graph: &mut pb::GraphProto) -> Vec<String> {
+    let by = |name: &str| {
+        let mut nodes = graph.node.iter();
+        nodes.find(|node| node.output.first().is_some_and(|output| output == name))
+    };
+    let axis_of = |sum: &pb::NodeProto| {
+        let stated = attribute(sum, "axes").map(|found| found.ints.clone());
+        let axes = stated.or_else(|| {
+            let name = sum.input.get(1)?;
+            let tensor = graph.initializer.iter().find(|found| found.name == *name)?;
+            let raw = tensor.raw_data.as_chunks().0.iter();
+            let raw = raw.map(|bytes| i64::from_le_bytes(*bytes));
+            Some(tensor.int64_data.iter().copied().chain(raw).collect())
+        });
+        <[i64; 1]>::try_from(axes?).ok().map(|[axis]| axis)
+    };
+    let softmax_of = |node: &pb::NodeProto| {
+        let [difference] = &node.input[..] else {
+            return None;
+        };
+        let difference = by(difference).filter(|node| node.op_type == "Sub")?;
+        let [x, subtracted] = &difference.input[..] else {
+            return None;
+        };
+        let mut sum = by(subtracted)?;
+        if sum.op_type == "Reshape" {
+            sum = by(sum.input.first()?)?;
+        }
+        let is_of_x = sum.op_type == "ReduceLogSumExp" && sum.input.first() == Some(x);
+        is_of_x.then(|| Some((x.clone(), axis_of(sum)?)))?
+    };
+    let found: Vec<(usize, (String, i64))> = (graph.node.iter().enumerate())
+        .filter(|(_, node)| node.op_type == "Exp")
+        .filter_map(|(place, node)| Some((place, softmax_of(node)?)))
+        .collect();
+    let replaced = found.first().map(|_| "ReduceLogSumExp".to_owned());
+    for (place, (x, axis)) in found {
+        let node = &mut graph.node[place];
+        "Softmax".clone_into(&mut node.op_type);
+        node.input = vec![x];
+        node.attribute = vec![integer("axis", axis)];
+    }
+    replaced.into_iter().collect()
 }
 
 /// Gives the classes numbers in place of texts. Nothing reads the label any more, and the inference

@@ -44,11 +44,12 @@ fn learner(operator: &str, outputs: &[&str], attribute: Vec<pb::AttributeProto>)
 }
 
 /// What the inference library computes for `y` of length `length` once `nodes` are replaced. The
-/// constants are `t`, numbers, and `which`, indices.
+/// constants are `t`, numbers, `which`, indices, and `upright`, a shape.
 fn run(nodes: &[pb::NodeProto], opset: i64, x: &[f32], length: usize) -> Vec<f32> {
     let mut graph = Graph::default();
     graph.constant("t", &[3], &[0.1, 0.7, 0.2]);
     graph.indices("which", &[2, 0]);
+    graph.indices("upright", &[-1, 1]);
     for node in nodes {
         graph.push(node.clone());
     }
@@ -141,6 +142,29 @@ fn a_sum_of_powers_neither_overflows_nor_vanishes() {
             (f64::from(found) - expected).abs() < 1e-4,
             "{found}, {expected}"
         );
+    }
+}
+
+#[test]
+fn probabilities_of_large_logarithms_add_up_to_one() {
+    let node = |operator: &str, inputs: &[&str], output: &str, attribute| pb::NodeProto {
+        op_type: operator.to_owned(),
+        input: inputs.iter().map(|&input| input.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        attribute,
+        ..Default::default()
+    };
+    let axes = vec![integers("axes", &[1]), integer("keepdims", 0)];
+    let nodes = [
+        node("ReduceLogSumExp", &["x"], "sum", axes),
+        node("Reshape", &["sum", "upright"], "column", Vec::new()),
+        node("Sub", &["x", "column"], "logarithms", Vec::new()),
+        node("Exp", &["logarithms"], "y", Vec::new()),
+    ];
+    let first = 1.0 / (1.0 + 0.5_f64.exp());
+    for shift in [-1e5, 0.0, 6124.0] {
+        let found = run(&nodes, MIN_OPSET, &[shift, shift + 0.5], 2);
+        assert_near(&found, &[first, 1.0 - first]);
     }
 }
 
