@@ -315,3 +315,38 @@ fn with_auto_tare_an_hour_of_drift_costs_no_press() {
     println!("{same} of 60 levels are those without drift");
     assert!(same >= 56, "{following:?} {without_drift:?}");
 }
+
+#[test]
+fn the_shore_hardness_is_in_the_range_of_the_level() {
+    let directory = tempfile::tempdir().unwrap();
+    let recording = directory.path().join("presses.bin");
+    let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
+        .args(["simulate", "--presses", "40", "--fps", "5", "--to"])
+        .arg(&recording)
+        .status()
+        .unwrap();
+    assert!(simulated.success());
+    let config = directory.path().join("hardnessd.toml");
+    for model in ["hrn", "course"] {
+        let text = format!(
+            "[[sensor]]\nname = \"forearm\"\nport = \"p\"\n[model]\nbuilt_in = \"{model}\"\n"
+        );
+        std::fs::write(&config, text).unwrap();
+        let events = replay(&recording, &["--config", config.to_str().unwrap()]);
+        let events = events
+            .lines()
+            .map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let mut verdicts = 0;
+        for event in events.filter(|event| event["type"] == "hardness") {
+            let probabilities = event["probabilities"].as_array().unwrap();
+            let probability = |place: &usize| probabilities[*place].as_f64().unwrap();
+            let place = (0..4).max_by(|a, b| probability(a).total_cmp(&probability(b)));
+            let least = [70.0, 60.0, 50.0, 0.0][place.unwrap()];
+            let most = [100.0, 71.0, 61.0, 51.0][place.unwrap()];
+            let value = event["shore"]["value"].as_f64().unwrap();
+            assert!((least..=most).contains(&value), "{model}: {event}");
+            verdicts += 1;
+        }
+        assert!(verdicts >= 40, "{model}: {verdicts}");
+    }
+}

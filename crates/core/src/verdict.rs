@@ -503,6 +503,17 @@ impl Hrn {
         })
     }
 
+    /// The Shore hardness within the part of the scale that the level covers, if the levels are parts of
+    /// the scale.
+    pub fn within(&self, shore: Shore, level: u8) -> Shore {
+        let levels = &self.card.levels;
+        let place = levels.iter().position(|known| known.level == level);
+        match (place, Borders::of(levels)) {
+            (Some(place), Ok(borders)) => shore.within(borders.part(place)),
+            _ => shore,
+        }
+    }
+
     /// Judges every check frame or press. The first judgement also warms up the plan.
     fn reproduce_check(&self) -> Result<(), ModelError> {
         for index in 0..self.checks.count() {

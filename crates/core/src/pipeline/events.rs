@@ -217,12 +217,15 @@ impl Pipeline {
             }
         };
         let object = object_of(self.seen.context.as_ref()).map(|name| {
-            let object = self.seen.objects.with(&name, &verdict);
+            let mut object = self.seen.objects.with(&name, &verdict);
             if phase == Phase::Final {
                 self.seen.objects.add(&name, &verdict);
             }
+            object.shore = object.shore.map(|shore| hrn.within(shore, object.level));
             object
         });
+        // Some models find the Shore hardness apart from the level.
+        let shore = verdict.shore.map(|shore| hrn.within(shore, verdict.level));
         let rejected = if peak.force_n < *min_force_n {
             Some(Rejection::LowForce)
         } else if verdict.confidence < *min_confidence {
@@ -265,7 +268,7 @@ impl Pipeline {
             mono_ns: (self.clock == Clock::Arrival).then_some(stamp.mono.as_nanos() as u64),
             age_at_publish_ms: None,
             latency_us: None,
-            shore: verdict.shore,
+            shore,
             levels: verdict.levels,
             course: beside.course,
             stiffness_n_per_mm: beside.stiffness_n_per_mm,

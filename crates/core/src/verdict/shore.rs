@@ -37,6 +37,28 @@ pub struct Shore {
     pub high: f32,
 }
 
+impl Shore {
+    /// The nearest value in this part of the scale, with an interval that contains it.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd_core::verdict::Shore;
+    ///
+    /// let shore = Shore { value: 53.0, low: 48.0, high: 59.0 };
+    /// let firm = Shore { value: 60.5, low: 48.0, high: 60.5 };
+    /// assert_eq!(shore.within([60.5, 70.5]), firm);
+    /// ```
+    pub fn within(self, [low, high]: [f32; 2]) -> Self {
+        let value = self.value.clamp(low, high);
+        Self {
+            value,
+            low: self.low.min(value),
+            high: self.high.max(value),
+        }
+    }
+}
+
 impl From<[f32; 3]> for Shore {
     fn from([value, low, high]: [f32; 3]) -> Self {
         Self { value, low, high }
