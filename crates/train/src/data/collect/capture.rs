@@ -89,6 +89,9 @@ pub(super) fn part(path: &Path, bytes: &[u8], settings: &Settings) -> Result<Par
         "labels": labels,
     });
     let mut new_objects = BTreeSet::new();
+    if FileKind::of(bytes) == FileKind::Raw {
+        capture["raw"] = Value::Bool(true);
+    }
     if number.is_none() {
         capture["new_object"] = Value::Bool(true);
         new_objects.insert(object);

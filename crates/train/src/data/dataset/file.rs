@@ -170,7 +170,7 @@ fn pitches_mm(meta: &serde_json::Value) -> Option<[f64; 2]> {
     Some(sensors.designs.pitches_mm())
 }
 
-/// The objects of recordings, and whether `hardnessd simulate` played them.
+/// The objects of recordings, and whether `hardnessd simulate` played them. Raw bytes do not say it.
 fn recorded(captures: &serde_json::Value) -> BTreeMap<(u32, u8), Kind> {
     let captures = captures.as_array().into_iter().flatten();
     let object = |capture: &serde_json::Value| {
@@ -178,6 +178,7 @@ fn recorded(captures: &serde_json::Value) -> BTreeMap<(u32, u8), Kind> {
         let level = u8::try_from(capture["level"].as_u64()?).ok()?;
         let kind = match capture["labels"]["simulated"].as_str() {
             Some("true") => Kind::Simulated,
+            _ if capture["raw"] == true => Kind::Unknown,
             _ => Kind::Recorded,
         };
         Some(((number, level), kind))
