@@ -54,7 +54,7 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
     /// Seed of everything random
-    #[arg(long, value_name = "S", default_value_t = 1)]
+    #[arg(long, value_name = "S", default_value_t = SEED)]
     seed: u64,
     /// Address of the live page; port 0 takes a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
@@ -120,6 +120,9 @@ impl Coded for Error {
         }
     }
 }
+
+/// The first four presses of this seed show each kind of answer, and none is near another.
+const SEED: u64 = 2;
 
 /// The longest time from the last byte to the last verdict.
 const PATIENCE: Duration = Duration::from_secs(3);
