@@ -506,8 +506,19 @@ class _Follower:
                 self._early.add(seq)
                 if len(self._early) > MOST_EARLY_LINES:
                     raise ProtocolError("too many events before the answer to the subscription")
-            return cast(Event, message)
+            return cast(Event, _Line(message, self.hello))
         return None
+
+
+class _Line(Message):
+    """An event of a daemon, whose text is the line of `hardnessd tail`."""
+
+    def __init__(self, event: Message, hello: Optional[Message]) -> None:
+        super().__init__(event)
+        self._hello = hello
+
+    def __str__(self) -> str:
+        return _readable(cast(Event, self), self._hello)
 
 
 def _disconnected(address: Address, error: BaseException) -> Disconnected:

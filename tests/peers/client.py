@@ -108,6 +108,9 @@ def resumes(bench, address, kind):
     first = numbers[0]
     assert sorted(numbers) == list(range(first, last + 1)), numbers
     assert not broken.of_type("gap"), broken.of_type("gap")
+    for verdict in broken.of_type("hardness"):
+        assert hardnessd.answer(verdict, broken.client.hello) in str(verdict), str(verdict)
+        assert json.loads(json.dumps(verdict)) == verdict
     assert len(broken.of_type("disconnected")) >= breaks / 2
     assert broken.cancelled > 100 or kind is hardnessd.Client, broken.cancelled
     run = broken.client.hello["run"]
