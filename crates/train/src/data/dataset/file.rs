@@ -436,6 +436,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_recording_says_whether_it_was_simulated_and_raw_bytes_do_not() {
+        let captures = serde_json::json!([
+            {"object": 1, "level": 4, "labels": {"simulated": "true"}},
+            {"object": 2, "level": 4, "labels": {}},
+            {"object": 3, "level": 4, "labels": {}, "raw": true},
+        ]);
+        let kinds = [Kind::Simulated, Kind::Recorded, Kind::Unknown];
+        assert!(recorded(&captures).into_values().eq(kinds));
+    }
+
+    #[test]
     fn an_array_as_large_as_another_may_be_all_zeros() {
         let header = Header {
             descr: "|u1".to_owned(),
