@@ -16,6 +16,7 @@ mod checks;
 mod places;
 mod proposal;
 mod found;
+mod noise;
 mod text;
 mod find;
 #[cfg(test)]
@@ -33,6 +34,7 @@ use clap::{ArgGroup, Args as ClapArgs};
 use self::find::find;
 pub use self::found::Failure;
 use self::found::{Found, Known, Shown};
+use self::noise::noise_counts;
 use self::picture::draw;
 use super::doctor;
 use super::simulate::positive;
@@ -40,7 +42,7 @@ use crate::apart::{self, NoThread};
 use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
 use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
-use hardnessd_core::frame::MOST_SIDE;
+use hardnessd_core::frame::{MOST_SIDE, Pitch};
 use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, Entry, FileKind, Reader};
@@ -219,12 +221,14 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
             .map(drop)
             .map_err(Error::Print);
     };
+    let proposal = &found.best.proposal;
     let listened_s = args.port.as_ref().map(|_| args.seconds);
-    let text = configuration(
-        args,
-        listened_s.map(|s| found.best.proposal.frames as f64 / s),
-    ) + &frame
-        + &calibration(found.best.proposal.most_counts)
+    let text = configuration(args, listened_s.map(|s| proposal.frames as f64 / s))
+        + &frame
+        + &thresholds(
+            proposal.most_counts,
+            noise_counts(&proposal.settings, bytes),
+        )
         + PAGE;
     let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
     written.map_err(|source| Error::Write {
@@ -270,18 +274,31 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
 /// The end of a configuration.
 const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for your browser\n";
 
-/// The part below `[sensor.frame]`, for counts that are finer than a byte: with the default newtons, the
-/// noise of such a sensor would pass for a touch. Full scale is as many newtons as that of a byte.
-fn calibration(most_counts: u16) -> String {
+/// The part below `[sensor.frame]`, where the noise at rest would pass for a touch by default. Counts
+/// that are finer than a byte get fewer newtons: full scale is as many newtons as that of a byte.
+fn thresholds(most_counts: u16, noise_counts: u16) -> String {
+    let mut text = String::new();
+    let mut newtons = NEWTONS_PER_COUNT;
     let full_scale = (u32::from(most_counts) + 1).next_power_of_two() - 1;
-    if full_scale <= u32::from(u8::MAX) {
-        return String::new();
+    if full_scale > u32::from(u8::MAX) {
+        newtons *= f32::from(u8::MAX) / full_scale as f32;
+        text += &format!(
+            "\n[sensor.calibration]\nnewtons_per_count = {newtons:.5}  # a guess from counts up to {most_counts}: \
+             measure it with weights\n"
+        );
     }
-    let newtons = NEWTONS_PER_COUNT * f32::from(u8::MAX) / full_scale as f32;
-    format!(
-        "\n[sensor.calibration]\nnewtons_per_count = {newtons:.5}  # a guess from counts up to {most_counts}: \
-         measure it with weights\n"
-    )
+    // What is as large as this may be a touch.
+    let is_noise = 10 * u32::from(noise_counts) < u32::from(most_counts);
+    // The zero may be taken where the noise goes the other way.
+    if is_noise && 2.0 * f32::from(noise_counts) * newtons >= Pitch::JX255N.contact_threshold_n() {
+        let threshold_n = (f32::from(noise_counts) + 1.5) * newtons;
+        let plural = if noise_counts == 1 { "" } else { "s" };
+        text += &format!(
+            "\n[press]\ncontact_threshold_n = {threshold_n:.3}  # noise of {noise_counts} count{plural} at rest is \
+             no touch\n"
+        );
+    }
+    text
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, Error> {

@@ -197,7 +197,7 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
 
 /// Lines of a sketch that prints 12 bits of 12x8 taxels, at 20 frames/s: 2 s of rest and three presses, with
 /// noise of up to four counts.
-fn fine_counts() -> String {
+fn noisy_counts(most: f32) -> String {
     let mut lines = String::new();
     let (mut noise, rest) = (1_u32, 40);
     for frame in 0..rest + 3 * 40 {
@@ -206,7 +206,7 @@ fn fine_counts() -> String {
         let depth = (std::f32::consts::PI * press.max(0.0).fract()).sin() - 0.2;
         let taxel = |place: usize| {
             let (down, along) = ((place / 8) as f32 - row, (place % 8) as f32 - col);
-            let load = 3000.0 * depth.max(0.0) * (-(down * down + along * along) / 4.0).exp();
+            let load = most * depth.max(0.0) * (-(down * down + along * along) / 4.0).exp();
             noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (60 + (noise >> 24) % 5 + load as u32).to_string()
         };
@@ -216,22 +216,20 @@ fn fine_counts() -> String {
     lines
 }
 
-#[test]
-fn what_sniff_writes_for_fine_counts_takes_noise_for_no_touch() {
+/// Asserts that three presses are found with what `sniff` writes for noisy counts up to `most`, and none
+/// without its part from `table` on, which has `line`.
+fn assert_noise_is_no_touch(most: f32, table: &str, line: &str) {
     let directory = tempfile::tempdir().unwrap();
     let (bytes, config) = (
         directory.path().join("s.bin"),
         directory.path().join("s.toml"),
     );
-    std::fs::write(&bytes, fine_counts()).unwrap();
+    std::fs::write(&bytes, noisy_counts(most)).unwrap();
     let [from, to] = [&bytes, &config].map(|path| path.to_str().unwrap());
     let sniffed = hardnessd(&["sniff", from, "--out", to]);
     assert!(sniffed.status.success(), "{sniffed:?}");
     let written = std::fs::read_to_string(&config).unwrap();
-    assert!(
-        written.contains("\nnewtons_per_count = 0.00249  # a guess"),
-        "{written}"
-    );
+    assert!(written.contains(line), "{written}");
     let replayed = |config: &str| {
         std::fs::write(directory.path().join("rate.toml"), config).unwrap();
         let at = directory.path().join("rate.toml");
@@ -240,9 +238,17 @@ fn what_sniff_writes_for_fine_counts_takes_noise_for_no_touch() {
     let at_rate = written.replace("# frame_rate_hz = 5.0", "frame_rate_hz = 20.0");
     let events = replayed(&at_rate);
     assert_eq!(events.matches("\"state\":\"end\"").count(), 3, "{events}");
-    // The default of a byte takes the noise for a touch, so there is no zero and no press.
-    let without = at_rate.split("\n[sensor.calibration]").next().unwrap();
+    // The defaults take the noise for a touch, so there is no zero and no press.
+    let without = at_rate.split(table).next().unwrap();
     assert!(!replayed(without).contains("\"state\":\"end\""));
+}
+
+#[test]
+fn what_sniff_writes_takes_noise_for_no_touch() {
+    let newtons = "\nnewtons_per_count = 0.00249  # a guess";
+    assert_noise_is_no_touch(3000.0, "\n[sensor.calibration]", newtons);
+    let threshold = "\ncontact_threshold_n = 0.180  # noise of 3 counts at rest is no touch\n";
+    assert_noise_is_no_touch(150.0, "\n[press]", threshold);
 }
 
 /// What came of the presses of a recording.
