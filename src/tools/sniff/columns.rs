@@ -41,6 +41,10 @@ pub(super) struct Columns {
     /// The number of frames in which each byte has another value.
     pub(super) changes: Vec<u32>,
     pub(super) numbers: Vec<Number>,
+    /// The places of the bytes that must belong to a mark.
+    pub(super) marks: Vec<usize>,
+    /// The numbers of bytes that are parts of numbers, and that are restless.
+    pub(super) counts: (usize, usize),
     /// Whether most of the bytes that change do so as a checksum does. No array is among them.
     pub(super) are_random: bool,
 }
@@ -103,10 +107,14 @@ impl Columns {
             rest,
             changes,
             numbers: Vec::new(),
+            marks: Vec::new(),
+            counts: (0, 0),
             are_random: false,
         };
         columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
+        let count = |kind| columns.kinds.iter().filter(|&&one| one == kind).count();
+        columns.counts = (count(Kind::Number), count(Kind::Restless));
         columns
     }
 

@@ -8,6 +8,8 @@ use super::period::Frames;
 
 /// The most active bytes on a side that a constant byte is compared with.
 const NEAR: usize = 64;
+/// The greatest distance of such a byte.
+const FARTHEST: usize = 4096;
 /// A side with fewer says little beside the other, and one with fewer than many does not show the
 /// range well.
 const FEWEST_NEAR: usize = 8;
@@ -34,27 +36,23 @@ impl Columns {
             let value = self.kinds[at].constant();
             value.is_some_and(|value| constant[usize::from(value)] < many)
         };
-        let rare: Vec<(usize, Vec<Vec<usize>>)> = (0..period)
-            .filter(|&at| is_rare(at))
-            .map(|at| (at, self.sides(at)))
-            .collect();
         let is_noisy = self.noisy(frames);
-        // Where all taxels are noisy, a byte that never changes is none of them. Some taxels read 0
-        // whatever their noise.
-        let is_taxel = |at: usize, near: &[usize]| {
+        // Bytes that no taxel near them is like, and bytes that are still where all taxels are noisy.
+        let (mut marking, mut still) = (Vec::new(), Vec::new());
+        for at in (0..period).filter(|&at| is_rare(at)) {
+            let sides = self.sides(at);
+            let among: Vec<&Vec<usize>> = sides
+                .iter()
+                .filter(|near| self.is_among(self.rest[at], near))
+                .collect();
+            // Some taxels read 0 whatever their noise.
             let is_still = self.changes[at] == 0 && self.rest[at] != 0;
-            self.is_among(self.rest[at], near) && !(is_still && are_mostly(near, &is_noisy))
-        };
-        let is_none = |(at, sides): &(usize, Vec<Vec<usize>>)| {
-            let mut sides = sides.iter();
-            (!sides.any(|near| is_taxel(*at, near))).then_some(*at)
-        };
-        let is_unlike = |(at, sides): &(usize, Vec<Vec<usize>>)| {
-            let mut sides = sides.iter();
-            (!sides.any(|near| self.is_among(self.rest[*at], near))).then_some(*at)
-        };
-        let still: Vec<usize> = rare.iter().filter_map(is_none).collect();
-        let mut marking: Vec<usize> = rare.iter().filter_map(is_unlike).collect();
+            if among.is_empty() {
+                marking.push(at);
+            } else if is_still && among.iter().all(|near| are_mostly(near, &is_noisy)) {
+                still.push(at);
+            }
+        }
         if marking.is_empty() {
             marking = longest_run(&still);
         } else {
@@ -67,16 +65,17 @@ impl Columns {
             let near: Vec<usize> = still.into_iter().filter(is_near).collect();
             marking.extend(near);
         }
-        for at in marking {
+        for &at in &marking {
             self.kinds[at] = Kind::Marking(self.rest[at]);
         }
+        self.marks = marking;
     }
 
     /// The bytes near `at` that have its role if it is a taxel at an end of the array: the nearest on
     /// each side, at even distances, because the low bytes and the high bytes of cells differ.
     fn sides(&self, at: usize) -> Vec<Vec<usize>> {
         let period = self.kinds.len();
-        let distances = || (2..period / 2).step_by(2);
+        let distances = || (2..(period / 2).min(FARTHEST)).step_by(2);
         let is_cell = |at: &usize| !matches!(self.kinds[*at], Kind::Number | Kind::Restless);
         let after = distances().map(|distance| (at + distance) % period);
         let before = distances().map(|distance| (at + period - distance) % period);

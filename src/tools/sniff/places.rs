@@ -81,16 +81,16 @@ fn beside(columns: &Columns, start: usize, length: usize) -> Vec<Kind> {
 impl Place {
     /// How unlikely the place is, as a score. `None` if no array can be there.
     pub(super) fn cost(&self, columns: &Columns) -> Option<f64> {
-        let all = |is: fn(&Kind) -> bool| columns.kinds.iter().filter(|kind| is(kind)).count();
+        let (numbers, restless) = columns.counts;
         let here = |is: fn(&Kind) -> bool| self.beside.iter().filter(|kind| is(kind)).count();
         let is_mark = |kind: &Kind| matches!(kind, Kind::Marking(_));
         let is_number = |kind: &Kind| *kind == Kind::Number;
         let is_restless = |kind: &Kind| *kind == Kind::Restless;
-        if here(is_mark) == 0 || here(is_number) < all(is_number) {
+        if here(is_mark) == 0 || here(is_number) < numbers {
             return None;
         }
         let mut cost = MARK_IN_CELLS * self.marks_in_cells(columns) as f64;
-        cost += RESTLESS_CELL * (all(is_restless) - here(is_restless)) as f64;
+        cost += RESTLESS_CELL * (restless - here(is_restless)) as f64;
         let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
         let unknown = (0..self.beside.len())
             .filter(|at| self.beside[*at] == Kind::Active && !checked.contains(at));
@@ -126,14 +126,12 @@ impl Place {
     /// change.
     fn marks_in_cells(&self, columns: &Columns) -> usize {
         let period = columns.kinds.len();
-        let is_in_mark = |kind: Kind| self.beside.contains(&kind);
-        let cells = (0..self.bytes).map(|at| (at, columns.kinds[(self.start + at) % period]));
-        let marks = cells.filter(|(_, kind)| matches!(kind, Kind::Marking(_)));
-        marks
-            .filter(|&(at, kind)| {
-                at < MOST_BESIDE || at + MOST_BESIDE >= self.bytes || is_in_mark(kind)
-            })
-            .count()
+        let marks = columns.marks.iter().filter(|&&mark| {
+            let at = (mark + period - self.start) % period;
+            let is_near = at < MOST_BESIDE || at + MOST_BESIDE >= self.bytes;
+            at < self.bytes && (is_near || self.beside.contains(&columns.kinds[mark]))
+        });
+        marks.count()
     }
 
     /// The number of bytes that look like cells at rest within a mark, beside the `after` and `before`

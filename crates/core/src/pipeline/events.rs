@@ -224,8 +224,11 @@ impl Pipeline {
             object.shore = object.shore.map(|shore| hrn.within(shore, object.level));
             object
         });
-        // Some models find the Shore hardness apart from the level.
-        let shore = verdict.shore.map(|shore| hrn.within(shore, verdict.level));
+        let mut shore = verdict.shore;
+        if hrn.format() == Format::Frame {
+            // Such a model finds the Shore hardness apart from the level.
+            shore = shore.map(|shore| hrn.within(shore, verdict.level));
+        }
         let rejected = if peak.force_n < *min_force_n {
             Some(Rejection::LowForce)
         } else if verdict.confidence < *min_confidence {
