@@ -19,6 +19,8 @@ const NOISY_SHARE: f64 = 0.05;
 /// The fewest bytes that show whether taxels are noisy, and the share of them that is.
 const FEWEST_NOISY: usize = 8;
 const MOSTLY_NOISY: f64 = 0.75;
+/// More bytes than this, in all of a frame, are not all of a mark.
+const MOST_MARKS: usize = 100;
 /// The greatest distance of two bytes of a mark.
 const NEAR_MARK: usize = 8;
 
@@ -55,6 +57,9 @@ impl Columns {
         }
         if marking.is_empty() {
             marking = longest_run(&still);
+        } else if marking.len() > MOST_MARKS {
+            // Taxels that never change have all kinds of values.
+            marking = longest_run(&marking);
         } else {
             // Far from a mark it is a taxel that is stuck.
             let is_near = |at: &usize| {
