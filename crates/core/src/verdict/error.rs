@@ -34,7 +34,10 @@ pub enum ModelError {
         found: Option<i64>,
     },
     /// A tensor's data lies outside the file.
-    #[error("tensor `{tensor}` lies in an external file: expected all data inside the model file")]
+    #[error(
+        "tensor `{tensor}` lies in an external file: expected all data inside the model file (PyTorch: \
+         `external_data=False`)"
+    )]
     ExternalData {
         /// The name of the tensor.
         tensor: String,
