@@ -118,10 +118,10 @@ impl Cable {
         });
     }
 
-    /// Sends frames without load until the port is read. The daemon may drop the first frame,
-    /// because it is from before the port was opened.
+    /// Sends frames without load until the port is read. The daemon drops what came before the port was
+    /// opened, twice: on a busy machine another frame may come between.
     fn wake(&self) {
-        for _ in 0..2 {
+        for _ in 0..3 {
             self.write(&self.bytes(&rest()));
             self.drain();
         }
