@@ -3,8 +3,8 @@
 
     python tests/peers/own_objects.py target/debug
 
-Claims: they run to their end, in a directory of their own, and the model that they train judges. The
-commands on simulated data run on few samples and in the profile `smoke`: the page's own take minutes.
+Claims: they run to their end, in a directory of their own, the model that they train judges, and the way back to
+the built-in one leaves its references. The commands on simulated data run on few samples and in the profile `smoke`: the page's own take minutes.
 """
 
 import json
@@ -43,18 +43,26 @@ def run(script, directory, path):
 
 
 def own_objects(text, directory, path):
-    printed = run(commands(text), directory, path)
+    run(commands(text), directory, path)
     inspected = run("hrn-train inspect own.onnx", directory, path)
     own = re.search(r"sha256 +([0-9a-f]{12})", inspected)[1]
-    events = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
-    verdicts = [event for event in events if event.get("phase") == "final"]
-    told = [event for event in verdicts if event["model"] != own]
-    assert told and all(event["references"] == "labelled" for event in told), verdicts
-    # The last command is the replay: its verdicts are of the new model.
-    for way, of_wood in [("told", told), ("trained", [event for event in verdicts if event["model"] == own])]:
+    trained = verdicts(directory, path)
+    assert all(event["model"] == own for event in trained), trained
+    # The page's way back to the built-in model, which has the references.
+    run(re.search(r"`(sed -i '/\^.*?)`", text)[1], directory, path)
+    told = verdicts(directory, path)
+    assert all(event["model"] != own and event["references"] == "labelled" for event in told), told
+    for way, of_wood in [("told", told), ("trained", trained)]:
         right = sum(event["level"] == 1 for event in of_wood)
         print(f"{way}: {right} of {len(of_wood)} presses of unknown wood said to be of level 1")
-        assert len(of_wood) >= 2 and right > len(of_wood) / 2, verdicts
+        assert len(of_wood) >= 2 and right > len(of_wood) / 2, of_wood
+
+
+def verdicts(directory, path):
+    """The final verdicts on wood that is neither learnt nor a reference."""
+    printed = run("hardnessd replay wood-12.mcap --config own.toml --json", directory, path)
+    events = map(json.loads, printed.splitlines())
+    return [event for event in events if event.get("phase") == "final"]
 
 
 def simulated(text, directory, path):
