@@ -381,8 +381,8 @@ fn is_unplugged(reason: &str) -> bool {
     UNPLUGGED.iter().any(|gone| reason.contains(gone))
 }
 
-/// Press, phase, verdict, probabilities in per cent and age. Force and notes follow if there is
-/// room.
+/// Press, phase, verdict, probabilities in per cent and age. Force, Shore hardness and notes follow if
+/// there is room.
 fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
     let shares = verdict
         .probabilities
@@ -394,8 +394,11 @@ fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
         verdict.press, verdict.phase, verdict.answer
     );
     let force = format!("  {:>5.1} N", verdict.force_n);
+    let shore = verdict
+        .shore
+        .map(|[value, low, high]| format!("  Shore {value:.0} ({low:.0} to {high:.0})"));
     let notes = verdict.notes.iter().map(|note| format!("  {note}"));
-    for more in std::iter::once(force).chain(notes) {
+    for more in std::iter::once(force).chain(shore).chain(notes) {
         if line.len() + more.len() > width {
             break;
         }

@@ -84,7 +84,7 @@ fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
     json!({"type": "hardness", "sensor": "forearm", "press": press, "phase": "final",
         "level": level, "label": "firm", "rejected": rejected, "probabilities": [0.07, 0.93],
         "confidence": 0.93,
-        "force_n": 12.34, "notes": []})
+        "force_n": 12.34, "shore": {"value": 65.2, "low": 58.8, "high": 71.0}, "notes": []})
 }
 
 /// A view of one sensor that is live and has been pressed.
@@ -307,6 +307,9 @@ fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
         "  3 final firm           7  93   10 s   12.3 N"
     );
     assert_eq!(lines[first + 3], "");
+    let text = shown(&view, 10_200, (120, 24), PLAIN);
+    let whole = "  3 final firm           7  93   10 s   12.3 N  Shore 65 (59 to 71)";
+    assert!(text.contains(whole), "{text}");
 }
 
 #[test]

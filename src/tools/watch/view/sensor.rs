@@ -88,6 +88,8 @@ pub(in crate::tools::watch) struct Verdict {
     pub(in crate::tools::watch) is_weak: bool,
     pub(in crate::tools::watch) probabilities: Vec<f64>,
     pub(in crate::tools::watch) force_n: f64,
+    /// The Shore hardness and its interval.
+    pub(in crate::tools::watch) shore: Option<[f64; 3]>,
     pub(in crate::tools::watch) notes: Vec<String>,
 }
 
@@ -158,6 +160,8 @@ impl Sensor {
             text: answer,
             is_weak,
         } = Answer::of(event, labels);
+        let shore = |key| event["shore"][key].as_f64();
+        let shore = shore("value").zip(shore("low")).zip(shore("high"));
         let verdict = Verdict {
             at,
             press: number(event, "press"),
@@ -168,6 +172,7 @@ impl Sensor {
                 .filter_map(Value::as_f64)
                 .collect(),
             force_n: event["force_n"].as_f64().unwrap_or_default(),
+            shore: shore.map(|((value, low), high)| [value, low, high]),
             notes: items(event, "notes")
                 .filter_map(Value::as_str)
                 .map(|note| plain(note).replace('_', " "))
