@@ -3,7 +3,6 @@
 mod arm;
 mod calibrate;
 mod commands;
-mod running;
 mod demo;
 mod doors;
 mod faults;
@@ -13,6 +12,7 @@ mod model;
 mod motion;
 mod port;
 mod publish;
+mod running;
 mod sensors;
 mod service;
 mod shipped;

@@ -43,8 +43,8 @@ pub(super) struct Columns {
     pub(super) numbers: Vec<Number>,
     /// The places of the bytes that must belong to a mark.
     pub(super) marks: Vec<usize>,
-    /// The numbers of bytes that are parts of numbers, and that are restless.
-    pub(super) counts: (usize, usize),
+    /// How many bytes are restless.
+    pub(super) restless: usize,
     /// Whether most of the bytes that change do so as a checksum does. No array is among them.
     pub(super) are_random: bool,
 }
@@ -108,13 +108,11 @@ impl Columns {
             changes,
             numbers: Vec::new(),
             marks: Vec::new(),
-            counts: (0, 0),
+            restless: 0,
             are_random: false,
         };
         columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
-        let count = |kind| columns.kinds.iter().filter(|&&one| one == kind).count();
-        columns.counts = (count(Kind::Number), count(Kind::Restless));
         columns
     }
 
@@ -235,6 +233,7 @@ impl Columns {
         let restless: Vec<usize> = active.iter().copied().filter(is_restless).collect();
         self.are_random = 2 * restless.len() > active.len();
         if restless.len() <= MOST_RESTLESS.min(active.len() / 2) {
+            self.restless = restless.len();
             for at in restless {
                 self.kinds[at] = Kind::Restless;
             }

@@ -81,19 +81,9 @@ impl Columns {
     fn sides(&self, at: usize) -> Vec<Vec<usize>> {
         let period = self.kinds.len();
         let distances = || (2..(period / 2).min(FARTHEST)).step_by(2);
-        let is_cell = |at: &usize| !matches!(self.kinds[*at], Kind::Number | Kind::Restless);
         let after = distances().map(|distance| (at + distance) % period);
         let before = distances().map(|distance| (at + period - distance) % period);
-        // As many as have changed, and those between.
-        let near = |places: &mut dyn Iterator<Item = usize>| -> Vec<usize> {
-            let mut active = 0;
-            let is_enough = |&at: &usize| {
-                active += usize::from(self.kinds[at] == Kind::Active);
-                active <= NEAR
-            };
-            places.filter(is_cell).take_while(is_enough).collect()
-        };
-        let sides = [near(&mut after.into_iter()), near(&mut before.into_iter())];
+        let sides = [self.near(after), self.near(before)];
         let says_much = |side: &&Vec<usize>| self.active(side).count() >= FEWEST_NEAR;
         let much: Vec<Vec<usize>> = sides.iter().filter(says_much).cloned().collect();
         if much.is_empty() {
@@ -101,6 +91,17 @@ impl Columns {
         } else {
             much
         }
+    }
+
+    /// As many of these bytes as [`NEAR`] active ones reach, without numbers and checksums.
+    fn near(&self, places: impl Iterator<Item = usize>) -> Vec<usize> {
+        let is_cell = |at: &usize| !matches!(self.kinds[*at], Kind::Number | Kind::Restless);
+        let mut active = 0;
+        let is_within = |&at: &usize| {
+            active += usize::from(self.kinds[at] == Kind::Active);
+            active <= NEAR
+        };
+        places.filter(is_cell).take_while(is_within).collect()
     }
 
     /// The active bytes of these.

@@ -81,7 +81,7 @@ fn beside(columns: &Columns, start: usize, length: usize) -> Vec<Kind> {
 impl Place {
     /// How unlikely the place is, as a score. `None` if no array can be there.
     pub(super) fn cost(&self, columns: &Columns) -> Option<f64> {
-        let (numbers, restless) = columns.counts;
+        let numbers: usize = columns.numbers.iter().map(|number| number.bytes).sum();
         let here = |is: fn(&Kind) -> bool| self.beside.iter().filter(|kind| is(kind)).count();
         let is_mark = |kind: &Kind| matches!(kind, Kind::Marking(_));
         let is_number = |kind: &Kind| *kind == Kind::Number;
@@ -90,7 +90,7 @@ impl Place {
             return None;
         }
         let mut cost = MARK_IN_CELLS * self.marks_in_cells(columns) as f64;
-        cost += RESTLESS_CELL * (restless - here(is_restless)) as f64;
+        cost += RESTLESS_CELL * (columns.restless - here(is_restless)) as f64;
         let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
         let unknown = (0..self.beside.len())
             .filter(|at| self.beside[*at] == Kind::Active && !checked.contains(at));
