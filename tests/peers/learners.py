@@ -48,8 +48,8 @@ from sklearn.tree import DecisionTreeClassifier
 
 LABELS = np.array(["hard", "firm", "soft", "very-soft"])
 TOLERANCE = 1e-5
-# Naive Bayes adds 784 logarithms in f32, and their order differs.
-ROUNDED = 3e-5
+# Naive Bayes adds the logarithms of 784 densities in f32. onnxruntime itself differs by 3e-5 from scikit-learn.
+ROUNDED = 1e-4
 
 
 def logistic():
@@ -57,7 +57,7 @@ def logistic():
 
 
 def kinds():
-    """Each kind of classifier by name."""
+    """Each kind of classifier by name, with its tolerance."""
     scaled = StandardScaler
     return {
         "logistic regression": logistic(),
@@ -85,7 +85,7 @@ def kinds():
         "SVC sigmoid": SVC(kernel="sigmoid", probability=True),
         "MLP": make_pipeline(scaled(), MLPClassifier((32,), max_iter=60)),
         "MLP tanh": MLPClassifier((16, 8), activation="tanh", max_iter=60),
-        "Gaussian naive Bayes": GaussianNB(),
+        "Gaussian naive Bayes": GaussianNB(var_smoothing=1e-2),
         "multinomial naive Bayes": MultinomialNB(),
         "complement naive Bayes": ComplementNB(),
         "Bernoulli naive Bayes": BernoulliNB(binarize=0.07),
@@ -141,13 +141,11 @@ def expected(path, frames, order=None):
     return np.array(found)
 
 
-def compare(name, path, data, order=None):
+def compare(name, path, data, order=None, tolerance=TOLERANCE, add_up=True):
     arrays = np.load(data)
     by_split = np.argsort(arrays["split"], kind="stable")
-    wanted, tolerance = expected(path, arrays["frames"][by_split], order), TOLERANCE
-    if "Bayes" in name:
-        tolerance = ROUNDED
-        # The file subtracts logarithms near 6000 in f32, so onnxruntime's probabilities add up to 1 +- 3e-4.
+    wanted = expected(path, arrays["frames"][by_split], order)
+    if not add_up:
         sums = wanted.sum(axis=1, keepdims=True)
         assert np.abs(sums - 1).max() < 3e-4, (name, sums)
         wanted /= sums
@@ -178,7 +176,10 @@ def classifiers(data):
     inputs = arrays["frames"].reshape(-1, 784)[train]
     level = arrays["level"][train].astype(np.int64)
     for name, classifier in kinds().items():
-        compare(name, export(classifier, inputs, level), data)
+        tolerance = ROUNDED if "Bayes" in name else TOLERANCE
+        compare(name, export(classifier, inputs, level), data, tolerance=tolerance)
+    # By default its logarithms are near 6000, and onnxruntime subtracts them in f32: its probabilities do not add up.
+    compare("GaussianNB()", export(GaussianNB(), inputs, level), data, add_up=False)
     compare("levels from 0", export(logistic(), inputs, level - 1), data)
     compare("without ZipMap", export(logistic(), inputs, level, {"zipmap": False}), data)
     for name, classifier in {"texts": logistic(), "texts, trees": DecisionTreeClassifier(max_depth=4)}.items():
