@@ -38,6 +38,17 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     if let Some(row) = rows.take(1) {
         page.title(row, view);
     }
+    if let Some(hello) = &view.hello
+        && !hello.without_effect.is_empty()
+        && let Some(row) = rows.take(1)
+    {
+        let keys = hello.without_effect.join(", ");
+        page.text(
+            row,
+            &format!("{keys}: changes no verdict of this model"),
+            look.aside(),
+        );
+    }
     let Some(sensor) = view.sensor() else {
         if let (Some(row), Some((link, reason))) = (rows.take(1), view.trouble(now)) {
             page.band(row, &format!(" {}  {reason}", link.name()), look.link(link));
@@ -145,8 +156,8 @@ impl Page<'_> {
             _ => String::new(),
         };
         let line = format!(
-            "{sensor}{dot}hardnessd {}{dot}model {} ({})",
-            hello.version, hello.model, hello.validation
+            "{sensor}{dot}hardnessd {}{dot}model {} ({}): {}",
+            hello.version, hello.model, hello.validation, hello.needs
         );
         self.text(rest, &line, self.look.aside());
     }

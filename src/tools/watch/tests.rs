@@ -62,7 +62,8 @@ fn hello(run: &str, sensors: &[&str]) -> Value {
         .map(|name| json!({"name": name, "rows": 28, "cols": 28, "pitch_mm": 3.5}))
         .collect();
     json!({"type": "hello", "protocol": 1, "robot": "arm-7", "version": "0.1.0", "run": run,
-        "sensors": sensors, "model": {"sha256": "0123456789abcdef", "validation": "simulated data only",
+        "sensors": sensors, "model": {"name": "built in", "validation": "simulated data only",
+        "needs": "judges single frames, needs no arm", "without_effect": [],
         "levels": [{"level": 1, "label": "hard"}, {"level": 2, "label": "firm"}]}})
 }
 
@@ -119,6 +120,25 @@ fn rows(buffer: &Buffer) -> Vec<String> {
 
 fn shown(view: &View, ms: u64, size: (u16, u16), look: Look) -> String {
     rows(&picture(view, ms, size, look)).join("\n")
+}
+
+#[test]
+fn the_model_is_named_with_its_needs_and_the_keys_that_change_no_verdict_of_it() {
+    let mut hello = hello("a", &["forearm"]);
+    let view = view_of(&[(0, hello.clone())]);
+    let shows = |view: &View, text: &str| shown(view, 100, (120, 30), PLAIN).contains(text);
+    assert!(shows(
+        &view,
+        "model built in (simulated data only): judges single frames, needs no arm"
+    ));
+    assert!(!shows(&view, "changes no verdict"));
+    hello["model"]["without_effect"] =
+        json!(["sensor.arm of \"forearm\"", "model.early_confidence"]);
+    let view = view_of(&[(0, hello)]);
+    assert!(shows(
+        &view,
+        "sensor.arm of \"forearm\", model.early_confidence: changes no verdict of this model"
+    ));
 }
 
 #[test]

@@ -77,9 +77,13 @@ pub(super) struct Hello {
     pub(super) robot: String,
     pub(super) version: String,
     run: String,
-    /// The first digits of the model's hash.
+    /// The file of the model, or `built in`.
     pub(super) model: String,
     pub(super) validation: String,
+    /// What the model judges, and what it needs beside the sensor.
+    pub(super) needs: String,
+    /// The keys of the configuration that change no verdict of the model.
+    pub(super) without_effect: Vec<String>,
     /// The labels of the levels, in order.
     pub(super) labels: Vec<String>,
 }
@@ -312,13 +316,15 @@ impl View {
 
 fn hello(event: &Value) -> Hello {
     let model = &event["model"];
-    let sha256 = text(model, "sha256");
+    let keys = items(model, "without_effect").filter_map(Value::as_str);
     Hello {
         robot: text(event, "robot"),
         version: text(event, "version"),
         run: text(event, "run"),
-        model: sha256.get(..12).unwrap_or(&sha256).to_owned(),
+        model: text(model, "name"),
         validation: text(model, "validation"),
+        needs: text(model, "needs"),
+        without_effect: keys.map(plain).collect(),
         labels: items(model, "levels")
             .map(|level| text(level, "label"))
             .collect(),
