@@ -450,7 +450,7 @@ pub(super) struct Evaluate {
     /// The model file
     #[arg(long, value_name = "M.onnx")]
     pub(super) model: PathBuf,
-    /// The data set
+    /// The data set. Of whole presses, a model of single frames judges the frame of maximal contact area
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
     /// Split to evaluate
