@@ -1,8 +1,6 @@
 #!/usr/bin/env python3
 """Presses an object no harder than its level needs: the arm withdraws when the level is known, or at a force.
 
-    gentle_press.py ARM [SENSOR] [--limit N]
-
 ARM is the socket of `hardnessd simulate --arm`; docs/motion.md shows how to start it. For a robot of yours, replace
 the class `Arm`. `hardnessd.py` must be beside this file or installed.
 """
@@ -66,12 +64,14 @@ def main():
     parser.add_argument("sensor", nargs="?", default="forearm")
     parser.add_argument("--limit", type=float, default=15.0, help="greatest force in newtons [default: 15]")
     args = parser.parse_args()
-    events = iter(hardnessd.Client(types=["frame", "hardness", "press", "status"]))
-    arm = Arm(args.arm)
-    early, final, greatest_n = press(arm, events, args.sensor, args.limit)
-    level = f"{final['level']} {final['label']}" if final["level"] else f"rejected: {final['rejected']}"
+    events = hardnessd.Client(types=["frame", "hardness", "press", "status"])
+    try:
+        arm = Arm(args.arm)
+        early, final, greatest_n = press(arm, events, args.sensor, args.limit)
+    except (OSError, RuntimeError) as error:
+        raise SystemExit(f"{args.arm}: {error}")
     why = f"an early verdict ({early['confidence']:.0%})" if early else "no early verdict"
-    print(f"{level} ({final['confidence']:.0%}), {why}, greatest force {greatest_n:.1f} N")
+    print(f"{final}\n{why}, greatest force {greatest_n:.1f} N")
     while arm.order(to_mm=0.0)["at_mm"] > 0:
         time.sleep(0.05)
 
