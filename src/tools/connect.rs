@@ -20,6 +20,10 @@ use crate::apart;
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{LineRead, Lines};
 
+/// The reason why there is no daemon where a line begins with `HTTP/`.
+pub(super) const WEB_SERVER: &str = "a web server answers there, such as the live page's: name the address \
+                                     of [publish.tcp]";
+
 /// Options that name a daemon.
 #[derive(Debug, Clone, Default, ClapArgs)]
 pub struct Source {

@@ -12,7 +12,7 @@ use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
 use super::answer;
-use super::connect::{self, Address, Connection, Source};
+use super::connect::{self, Address, Connection, Source, WEB_SERVER};
 use super::readable::Printer;
 use super::simulate::positive;
 use crate::maybe;
@@ -86,10 +86,7 @@ pub enum Error {
         found: String,
     },
     /// The other end is a web server.
-    #[error(
-        "{address}: a web server answers there, such as the live page's: name the address of \
-         [publish.tcp]"
-    )]
+    #[error("{address}: {WEB_SERVER}")]
     Web {
         /// The address.
         address: Address,

@@ -174,6 +174,10 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
         for part in ["NO DAEMON", "found protocol 2, expected 1"] {
             assert!(refused.contains(part), "{refused}");
         }
+        view.take_line("HTTP/1.1 400 Bad Request", at(5_000));
+        view.lose(Loss::Closed);
+        let page = text(&view, 5_100);
+        assert!(page.contains("NO DAEMON  a web server answers"), "{page}");
     }
 }
 

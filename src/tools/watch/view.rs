@@ -11,6 +11,7 @@ use jiff::SignedDuration;
 use serde_json::{Value, json};
 
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
+use super::super::connect::WEB_SERVER;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::wording;
@@ -154,6 +155,10 @@ impl View {
     /// Takes in a line of the daemon, read at `now`. Ignores an unknown line. The caller must send
     /// the returned requests to the daemon.
     pub(super) fn take_line(&mut self, line: &str, now: Stamp) -> Option<String> {
+        if line.starts_with("HTTP/") {
+            self.daemon = Daemon::Absent(WEB_SERVER.to_owned());
+            return None;
+        }
         let event = serde_json::from_str::<Value>(line).ok()?;
         self.last_line = now.mono;
         match text(&event, "type").as_str() {
