@@ -29,6 +29,14 @@ const BINS: RangeInclusive<usize> = 10..=400;
 /// The numbers that such a model may take of a reference.
 const NUMBERS: RangeInclusive<usize> = 1..=1024;
 
+fn invalid(key: &'static str, found: impl Into<String>, expected: impl Into<String>) -> ModelError {
+    ModelError::KeyInvalid {
+        key,
+        found: found.into(),
+        expected: expected.into(),
+    }
+}
+
 pub(super) fn check_opset(proto: &pb::ModelProto) -> Result<(), ModelError> {
     let found = proto
         .opset_import
@@ -202,10 +210,7 @@ fn check_course_inputs(
         }
         _ => Err(ModelError::Signature {
             what: "inputs",
-            found: match described.is_empty() {
-                true => "none".to_owned(),
-                false => described.join(", "),
-            },
+            found: describe(inputs),
             expected: expected_inputs(wanted),
         }),
     }
@@ -238,15 +243,11 @@ fn expected_inputs(wanted: &[Input]) -> String {
 /// Refuses check presses that have more frames, and references of which there are more, than the
 /// model takes.
 fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError> {
-    let invalid = |found: String, expected: String| ModelError::KeyInvalid {
-        key: "hrn.check",
-        found,
-        expected,
-    };
+    let key = "hrn.check";
     let (most, found) = (lengths.references, check.references.len());
     if found > most {
         let expected = format!("at most {most}, as the input `references` has");
-        return Err(invalid(format!("{found} references"), expected));
+        return Err(invalid(key, format!("{found} references"), expected));
     }
     let presses = check.presses.iter().map(|press| &press.course);
     let references = check.references.iter().map(|press| &press.course);
@@ -254,6 +255,7 @@ fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError
     let most = lengths.frames;
     match frames.find(|&found| found > most) {
         Some(found) => Err(invalid(
+            key,
             format!("a press of {found} frames"),
             format!("at most {most}, as the input `frames` has"),
         )),
@@ -304,11 +306,7 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
         let first = entries.next().ok_or(ModelError::KeyMissing { key })?;
         match entries.count() {
             0 => Ok(first.value.as_str()),
-            more => Err(ModelError::KeyInvalid {
-                key,
-                found: format!("it {} times", 1 + more),
-                expected: "it once".to_owned(),
-            }),
+            more => Err(invalid(key, format!("it {} times", 1 + more), "it once")),
         }
     };
     let line = |key: &'static str| {
@@ -317,44 +315,28 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
             let expected = format!(
                 "text without control or bidirectional characters, of at most {LONGEST_LINE_BYTES} bytes"
             );
-            return Err(ModelError::KeyInvalid {
-                key,
-                found: shown(value),
-                expected,
-            });
+            return Err(invalid(key, shown(value), expected));
         }
         Ok(value.to_owned())
     };
 
     let format = text("hrn.format")?.to_owned();
     if !["1", "2", "3"].contains(&format.as_str()) {
-        let (found, expected) = (format!("{format:?}"), "\"1\", \"2\" or \"3\"".to_owned());
-        return Err(ModelError::KeyInvalid {
-            key: "hrn.format",
-            found,
-            expected,
-        });
+        let expected = "\"1\", \"2\" or \"3\"";
+        return Err(invalid("hrn.format", format!("{format:?}"), expected));
     }
     let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
     check_levels(&levels)?;
     if format == "3" {
-        Borders::of(&levels).map_err(|error| ModelError::KeyInvalid {
-            key: "hrn.levels",
-            found: error.to_string(),
-            expected: "ranges of Shore OO from the hardest to the softest".to_owned(),
-        })?;
+        let expected = "ranges of Shore OO from the hardest to the softest";
+        Borders::of(&levels).map_err(|error| invalid("hrn.levels", error.to_string(), expected))?;
     }
     let pitch = text("hrn.pitch_mm")?;
     let pitch_mm = match pitch.trim().parse::<f32>() {
         Ok(value) if value.is_finite() && value > 0.0 => value,
         _ => {
-            let expected = "millimetres above 0".to_owned();
             let found = format!("{pitch:?}");
-            return Err(ModelError::KeyInvalid {
-                key: "hrn.pitch_mm",
-                found,
-                expected,
-            });
+            return Err(invalid("hrn.pitch_mm", found, "millimetres above 0"));
         }
     };
     let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
@@ -395,24 +377,15 @@ fn read_conformal(text: &str) -> Result<Conformal, ModelError> {
     if alpha > 0.0 && alpha < 1.0 && (0.0..=1.0).contains(&threshold) {
         return Ok(conformal);
     }
-    Err(ModelError::KeyInvalid {
-        key,
-        found: format!("{conformal:?}"),
-        expected: expected.to_owned(),
-    })
+    Err(invalid(key, format!("{conformal:?}"), expected))
 }
 
 fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelError> {
-    let invalid = |found: String, expected: String| {
-        Err(ModelError::KeyInvalid {
-            key: "hrn.check",
-            found,
-            expected,
-        })
-    };
+    let key = "hrn.check";
     let count = check.presses.len();
     if ![8, 2 * levels].contains(&count) {
-        return invalid(format!("{count} presses"), "8, or two a level".to_owned());
+        let found = format!("{count} presses");
+        return Err(invalid(key, found, "8, or two a level"));
     }
     if let Some(press) = check
         .presses
@@ -420,7 +393,7 @@ fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelErr
         .find(|press| press.probabilities.len() != levels)
     {
         let found = format!("{} probabilities of a press", press.probabilities.len());
-        return invalid(found, format!("{levels}"));
+        return Err(invalid(key, found, levels.to_string()));
     }
     let presses = check.presses.iter().map(|press| &press.course);
     let references = check.references.iter().map(|press| &press.course);
@@ -430,7 +403,7 @@ fn check_course_check(check: &CourseCheck, levels: usize) -> Result<(), ModelErr
         if !numbers.all(f32::is_finite) || course.arm_n_per_mm.is_nan() || course.arm_n_per_mm < 0.0
         {
             let expected = "finite times and positions, and an arm of 0 N/mm or more";
-            return invalid("another number in a press".to_owned(), expected.to_owned());
+            return Err(invalid(key, "another number in a press", expected));
         }
     }
     Ok(())
@@ -441,11 +414,7 @@ fn json<T: for<'a> Deserialize<'a>>(
     value: &str,
     expected: &str,
 ) -> Result<T, ModelError> {
-    serde_json::from_str(value).map_err(|error| ModelError::KeyInvalid {
-        key,
-        found: error.to_string(),
-        expected: expected.to_owned(),
-    })
+    serde_json::from_str(value).map_err(|error| invalid(key, error.to_string(), expected))
 }
 
 /// Checks the levels that a model states: numbers from 1, and labels that can be shown.
@@ -457,12 +426,8 @@ pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
         .zip(1..=u8::MAX)
         .all(|(&number, wanted)| number == wanted);
     if levels.len() < 2 || levels.len() > usize::from(u8::MAX) || !consecutive {
-        let expected = "levels 1, 2, ... in order, at least two".to_owned();
-        return Err(ModelError::KeyInvalid {
-            key,
-            found: format!("{numbers:?}"),
-            expected,
-        });
+        let expected = "levels 1, 2, ... in order, at least two";
+        return Err(invalid(key, format!("{numbers:?}"), expected));
     }
     for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
         if text.is_empty() || !is_plain(text) || text.len() > LONGEST_LABEL_BYTES {
@@ -470,11 +435,7 @@ pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
                 "`label` and `shore` of 1 to {LONGEST_LABEL_BYTES} bytes, without control or bidirectional \
                  characters"
             );
-            return Err(ModelError::KeyInvalid {
-                key,
-                found: shown(text),
-                expected,
-            });
+            return Err(invalid(key, shown(text), expected));
         }
     }
     Ok(())
@@ -504,21 +465,20 @@ fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
     } else {
         return Ok(());
     };
-    Err(ModelError::KeyInvalid {
-        key: "hrn.range",
-        found: format!("{range:?}"),
-        expected: expected.to_owned(),
-    })
+    Err(invalid("hrn.range", format!("{range:?}"), expected))
 }
 
 fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
-    let usable = |newtons: &Vec<f32>| {
-        newtons.len() == TAXELS && newtons.iter().all(|n| n.is_finite() && *n >= 0.0)
-    };
+    let key = "hrn.check";
+    let unusable = |n: &&f32| !(n.is_finite() && **n >= 0.0);
+    if let Some(newtons) = check.frames.iter().flatten().find(unusable) {
+        let found = format!("{newtons} in a frame");
+        return Err(invalid(key, found, "newtons of 0 or more"));
+    }
     // There are 8 check frames, or two a level. Only a model of four levels has both.
     if [8, 2 * levels].contains(&check.frames.len())
         && check.frames.len() == check.probabilities.len()
-        && check.frames.iter().all(usable)
+        && check.frames.iter().all(|newtons| newtons.len() == TAXELS)
         && check.probabilities.iter().all(|row| row.len() == levels)
     {
         return Ok(());
@@ -528,14 +488,6 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
         lengths.dedup();
         lengths
     };
-    let unusable = |n: &&f32| !(n.is_finite() && **n >= 0.0);
-    if let Some(newtons) = check.frames.iter().flatten().find(unusable) {
-        return Err(ModelError::KeyInvalid {
-            key: "hrn.check",
-            found: format!("{newtons} in a frame"),
-            expected: "newtons of 0 or more".to_owned(),
-        });
-    }
     let found = format!(
         "{} frames of lengths {:?}, {} rows of probabilities of lengths {:?}",
         check.frames.len(),
@@ -545,9 +497,5 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
     );
     let expected =
         format!("8 frames of {TAXELS} newtons, or two a level, as many rows of {levels}");
-    Err(ModelError::KeyInvalid {
-        key: "hrn.check",
-        found,
-        expected,
-    })
+    Err(invalid(key, found, expected))
 }
