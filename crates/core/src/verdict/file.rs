@@ -20,7 +20,7 @@ use crate::wording::is_plain;
 
 /// The longest `label` and `shore` of a level: every event carries a label.
 const LONGEST_LABEL_BYTES: usize = 255;
-/// The longest part of a name in a message.
+/// The longest part of a name or a text in a message.
 const NAME_CHARS: usize = 60;
 /// The longest text of another key.
 const LONGEST_LINE_BYTES: usize = 16_384;
@@ -442,8 +442,8 @@ pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
 }
 
 /// The beginning of a text, quoted.
-fn shown(text: &str) -> String {
-    let begin: String = text.chars().take(60).collect();
+pub(super) fn shown(text: &str) -> String {
+    let begin: String = text.chars().take(NAME_CHARS).collect();
     match begin.len() < text.len() {
         true => format!("{begin:?}... of {} bytes", text.len()),
         false => format!("{text:?}"),

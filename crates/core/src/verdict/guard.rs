@@ -13,6 +13,7 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_core::ops::scan::Scan;
 
 use super::error::{MOST_NUMBERS, ModelError, NodeProblem};
+use super::file::shown;
 
 /// The domain of ONNX's classic learners.
 const LEARNERS: &str = "ai.onnx.ml";
@@ -155,10 +156,10 @@ pub(super) fn check_operators(graph: &pb::GraphProto) -> Result<(), ModelError> 
                 "" | "ai.onnx" => node.op_type.clone(),
                 domain => format!("{domain}.{}", node.op_type),
             };
-            let operator = quoted(&operator);
+            let operator = shown(&operator);
             let operator = operator.trim_matches('"');
             ModelError::Node {
-                node: format!("{} ({operator})", quoted(name)),
+                node: format!("{} ({operator})", shown(name)),
                 problem,
             }
         })?;
@@ -271,7 +272,7 @@ pub(super) fn check_values(model: &TypedModel) -> Result<(), ModelError> {
 fn count_numbers(model: &TypedModel, mut numbers: usize) -> Result<usize, ModelError> {
     for node in model.nodes() {
         let refused = |problem| ModelError::Node {
-            node: format!("{} ({})", quoted(&node.name), node.op.name()),
+            node: format!("{} ({})", shown(&node.name), node.op.name()),
             problem,
         };
         for output in &node.outputs {
@@ -299,15 +300,6 @@ fn count_numbers(model: &TypedModel, mut numbers: usize) -> Result<usize, ModelE
         }
     }
     Ok(numbers)
-}
-
-/// A name from a file, on one line and of a readable length.
-fn quoted(name: &str) -> String {
-    if name.chars().count() <= 60 {
-        return format!("{name:?}");
-    }
-    let start: String = name.chars().take(60).collect();
-    format!("{start:?}...")
 }
 
 #[cfg(test)]
