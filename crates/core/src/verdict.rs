@@ -28,7 +28,7 @@ pub use self::error::{
     ReferencesError, SHORE_TOLERANCE,
 };
 pub use self::file::{check_levels, describe};
-pub use self::grid::{COLS, Laying, ModelFrame, ModelFrameError, ROWS, TAXELS};
+pub use self::grid::{COLS, Laying, ModelFrame, ROWS, TAXELS};
 use self::inputs::{Input, Lengths, Query};
 pub use self::inputs::{course_inputs, identified_inputs};
 pub use self::probabilities::argmax;

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::grid::{ModelFrame, ModelFrameError, TAXELS};
+use super::grid::{ModelFrame, TAXELS};
 use crate::frame::sparse::{self, SparseError};
 
 /// The fewest and the most frames that a model of courses may take.
@@ -141,8 +141,6 @@ pub(super) enum Unwritten {
     },
     #[error("frame {0} of a press: {1}")]
     Frame(usize, #[source] SparseError),
-    #[error(transparent)]
-    Newtons(#[from] ModelFrameError),
 }
 
 impl TryFrom<Written> for Course {
@@ -163,7 +161,8 @@ impl TryFrom<Written> for Course {
         let moment = |(place, ((&time_s, &approach_mm), frame)): (usize, ((&f32, _), &String))| {
             let newtons = sparse::read(frame, TAXELS);
             let newtons = newtons.map_err(|error| Unwritten::Frame(place, error))?;
-            let frame = ModelFrame::try_from(newtons)?;
+            let newtons = newtons.try_into().expect("as many as were asked for");
+            let frame = ModelFrame { newtons };
             Ok::<_, Unwritten>(CourseMoment {
                 time_s,
                 approach_mm,

@@ -3,8 +3,6 @@
 //! In: the [`Frame`]s of a press, in the sensor's grid. Out: [`ModelFrame`]s, in the model's. Each
 //! taxel's force is shared out over the model's taxels by area, so the force stays the same.
 
-use serde::{Deserialize, Serialize};
-
 use crate::frame::{self, Array, Frame, Pitch};
 
 /// Rows of the model's input (paper, "Tactile sensor").
@@ -22,19 +20,14 @@ const SAME_PITCH: f64 = 0.02;
 /// # Example
 ///
 /// ```
-/// use hardnessd_core::verdict::{ModelFrame, TAXELS};
+/// use hardnessd_core::verdict::ModelFrame;
 ///
-/// let mut newtons = vec![0.0; TAXELS];
-/// newtons[100..104].fill(0.5);
-/// let frame = ModelFrame::try_from(newtons)?;
+/// let mut frame = ModelFrame::default();
+/// frame.newtons[100..104].fill(0.5);
 /// assert_eq!(frame.contact_area_taxels(0.07), 4);
 /// assert_eq!(frame.force_n(), 2.0);
-///
-/// assert!(ModelFrame::try_from(vec![0.0; 100]).is_err());
-/// # Ok::<(), hardnessd_core::verdict::ModelFrameError>(())
 /// ```
-#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<f32>", into = "Vec<f32>")]
+#[derive(Clone, Copy, PartialEq)]
 pub struct ModelFrame {
     /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
     pub newtons: [f32; TAXELS],
@@ -55,37 +48,6 @@ impl std::fmt::Debug for ModelFrame {
             .field("force_n", &self.force_n())
             .field("peak_n", &peak)
             .finish()
-    }
-}
-
-impl From<ModelFrame> for Vec<f32> {
-    fn from(frame: ModelFrame) -> Self {
-        frame.newtons.to_vec()
-    }
-}
-
-/// The reason why numbers are not a frame of the model's grid.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum ModelFrameError {
-    /// The force is negative or not finite.
-    #[error("found {0} N at a taxel, expected 0 or more")]
-    Newtons(f32),
-    /// There are too many or too few taxels.
-    #[error("found {0} taxels, expected {TAXELS}")]
-    Length(usize),
-}
-
-impl TryFrom<Vec<f32>> for ModelFrame {
-    type Error = ModelFrameError;
-
-    fn try_from(newtons: Vec<f32>) -> Result<Self, ModelFrameError> {
-        if let Some(&found) = newtons.iter().find(|&&n| !n.is_finite() || n < 0.0) {
-            return Err(ModelFrameError::Newtons(found));
-        }
-        match newtons.try_into() {
-            Ok(newtons) => Ok(Self { newtons }),
-            Err(found) => Err(ModelFrameError::Length(Vec::len(&found))),
-        }
     }
 }
 
