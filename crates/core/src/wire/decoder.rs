@@ -50,13 +50,10 @@ pub struct Decoded {
 #[derive(Debug)]
 pub struct Decoder {
     layout: Layout,
-    buffer: Vec<u8>,
+    /// The state. Before its pending bytes are those that were taken and not yet removed.
+    memory: Memory,
+    /// The number of bytes that were taken and not yet removed.
     start: usize,
-    received: u64,
-    skipped: u64,
-    settled: bool,
-    locked: bool,
-    anchor: u64,
 }
 
 /// The state of a [`Decoder`], without its layout.
@@ -91,38 +88,28 @@ impl Decoder {
         let locked = layout.begins_locked();
         Self {
             layout,
-            buffer: Vec::with_capacity(capacity),
+            memory: Memory {
+                pending: Vec::with_capacity(capacity),
+                received: 0,
+                skipped: 0,
+                settled: false,
+                locked,
+                anchor: 0,
+            },
             start: 0,
-            received: 0,
-            skipped: 0,
-            settled: false,
-            locked,
-            anchor: 0,
         }
     }
 
     /// The decoder's state.
     pub fn memory(&self) -> Memory {
-        Memory {
-            pending: self.buffer[self.start..].to_vec(),
-            received: self.received,
-            skipped: self.skipped,
-            settled: self.settled,
-            locked: self.locked,
-            anchor: self.anchor,
-        }
+        let mut memory = self.memory.clone();
+        memory.pending.drain(..self.start);
+        memory
     }
 
     /// Continues from the state of another decoder.
     pub fn recall(&mut self, memory: Memory) {
-        Memory {
-            pending: self.buffer,
-            received: self.received,
-            skipped: self.skipped,
-            settled: self.settled,
-            locked: self.locked,
-            anchor: self.anchor,
-        } = memory;
+        self.memory = memory;
         self.start = 0;
     }
 
@@ -137,49 +124,49 @@ impl Decoder {
         if bytes.is_empty() {
             return;
         }
-        self.settled = false;
+        self.memory.settled = false;
         if self.start > 0 {
-            self.buffer.drain(..self.start);
+            self.memory.pending.drain(..self.start);
             self.start = 0;
         }
-        self.buffer.extend_from_slice(bytes);
-        self.received += bytes.len() as u64;
+        self.memory.pending.extend_from_slice(bytes);
+        self.memory.received += bytes.len() as u64;
     }
 
     /// Tells the decoder that the input ended or paused for half a period. A complete frame that
     /// only waited for the next header is then whole.
     pub fn settle(&mut self) {
-        self.settled = true;
+        self.memory.settled = true;
     }
 
     /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
         let pending = self.pending();
-        self.skipped += pending as u64;
-        self.buffer.clear();
+        self.memory.skipped += pending as u64;
+        self.memory.pending.clear();
         self.start = 0;
-        self.settled = false;
-        self.anchor = self.received;
-        self.locked = self.layout.begins_locked();
+        self.memory.settled = false;
+        self.memory.anchor = self.memory.received;
+        self.memory.locked = self.layout.begins_locked();
     }
 
     /// The next frame or damaged candidate, or `None` when more bytes are needed.
     pub fn next_frame(&mut self) -> Option<Result<Decoded, Damage>> {
         loop {
-            let bytes = &self.buffer[self.start..];
-            let offset = self.received - bytes.len() as u64;
+            let bytes = &self.memory.pending[self.start..];
+            let offset = self.memory.received - bytes.len() as u64;
             let context = Context {
-                settled: self.settled,
-                locked: self.locked,
+                settled: self.memory.settled,
+                locked: self.memory.locked,
                 offset,
-                anchor: self.anchor,
+                anchor: self.memory.anchor,
             };
             match self.layout.scan(bytes, context) {
                 Scan::Wait => return None,
                 Scan::Skip(count) => self.pass_over(count),
                 Scan::Excess(count) => {
                     self.start += count;
-                    self.skipped += count as u64;
+                    self.memory.skipped += count as u64;
                 }
                 Scan::Damaged(count) => {
                     self.pass_over(count);
@@ -187,11 +174,11 @@ impl Decoder {
                 }
                 Scan::Frame(count, frame) => {
                     self.start += count;
-                    self.locked = true;
-                    self.anchor = offset + count as u64;
+                    self.memory.locked = true;
+                    self.memory.anchor = offset + count as u64;
                     return Some(Ok(Decoded {
                         frame,
-                        end: self.anchor,
+                        end: self.memory.anchor,
                     }));
                 }
             }
@@ -200,22 +187,22 @@ impl Decoder {
 
     /// The number of bytes taken in since the start.
     pub fn received(&self) -> u64 {
-        self.received
+        self.memory.received
     }
 
     /// The number of bytes that belonged to no whole frame.
     pub fn skipped(&self) -> u64 {
-        self.skipped
+        self.memory.skipped
     }
 
     /// The number of held bytes that may yet become a frame.
     pub fn pending(&self) -> usize {
-        self.buffer.len() - self.start
+        self.memory.pending.len() - self.start
     }
 
     fn pass_over(&mut self, count: usize) {
         self.start += count;
-        self.skipped += count as u64;
-        self.locked = self.layout.ends_with_dropped();
+        self.memory.skipped += count as u64;
+        self.memory.locked = self.layout.ends_with_dropped();
     }
 }
