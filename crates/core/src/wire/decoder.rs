@@ -113,11 +113,6 @@ impl Decoder {
         self.start = 0;
     }
 
-    /// The decoder's layout.
-    pub fn layout(&self) -> &Layout {
-        &self.layout
-    }
-
     /// Takes bytes in. It never blocks and never fails. Call [`Self::next_frame`] until it is
     /// `None` before the next push, or the buffer grows.
     pub fn push(&mut self, bytes: &[u8]) {
