@@ -160,7 +160,7 @@ pub enum Change {
 }
 
 /// The frames in contact of a press up to now.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SoFar {
     press: u64,
     peak: ContactFrame,
@@ -232,13 +232,17 @@ impl Memory {
     /// Whether a tracker of `array` can have this state after this many frames.
     pub(crate) fn is_possible(&self, frames: u64, array: Array) -> bool {
         let is_press = |pressed: &Pressed| {
-            let peak = &pressed.peak;
-            pressed.press == self.presses
+            let SoFar {
+                press,
+                peak,
+                course,
+            } = &pressed.so_far;
+            *press == self.presses
                 && pressed.frames <= frames
                 && peak.moment.frame < frames
                 && peak.frame.array == array
                 && peak.contact_area_taxels as usize <= array.taxels()
-                && pressed.course.is_possible(frames, array)
+                && course.is_possible(frames, array)
                 && pressed.settling.as_ref().is_none_or(Settling::is_possible)
         };
         self.presses <= frames
@@ -261,13 +265,12 @@ enum State {
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Pressed {
-    press: u64,
+    #[serde(flatten)]
+    so_far: SoFar,
     began: Duration,
     last: FrameAt,
     frames: u64,
     released_frames: u32,
-    peak: ContactFrame,
-    course: HeldFrames,
     /// `None` once the early verdict has come.
     settling: Option<Settling>,
 }
@@ -325,7 +328,7 @@ impl PressTracker {
 
     /// The frames of the press under way.
     pub fn so_far(&self) -> Option<SoFar> {
-        self.pressed().map(Pressed::so_far)
+        self.pressed().map(|pressed| pressed.so_far.clone())
     }
 
     fn pressed(&self) -> Option<&Pressed> {
@@ -351,22 +354,22 @@ impl PressTracker {
             State::Idle if area < self.thresholds.begin_area_taxels => return changes,
             State::Idle => {
                 self.presses += 1;
+                let press = self.presses;
                 let peak = contact();
-                changes.push(Change::Begin {
-                    press: self.presses,
-                    at,
-                });
+                changes.push(Change::Begin { press, at });
                 let mut course = HeldFrames::default();
                 course.push(peak.clone());
                 self.state = State::Pressed(Box::new(Pressed {
-                    press: self.presses,
+                    so_far: SoFar {
+                        press,
+                        peak,
+                        course,
+                    },
                     began: at.stamp.mono,
                     last: at,
                     frames: 1,
                     released_frames: 0,
                     settling: Some(Settling::default()),
-                    peak,
-                    course,
                 }));
             }
             State::Pressed(pressed) if touched => pressed.touch(contact()),
@@ -385,18 +388,9 @@ impl PressTracker {
 
     /// Ends a press under way without a verdict.
     pub fn abort(&mut self, reason: Abort) -> Option<Change> {
-        match std::mem::replace(&mut self.state, State::Idle) {
-            State::Pressed(pressed) => Some(Change::Aborted {
-                press: pressed.press,
-                last: pressed.last,
-                frames: pressed.frames,
-                reason,
-            }),
-            other => {
-                self.state = other;
-                None
-            }
-        }
+        let aborted = self.pressed()?.aborted(reason);
+        self.state = State::Idle;
+        Some(aborted)
     }
 
     /// Adds the changes of this frame to the press: settled, released or timed out.
@@ -413,8 +407,8 @@ impl PressTracker {
             if settling.push(load, &self.thresholds) {
                 pressed.settling = None;
                 changes.push(Change::Settled {
-                    press: pressed.press,
-                    peak: Box::new(pressed.peak.clone()),
+                    press: pressed.so_far.press,
+                    peak: Box::new(pressed.so_far.peak.clone()),
                 });
             }
         }
@@ -448,45 +442,30 @@ impl Pressed {
         self.last = touched.moment;
         self.frames += 1;
         self.released_frames = 0;
-        if is_greater(&touched, &self.peak) {
-            self.peak = touched.clone();
+        let so_far = &mut self.so_far;
+        if is_greater(&touched, &so_far.peak) {
+            so_far.peak = touched.clone();
         }
-        self.course.push(touched);
+        so_far.course.push(touched);
     }
 
-    fn so_far(&self) -> SoFar {
-        SoFar {
-            press: self.press,
-            peak: self.peak.clone(),
-            course: self.course.clone(),
+    fn aborted(&self, reason: Abort) -> Change {
+        Change::Aborted {
+            press: self.so_far.press,
+            last: self.last,
+            frames: self.frames,
+            reason,
         }
     }
 
     fn finish(self, end: End, min_frames: u64) -> Change {
-        let Pressed {
-            press,
-            last,
-            frames,
-            peak,
-            course,
-            ..
-        } = self;
-        if frames < min_frames {
-            return Change::Aborted {
-                press,
-                last,
-                frames,
-                reason: Abort::Short,
-            };
+        if self.frames < min_frames {
+            return self.aborted(Abort::Short);
         }
         Change::End {
-            press: Box::new(SoFar {
-                press,
-                peak,
-                course,
-            }),
-            last,
-            frames,
+            press: Box::new(self.so_far),
+            last: self.last,
+            frames: self.frames,
             end,
         }
     }
