@@ -217,8 +217,7 @@ impl SoFar {
 #[derive(Debug)]
 pub struct PressTracker {
     thresholds: Thresholds,
-    state: State,
-    presses: u64,
+    memory: Memory,
 }
 
 /// The state of a [`PressTracker`], without its thresholds.
@@ -280,8 +279,10 @@ impl PressTracker {
     pub fn new(thresholds: Thresholds) -> Self {
         Self {
             thresholds,
-            state: State::Idle,
-            presses: 0,
+            memory: Memory {
+                state: State::Idle,
+                presses: 0,
+            },
         }
     }
 
@@ -292,18 +293,12 @@ impl PressTracker {
 
     /// The tracker's state.
     pub fn memory(&self) -> Memory {
-        Memory {
-            state: self.state.clone(),
-            presses: self.presses,
-        }
+        self.memory.clone()
     }
 
     /// Continues from the state of another tracker.
     pub fn recall(&mut self, memory: Memory) {
-        Memory {
-            state: self.state,
-            presses: self.presses,
-        } = memory;
+        self.memory = memory;
     }
 
     /// Whether a press is under way.
@@ -313,7 +308,7 @@ impl PressTracker {
 
     /// Whether there is no press under way, and no press that timed out and is not yet released.
     pub fn is_idle(&self) -> bool {
-        matches!(self.state, State::Idle)
+        matches!(self.memory.state, State::Idle)
     }
 
     /// The number of frames in contact of the press under way.
@@ -332,7 +327,7 @@ impl PressTracker {
     }
 
     fn pressed(&self) -> Option<&Pressed> {
-        match &self.state {
+        match &self.memory.state {
             State::Pressed(pressed) => Some(pressed),
             State::Idle | State::AwaitingRelease { .. } => None,
         }
@@ -350,16 +345,16 @@ impl PressTracker {
             force_n: frame.force_n(),
         };
         let mut changes = Vec::new();
-        match &mut self.state {
+        match &mut self.memory.state {
             State::Idle if area < self.thresholds.begin_area_taxels => return changes,
             State::Idle => {
-                self.presses += 1;
-                let press = self.presses;
+                self.memory.presses += 1;
+                let press = self.memory.presses;
                 let peak = contact();
                 changes.push(Change::Begin { press, at });
                 let mut course = HeldFrames::default();
                 course.push(peak.clone());
-                self.state = State::Pressed(Box::new(Pressed {
+                self.memory.state = State::Pressed(Box::new(Pressed {
                     so_far: SoFar {
                         press,
                         peak,
@@ -377,7 +372,7 @@ impl PressTracker {
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if touched { 0 } else { *released_frames + 1 };
                 if *released_frames >= self.thresholds.end_frames {
-                    self.state = State::Idle;
+                    self.memory.state = State::Idle;
                 }
                 return changes;
             }
@@ -389,13 +384,13 @@ impl PressTracker {
     /// Ends a press under way without a verdict.
     pub fn abort(&mut self, reason: Abort) -> Option<Change> {
         let aborted = self.pressed()?.aborted(reason);
-        self.state = State::Idle;
+        self.memory.state = State::Idle;
         Some(aborted)
     }
 
     /// Adds the changes of this frame to the press: settled, released or timed out.
     fn conclude(&mut self, frame: &Frame, at: FrameAt, area: u32, changes: &mut Vec<Change>) {
-        let State::Pressed(pressed) = &mut self.state else {
+        let State::Pressed(pressed) = &mut self.memory.state else {
             return;
         };
         if let Some(settling) = &mut pressed.settling {
@@ -426,7 +421,7 @@ impl PressTracker {
                 released_frames: pressed.released_frames,
             },
         };
-        if let State::Pressed(pressed) = std::mem::replace(&mut self.state, next) {
+        if let State::Pressed(pressed) = std::mem::replace(&mut self.memory.state, next) {
             changes.push(pressed.finish(end, self.thresholds.min_frames));
         }
     }
