@@ -13,7 +13,6 @@ use serde::{Serialize, Serializer};
 use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
-use crate::frame::Frame;
 use crate::verdict::{ReferenceKinds, Shore};
 
 /// The version of the format, as announced in `hello`.
@@ -471,30 +470,6 @@ pub struct FrameEvent {
     /// is for views; the verdict has a more exact value.
     #[serde(serialize_with = "rounded_or_null")]
     pub approach_mm: Option<f64>,
-}
-
-impl FrameEvent {
-    /// The event of one frame.
-    pub fn new(
-        sensor: String,
-        time: Timestamp,
-        number: u64,
-        frame: &Frame,
-        contact_area_taxels: u32,
-        tared: bool,
-    ) -> Self {
-        Self {
-            sensor,
-            time,
-            frame: number,
-            rows: frame.array.rows,
-            cols: frame.array.cols,
-            newtons: frame.newtons.to_vec(),
-            contact_area_taxels,
-            tared,
-            approach_mm: None,
-        }
-    }
 }
 
 fn line<T: Serialize>(value: &T) -> String {

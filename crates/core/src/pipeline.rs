@@ -467,17 +467,17 @@ impl Pipeline {
             let delay_ms = self.sensor.description().arm.delay_ms;
             self.track.latest(began, stamp.mono, delay_ms)
         });
-        let shown = FrameEvent::new(
-            self.sensor.name().to_owned(),
-            stamp.wall,
-            at.frame,
-            &frame,
-            frame.contact_area_taxels(self.sensor.thresholds().contact_threshold_n),
-            tared,
-        );
+        let threshold_n = self.sensor.thresholds().contact_threshold_n;
         events.push(Event::Frame(FrameEvent {
+            sensor: self.sensor.name().to_owned(),
+            time: stamp.wall,
+            frame: at.frame,
+            rows: frame.array.rows,
+            cols: frame.array.cols,
+            contact_area_taxels: frame.contact_area_taxels(threshold_n),
+            newtons: frame.newtons.into_vec(),
+            tared,
             approach_mm,
-            ..shown
         }));
         for change in changes {
             self.publish(change, events);

@@ -67,15 +67,18 @@ pub(in crate::daemon) fn press(sensor: &str) -> Event {
 }
 
 fn frame(sensor: &str, number: u64) -> Event {
-    let newtons = hardnessd_core::frame::Frame::default();
-    Event::Frame(FrameEvent::new(
-        sensor.to_owned(),
-        jiff::Timestamp::UNIX_EPOCH,
-        number,
-        &newtons,
-        0,
-        true,
-    ))
+    let shown = hardnessd_core::frame::Frame::default();
+    Event::Frame(FrameEvent {
+        sensor: sensor.to_owned(),
+        time: jiff::Timestamp::UNIX_EPOCH,
+        frame: number,
+        rows: shown.array.rows,
+        cols: shown.array.cols,
+        newtons: shown.newtons.into_vec(),
+        contact_area_taxels: 0,
+        tared: true,
+        approach_mm: None,
+    })
 }
 
 impl Hub {

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use hardnessd_core::event::*;
-use hardnessd_core::frame::{Array, Frame, Pitch};
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::tare::Offsets;
 use hardnessd_core::verdict::{Level, ReferenceKinds};
 use jiff::Timestamp;
@@ -143,16 +143,17 @@ fn a_probability_has_at_most_six_digits_after_the_point() {
 
 #[test]
 fn frame_is_frozen_and_never_numbered() {
-    let mut shown = Frame::zero(Array { rows: 1, cols: 3 });
-    shown.newtons.copy_from_slice(&[0.0, 0.123_456, 10.2]);
-    let mut frame = Event::Frame(FrameEvent::new(
-        "forearm".to_owned(),
-        time(),
-        5,
-        &shown,
-        2,
-        true,
-    ));
+    let mut frame = Event::Frame(FrameEvent {
+        sensor: "forearm".to_owned(),
+        time: time(),
+        frame: 5,
+        rows: 1,
+        cols: 3,
+        newtons: vec![0.0, 0.123_456, 10.2],
+        contact_area_taxels: 2,
+        tared: true,
+        approach_mm: None,
+    });
     frame.number(9);
     check(
         &frame.to_line(),
