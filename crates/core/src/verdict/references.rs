@@ -5,7 +5,8 @@
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::course::Course;
 
@@ -93,76 +94,47 @@ impl ReferenceKinds {
 /// A sensor's references as one model takes them. [`super::Hrn::references`] computes them.
 /// Recordings hold them, so that a replay needs no other file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(into = "Recorded", try_from = "Recorded")]
+#[serde(deny_unknown_fields)]
 pub struct References {
     kinds: ReferenceKinds,
-    /// The features of each press, one after the other.
-    pub(super) features: Vec<f32>,
     /// The number of presses.
     pub(super) count: usize,
+    /// The features of each press, one after the other. In a recording they are base64 of
+    /// little-endian f32.
+    #[serde(serialize_with = "write_features", deserialize_with = "read_features")]
+    pub(super) features: Vec<f32>,
 }
 
-/// References in a recording.
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Recorded {
-    kinds: ReferenceKinds,
-    count: usize,
-    /// The features as base64 of little-endian f32.
-    features: String,
+fn write_features<S: Serializer>(features: &[f32], serializer: S) -> Result<S::Ok, S::Error> {
+    let bytes: Vec<u8> = features.iter().flat_map(|x| x.to_le_bytes()).collect();
+    serializer.serialize_str(&STANDARD.encode(bytes))
 }
 
-impl From<References> for Recorded {
-    fn from(references: References) -> Self {
-        let bytes = references.features.iter().flat_map(|x| x.to_le_bytes());
-        Self {
-            kinds: references.kinds,
-            count: references.count,
-            features: STANDARD.encode(bytes.collect::<Vec<u8>>()),
-        }
+fn read_features<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>, D::Error> {
+    let bytes = STANDARD.decode(String::deserialize(deserializer)?);
+    let bytes = bytes.map_err(|error| D::Error::custom(format_args!("features: {error}")))?;
+    let (numbers, rest) = bytes.as_chunks::<4>();
+    let features: Vec<f32> = numbers.iter().map(|&x| f32::from_le_bytes(x)).collect();
+    if !rest.is_empty() || !features.iter().all(|x| x.is_finite()) {
+        let found = "numbers that are not finite, or another number of bytes";
+        return Err(D::Error::custom(format_args!("features: found {found}")));
     }
-}
-
-/// The reason why a recording's references are none.
-#[derive(Debug, thiserror::Error)]
-enum RecordedError {
-    #[error("features: {0}")]
-    Base64(#[from] base64::DecodeError),
-    #[error("features: found numbers that are not finite, or another number of bytes")]
-    Numbers,
-}
-
-impl TryFrom<Recorded> for References {
-    type Error = RecordedError;
-
-    fn try_from(recorded: Recorded) -> Result<Self, RecordedError> {
-        let bytes = STANDARD.decode(&recorded.features)?;
-        let (numbers, rest) = bytes.as_chunks::<4>();
-        let features: Vec<f32> = numbers.iter().map(|&x| f32::from_le_bytes(x)).collect();
-        if !rest.is_empty() || !features.iter().all(|x| x.is_finite()) {
-            return Err(RecordedError::Numbers);
-        }
-        Ok(Self {
-            kinds: recorded.kinds,
-            features,
-            count: recorded.count,
-        })
-    }
+    Ok(features)
 }
 
 impl References {
     /// The references that a model takes without any.
     pub const NONE: Self = Self {
         kinds: ReferenceKinds::None,
-        features: Vec::new(),
         count: 0,
+        features: Vec::new(),
     };
 
     pub(super) fn new(presses: &[ReferencePress], features: Vec<f32>) -> Self {
         Self {
             kinds: ReferenceKinds::of(presses),
-            features,
             count: presses.len(),
+            features,
         }
     }
 
