@@ -21,7 +21,7 @@ pub(crate) use self::tally::{Counts, Tally, Verdicts};
 pub(crate) use self::task::{Closed, Handle, start};
 use super::log;
 use super::record::EventRecorder;
-use super::request::{Kinds, Subscription};
+use super::request::Subscription;
 use hardnessd_core::event::{Event, Hello, Kind, Reply, Status};
 
 /// A line to send.
@@ -94,7 +94,7 @@ struct Hub {
     /// The last [`HELD`] events. The newest has the number `hello.seq`.
     held: VecDeque<Held>,
     /// The number of events that are no longer held, by kind.
-    forgotten: [u64; Kinds::NUMBERED.len()],
+    forgotten: [u64; Kind::NUMBERED.len()],
     /// The last final verdict of each sensor.
     finals: BTreeMap<String, Line>,
     /// The force and contact area of each sensor.
@@ -110,7 +110,7 @@ impl Hub {
         Self {
             hello,
             held: VecDeque::new(),
-            forgotten: [0; Kinds::NUMBERED.len()],
+            forgotten: [0; Kind::NUMBERED.len()],
             finals: BTreeMap::new(),
             histories: BTreeMap::new(),
             tally: Tally::default(),
@@ -219,7 +219,7 @@ impl Hub {
             return Ok(());
         };
         let Some(since) = &wanted.since else {
-            subscriber.change(wanted.kinds, wanted.policy);
+            subscriber.change(wanted.kinds.clone(), wanted.policy);
             return Ok(());
         };
         let known = since.run == self.hello.run;
@@ -227,20 +227,17 @@ impl Hub {
             let found = since.seq;
             return Err(Ahead { found, latest });
         }
-        subscriber.change(wanted.kinds, wanted.policy);
+        subscriber.change(wanted.kinds.clone(), wanted.policy);
         let first = if known { since.seq + 1 } else { oldest };
+        let is_wanted = |kind: &Kind| wanted.kinds.contains(kind);
         let missing = match first.max(oldest) - first {
             0 if known => Some(0),
             // Every numbered event is wanted, so each number that is no longer held is a missed
             // event.
-            gone if known && Kinds::NUMBERED.iter().all(|&k| wanted.kinds.contains(k)) => {
-                Some(gone)
-            }
+            gone if known && Kind::NUMBERED.iter().all(is_wanted) => Some(gone),
             // From the start of the run, every event that is no longer held was missed.
             _ if known && since.seq == 0 => {
-                let wanted = Kinds::NUMBERED
-                    .into_iter()
-                    .filter(|&k| wanted.kinds.contains(k));
+                let wanted = Kind::NUMBERED.into_iter().filter(is_wanted);
                 Some(wanted.map(|kind| self.forgotten[kind as usize]).sum())
             }
             // The kinds of the missed events are no longer known.

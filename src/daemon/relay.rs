@@ -7,6 +7,7 @@
 //! In the other direction, a thread may pass on positions of the arm that the robot reports. They
 //! take the same path as a command of the control socket. Nothing else can be passed on.
 
+use std::collections::BTreeSet;
 use std::thread;
 use std::time::Duration;
 
@@ -161,7 +162,7 @@ async fn relay<J: From<Vec<Line>>>(
     vitals: Option<Vitals<J>>,
 ) -> Result<(), hub::Closed> {
     let wanted = Subscription {
-        kinds: Kind::ALL.into_iter().collect(),
+        kinds: BTreeSet::from(Kind::ALL),
         policy: Policy::LatestFrames,
         since: None,
     };

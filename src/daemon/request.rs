@@ -6,6 +6,8 @@
 
 pub(crate) mod motion;
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -60,7 +62,7 @@ impl Change {
 #[serde(deny_unknown_fields)]
 pub(crate) struct Subscription {
     #[serde(rename = "subscribe")]
-    pub(crate) kinds: Kinds,
+    pub(crate) kinds: BTreeSet<Kind>,
     #[serde(default)]
     pub(crate) policy: Policy,
     /// The last event that the subscriber had in an earlier connection.
@@ -69,11 +71,8 @@ pub(crate) struct Subscription {
 
 impl Default for Subscription {
     fn default() -> Self {
-        let kinds = [Kind::Hardness, Kind::Press, Kind::Status]
-            .into_iter()
-            .collect();
         Self {
-            kinds,
+            kinds: BTreeSet::from([Kind::Hardness, Kind::Press, Kind::Status]),
             policy: Policy::Queue,
             since: None,
         }
@@ -123,41 +122,6 @@ impl TryFrom<String> for Since {
             found: short(&token),
             expected: "\"RUN:SEQ\"",
         })
-    }
-}
-
-/// A set of event kinds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(from = "Vec<Kind>")]
-pub(crate) struct Kinds(u8);
-
-impl From<Vec<Kind>> for Kinds {
-    fn from(kinds: Vec<Kind>) -> Self {
-        kinds.into_iter().collect()
-    }
-}
-
-impl Kinds {
-    /// The kinds that carry a `seq`.
-    pub(crate) const NUMBERED: [Kind; 3] = [Kind::Status, Kind::Press, Kind::Hardness];
-
-    pub(crate) fn contains(self, kind: Kind) -> bool {
-        self.0 & Self::bit(kind) != 0
-    }
-
-    fn bit(kind: Kind) -> u8 {
-        1 << kind as u8
-    }
-}
-
-impl FromIterator<Kind> for Kinds {
-    fn from_iter<I: IntoIterator<Item = Kind>>(kinds: I) -> Self {
-        Self(
-            kinds
-                .into_iter()
-                .map(Self::bit)
-                .fold(0, |set, bit| set | bit),
-        )
     }
 }
 
@@ -318,10 +282,10 @@ mod tests {
             other => panic!("{text}: {other:?}"),
         };
         let all = subscription(r#"{"subscribe":["hardness","press","status","frame"]}"#);
-        assert!(all.kinds.contains(Kind::Frame) && all.kinds.contains(Kind::Status));
+        assert!(all.kinds.contains(&Kind::Frame) && all.kinds.contains(&Kind::Status));
         assert_eq!(all.policy, Policy::Queue);
         let resumed = subscription(r#"{"subscribe":["press"],"policy":"latest","since":"ab:7"}"#);
-        assert!(!resumed.kinds.contains(Kind::Hardness));
+        assert!(!resumed.kinds.contains(&Kind::Hardness));
         assert_eq!(resumed.policy, Policy::Latest);
         assert_eq!(
             resumed.since,

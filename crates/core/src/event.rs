@@ -129,6 +129,9 @@ impl Kind {
     /// Every kind.
     pub const ALL: [Kind; 4] = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
 
+    /// The kinds whose events carry a `seq`.
+    pub const NUMBERED: [Kind; 3] = [Kind::Status, Kind::Press, Kind::Hardness];
+
     /// The `type` of this kind's events.
     pub fn name(self) -> &'static str {
         match self {

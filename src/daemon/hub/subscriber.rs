@@ -1,10 +1,10 @@
 //! One subscriber in the hub: its subscription, the events that wait for it, and the events that it
 //! missed.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use super::{HELD, Line};
-use crate::daemon::request::{Kinds, Policy, Subscription};
+use crate::daemon::request::{Policy, Subscription};
 use hardnessd_core::event::{Kind, Reply};
 
 /// The most events that wait for a subscriber (`docs/controller.md`).
@@ -16,7 +16,7 @@ const BATCH_BYTES: usize = 32 * 1024;
 
 /// A subscriber's state.
 pub(super) struct Subscriber {
-    kinds: Kinds,
+    kinds: BTreeSet<Kind>,
     policy: Policy,
     /// A `gap` to send before all else, because `since` reached back too far.
     missing: Option<Reply>,
@@ -49,16 +49,17 @@ impl Default for Subscriber {
 
 impl Subscriber {
     pub(super) fn wants(&self, kind: Kind) -> bool {
-        self.kinds.contains(kind)
+        self.kinds.contains(&kind)
     }
 
     /// Changes the subscription. Events that wait and are no longer wanted are removed without a
     /// `gap`.
-    pub(super) fn change(&mut self, kinds: Kinds, policy: Policy) {
+    pub(super) fn change(&mut self, kinds: BTreeSet<Kind>, policy: Policy) {
         (self.kinds, self.policy) = (kinds, policy);
-        self.replay.retain(|&(_, kind)| kinds.contains(kind));
+        let kinds = &self.kinds;
+        self.replay.retain(|(_, kind)| kinds.contains(kind));
         self.queue
-            .retain(|line| line.about().is_some_and(|(kind, _)| kinds.contains(kind)));
+            .retain(|line| line.about().is_some_and(|(kind, _)| kinds.contains(&kind)));
         if policy != Policy::Queue {
             for line in std::mem::take(&mut self.queue) {
                 self.enqueue(line);
@@ -74,7 +75,7 @@ impl Subscriber {
         self.queue.retain(|line| line.seq.is_none());
         self.lost = 0;
         self.replay = held
-            .filter(|&(seq, kind)| self.kinds.contains(kind) && !self.handed.contains(seq))
+            .filter(|&(seq, kind)| self.kinds.contains(&kind) && !self.handed.contains(seq))
             .collect();
     }
 

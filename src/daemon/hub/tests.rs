@@ -235,7 +235,7 @@ fn another_subscription_reaches_what_since_asked_for() {
         hub.publish_now(status("a"));
     }
     let (id, _) = hub.join();
-    hub.subscribe(id, &wanting(&Kinds::NUMBERED, Policy::Queue, Some(0)))
+    hub.subscribe(id, &wanting(&Kind::NUMBERED, Policy::Queue, Some(0)))
         .unwrap();
     hub.subscribe(id, &wanting(&[Kind::Status], Policy::Queue, None))
         .unwrap();
@@ -257,7 +257,7 @@ fn since_older_than_what_is_held_says_how_much_is_gone() {
         assert_eq!(lines[0], format!("gap:{lost}"));
         assert_eq!(lines[1..], held);
     };
-    check(&Kinds::NUMBERED, 40, "60");
+    check(&Kind::NUMBERED, 40, "60");
     // The kinds of the 60 events are no longer known.
     check(&[Kind::Press], 40, "null");
     check(&[Kind::Press], 0, "100");
