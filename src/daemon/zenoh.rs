@@ -26,7 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
 use super::request::{self, Change, Request};
-use hardnessd_core::event::{Event, Hello, Kind, Phase, Reply, Status};
+use hardnessd_core::event::{self, Event, Hello, Kind, Phase, Reply, Status};
 
 /// The reason the session could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -241,7 +241,7 @@ fn take_positions(sample: &Sample, door: &Door) {
 }
 
 fn key(site: &str, sensor: &str, kind: Kind) -> String {
-    format!("tactile/{site}/{sensor}/{}", kind.name())
+    format!("tactile/{site}/{sensor}/{}", event::name(&kind))
 }
 
 /// The JSON without its newline, because each message is one event.

@@ -9,9 +9,6 @@ use std::sync::mpsc::{self, TryRecvError};
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
-use serde::Deserialize;
-use serde::de::IntoDeserializer;
-use serde::de::value::Error as NameError;
 use tokio::time::Instant;
 
 use super::arm::{self, Arm};
@@ -26,9 +23,8 @@ use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
-use hardnessd_simulator::{
-    Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings, named,
-};
+use hardnessd_core::wording::named;
+use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -41,7 +37,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", conflicts_with_all = ["link", "speed", "baud"], requires = "presses")]
     to: Option<PathBuf>,
     /// Layout of a frame: a preset of the configuration
-    #[arg(long, value_name = "P", default_value = "jx255n", value_parser = preset)]
+    #[arg(long, value_name = "P", default_value = "jx255n", value_parser = named::<Preset>)]
     preset: Preset,
     /// Frames per second, 0.1 to 1000
     #[arg(long, value_name = "F", default_value_t = DEFAULT_FRAME_RATE_HZ, value_parser = frame_rate_hz)]
@@ -353,11 +349,6 @@ fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
         None
     };
     Ok((baud, warning))
-}
-
-/// A preset, by its name in the configuration.
-fn preset(name: &str) -> Result<Preset, NameError> {
-    Preset::deserialize(name.into_deserializer())
 }
 
 /// Parses `--fps`. A press is computed as a whole, with as many frames as it takes to reach its

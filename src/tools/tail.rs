@@ -129,7 +129,7 @@ fn events(found: u64, count: Option<u64>) -> String {
 }
 
 fn kind(name: &str) -> Result<Kind, &'static str> {
-    Kind::named(name).ok_or("expected hardness, press, status or frame")
+    wording::named(name).map_err(|_| "expected hardness, press, status or frame")
 }
 
 /// Prints until the count is reached, `shutdown` comes or nobody reads stdout.
@@ -177,7 +177,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
         let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
         // Events that were queued before the subscription took effect are left out.
-        let counts = Kind::named(kind).is_some_and(|kind| args.types.contains(&kind));
+        let counts = wording::named::<Kind>(kind).is_ok_and(|kind| args.types.contains(&kind));
         if !counts && kind != "gap" {
             continue;
         }

@@ -131,21 +131,6 @@ impl Kind {
 
     /// The kinds whose events carry a `seq`.
     pub const NUMBERED: [Kind; 3] = [Kind::Status, Kind::Press, Kind::Hardness];
-
-    /// The `type` of this kind's events.
-    pub fn name(self) -> &'static str {
-        match self {
-            Kind::Status => "status",
-            Kind::Press => "press",
-            Kind::Hardness => "hardness",
-            Kind::Frame => "frame",
-        }
-    }
-
-    /// The kind whose events have this `type`.
-    pub fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|kind| kind.name() == name)
-    }
 }
 
 impl Event {
@@ -482,8 +467,8 @@ fn line<T: Serialize>(value: &T) -> String {
     text
 }
 
-/// The name under which a state, phase or note is published. The log, the metrics and recordings
-/// use it too.
+/// The name under which a kind, state, phase or note is published. The log, the metrics and
+/// recordings use it too. [`crate::wording::named`] reads it.
 pub fn name(state: &impl Serialize) -> String {
     match serde_json::to_value(state) {
         Ok(serde_json::Value::String(name)) => name,

@@ -2,6 +2,8 @@
 
 use std::error::Error;
 
+use serde::de::{DeserializeOwned, IntoDeserializer as _, value};
+
 /// Writes a line to stderr, like `eprintln!`, but goes on if nobody can read it: the disk is full, or the
 /// terminal has gone. `eprintln!` panics then, and a panic ends the process.
 #[macro_export]
@@ -19,6 +21,15 @@ macro_rules! stderr_part {
         use std::io::Write as _;
         let _ = write!(std::io::stderr(), $($text)*);
     }};
+}
+
+/// The value of this name, as commands, files and events write it.
+///
+/// # Errors
+///
+/// Returns an error that lists the names if there is no such one.
+pub fn named<T: DeserializeOwned>(name: &str) -> Result<T, value::Error> {
+    T::deserialize(name.into_deserializer())
 }
 
 /// The text of an error on one line, with every cause that the text does not contain already.

@@ -53,16 +53,6 @@ pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials};
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
-use serde::de::{DeserializeOwned, IntoDeserializer as _, value};
-
-/// The material, law, shapes or profile of this name, as commands and files write it.
-///
-/// # Errors
-///
-/// Returns an error that lists the names if there is no such one.
-pub fn named<T: DeserializeOwned>(name: &str) -> Result<T, value::Error> {
-    T::deserialize(name.into_deserializer())
-}
 
 /// The names that a sample's `material` indexes: the eight named materials, then, for broad
 /// materials, their laws.

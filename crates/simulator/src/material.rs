@@ -294,7 +294,7 @@ const PROPERTIES: [Properties; 8] = [
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::named;
+    use hardnessd_core::wording::named;
 
     #[test]
     fn names_round_trip_and_a_wrong_one_lists_them() {

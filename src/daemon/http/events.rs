@@ -20,6 +20,7 @@ use super::{Client, Sources, full, refusal, reserve};
 use crate::daemon::hub::{Ahead, Closed, Line};
 use crate::daemon::request::{Policy, Since, Subscription, Unusable};
 use hardnessd_core::event::Kind;
+use hardnessd_core::wording::named;
 
 const LAST_EVENT_ID: &str = "Last-Event-ID";
 
@@ -121,7 +122,7 @@ fn wanted<B>(request: &Request<B>) -> Result<Subscription, Unusable> {
 
 fn kinds(names: &str) -> Result<BTreeSet<Kind>, Unusable> {
     let kind = |name: &str| {
-        Kind::named(name).ok_or_else(|| Unusable::Value {
+        named::<Kind>(name).map_err(|_| Unusable::Value {
             key: "types",
             found: format!("{name:?}"),
             expected: "hardness, press, status or frame",

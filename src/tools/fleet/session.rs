@@ -23,8 +23,9 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::daemon::config::Endpoint;
 use crate::daemon::now;
 use crate::daemon::zenoh::searching;
-use hardnessd_core::event::Kind;
+use hardnessd_core::event::{self, Kind};
 use hardnessd_core::frame::Stamp;
+use hardnessd_core::wording::named;
 
 /// What is new.
 #[derive(Debug)]
@@ -242,7 +243,7 @@ impl Link {
         let events = [Kind::Hardness, Kind::Press, Kind::Status].map(|kind| {
             let outlet = outlet.clone();
             session
-                .declare_subscriber(format!("{ROOT}**/{}", kind.name()))
+                .declare_subscriber(format!("{ROOT}**/{}", event::name(&kind)))
                 .callback(move |sample| take(&sample, &outlet, false))
                 .wait()
         });
@@ -369,8 +370,8 @@ fn take(sample: &Sample, outlet: &Outlet, is_answer: bool) {
 fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, FleetEvent)> {
     #[derive(Deserialize)]
     struct Said<'a> {
-        #[serde(borrow, rename = "type")]
-        kind: Cow<'a, str>,
+        #[serde(rename = "type")]
+        kind: Kind,
         #[serde(borrow)]
         sensor: Cow<'a, str>,
         seq: Option<u64>,
@@ -380,12 +381,15 @@ fn event<'a>(key: &'a str, bytes: &[u8], is_answer: bool) -> Option<(&'a str, Fl
     let (rest, kind) = key.rsplit_once('/')?;
     let (rest, sensor) = rest.rsplit_once('/')?;
     let site = site(rest)?;
-    let kind = Kind::named(kind).filter(|kind| *kind != Kind::Frame)?;
+    let kind = named::<Kind>(kind).ok()?;
+    if kind == Kind::Frame {
+        return None;
+    }
     if bytes.len() > LONGEST_EVENT_BYTES || sensor.len() > LONGEST_SENSOR_BYTES {
         return None;
     }
     let said: Said = serde_json::from_slice(bytes).ok()?;
-    if said.kind != kind.name() || said.sensor != sensor {
+    if said.kind != kind || said.sensor != sensor {
         return None;
     }
     let is_final = kind == Kind::Hardness && said.phase == "final";

@@ -210,7 +210,6 @@ mod tests {
 
     use super::super::session::{FleetEvent, Hello, Model, News, What};
     use super::*;
-    use hardnessd_core::event::Kind;
 
     fn at(second: u64) -> Stamp {
         Stamp {
@@ -227,7 +226,7 @@ mod tests {
 
     fn event(json: &Value) -> What {
         What::Event(FleetEvent {
-            kind: Kind::named(json["type"].as_str().unwrap()).unwrap(),
+            kind: wording::named(json["type"].as_str().unwrap()).unwrap(),
             sensor: json["sensor"].as_str().unwrap().to_owned(),
             seq: json["seq"].as_u64(),
             is_final: json["phase"] == "final",

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use clap::builder::RangedU64ValueParser;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand, ValueEnum};
+use hardnessd_core::wording::named;
 use hardnessd_simulator::{
-    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split, named,
+    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split,
 };
 use hrn_train::data::dataset::LabelChoice;
 use hrn_train::methods::Method;
