@@ -6,6 +6,8 @@
 
 pub mod sparse;
 
+use std::time::Duration;
+
 use serde::de::{SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -318,7 +320,16 @@ pub(crate) fn force_n(newtons: &[f32]) -> f64 {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// The time by CLOCK_MONOTONIC.
-    pub mono: std::time::Duration,
+    pub mono: Duration,
     /// The time in UTC.
     pub wall: jiff::Timestamp,
+}
+
+impl Stamp {
+    /// The time by CLOCK_MONOTONIC of an event at `time`, if UTC was not set between both.
+    pub fn mono_of(self, time: jiff::Timestamp) -> Duration {
+        let ago = self.wall.as_nanosecond() - time.as_nanosecond();
+        let mono = self.mono.as_nanos() as i128 - ago;
+        Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
+    }
 }

@@ -153,7 +153,7 @@ impl Gathered {
                     }
                     self.frames.push(Taken {
                         number: frame.frame,
-                        mono: moment(at, frame.time),
+                        mono: at.mono_of(frame.time),
                         newtons: frame.newtons,
                     });
                 }
@@ -164,7 +164,7 @@ impl Gathered {
                         self.ended.push(Ended {
                             number: press.press,
                             frames: [first, press.frame],
-                            end: moment(at, press.time),
+                            end: at.mono_of(press.time),
                             described: self.described.clone(),
                             saturated: false,
                         });
@@ -217,13 +217,6 @@ impl Gathered {
         self.settle(Duration::MAX, track);
         self.presses
     }
-}
-
-/// The moment of an event by the clock of the positions.
-fn moment(at: Stamp, time: Timestamp) -> Duration {
-    let ago = at.wall.as_nanosecond() - time.as_nanosecond();
-    let mono = at.mono.as_nanos() as i128 - ago;
-    Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
 }
 
 #[cfg(test)]

@@ -3,8 +3,6 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use jiff::Timestamp;
-
 use hardnessd_core::event::{Event, Hardness, Phase, PressState};
 use hardnessd_core::frame::{Array, Frame, Stamp};
 use hardnessd_core::motion::Track;
@@ -126,7 +124,7 @@ impl Selection {
                         held.frames.clear();
                     }
                     let shown = Shown {
-                        mono: moment(at, frame.time),
+                        mono: at.mono_of(frame.time),
                         area: frame.contact_area_taxels,
                         frame: Frame {
                             array: Array {
@@ -235,11 +233,4 @@ pub(super) fn grid_mm(sensor: &Sensor) -> f64 {
     } else {
         PITCH_MM
     }
-}
-
-/// The moment of an event on the clock of the positions.
-fn moment(at: Stamp, time: Timestamp) -> Duration {
-    let ago = at.wall.as_nanosecond() - time.as_nanosecond();
-    let mono = at.mono.as_nanos() as i128 - ago;
-    Duration::from_nanos(u64::try_from(mono).unwrap_or(0))
 }
