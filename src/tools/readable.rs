@@ -50,7 +50,7 @@ impl Printer {
 }
 
 /// The same JSON without hidden characters, for a terminal. They are inside strings only.
-fn json_escaped(line: &str) -> String {
+pub(super) fn json_escaped(line: &str) -> String {
     let mut escaped = String::with_capacity(line.len());
     for c in line.chars() {
         if wording::is_hidden(c) {

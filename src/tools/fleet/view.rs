@@ -2,15 +2,14 @@
 //!
 //! In: the fleet and the time. Out: text that a terminal can show, whatever strangers sent.
 
-use std::fmt::Write;
-
 use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::robots::{Fleet, Robot, Sensor, read, time};
 use crate::tools::answer::Answer;
+use crate::tools::readable::json_escaped;
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::wording::{self, escaped};
+use hardnessd_core::wording::escaped;
 
 /// Clears the terminal, so that a table takes the place of the last one.
 pub(super) const CLEAR: &str = "\u{1b}[2J\u{1b}[H";
@@ -61,15 +60,7 @@ fn line(site: &str, robot: &Robot, of: Option<(&str, &Sensor)>, now: Stamp) -> S
         "verdict_heard": sensor.and_then(|sensor| sensor.verdict_at),
         "verdict": verdict,
     });
-    let mut shown = String::new();
-    for c in line.to_string().chars() {
-        // Such a character is inside a string: JSON has none elsewhere.
-        match wording::is_hidden(c) {
-            true => write!(shown, "\\u{:04x}", u32::from(c)).expect("a string takes text"),
-            false => shown.push(c),
-        }
-    }
-    shown + "\n"
+    json_escaped(&line.to_string()) + "\n"
 }
 
 const HEAD: [&str; 9] = [
@@ -210,6 +201,7 @@ mod tests {
 
     use super::super::session::{FleetEvent, Hello, Model, News, What};
     use super::*;
+    use hardnessd_core::wording::named;
 
     fn at(second: u64) -> Stamp {
         Stamp {
@@ -226,7 +218,7 @@ mod tests {
 
     fn event(json: &Value) -> What {
         What::Event(FleetEvent {
-            kind: wording::named(json["type"].as_str().unwrap()).unwrap(),
+            kind: named(json["type"].as_str().unwrap()).unwrap(),
             sensor: json["sensor"].as_str().unwrap().to_owned(),
             seq: json["seq"].as_u64(),
             is_final: json["phase"] == "final",
