@@ -28,7 +28,7 @@ use super::relay::Worker;
 use hardnessd_core::event::{Event, Phase};
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Entry, Found, MOTION};
-use hardnessd_core::ros::{self, Topic};
+use hardnessd_core::ros;
 
 /// The reason the server could not start.
 #[derive(Debug, thiserror::Error)]
@@ -198,7 +198,7 @@ impl Topics {
                 ros::STATUS,
                 MOTION,
             ] {
-                let name = full_name(&sensor.name, topic);
+                let name = topic.of(&sensor.name);
                 let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
                 let channel = ChannelBuilder::new(name.clone())
                     .message_encoding("cdr")
@@ -225,7 +225,7 @@ impl Topics {
             return;
         };
         for (topic, time, bytes) in ros::encode_all(event, pitch) {
-            let name = full_name(event.sensor(), topic);
+            let name = topic.of(event.sensor());
             let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);
             let message = Message { at_ns, bytes };
             if let Some(channel) = self.channels.get(&name) {
@@ -245,7 +245,7 @@ impl Topics {
             return;
         }
         let (topic, bytes) = found.message();
-        if let Some(channel) = self.channels.get(&full_name(&found.sensor, topic)) {
+        if let Some(channel) = self.channels.get(&topic.of(&found.sensor)) {
             let at_ns = u64::try_from(found.at.wall.as_nanosecond()).unwrap_or(0);
             Message { at_ns, bytes }.send(channel, None);
         }
@@ -276,11 +276,6 @@ fn greets(event: &Event) -> bool {
         Event::Status(_) => true,
         Event::Press(_) | Event::Frame(_) => false,
     }
-}
-
-/// The full name of a topic, as in a recording.
-fn full_name(sensor: &str, topic: Topic) -> String {
-    format!("/tactile/{sensor}/{}", topic.name)
 }
 
 /// The listener that passes new subscriptions of viewers on to the thread.

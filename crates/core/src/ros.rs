@@ -54,6 +54,11 @@ pub const STATUS: Topic = Topic {
 };
 
 impl Topic {
+    /// The full name of a sensor's topic.
+    pub fn of(&self, sensor: &str) -> String {
+        format!("/tactile/{sensor}/{}", self.name)
+    }
+
     /// The package and the name of the topic's schema, as a middleware names them.
     pub fn package_and_name(&self) -> (&'static str, &'static str) {
         let named = self.schema.split_once("/msg/");

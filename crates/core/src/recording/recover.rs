@@ -458,7 +458,7 @@ impl<W: Write> Copy<W> {
         let channel = Channel {
             id,
             schema_id,
-            topic: writer::topic_name(&sensor, topic),
+            topic: topic.of(&sensor),
             message_encoding: "cdr".to_owned(),
             metadata: BTreeMap::new(),
         };

@@ -100,11 +100,6 @@ pub(super) fn schema_id(topic: Topic) -> u16 {
     place.expect("every topic of a sensor is in TOPICS") as u16 + 1
 }
 
-/// The name of a channel.
-pub(super) fn topic_name(sensor: &str, topic: Topic) -> String {
-    format!("/tactile/{sensor}/{}", topic.name)
-}
-
 /// Whether this program may have written a channel of this name.
 pub(super) fn is_topic_of_ours(name: &str) -> bool {
     let parts = name
@@ -158,7 +153,7 @@ impl<W: Write> Writer<W> {
         }
         for (index, sensor) in about.sensors.iter().enumerate() {
             for topic in TOPICS {
-                let name = topic_name(sensor.name(), topic);
+                let name = topic.of(sensor.name());
                 let id = channel_id(index, topic);
                 out.add_channel_with_id(id, schema_id(topic), &name, "cdr", &BTreeMap::new())?;
             }
