@@ -25,7 +25,6 @@ use tracing::{info, warn};
 use super::config;
 use super::hub::Line;
 use super::relay::Worker;
-use hardnessd_core::event::{Event, Phase};
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Entry, Found, MOTION};
 use hardnessd_core::ros;
@@ -231,7 +230,7 @@ impl Topics {
             if let Some(channel) = self.channels.get(&name) {
                 message.send(channel, None);
             }
-            if greets(event) {
+            if event.lasts() {
                 self.last.insert(name, message);
             }
         }
@@ -266,15 +265,6 @@ impl Message {
             log_time: Some(self.at_ns),
         };
         channel.log_with_meta_to_sink(&self.bytes, meta, viewer);
-    }
-}
-
-/// Whether a viewer that comes later gets this event.
-fn greets(event: &Event) -> bool {
-    match event {
-        Event::Hardness(verdict) => verdict.phase == Phase::Final,
-        Event::Status(_) => true,
-        Event::Press(_) | Event::Frame(_) => false,
     }
 }
 

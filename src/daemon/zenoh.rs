@@ -26,7 +26,7 @@ use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
 use super::request::{self, Change, Request};
-use hardnessd_core::event::{self, Event, Hello, Kind, Phase, Reply, Status};
+use hardnessd_core::event::{self, Hello, Kind, Reply, Status};
 
 /// The reason the session could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -195,12 +195,7 @@ impl Zenoh {
         if let Err(error) = publisher.put(text(&line)).wait() {
             warn!(key, %error, "not published on zenoh");
         }
-        let answers = match &**event {
-            Event::Hardness(verdict) => verdict.phase == Phase::Final,
-            Event::Status(_) => true,
-            Event::Press(_) | Event::Frame(_) => false,
-        };
-        if answers {
+        if event.lasts() {
             self.last.insert(key, line);
         }
     }

@@ -174,6 +174,16 @@ impl Event {
         }
     }
 
+    /// Whether whoever comes later gets this event too, until the next one of its kind: a status, or a
+    /// final verdict.
+    pub fn lasts(&self) -> bool {
+        match self {
+            Event::Hardness(verdict) => verdict.phase == Phase::Final,
+            Event::Status(_) => true,
+            Event::Press(_) | Event::Frame(_) => false,
+        }
+    }
+
     /// The event as one line, newline included.
     pub fn to_line(&self) -> String {
         line(self)
