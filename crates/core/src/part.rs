@@ -17,16 +17,8 @@ use tempfile::NamedTempFile;
 pub struct Part {
     file: NamedTempFile,
     path: PathBuf,
-    to: To,
-}
-
-/// What may be at the path when the file is finished.
-#[derive(Debug)]
-enum To {
-    /// Nothing.
-    Free,
-    /// An earlier file, which is replaced.
-    Any,
+    /// Whether an earlier file at the path is replaced.
+    replaces: bool,
 }
 
 impl Part {
@@ -43,7 +35,7 @@ impl Part {
         Ok(Self {
             file: beside(path)?,
             path: path.to_owned(),
-            to: To::Free,
+            replaces: false,
         })
     }
 
@@ -76,7 +68,7 @@ impl Part {
         Ok(Self {
             file,
             path: target,
-            to: To::Any,
+            replaces: true,
         })
     }
 
@@ -103,9 +95,9 @@ impl Part {
     /// renamed.
     pub fn finish(self) -> io::Result<()> {
         self.as_file().sync_all()?;
-        let named = match self.to {
-            To::Free => self.file.persist_noclobber(&self.path),
-            To::Any => self.file.persist(&self.path),
+        let named = match self.replaces {
+            true => self.file.persist(&self.path),
+            false => self.file.persist_noclobber(&self.path),
         };
         named.map_err(|failed| match failed.error.kind() {
             ErrorKind::AlreadyExists => taken(),
