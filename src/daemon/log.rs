@@ -23,7 +23,7 @@ use self::journal::Journal;
 use self::limit::Limit;
 use self::lines::Lines;
 use super::serial::tty::Changed;
-use hardnessd_core::event::{Event, LinkState, PressState, Tared, name};
+use hardnessd_core::event::{Event, LinkState, PressState, Tared, name, round_3};
 use hardnessd_core::pipeline::Unjudged;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::wording;
@@ -257,7 +257,7 @@ pub(crate) fn event(event: &Event) {
             rejected = verdict.rejected.as_ref().map(name),
             confidence = (f64::from(verdict.confidence) * 1e4).round() / 1e4,
             frame = verdict.frame,
-            force_n = (verdict.force_n * 1e3).round() / 1e3,
+            force_n = round_3(verdict.force_n),
             contact_area_taxels = verdict.contact_area_taxels,
             model = verdict.model.as_str(),
             "hardness"

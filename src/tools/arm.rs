@@ -21,6 +21,7 @@ use crate::apart::NoThread;
 use crate::daemon::accept::Listener;
 use crate::daemon::lines::{LineRead, Lines};
 use crate::daemon::socket::{self, Socket};
+use hardnessd_core::event::round_3;
 use hardnessd_simulator::{Rig, SequenceSettings, Touched};
 
 /// The time between the moment that a frame shows and its first byte: a sensor needs some to scan its
@@ -196,7 +197,7 @@ impl Arm {
         let now = Instant::now();
         let at_mm = self.state.borrow().leg.mm(now);
         if order.object.is_some() && at_mm > 0.0 {
-            let found = rounded(at_mm);
+            let found = round_3(at_mm);
             return json!({"error": format!("object: found the arm at {found} mm, expected 0: withdraw it first")});
         }
         self.state.send_modify(|state| {
@@ -220,23 +221,19 @@ impl Arm {
             .expect("this arm holds the sender");
         let touched = state.touched.expect("waited for");
         json!({
-            "at_mm": rounded(state.leg.mm(Instant::now())),
-            "to_mm": rounded(state.leg.to_mm),
+            "at_mm": round_3(state.leg.mm(Instant::now())),
+            "to_mm": round_3(state.leg.to_mm),
             "speed_mm_s": state.leg.speed_mm_s,
             "truth": {
                 "object": touched.object,
                 "material": touched.material.name(),
                 "level": touched.material.level(),
-                "shore": rounded(touched.shore),
-                "force_n": rounded(touched.force_n),
-                "greatest_n": rounded(touched.greatest_n),
+                "shore": round_3(touched.shore),
+                "force_n": round_3(touched.force_n),
+                "greatest_n": round_3(touched.greatest_n),
             },
         })
     }
-}
-
-fn rounded(value: f64) -> f64 {
-    (1e3 * value).round() / 1e3
 }
 
 /// Steps the physics in time with the clock, until nobody takes the frames. A step that comes too late

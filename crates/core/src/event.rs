@@ -529,7 +529,8 @@ fn millionths<S: Serializer>(values: &[f32], serializer: S) -> Result<S::Ok, S::
     serializer.collect_seq(values.iter().map(|&value| round_6(value)))
 }
 
-fn round_3(value: f64) -> f64 {
+/// Rounds to three digits.
+pub fn round_3(value: f64) -> f64 {
     (value * 1e3).round() / 1e3
 }
 

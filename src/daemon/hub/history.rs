@@ -6,7 +6,7 @@ use jiff::{SignedDuration, Timestamp};
 use serde_json::json;
 
 use super::Line;
-use hardnessd_core::event::FrameEvent;
+use hardnessd_core::event::{FrameEvent, round_3};
 
 /// How far back a history goes.
 const SPAN: SignedDuration = SignedDuration::from_secs(120);
@@ -59,12 +59,11 @@ impl History {
     /// The line of the history. A point has its age at `time` in seconds, newtons and taxels.
     pub(crate) fn line(&self, sensor: &str) -> Line {
         let newest = self.0.back().map(|point| point.at);
-        let rounded = |number: f64| (number * 1e3).round() / 1e3;
         let point = |point: &Point| {
             let age = newest.unwrap_or(point.at).duration_since(point.at);
             json!([
-                rounded(age.as_secs_f64()),
-                rounded(point.force_n.into()),
+                round_3(age.as_secs_f64()),
+                round_3(point.force_n.into()),
                 point.contact_area_taxels
             ])
         };

@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::robots::{Fleet, Robot, Sensor, read, time};
 use crate::tools::answer::Answer;
 use crate::tools::readable::json_escaped;
+use hardnessd_core::event::round_3;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::wording::escaped;
 
@@ -151,16 +152,12 @@ fn judged(verdict: &Value, robot: &Robot) -> String {
 
 /// Seconds since `then`, by the clock of this machine that nobody sets.
 fn since(now: Stamp, then: Stamp) -> f64 {
-    rounded(now.mono.saturating_sub(then.mono).as_secs_f64())
+    round_3(now.mono.saturating_sub(then.mono).as_secs_f64())
 }
 
 /// Seconds since a robot's `then`. Clocks of two machines differ: what is of the future is new.
 fn aged(now: Stamp, then: Timestamp) -> f64 {
-    rounded(now.wall.duration_since(then).as_secs_f64().max(0.0))
-}
-
-fn rounded(seconds: f64) -> f64 {
-    (seconds * 1e3).round() / 1e3
+    round_3(now.wall.duration_since(then).as_secs_f64().max(0.0))
 }
 
 fn age(seconds: f64) -> String {
