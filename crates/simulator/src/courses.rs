@@ -26,7 +26,7 @@ use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
-use hardnessd_core::verdict::Laying;
+use hardnessd_core::verdict::{COURSE_FRAMES, Laying};
 
 /// The settings of a simulated data set of presses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -78,8 +78,6 @@ impl Default for CourseSettings {
     }
 }
 
-/// The most frames of a press, not counting those before its begin: as many as a model takes.
-pub const MOST_FRAMES: usize = 48;
 /// The number of frames kept before the frame that begins the press.
 const BEFORE: usize = 2;
 
@@ -416,7 +414,7 @@ fn kept(
         .contact
         .binary_search(&seen.best)
         .expect("the best frame is in contact");
-    let thin = thinned(seen.contact.len(), best, MOST_FRAMES);
+    let thin = thinned(seen.contact.len(), best, COURSE_FRAMES.1);
     let places: Vec<usize> = (begin.saturating_sub(BEFORE)..begin)
         .chain(thin.iter().map(|&place| seen.contact[place]))
         .collect();

@@ -38,8 +38,8 @@ mod rig;
 
 pub use broad::{LawName, Laws, NoLaw};
 pub use courses::{
-    BroadSensors, CourseMoment, CourseSettings, LabelledCourse, MOST_FRAMES, REFERENCES,
-    SensorDesigns, SensorSummary, courses,
+    BroadSensors, CourseMoment, CourseSettings, LabelledCourse, REFERENCES, SensorDesigns,
+    SensorSummary, courses,
 };
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, borders, level_of};

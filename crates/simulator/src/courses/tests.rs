@@ -35,7 +35,7 @@ fn threads_do_not_show_and_courses_are_whole() {
         let times: Vec<f32> = course.moments.iter().map(|m| m.time_s).collect();
         assert!(times.is_sorted_by(|a, b| a < b), "{times:?}");
         let begin = times.iter().position(|&time_s| time_s == 0.0).unwrap();
-        assert!(begin <= BEFORE && times.len() - begin <= MOST_FRAMES);
+        assert!(begin <= BEFORE && times.len() - begin <= COURSE_FRAMES.1);
         let area = |place: usize| {
             let taxels = course.moments[place].millinewtons.iter();
             let contact = taxels.filter(|&&taxel| taxel >= 70);

@@ -10,8 +10,7 @@ use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, is_inform
 use hardnessd_core::press::thinned;
 use hardnessd_core::recording::{Entry, Found};
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{COLS, Laying, ModelFrame, ROWS};
-use hardnessd_simulator::MOST_FRAMES;
+use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Laying, ModelFrame, ROWS};
 
 use crate::data::dataset::PITCH_MM;
 
@@ -203,7 +202,7 @@ impl Held {
         let way = way.filter(|way| is_informative(way, best));
         let way = way.unwrap_or_else(|| vec![None; moments.len()]);
         let mut before_s = -1.0_f32;
-        for place in thinned(pressed.len(), best, MOST_FRAMES) {
+        for place in thinned(pressed.len(), best, COURSE_FRAMES.1) {
             // Two frames may have arrived at the same moment, but times in a file must ascend.
             let time_s = moments[place].saturating_sub(begin).as_secs_f32();
             before_s = time_s.max(before_s.next_up());
