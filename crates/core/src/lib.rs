@@ -12,6 +12,7 @@ pub mod exit;
 pub mod range;
 pub mod part;
 pub mod npy;
+pub mod npz;
 pub mod wire;
 pub mod tare;
 pub mod press;

@@ -9,8 +9,8 @@ use std::io::{BufRead as _, Write as _};
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use hardnessd_core::npz::Writer;
 use hardnessd_simulator::random::Stream;
-use hrn_train::data::npz::Writer;
 use hrn_train::learn::learner::Learner;
 use hrn_train::learn::{fit, gan};
 use hrn_train::net::losses::Game;

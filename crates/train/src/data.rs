@@ -1,6 +1,5 @@
 //! Sources of frames (data set files, the simulator, recordings), and the variation of a frame.
 
-pub mod npz;
 pub mod dataset;
 pub mod courses;
 pub mod simulated;

@@ -17,7 +17,7 @@ use super::dataset::{
     self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits,
     objects_after, pitch_mm, warn_of_object_in_both_splits,
 };
-use super::npz::Writer;
+use hardnessd_core::npz::Writer;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};
 use hardnessd_simulator::{LabelledCourse, Reference, Split};
 

@@ -14,9 +14,9 @@ use sha2::{Digest as _, Sha256};
 use zip::ZipArchive;
 
 use crate::data::dataset::Dataset;
-use crate::data::npz::{Element as _, Writer};
 use crate::net::network::{Weight, Weights, numbers};
 use hardnessd_core::npy::Header;
+use hardnessd_core::npz::{Element as _, Writer};
 
 /// The name of the list of the best weights so far. That of a GAN's side has a prefix.
 pub const BEST: &str = "best";

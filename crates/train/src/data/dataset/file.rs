@@ -10,8 +10,8 @@ use zip::ZipArchive;
 use zip::result::ZipError;
 
 use super::{Dataset, DatasetError, Kind, Sample, Source, levels};
-use crate::data::npz::{Element, Writer};
 use hardnessd_core::npy::{Header, NpyError};
+use hardnessd_core::npz::{Element, Writer};
 use hardnessd_core::verdict::{COLS, Level, ModelFrame, ROWS, TAXELS, check_levels, sha256_hex};
 use hardnessd_simulator::{BroadSensors, Split};
 

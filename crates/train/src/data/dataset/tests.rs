@@ -3,8 +3,8 @@
 use std::io::Cursor;
 
 use super::*;
-use crate::data::npz::{Element, Writer};
 use hardnessd_core::npy::Header;
+use hardnessd_core::npz::{Element, Writer};
 use hardnessd_core::verdict::{COLS, ROWS, TAXELS, sha256_hex};
 
 fn sample(level: u8, object: u32, split: Split) -> Sample {

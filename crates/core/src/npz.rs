@@ -8,7 +8,7 @@ use std::io::{self, Seek, Write};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-use hardnessd_core::npy::Header;
+use crate::npy::Header;
 
 /// An array above this size gets 64-bit lengths in the archive. Packed bytes may be slightly more
 /// than unpacked ones, so it is less than 4 GiB.
