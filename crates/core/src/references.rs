@@ -5,13 +5,13 @@
 //! calibration.
 
 use std::fmt::Display;
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::ops::RangeInclusive;
 
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipArchive, ZipWriter};
+use zip::ZipArchive;
 
 use crate::npy::{Header, NpyError};
+use crate::npz::Writer;
 use crate::verdict::{
     COLS, COURSE_FRAMES, Course, CourseMoment, MOST_REFERENCES, ModelFrame, Piece, ROWS,
     ReferencePress, TAXELS,
@@ -202,7 +202,6 @@ pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
                 .map(move |moment| (number, moment))
         })
     };
-    let frames = moments().count();
     let piece_mm = |press: &ReferencePress| match press.piece {
         Piece::Flat { width_mm } => width_mm,
         Piece::Ball { radius_mm } => radius_mm,
@@ -217,64 +216,38 @@ pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
         Piece::Ball { .. } => 2,
         Piece::Shore { .. } => 3,
     };
-    let mut zip = Packed(ZipWriter::new(Cursor::new(Vec::new())));
+    let mut npz = Writer::compressed(Cursor::new(Vec::new()));
     let presses = references.iter();
-    let count = [references.len()];
-    let kinds = presses.clone().map(kind);
-    zip.add("piece", "|u1", &count, kinds.map(u8::to_le_bytes))?;
-    zip.floats("piece_mm", &count, presses.clone().map(piece_mm))?;
-    zip.floats("shore", &[count[0], 2], presses.clone().flat_map(shore))?;
-    let arms = presses.map(|press| press.course.arm_n_per_mm);
-    zip.floats("arm_n_per_mm", &count, arms)?;
-    let numbers = moments().map(|(number, _)| number.to_le_bytes());
-    zip.add("press", "<u4", &[frames], numbers)?;
-    zip.floats("time_s", &[frames], moments().map(|(_, m)| m.time_s))?;
+    let kinds: Vec<u8> = presses.clone().map(kind).collect();
+    npz.add_list("piece", &kinds)?;
+    let piece_mm: Vec<f32> = presses.clone().map(piece_mm).collect();
+    npz.add_list("piece_mm", &piece_mm)?;
+    let shore: Vec<f32> = presses.clone().flat_map(shore).collect();
+    npz.add("shore", &[references.len(), 2], &shore)?;
+    let arms: Vec<f32> = presses.map(|press| press.course.arm_n_per_mm).collect();
+    npz.add_list("arm_n_per_mm", &arms)?;
+    let numbers: Vec<u32> = moments().map(|(number, _)| number).collect();
+    npz.add_list("press", &numbers)?;
+    let time_s: Vec<f32> = moments().map(|(_, m)| m.time_s).collect();
+    npz.add_list("time_s", &time_s)?;
     let approach_mm = moments().map(|(_, m)| m.approach_mm.unwrap_or(0.0));
-    zip.floats("approach_mm", &[frames], approach_mm)?;
-    let known = moments().map(|(_, m)| [u8::from(m.approach_mm.is_some())]);
-    zip.add("known", "|u1", &[frames], known)?;
+    npz.add_list("approach_mm", &approach_mm.collect::<Vec<f32>>())?;
+    let known = moments().map(|(_, m)| u8::from(m.approach_mm.is_some()));
+    npz.add_list("known", &known.collect::<Vec<u8>>())?;
     // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
-    let millinewtons = moments().flat_map(|(_, m)| m.frame.newtons);
-    let millinewtons = millinewtons.map(|n| ((n / NEWTONS).round() as u16).to_le_bytes());
-    zip.add("frames_mn", "<u2", &[frames, ROWS, COLS], millinewtons)?;
-    Ok(zip.0.finish()?.into_inner())
-}
-
-/// A file that is being written. It holds no date.
-struct Packed(ZipWriter<Cursor<Vec<u8>>>);
-
-impl Packed {
-    fn floats(
-        &mut self,
-        name: &str,
-        shape: &[usize],
-        values: impl Iterator<Item = f32>,
-    ) -> std::io::Result<()> {
-        self.add(name, "<f4", shape, values.map(f32::to_le_bytes))
-    }
-
-    fn add<const N: usize>(
-        &mut self,
-        name: &str,
-        descr: &str,
-        shape: &[usize],
-        elements: impl Iterator<Item = [u8; N]>,
-    ) -> std::io::Result<()> {
-        let header = Header {
-            descr: descr.to_owned(),
-            fortran_order: false,
-            shape: shape.to_vec(),
-        };
-        let mut bytes = header.to_bytes();
-        bytes.extend(elements.flatten());
-        let options = SimpleFileOptions::default().compression_method(CompressionMethod::Deflated);
-        self.0.start_file(format!("{name}.npy"), options)?;
-        self.0.write_all(&bytes)
-    }
+    let newtons = moments().flat_map(|(_, m)| m.frame.newtons);
+    let millinewtons: Vec<u16> = newtons.map(|n| (n / NEWTONS).round() as u16).collect();
+    npz.add("frames_mn", &[numbers.len(), ROWS, COLS], &millinewtons)?;
+    Ok(npz.finish()?.into_inner())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write as _;
+
+    use zip::ZipWriter;
+    use zip::write::SimpleFileOptions;
+
     use super::*;
 
     fn press(frames: usize, piece: Piece) -> ReferencePress {
