@@ -299,7 +299,7 @@ impl Config {
     /// Returns an [`Error`] if the file cannot be read or is not TOML, if it has an unknown key, a
     /// value of another type or a path that cannot be used, or if a file of gains cannot be used.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        parse::load(path, None)
+        parse::load(path, None).map_err(Error::at(path))
     }
 
     /// Checks every value, and whether the values fit together. Returns the sensors in their order.
@@ -309,7 +309,7 @@ impl Config {
     ///
     /// Returns an [`Error`] for the first value that cannot be used.
     pub fn check(&self, path: &Path) -> Result<Vec<Sensor>, Error> {
-        check::check(self, path)
+        check::check(self).map_err(Error::at(path))
     }
 
     /// The description of `sensor`, composed from all tables of the file.
@@ -504,7 +504,7 @@ impl Setup {
         model: Option<&Path>,
         until: Instant,
     ) -> Result<Self, Error> {
-        let config = parse::load(path, Some(until))?;
+        let config = parse::load(path, Some(until)).map_err(Error::at(path))?;
         Self::of_until(config.with_model(model), path, Some(until))
     }
 
@@ -522,11 +522,13 @@ impl Setup {
         let sensors = config.check(path)?;
         let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);
         let most = trial::verdict_most(rates.fold(0.0, f64::max));
-        let hrn = Arc::new(parse::model(&config, most, path, until)?);
+        let hrn = parse::model(&config, most, until).map_err(Error::at(path))?;
+        let hrn = Arc::new(hrn);
         let mut identified = BTreeMap::new();
         for sensor in &config.sensors {
             if let Some(file) = &sensor.references {
-                let own = parse::identified(&hrn, file, &sensor.name, path, until)?;
+                let own = parse::identified(&hrn, file, &sensor.name, until);
+                let own = own.map_err(Error::at(path))?;
                 identified.insert(sensor.name.clone(), Arc::new(own));
             }
         }

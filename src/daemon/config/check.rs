@@ -2,55 +2,51 @@
 
 use std::collections::{HashMap, HashSet};
 use std::net::{IpAddr, SocketAddr};
-use std::path::Path;
 
-use super::error::Error;
+use super::error::Problem;
 use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
 use crate::daemon::port::Port;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
 
-/// Checks a configuration whose paths are already resolved, and returns its sensors. `path` is only
-/// for messages.
-pub(super) fn check(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
+/// Checks a configuration whose paths are already resolved, and returns its sensors.
+pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
     let publish = &config.publish;
-    check_built(publish, path)?;
-    check_robot(&config.robot, path)?;
-    let sensors = check_sensors(config, path)?;
-    check_model(&config.model, path)?;
-    check_unix(&publish.unix, path)?;
+    check_built(publish)?;
+    check_robot(&config.robot)?;
+    let sensors = check_sensors(config)?;
+    check_model(&config.model)?;
+    check_unix(&publish.unix)?;
     if let Some(record) = &config.record {
-        check_record(record, path)?;
+        check_record(record)?;
     }
     if let Some(zenoh) = &publish.zenoh {
-        check_zenoh(zenoh, &config.robot, path)?;
+        check_zenoh(zenoh, &config.robot)?;
     }
     if let Some(ros2) = &publish.ros2 {
-        check_ros2(ros2, &config.sensors, path)?;
+        check_ros2(ros2, &config.sensors)?;
     }
-    check_listeners(config, path)?;
+    check_listeners(config)?;
     Ok(sensors)
 }
 
-fn value(path: &Path, key: impl Into<String>, found: String, expected: &'static str) -> Error {
-    Error::Value {
-        path: path.to_owned(),
+fn value(key: impl Into<String>, found: String, expected: &'static str) -> Problem {
+    Problem::Value {
         key: key.into(),
         found,
         expected,
     }
 }
 
-fn clash(path: &Path, key: impl Into<String>, problem: String) -> Error {
-    Error::Clash {
-        path: path.to_owned(),
+fn clash(key: impl Into<String>, problem: String) -> Problem {
+    Problem::Clash {
         key: key.into(),
         problem,
     }
 }
 
 /// Checks that this program was built with the features that the tables need.
-fn check_built(publish: &Publish, path: &Path) -> Result<(), Error> {
+fn check_built(publish: &Publish) -> Result<(), Problem> {
     for (feature, built, given) in [
         (
             "foxglove",
@@ -61,24 +57,21 @@ fn check_built(publish: &Publish, path: &Path) -> Result<(), Error> {
         ("ros2", cfg!(feature = "ros2"), publish.ros2.is_some()),
     ] {
         if given && !built {
-            return Err(Error::NotBuilt {
-                path: path.to_owned(),
-                feature,
-            });
+            return Err(Problem::NotBuilt { feature });
         }
     }
     Ok(())
 }
 
-fn check_robot(robot: &str, path: &Path) -> Result<(), Error> {
+fn check_robot(robot: &str) -> Result<(), Problem> {
     let chars = robot.chars().count();
     if chars > MOST_ROBOT_CHARS {
         let found = format!("{chars} characters");
-        return Err(value(path, "robot", found, "a name of at most 255"));
+        return Err(value("robot", found, "a name of at most 255"));
     }
     if robot.is_empty() || !wording::is_plain(robot) {
         let expected = "a name without control or bidirectional characters";
-        return Err(value(path, "robot", format!("{robot:?}"), expected));
+        return Err(value("robot", format!("{robot:?}"), expected));
     }
     Ok(())
 }
@@ -86,27 +79,24 @@ fn check_robot(robot: &str, path: &Path) -> Result<(), Error> {
 /// Twice as many sensors as a core can read at 100 frames/s.
 const MOST_SENSORS: usize = 1000;
 
-fn check_sensors(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
+fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     if config.sensors.is_empty() {
-        return Err(Error::NoSensor {
-            path: path.to_owned(),
-        });
+        return Err(Problem::NoSensor);
     }
     let count = config.sensors.len();
     if count > MOST_SENSORS {
         let found = format!("{count} tables");
-        return Err(value(path, "sensor", found, "at most 1000"));
+        return Err(value("sensor", found, "at most 1000"));
     }
     let mut sensors = Vec::with_capacity(count);
     let mut taken = Taken::default();
     for given in &config.sensors {
         let sensor = Sensor::new(config.describe(given));
-        sensors.push(sensor.map_err(|problem| Error::Sensor {
-            path: path.to_owned(),
+        sensors.push(sensor.map_err(|problem| Problem::Sensor {
             sensor: given.name.clone(),
             problem,
         })?);
-        taken.add(given, path)?;
+        taken.add(given)?;
     }
     Ok(sensors)
 }
@@ -114,22 +104,22 @@ fn check_sensors(config: &Config, path: &Path) -> Result<Vec<Sensor>, Error> {
 /// More connections than a process may have open files.
 const MOST_CLIENTS: usize = 1_000_000;
 
-fn check_unix(unix: &Unix, path: &Path) -> Result<(), Error> {
+fn check_unix(unix: &Unix) -> Result<(), Problem> {
     if !(1..=MOST_CLIENTS).contains(&unix.max_clients) {
         let (key, found) = ("publish.unix.max_clients", unix.max_clients.to_string());
-        return Err(value(path, key, found, "1 to 1000000"));
+        return Err(value(key, found, "1 to 1000000"));
     }
     if unix.enabled && unix.control_path() == unix.path() {
         let problem = format!(
             "{} is the socket of events too: set another path",
             unix.control_path().display()
         );
-        return Err(clash(path, "publish.unix.control_path", problem));
+        return Err(clash("publish.unix.control_path", problem));
     }
     Ok(())
 }
 
-fn check_record(record: &Record, path: &Path) -> Result<(), Error> {
+fn check_record(record: &Record) -> Result<(), Problem> {
     for (key, found, least) in [
         ("record.rotate_mb", record.rotate_mb, 1),
         ("record.rotate_s", record.rotate_s, 1),
@@ -137,14 +127,14 @@ fn check_record(record: &Record, path: &Path) -> Result<(), Error> {
     ] {
         if !(least..=MOST).contains(&found) {
             let expected = "1 to 1000000000 (keep_free_mb also 0)";
-            return Err(value(path, key, found.to_string(), expected));
+            return Err(value(key, found.to_string(), expected));
         }
     }
     Ok(())
 }
 
 /// Checks that all tables that listen on the network can do so at the same time.
-fn check_listeners(config: &Config, path: &Path) -> Result<(), Error> {
+fn check_listeners(config: &Config) -> Result<(), Problem> {
     let publish = &config.publish;
     let listeners = [
         (
@@ -165,14 +155,14 @@ fn check_listeners(config: &Config, path: &Path) -> Result<(), Error> {
                 let problem = format!(
                     "{listen} cannot be used beside {other_key} = {other}: set another address or port"
                 );
-                return Err(clash(path, key, problem));
+                return Err(clash(key, problem));
             }
         }
     }
     Ok(())
 }
 
-fn check_zenoh(zenoh: &Zenoh, robot: &str, path: &Path) -> Result<(), Error> {
+fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
     // These characters have a meaning in zenoh's key expressions. The log and `fleet` show a site.
     let is_key = |key: &str| {
         !key.split('/').any(str::is_empty)
@@ -182,7 +172,6 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str, path: &Path) -> Result<(), Error> {
     let site = zenoh.site(robot);
     if !is_key(site) {
         return Err(value(
-            path,
             "publish.zenoh.site",
             format!("{site:?} (by default the robot's name)"),
             "parts of a key, without * $ ? #, control or bidirectional characters",
@@ -190,7 +179,6 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str, path: &Path) -> Result<(), Error> {
     }
     if let Some(motion) = zenoh.motion.as_ref().filter(|motion| !is_key(motion)) {
         return Err(value(
-            path,
             "publish.zenoh.motion",
             format!("{motion:?}"),
             "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters",
@@ -199,14 +187,14 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str, path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), Error> {
+fn check_ros2(ros2: &Ros2, sensors: &[SensorTable]) -> Result<(), Problem> {
     let found = match ros2.chosen_domain_id() {
         Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
         Ok(_) => None,
         Err(found) => Some(found.to_string()),
     };
     if let Some(found) = found {
-        return Err(value(path, "publish.ros2.domain_id", found, "0 to 232"));
+        return Err(value("publish.ros2.domain_id", found, "0 to 232"));
     }
     let token = |token: &str| {
         token.starts_with(|first: char| first.is_ascii_alphabetic())
@@ -217,7 +205,6 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
     let tokens = namespace.strip_prefix('/');
     if !tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token)) {
         return Err(value(
-            path,
             "publish.ros2.namespace",
             format!("{namespace:?}"),
             "a namespace of ROS such as \"/arm_7\"",
@@ -226,7 +213,6 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
     for (sensor, topic) in &ros2.motion {
         if !sensors.iter().any(|known| known.name == *sensor) {
             return Err(value(
-                path,
                 "publish.ros2.motion",
                 format!("{sensor:?}"),
                 "the name of a [[sensor]] before each topic",
@@ -235,7 +221,6 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
         let tokens = topic.strip_prefix('/');
         if !tokens.is_some_and(|tokens| tokens.split('/').all(token)) {
             return Err(value(
-                path,
                 format!("publish.ros2.motion.{sensor}"),
                 format!("{topic:?}"),
                 "a topic of ROS such as \"/arm_7/approach\"",
@@ -244,7 +229,6 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable], path: &Path) -> Result<(), E
     }
     match sensors.iter().find(|sensor| !token(&sensor.name)) {
         Some(sensor) => Err(clash(
-            path,
             format!("sensor.name of {:?}", sensor.name),
             "ROS takes no name with two _ in a row: rename the sensor, or remove publish.ros2"
                 .to_owned(),
@@ -282,12 +266,12 @@ struct Taken<'a> {
 
 impl<'a> Taken<'a> {
     /// Checks that a sensor has a name and a port of its own.
-    fn add(&mut self, sensor: &'a SensorTable, path: &Path) -> Result<(), Error> {
+    fn add(&mut self, sensor: &'a SensorTable) -> Result<(), Problem> {
         let name = &sensor.name;
         let key = |key| format!("sensor.{key} of {name:?}");
         if !self.names.insert(name) {
             let problem = "two sensors have this name: give each a name of its own".to_owned();
-            return Err(clash(path, key("name"), problem));
+            return Err(clash(key("name"), problem));
         }
         let port = &sensor.port;
         let device = port.device().and_then(|path| path.canonicalize().ok());
@@ -295,17 +279,17 @@ impl<'a> Taken<'a> {
         if let Some(other) = self.ports.insert(one, name) {
             let problem =
                 format!("{port} is the port of {other:?} too: give each sensor a port of its own");
-            return Err(clash(path, key("port"), problem));
+            return Err(clash(key("port"), problem));
         }
         Ok(())
     }
 }
 
-fn check_model(model: &Model, path: &Path) -> Result<(), Error> {
+fn check_model(model: &Model) -> Result<(), Problem> {
     match &model.sha256 {
         Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
             let found = format!("{hash:?}");
-            Err(value(path, "model.sha256", found, "64 hex digits"))
+            Err(value("model.sha256", found, "64 hex digits"))
         }
         _ => Ok(()),
     }

@@ -15,50 +15,49 @@ pub(super) const MAX_BYTES: usize = 1 << 20;
 /// The reason a configuration cannot be used. Each message names the file and the key, what was
 /// found and what was expected.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
+#[error("{path}: {problem}")]
+pub struct Error {
+    /// The path of the configuration.
+    path: PathBuf,
+    #[source]
+    problem: Problem,
+}
+
+impl Error {
+    /// Makes the error of a problem in the configuration at `path`.
+    pub(super) fn at(path: &Path) -> impl FnOnce(Problem) -> Self {
+        move |problem| Self {
+            path: path.to_owned(),
+            problem,
+        }
+    }
+}
+
+/// The problem of a configuration, which its caller names.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Problem {
     /// The configuration file cannot be read.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// The path of the configuration.
-        path: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
+    #[error("cannot read: {0}")]
+    Unreadable(#[source] std::io::Error),
     /// The file is longer than any configuration. It may be another file, or an endless device.
-    #[error("{path}: more than {MAX_BYTES} bytes: no configuration is so long: name another file")]
-    TooLong {
-        /// The path of the configuration.
-        path: PathBuf,
-    },
-    /// The file is not TOML, or has an unknown key or a value of the wrong type.
-    #[error("{path}: {problem}")]
-    Syntax {
-        /// The path of the configuration.
-        path: PathBuf,
-        /// The place in the file, and the parser's message.
-        problem: String,
-    },
+    #[error("more than {MAX_BYTES} bytes: no configuration is so long: name another file")]
+    TooLong,
+    /// The file is not TOML, or has an unknown key or a value of the wrong type. The text is the
+    /// place in the file, and the parser's message.
+    #[error("{0}")]
+    Syntax(String),
     /// The file has `[sensor]` in place of `[[sensor]]`.
-    #[error("{path}: write [[sensor]], not [sensor]: there may be several")]
-    SingleBrackets {
-        /// The path of the configuration.
-        path: PathBuf,
-    },
+    #[error("write [[sensor]], not [sensor]: there may be several")]
+    SingleBrackets,
     /// A `[[sensor]]` has no port.
-    #[error(
-        "{path}: sensor.port of {sensor:?} is missing: set it to a path under /dev/serial/by-id/"
-    )]
+    #[error("sensor.port of {sensor:?} is missing: set it to a path under /dev/serial/by-id/")]
     NoPort {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The sensor's name.
         sensor: String,
     },
     /// A value cannot be used.
-    #[error("{path}: {key}: found {found}, expected {expected}")]
+    #[error("{key}: found {found}, expected {expected}")]
     Value {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The key, as it is written in the file.
         key: String,
         /// The value found.
@@ -67,26 +66,19 @@ pub enum Error {
         expected: &'static str,
     },
     /// Two values cannot be used together.
-    #[error("{path}: {key}: {problem}")]
+    #[error("{key}: {problem}")]
     Clash {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The key to change, as it is written in the file.
         key: String,
         /// The problem, and the remedy.
         problem: String,
     },
     /// The configuration has no sensor.
-    #[error("{path}: no sensor: add a [[sensor]] with a port")]
-    NoSensor {
-        /// The path of the configuration.
-        path: PathBuf,
-    },
+    #[error("no sensor: add a [[sensor]] with a port")]
+    NoSensor,
     /// A value of a sensor's description cannot be used.
-    #[error("{path}: {}{problem}", table_of(sensor, problem))]
+    #[error("{}{problem}", table_of(sensor, problem))]
     Sensor {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The sensor's name.
         sensor: String,
         /// The value found, and the values that can be used.
@@ -95,23 +87,16 @@ pub enum Error {
     /// A table belongs to a feature that this program was built without. Such a table is never
     /// ignored.
     #[error(
-        "{path}: publish.{feature}: this hardnessd was built without {feature}: build it with \
+        "publish.{feature}: this hardnessd was built without {feature}: build it with \
          --features {feature}, or remove the table"
     )]
     NotBuilt {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The feature of the package, which is also the table's name.
         feature: &'static str,
     },
     /// A file of gains cannot be read, or does not hold gains.
-    #[error(
-        "{path}: sensor.calibration.gains of {sensor:?}: {}",
-        of_gains(file, source)
-    )]
+    #[error("sensor.calibration.gains of {sensor:?}: {}", of_gains(file, source))]
     Gains {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The sensor's name.
         sensor: String,
         /// The path of the file of gains.
@@ -120,10 +105,8 @@ pub enum Error {
         source: NpyError,
     },
     /// A file of references cannot be used.
-    #[error("{path}: sensor.references of {sensor:?}: {file}: {source}")]
+    #[error("sensor.references of {sensor:?}: {file}: {source}")]
     References {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The sensor's name.
         sensor: String,
         /// The path of the file of references.
@@ -132,38 +115,27 @@ pub enum Error {
         source: Box<ReferencesProblem>,
     },
     /// The model cannot have the levels of the configuration.
-    #[error("{path}: level: {source}")]
-    Levels {
-        /// The path of the configuration.
-        path: PathBuf,
-        /// The reason.
-        source: LevelsError,
-    },
+    #[error("level: {0}")]
+    Levels(#[from] LevelsError),
     /// The model file cannot be read.
-    #[error("{path}: model.path: cannot read {model}: {source}")]
+    #[error("model.path: cannot read {model}: {source}")]
     ModelUnreadable {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The path of the model file.
         model: PathBuf,
         /// The system's error.
         source: std::io::Error,
     },
     /// The model has another hash than `model.sha256`.
-    #[error("{path}: model.sha256: found a model of {found}, expected {expected}")]
+    #[error("model.sha256: found a model of {found}, expected {expected}")]
     ModelHash {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The hash of the model.
         found: String,
         /// The hash in `model.sha256`.
         expected: String,
     },
     /// The model is refused.
-    #[error("{path}: model.path: {model}: {source}")]
+    #[error("model.path: {model}: {source}")]
     Model {
-        /// The path of the configuration.
-        path: PathBuf,
         /// The path of the model file, or "the model built in".
         model: String,
         /// The reason the model is refused.
@@ -198,8 +170,8 @@ pub enum ReferencesProblem {
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
-        match self {
-            Error::Unreadable { .. } => NO_INPUT,
+        match self.problem {
+            Problem::Unreadable(_) => NO_INPUT,
             _ => CONFIG,
         }
     }

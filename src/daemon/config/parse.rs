@@ -3,48 +3,39 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::error::{Error, MAX_BYTES, ReferencesProblem};
+use super::error::{MAX_BYTES, Problem, ReferencesProblem};
 use super::read::{Until, read};
 use super::{Config, LevelTable};
 use crate::daemon::port::Port;
 use hardnessd_core::npy::{self, NpyError};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{self, Hrn, Level, LevelsError};
+use hardnessd_core::verdict::{self, Hrn, Level};
 use hardnessd_core::{references, trial, wording};
 
-pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
-    let bytes = read(path, MAX_BYTES, until).map_err(|source| Error::Unreadable {
-        path: path.to_owned(),
-        source,
-    })?;
+pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
+    let bytes = read(path, MAX_BYTES, until).map_err(Problem::Unreadable)?;
     if bytes.len() > MAX_BYTES {
-        return Err(Error::TooLong {
-            path: path.to_owned(),
-        });
+        return Err(Problem::TooLong);
     }
-    let text = std::str::from_utf8(&bytes).map_err(|error| Error::Syntax {
-        path: path.to_owned(),
-        problem: error.to_string(),
-    })?;
-    let mut config: Config = toml::from_str(text).map_err(|error| syntax(path, text, &error))?;
+    let text = std::str::from_utf8(&bytes).map_err(|error| Problem::Syntax(error.to_string()))?;
+    let mut config: Config = toml::from_str(text).map_err(|error| syntax(text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
     for sensor in &mut config.sensors {
         if let Port::Device(device) = &mut sensor.port {
             if device.as_os_str().is_empty() {
-                return Err(Error::NoPort {
-                    path: path.to_owned(),
+                return Err(Problem::NoPort {
                     sensor: sensor.name.clone(),
                 });
             }
             let key = format!("sensor.port of {:?}", sensor.name);
-            resolve(device, directory, key, "the path of a device", path)?;
+            resolve(device, directory, key, "the path of a device")?;
         }
         if let Some(file) = &mut sensor.references {
             let key = format!("sensor.references of {:?}", sensor.name);
-            resolve(file, directory, key, "the path of an .npz file", path)?;
+            resolve(file, directory, key, "the path of an .npz file")?;
         }
         if let Some(given) = &mut sensor.calibration.gains {
-            *given = gains(given, directory, &sensor.name, path, until)?;
+            *given = gains(given, directory, &sensor.name, until)?;
         }
     }
     let unix = &mut config.publish.unix;
@@ -59,33 +50,25 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Error> {
     ];
     for (key, given) in paths {
         if let Some(Some(given)) = given {
-            resolve(given, directory, key.to_owned(), "a path", path)?;
+            resolve(given, directory, key.to_owned(), "a path")?;
         }
     }
     Ok(config)
 }
 
 /// Reads the gains from the file that the configuration names.
-fn gains(
-    given: &Gains,
-    directory: &Path,
-    sensor: &str,
-    path: &Path,
-    until: Until,
-) -> Result<Gains, Error> {
+fn gains(given: &Gains, directory: &Path, sensor: &str, until: Until) -> Result<Gains, Problem> {
     let key = format!("sensor.calibration.gains of {sensor:?}");
     let Gains::File(file) = given else {
-        return Err(Error::Value {
-            path: path.to_owned(),
+        return Err(Problem::Value {
             key,
             found: "a list".to_owned(),
             expected: "the path of an .npy file",
         });
     };
     let mut file = file.clone();
-    resolve(&mut file, directory, key, "the path of an .npy file", path)?;
-    let refused = |source| Error::Gains {
-        path: path.to_owned(),
+    resolve(&mut file, directory, key, "the path of an .npy file")?;
+    let refused = |source| Problem::Gains {
         sensor: sensor.to_owned(),
         file: file.clone(),
         source,
@@ -103,12 +86,10 @@ fn resolve(
     directory: &Path,
     key: String,
     expected: &'static str,
-    path: &Path,
-) -> Result<(), Error> {
+) -> Result<(), Problem> {
     let text = given.to_string_lossy();
     if text.is_empty() || !wording::is_plain(&text) {
-        return Err(Error::Value {
-            path: path.to_owned(),
+        return Err(Problem::Value {
             key,
             found: format!("{text:?}"),
             expected,
@@ -119,41 +100,30 @@ fn resolve(
 }
 
 /// The parser's error, or the better words for a file that has `[sensor]` in place of `[[sensor]]`.
-fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Error {
-    let path = path.to_owned();
+fn syntax(text: &str, error: &toml::de::Error) -> Problem {
     let table = text.parse::<toml::Table>().unwrap_or_default();
     if table.get("sensor").is_some_and(toml::Value::is_table) {
-        return Error::SingleBrackets { path };
+        return Problem::SingleBrackets;
     }
-    Error::Syntax {
-        path,
-        problem: wording::of_toml(text, error),
-    }
+    Problem::Syntax(wording::of_toml(text, error))
 }
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
-pub(super) fn model(
-    config: &Config,
-    most: Duration,
-    path: &Path,
-    until: Until,
-) -> Result<Hrn, Error> {
+pub(super) fn model(config: &Config, most: Duration, until: Until) -> Result<Hrn, Problem> {
     let model = &config.model;
     let hrn = match &model.path {
         None => Hrn::load(model.built_in.bytes()),
         Some(file) => {
             let bytes = read(file, verdict::MAX_FILE_BYTES, until);
-            let bytes = bytes.map_err(|source| Error::ModelUnreadable {
-                path: path.to_owned(),
+            let bytes = bytes.map_err(|source| Problem::ModelUnreadable {
                 model: file.clone(),
                 source,
             })?;
             trial::load(&bytes, Some(most))
         }
     };
-    let hrn = hrn.map_err(|problem| Error::Model {
-        path: path.to_owned(),
+    let hrn = hrn.map_err(|problem| Problem::Model {
         model: model.path.as_ref().map_or_else(
             || "the model built in".to_owned(),
             |file| file.display().to_string(),
@@ -163,8 +133,7 @@ pub(super) fn model(
     if let Some(expected) = &model.sha256
         && !expected.eq_ignore_ascii_case(hrn.sha256())
     {
-        return Err(Error::ModelHash {
-            path: path.to_owned(),
+        return Err(Problem::ModelHash {
             found: hrn.sha256().to_owned(),
             expected: expected.clone(),
         });
@@ -178,11 +147,7 @@ pub(super) fn model(
         shore: format!("{}-{}", table.shore[0], table.shore[1]),
     };
     let levels: Vec<Level> = (1..=u8::MAX).zip(&config.levels).map(level).collect();
-    let refused = |source: LevelsError| Error::Levels {
-        path: path.to_owned(),
-        source,
-    };
-    hrn.with_levels(levels).map_err(refused)
+    Ok(hrn.with_levels(levels)?)
 }
 
 /// The model with the references in `file`, which are those of `sensor`.
@@ -190,11 +155,9 @@ pub(super) fn identified(
     hrn: &Hrn,
     file: &Path,
     sensor: &str,
-    path: &Path,
     until: Until,
-) -> Result<Hrn, Error> {
-    let refused = |source: ReferencesProblem| Error::References {
-        path: path.to_owned(),
+) -> Result<Hrn, Problem> {
+    let refused = |source: ReferencesProblem| Problem::References {
         sensor: sensor.to_owned(),
         file: file.to_owned(),
         source: Box::new(source),

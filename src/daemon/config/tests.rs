@@ -2,6 +2,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::*;
+use hardnessd_core::exit::{CONFIG, Coded};
 use hardnessd_core::npy;
 
 fn load(text: &str) -> Result<Config, String> {
@@ -319,7 +320,7 @@ fn a_file_that_is_no_utf_8_is_a_bad_one_and_its_place_is_named() {
         text.contains("toml: invalid utf-8 sequence of 1 bytes from index 13"),
         "{text}"
     );
-    assert!(matches!(error, Error::Syntax { .. }));
+    assert_eq!(error.exit_code(), CONFIG);
 }
 
 #[test]
