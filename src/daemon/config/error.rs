@@ -3,10 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use hardnessd_core::exit::{CONFIG, Coded, NO_INPUT};
-use hardnessd_core::npy::NpyError;
-use hardnessd_core::references;
 use hardnessd_core::sensor::SensorError;
-use hardnessd_core::verdict::{LevelsError, ModelError, ReferencesError};
+use hardnessd_core::verdict::LevelsError;
 
 /// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
 /// dead.
@@ -94,37 +92,19 @@ pub(super) enum Problem {
         /// The feature of the package, which is also the table's name.
         feature: &'static str,
     },
-    /// A file of gains cannot be read, or does not hold gains.
-    #[error("sensor.calibration.gains of {sensor:?}: {}", of_gains(file, source))]
-    Gains {
-        /// The sensor's name.
-        sensor: String,
-        /// The path of the file of gains.
+    /// A file that the configuration names cannot be used.
+    #[error("{key}: {file}: {source}")]
+    File {
+        /// The key, as it is written in the file.
+        key: String,
+        /// The path of the file, or "the model built in".
         file: PathBuf,
         /// The reason the file cannot be used.
-        source: NpyError,
-    },
-    /// A file of references cannot be used.
-    #[error("sensor.references of {sensor:?}: {file}: {source}")]
-    References {
-        /// The sensor's name.
-        sensor: String,
-        /// The path of the file of references.
-        file: PathBuf,
-        /// The reason the file cannot be used.
-        source: Box<ReferencesProblem>,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// The model cannot have the levels of the configuration.
     #[error("level: {0}")]
     Levels(#[from] LevelsError),
-    /// The model file cannot be read.
-    #[error("model.path: cannot read {model}: {source}")]
-    ModelUnreadable {
-        /// The path of the model file.
-        model: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
     /// The model has another hash than `model.sha256`.
     #[error("model.sha256: found a model of {found}, expected {expected}")]
     ModelHash {
@@ -133,39 +113,6 @@ pub(super) enum Problem {
         /// The hash in `model.sha256`.
         expected: String,
     },
-    /// The model is refused.
-    #[error("model.path: {model}: {source}")]
-    Model {
-        /// The path of the model file, or "the model built in".
-        model: String,
-        /// The reason the model is refused.
-        source: Box<ModelError>,
-    },
-}
-
-/// The reason why a file of references cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ReferencesProblem {
-    /// The file cannot be read.
-    #[error("cannot read: {0}")]
-    Unreadable(#[source] std::io::Error),
-    /// The file holds no references.
-    #[error(transparent)]
-    File(#[from] references::Error),
-    /// There are more than the model takes.
-    #[error("found {found} presses, expected at most {expected}, as many as the model takes")]
-    Many {
-        /// The number of presses in the file.
-        found: usize,
-        /// The most that the model takes.
-        expected: usize,
-    },
-    /// The model fails on one of them.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The model cannot take what it computed.
-    #[error(transparent)]
-    Identified(#[from] ReferencesError),
 }
 
 impl Coded for Error {
@@ -174,15 +121,6 @@ impl Coded for Error {
             Problem::Unreadable(_) => NO_INPUT,
             _ => CONFIG,
         }
-    }
-}
-
-/// The message about an unusable file of gains.
-fn of_gains(file: &Path, source: &NpyError) -> String {
-    let file = file.display();
-    match source {
-        NpyError::Io(error) => format!("cannot read {file}: {error}"),
-        found => format!("{file}: found {found}, expected f32 [rows, cols]"),
     }
 }
 

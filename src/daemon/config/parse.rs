@@ -1,16 +1,16 @@
 //! Reads the file into a [`Config`], and loads the model that the file names.
 
+use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::error::{MAX_BYTES, Problem, ReferencesProblem};
+use super::error::{MAX_BYTES, Problem};
 use super::read::{Until, read};
 use super::{Config, LevelTable};
 use crate::daemon::port::Port;
-use hardnessd_core::npy::{self, NpyError};
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, Hrn, Level};
-use hardnessd_core::{references, trial, wording};
+use hardnessd_core::{npy, references, trial, wording};
 
 pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
     let bytes = read(path, MAX_BYTES, until).map_err(Problem::Unreadable)?;
@@ -28,11 +28,11 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
                 });
             }
             let key = format!("sensor.port of {:?}", sensor.name);
-            resolve(device, directory, key, "the path of a device")?;
+            resolve(device, directory, &key, "the path of a device")?;
         }
         if let Some(file) = &mut sensor.references {
             let key = format!("sensor.references of {:?}", sensor.name);
-            resolve(file, directory, key, "the path of an .npz file")?;
+            resolve(file, directory, &key, "the path of an .npz file")?;
         }
         if let Some(given) = &mut sensor.calibration.gains {
             *given = gains(given, directory, &sensor.name, until)?;
@@ -50,7 +50,7 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
     ];
     for (key, given) in paths {
         if let Some(Some(given)) = given {
-            resolve(given, directory, key.to_owned(), "a path")?;
+            resolve(given, directory, key, "a path")?;
         }
     }
     Ok(config)
@@ -67,15 +67,28 @@ fn gains(given: &Gains, directory: &Path, sensor: &str, until: Until) -> Result<
         });
     };
     let mut file = file.clone();
-    resolve(&mut file, directory, key, "the path of an .npy file")?;
-    let refused = |source| Problem::Gains {
-        sensor: sensor.to_owned(),
-        file: file.clone(),
-        source,
-    };
-    let bytes = read(&file, MAX_BYTES, until).map_err(|source| refused(NpyError::Io(source)))?;
-    let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
+    resolve(&mut file, directory, &key, "the path of an .npy file")?;
+    let bytes = read_named(&key, &file, MAX_BYTES, until)?;
+    let rows = npy::table(&mut bytes.as_slice()).map_err(|found| {
+        let problem = format!("found {found}, expected f32 [rows, cols]");
+        unusable(&key, &file, problem)
+    })?;
     Ok(Gains::Taxels(rows))
+}
+
+/// Reads the file that the configuration names at `key`.
+fn read_named(key: &str, file: &Path, most: usize, until: Until) -> Result<Vec<u8>, Problem> {
+    let bytes = read(file, most, until);
+    bytes.map_err(|error| unusable(key, file, format!("cannot read: {error}")))
+}
+
+/// The problem of the file that the configuration names at `key`.
+fn unusable(key: &str, file: &Path, source: impl Into<Box<dyn Error + Send + Sync>>) -> Problem {
+    Problem::File {
+        key: key.to_owned(),
+        file: file.to_owned(),
+        source: source.into(),
+    }
 }
 
 /// Resolves a path of the configuration against its directory. An empty path is refused, because it
@@ -84,13 +97,13 @@ fn gains(given: &Gains, directory: &Path, sensor: &str, until: Until) -> Result<
 fn resolve(
     given: &mut PathBuf,
     directory: &Path,
-    key: String,
+    key: &str,
     expected: &'static str,
 ) -> Result<(), Problem> {
     let text = given.to_string_lossy();
     if text.is_empty() || !wording::is_plain(&text) {
         return Err(Problem::Value {
-            key,
+            key: key.to_owned(),
             found: format!("{text:?}"),
             expected,
         });
@@ -111,25 +124,18 @@ fn syntax(text: &str, error: &toml::de::Error) -> Problem {
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
 pub(super) fn model(config: &Config, most: Duration, until: Until) -> Result<Hrn, Problem> {
-    let model = &config.model;
-    let hrn = match &model.path {
-        None => Hrn::load(model.built_in.bytes()),
+    let (key, model) = ("model.path", &config.model);
+    let (file, hrn) = match &model.path {
+        None => (
+            Path::new("the model built in"),
+            Hrn::load(model.built_in.bytes()),
+        ),
         Some(file) => {
-            let bytes = read(file, verdict::MAX_FILE_BYTES, until);
-            let bytes = bytes.map_err(|source| Problem::ModelUnreadable {
-                model: file.clone(),
-                source,
-            })?;
-            trial::load(&bytes, Some(most))
+            let bytes = read_named(key, file, verdict::MAX_FILE_BYTES, until)?;
+            (file.as_path(), trial::load(&bytes, Some(most)))
         }
     };
-    let hrn = hrn.map_err(|problem| Problem::Model {
-        model: model.path.as_ref().map_or_else(
-            || "the model built in".to_owned(),
-            |file| file.display().to_string(),
-        ),
-        source: Box::new(problem),
-    })?;
+    let hrn = hrn.map_err(|error| unusable(key, file, error))?;
     if let Some(expected) = &model.sha256
         && !expected.eq_ignore_ascii_case(hrn.sha256())
     {
@@ -157,26 +163,20 @@ pub(super) fn identified(
     sensor: &str,
     until: Until,
 ) -> Result<Hrn, Problem> {
-    let refused = |source: ReferencesProblem| Problem::References {
-        sensor: sensor.to_owned(),
-        file: file.to_owned(),
-        source: Box::new(source),
-    };
-    let bytes = read(file, references::MAX_FILE_BYTES, until);
-    let bytes = bytes.map_err(|source| refused(ReferencesProblem::Unreadable(source)))?;
-    let presses = references::read(&bytes).map_err(|source| refused(source.into()))?;
-    if hrn.most_references() == 0 {
+    let key = format!("sensor.references of {sensor:?}");
+    let bytes = read_named(&key, file, references::MAX_FILE_BYTES, until)?;
+    let presses = references::read(&bytes).map_err(|error| unusable(&key, file, error))?;
+    let (found, most) = (presses.len(), hrn.most_references());
+    if most == 0 {
         return Ok(hrn.clone());
     }
-    if presses.len() > hrn.most_references() {
-        return Err(refused(ReferencesProblem::Many {
-            found: presses.len(),
-            expected: hrn.most_references(),
-        }));
+    if found > most {
+        let problem =
+            format!("found {found} presses, expected at most {most}, as many as the model takes");
+        return Err(unusable(&key, file, problem));
     }
-    let references = hrn
-        .references(&presses)
-        .map_err(|source| refused(source.into()))?;
-    hrn.identified(references)
-        .map_err(|source| refused(source.into()))
+    let references = hrn.references(&presses);
+    let references = references.map_err(|error| unusable(&key, file, error))?;
+    let identified = hrn.identified(references);
+    identified.map_err(|error| unusable(&key, file, error))
 }

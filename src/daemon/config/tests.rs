@@ -262,9 +262,9 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
     let write = |bytes: &[u8]| std::fs::write(directory.path().join("gains.npy"), bytes).unwrap();
     let gains = [1.0, 1.1, 0.9, 1.0, 0.5, 2.0];
     let error = checked(&path).unwrap_err();
-    let expected = "hardnessd.toml: sensor.calibration.gains of \"sensor\": cannot read ";
+    let expected = "hardnessd.toml: sensor.calibration.gains of \"sensor\": ";
     assert!(
-        error.contains(expected) && error.contains("gains.npy: No such file"),
+        error.contains(expected) && error.contains("gains.npy: cannot read: No such file"),
         "{error}"
     );
     write(&npy::to_bytes(&gains, 2, 3));
@@ -368,7 +368,10 @@ fn paths_are_relative_to_the_file() {
     assert_eq!(unix.path(), Path::new("/run/events.sock"));
     assert_eq!(unix.control_path(), directory.path().join("c"));
     let error = Setup::load(&path, None).unwrap_err().to_string();
-    assert!(error.contains("model.path: cannot read"), "{error}");
+    assert!(
+        error.contains("model.path: ") && error.contains("hrn.onnx: cannot read: "),
+        "{error}"
+    );
 }
 
 #[test]
@@ -406,12 +409,12 @@ fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
         (
             "gains.npy",
             npy::to_bytes(&[1.0, 1.5], 1, 2),
-            "gains.npy: it did not end in time",
+            "gains.npy: cannot read: it did not end in time",
         ),
         (
             "model.onnx",
             hardnessd_core::verdict::BUILT_IN_HRN.to_vec(),
-            "model.onnx: it did not end in time",
+            "model.onnx: cannot read: it did not end in time",
         ),
     ];
     for (name, bytes, _) in &files {
