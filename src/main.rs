@@ -84,9 +84,9 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Demo(args) => {
             // The events are the output. The log would repeat each of them.
             let _log = Log::start(LogSettings::default(), "error")?;
-            Ok(demo::run(args, signals.received()).await?)
+            demo::run(args, signals.received()).await
         }
-        Command::Simulate(args) => Ok(simulate::run(args, signals.received()).await?),
+        Command::Simulate(args) => simulate::run(args, signals.received()).await,
         Command::Record(args) => {
             let mut end = pin!(signals.received());
             let Some(setup) = load(args.config.path()?, None, end.as_mut()).await? else {
@@ -102,11 +102,11 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
         Command::Replay(args) => finish(signals, replay::run(args)).await,
-        Command::Tail(args) => Ok(tail::run(args, signals.received()).await?),
+        Command::Tail(args) => tail::run(args, signals.received()).await,
         #[cfg(feature = "watch")]
         Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
         #[cfg(feature = "zenoh")]
-        Command::Fleet(args) => Ok(fleet::run(args, signals.received()).await?),
+        Command::Fleet(args) => fleet::run(args, signals.received()).await,
         Command::Tare(target) => {
             finish(signals, control::run(control::Command::Tare(target))).await
         }
@@ -160,20 +160,20 @@ async fn identify(args: identify::Args, signals: Signals) -> Result<(), Failure>
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.
-async fn finish<E: Into<Failure>>(
+async fn finish(
     signals: Signals,
-    work: impl Future<Output = Result<(), E>>,
+    work: impl Future<Output = Result<(), Failure>>,
 ) -> Result<(), Failure> {
     tokio::select! {
-        done = work => done.map_err(Into::into),
+        done = work => done,
         stop = signals.end() => Err(stop.into()),
     }
 }
 
 /// Like [`finish`], for work that blocks. The work runs on another thread.
-async fn finish_blocking<E: Into<Failure> + Send + 'static>(
+async fn finish_blocking(
     signals: Signals,
-    work: impl FnOnce() -> Result<(), E> + Send + 'static,
+    work: impl FnOnce() -> Result<(), Failure> + Send + 'static,
 ) -> Result<(), Failure> {
     let done = apart::start("work", work)?;
     finish(signals, async {

@@ -29,6 +29,7 @@ pub use self::publish::{
 use self::read::Until;
 use super::log;
 use super::port::Port;
+use hardnessd_core::exit::{Coded, USAGE};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{self, Format, Hrn};
 use hardnessd_core::{motion, press, tare, trial, wire};
@@ -418,6 +419,12 @@ pub struct Setup {
 pub struct UnknownSensor {
     found: String,
     names: Vec<String>,
+}
+
+impl Coded for UnknownSensor {
+    fn exit_code(&self) -> u8 {
+        USAGE
+    }
 }
 
 impl Setup {

@@ -18,13 +18,14 @@ use std::sync::Arc;
 use clap::{Args as ClapArgs, ValueEnum};
 
 use self::gather::Press;
-use super::Unreadable;
+use super::Unplayable;
 use super::configuration::Configuration;
+use super::exit::Failure;
 use super::live;
 use super::simulate::{OutOfRange, within};
-use crate::apart::{self, NoThread};
-use crate::daemon::config::{Setup, UnknownSensor};
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use crate::apart;
+use crate::daemon::config::Setup;
+use hardnessd_core::exit::{Coded, FAILED, IO, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
@@ -79,49 +80,24 @@ pub enum What {
     Taxels,
 }
 
-/// The reason why there are no values.
+/// The reason why presses have no values.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
-    /// The configuration has no sensor of this name.
-    #[error(transparent)]
-    NoSensor(#[from] UnknownSensor),
     /// Weights were given, but not for `calibrate force`.
     #[error("--newtons is only for `calibrate force`: leave it out")]
     Unasked,
     /// A file was given, but not for `calibrate taxels`.
     #[error("--out is only for `calibrate taxels`: leave it out")]
     NoFile,
-    /// The presses cannot be recorded.
-    #[error(transparent)]
-    Live(#[from] live::Error),
-    /// A recording that the command line names cannot be opened.
-    #[error("{path}: {source}")]
-    Missing {
-        /// The path on the command line.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// A recording cannot be read.
-    #[error("{path}: {source}")]
-    Recording {
-        /// The path of the recording, or words for the recording that was made just now.
-        path: String,
-        /// The error of the recording.
-        source: Unreadable,
-    },
     /// The presses do not determine the values of the arm.
     #[error(transparent)]
-    Arm(#[from] arm::Unfit),
+    Arm(arm::Unfit),
     /// The weights do not determine the newtons per count.
     #[error(transparent)]
-    Force(#[from] force::Unfit),
+    Force(force::Unfit),
     /// The presses do not determine the gains.
     #[error(transparent)]
-    Taxels(#[from] taxels::Unfit),
+    Taxels(taxels::Unfit),
     /// The number of presses is not the number of weights.
     #[error("found {found} presses, expected {expected}: put each weight on once")]
     Count {
@@ -138,24 +114,14 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Live(error) => error.exit_code(),
-            Error::NoSensor(_) | Error::Unasked | Error::NoFile => USAGE,
-            Error::Missing { .. } => NO_INPUT,
-            Error::Recording { source, .. } if source.is_io() => IO,
-            Error::Arm(_)
-            | Error::Force(_)
-            | Error::Taxels(_)
-            | Error::Count { .. }
-            | Error::Recording { .. } => FAILED,
-            Error::Out { .. } | Error::Print(_) | Error::Thread(_) => IO,
+            Error::Unasked | Error::NoFile => USAGE,
+            Error::Arm(_) | Error::Force(_) | Error::Taxels(_) | Error::Count { .. } => FAILED,
+            Error::Out { .. } => IO,
         }
     }
 }
@@ -186,19 +152,19 @@ impl Args {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the daemon cannot serve, a recording cannot be read, or the presses do not
-/// determine the values.
+/// Returns a [`Failure`] if the daemon cannot serve, a recording cannot be read, or the presses do
+/// not determine the values.
 pub async fn run(
     args: Args,
     setup: Setup,
     config: &Path,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     if !matches!(args.what, What::Force) && !args.newtons.is_empty() {
-        return Err(Error::Unasked);
+        return Err(Error::Unasked.into());
     }
     if !matches!(args.what, What::Taxels) && args.out.is_some() {
-        return Err(Error::NoFile);
+        return Err(Error::NoFile.into());
     }
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // Test the output file now, before anybody presses two hundred times.
@@ -208,7 +174,7 @@ pub async fn run(
             let path = named.unwrap_or_else(|| config.with_file_name(GAINS));
             match Part::new(&path) {
                 Ok(part) => Some((path, part)),
-                Err(source) => return Err(Error::Out { path, source }),
+                Err(source) => return Err(Error::Out { path, source }.into()),
             }
         }
         What::Arm | What::Force => None,
@@ -229,14 +195,15 @@ pub async fn run(
         }
     };
     let text = match args.what {
-        What::Arm => of_arm(&arm::Fit::of(&presses)?),
+        What::Arm => of_arm(&arm::Fit::of(&presses).map_err(Error::Arm)?),
         What::Force => {
             let (found, expected) = (presses.len(), args.newtons.len());
             if found != expected {
-                return Err(Error::Count { found, expected });
+                return Err(Error::Count { found, expected }.into());
             }
             let weights = args.newtons.iter().copied().zip(&presses);
-            let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor)?;
+            let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor);
+            let fit = fit.map_err(Error::Force)?;
             let error = fit.error();
             if error > DOUBTFUL_ERROR {
                 hardnessd_core::stderr_line!(
@@ -259,7 +226,7 @@ pub async fn run(
             let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
             let dead = &dead_taxels(&sensor, &presses);
             let array = sensor.layout().array();
-            let fit = taxels::Fit::of(&plain, array, dead)?;
+            let fit = taxels::Fit::of(&plain, array, dead).map_err(Error::Taxels)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
             let (path, part) = out.expect("the gains have a file");
             part.write(&bytes).map_err(|source| Error::Out {
@@ -269,9 +236,7 @@ pub async fn run(
             of_taxels(&fit, array, dead, &super::as_in(config, &path))
         }
     };
-    super::print_apart(text.into_bytes())
-        .await
-        .map_err(Error::Print)?;
+    super::print_apart(text.into_bytes()).await?;
     Ok(())
 }
 
@@ -281,7 +246,7 @@ async fn live(
     setup: Setup,
     sensor: &Sensor,
     shutdown: impl Future<Output = ()>,
-) -> Result<Option<Vec<Press>>, Error> {
+) -> Result<Option<Vec<Press>>, Failure> {
     let hrn = setup.hrn.clone();
     let print_next = |seen| print_next(args, seen);
     let recorded = live::record(setup, sensor.name(), args.wanted(), print_next, shutdown);
@@ -289,10 +254,7 @@ async fn live(
         return Ok(None);
     };
     let read = gather::presses(recorded, sensor, hrn, matches!(args.what, What::Arm));
-    let mut presses = read.map_err(|source| Error::Recording {
-        path: "what was recorded".to_owned(),
-        source,
-    })?;
+    let mut presses = read.map_err(Unplayable::at(Path::new(live::RECORDED)))?;
     // Something else may have been pressed before the recording ended.
     presses.truncate(args.wanted() as usize);
     Ok(Some(presses))
@@ -304,18 +266,12 @@ fn recorded(
     sensor: &Sensor,
     hrn: &Arc<Hrn>,
     with_track: bool,
-) -> Result<Vec<Press>, Error> {
+) -> Result<Vec<Press>, Failure> {
     let mut presses = Vec::new();
     for path in files {
-        let file = super::open(path).map_err(|source| Error::Missing {
-            path: path.clone(),
-            source,
-        })?;
+        let file = super::open(path)?;
         let read = gather::presses(file, sensor, hrn.clone(), with_track);
-        presses.extend(read.map_err(|source| Error::Recording {
-            path: path.display().to_string(),
-            source,
-        })?);
+        presses.extend(read.map_err(Unplayable::at(path))?);
     }
     Ok(presses)
 }

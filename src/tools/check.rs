@@ -1,17 +1,17 @@
 //! `hardnessd check`: prints what the daemon would run, without opening a device.
 
-use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 use rustix::fs::Access;
 
-use super::configuration::{self, Configuration};
+use super::configuration::Configuration;
+use super::exit::Failure;
 use crate::daemon;
 use crate::daemon::baud::{Excess, Load, Pace};
-use crate::daemon::config::{self, Endpoint, SensorTable, Setup};
-use hardnessd_core::exit::{CONFIG, Coded, IO};
+use crate::daemon::config::{Endpoint, SensorTable, Setup};
+use hardnessd_core::exit::{CONFIG, Coded};
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::tare::{self, Gains};
 use hardnessd_core::verdict::Card;
@@ -35,12 +35,6 @@ pub struct Args {
 /// An error of a configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The configuration cannot be used.
-    #[error(transparent)]
-    Config(#[from] config::Error),
-    /// There is no configuration.
-    #[error(transparent)]
-    Missing(#[from] configuration::Missing),
     /// A path that the configuration names cannot be written to.
     #[error("{path}: {source}")]
     Daemon {
@@ -59,19 +53,13 @@ pub enum Error {
         /// What the line cannot carry.
         excess: Excess,
     },
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Config(error) => error.exit_code(),
             Error::Daemon { source, .. } => source.exit_code(),
-            Error::Missing(error) => error.exit_code(),
             Error::FrameRate { .. } => CONFIG,
-            Error::Print(_) => IO,
         }
     }
 }
@@ -80,9 +68,9 @@ impl Coded for Error {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the configuration or its model cannot be used, a line cannot carry its
+/// Returns a [`Failure`] if the configuration or its model cannot be used, a line cannot carry its
 /// frames, or a path for sockets, the log or recordings cannot be written to.
-pub fn run(args: &Args) -> Result<(), Error> {
+pub fn run(args: &Args) -> Result<(), Failure> {
     let path = &args.config.path()?;
     let setup = Setup::load(path, None)?;
     daemon::check(&setup.config).map_err(|source| Error::Daemon {
@@ -151,9 +139,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
         }
     }
     lines += &networks(&setup, path);
-    super::print(lines.as_bytes())
-        .map(drop)
-        .map_err(Error::Print)
+    super::print(lines.as_bytes())?;
+    Ok(())
 }
 
 /// Warns if you may not make a socket at `socket`. It is no error, because the daemon may run as another

@@ -38,11 +38,8 @@ pub struct ModelFile {
 
 /// The file of `--model` cannot be read.
 #[derive(Debug, thiserror::Error)]
-#[error("--model {path}: cannot read: {source}")]
-pub struct NoModel {
-    path: PathBuf,
-    source: std::io::Error,
-}
+#[error("--model {0}")]
+pub struct NoModel(#[source] super::CannotRead);
 
 impl Coded for NoModel {
     fn exit_code(&self) -> u8 {
@@ -60,13 +57,8 @@ impl ModelFile {
         let Some(path) = &self.model else {
             return Ok(None);
         };
-        match super::open(path) {
-            Ok(_) => Ok(Some(path.clone())),
-            Err(source) => Err(NoModel {
-                path: path.clone(),
-                source,
-            }),
-        }
+        super::open(path).map_err(NoModel)?;
+        Ok(Some(path.clone()))
     }
 }
 

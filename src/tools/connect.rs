@@ -19,6 +19,7 @@ use super::demo;
 use crate::apart;
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{LineRead, Lines};
+use hardnessd_core::exit::{Coded, UNAVAILABLE};
 
 /// The reason why there is no daemon where a line begins with `HTTP/`.
 pub(super) const WEB_SERVER: &str = "a web server answers there, such as the live page's: name the address \
@@ -119,6 +120,12 @@ pub enum Error {
         /// The address.
         address: Address,
     },
+}
+
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        UNAVAILABLE
+    }
 }
 
 /// The longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame

@@ -8,7 +8,8 @@ use clap::Args as ClapArgs;
 use serde_json::{Map, Value, json};
 
 use super::connect::{self, Connection};
-use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
+use super::exit::Failure;
+use hardnessd_core::exit::{Coded, FAILED};
 use hardnessd_core::wording;
 
 /// The sensor and the socket of a command.
@@ -59,27 +60,17 @@ fn pair(text: &str) -> Result<(String, Value), &'static str> {
 /// The reason why a command was not carried out.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// There is no connection to a daemon.
-    #[error(transparent)]
-    Connect(#[from] connect::Error),
     /// The daemon refused the command.
     #[error("{0}")]
     Refused(String),
     /// The daemon did not answer in time.
     #[error("no answer within {} s", ANSWER.as_secs())]
     Mute,
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] std::io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
-        match self {
-            Error::Connect(_) => UNAVAILABLE,
-            Error::Refused(_) | Error::Mute => FAILED,
-            Error::Print(_) => IO,
-        }
+        FAILED
     }
 }
 
@@ -90,8 +81,8 @@ const ANSWER: Duration = Duration::from_secs(60);
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if no daemon answers, or the daemon refuses.
-pub async fn run(command: Command) -> Result<(), Error> {
+/// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
+pub async fn run(command: Command) -> Result<(), Failure> {
     let (target, request) = match command {
         Command::Tare(target) => {
             let request = json!({"tare": target.sensor, "id": 1});
@@ -113,15 +104,15 @@ pub async fn run(command: Command) -> Result<(), Error> {
     let answer = answer.map_err(|_| Error::Mute)??;
     if answer["type"] == "error" {
         let message = answer["message"].as_str().unwrap_or_default();
-        return Err(Error::Refused(wording::escaped(message)));
+        return Err(Error::Refused(wording::escaped(message)).into());
     }
     let line = in_words(&answer) + "\n";
-    super::print(line.as_bytes()).map_err(Error::Print)?;
+    super::print(line.as_bytes())?;
     Ok(())
 }
 
 /// The answer to the command. Other lines come before it.
-async fn answer(daemon: &mut Connection) -> Result<Value, Error> {
+async fn answer(daemon: &mut Connection) -> Result<Value, connect::Error> {
     loop {
         let line = daemon.next().await?;
         let answer: Value = serde_json::from_str(&line).unwrap_or_default();

@@ -25,19 +25,20 @@ use tokio::time::Instant;
 use self::account::Account;
 use self::place::Place;
 pub(super) use self::place::sockets;
-use super::configuration::{ModelFile, NoModel};
+use super::Stdout;
+use super::configuration::ModelFile;
+use super::exit::Failure;
 use super::faults::Faults;
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
 use super::simulate::{OutOfRange, within};
-use crate::apart::NoThread;
+use crate::daemon::Daemon;
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::{Config, Http, SensorTable, Setup};
-use crate::daemon::{self, Daemon};
 use crate::maybe;
-use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
+use hardnessd_core::exit::{Coded, FAILED, IO};
 use hardnessd_core::motion;
-use hardnessd_core::wire::{Layout, LayoutError};
+use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
 /// What `--help` says below the options.
@@ -72,19 +73,7 @@ pub struct Args {
 /// The reason why the demonstration failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The daemon's configuration or model cannot be used.
-    #[error(transparent)]
-    Config(#[from] daemon::config::Error),
-    /// The file of `--model` cannot be read.
-    #[error(transparent)]
-    Model(#[from] NoModel),
-    /// The daemon failed.
-    #[error(transparent)]
-    Daemon(#[from] daemon::Error),
-    /// The sensor's layout cannot be used.
-    #[error(transparent)]
-    Layout(#[from] LayoutError),
-    /// The pty, the socket or stdout failed.
+    /// The pty or the socket failed.
     #[error("{what}: {source}")]
     Io {
         /// The part that failed, such as the pty.
@@ -92,9 +81,6 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
     /// Some presses got no verdict.
     #[error("only {found} of {presses} presses got a verdict")]
     Missed {
@@ -111,12 +97,8 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Config(error) => error.exit_code(),
-            Error::Model(error) => error.exit_code(),
-            Error::Daemon(error) => error.exit_code(),
             Error::Missed { .. } | Error::Closed => FAILED,
-            Error::Io { .. } | Error::Thread(_) => IO,
-            Error::Layout(_) => CONFIG,
+            Error::Io { .. } => IO,
         }
     }
 }
@@ -131,9 +113,9 @@ const PATIENCE: Duration = Duration::from_secs(3);
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the daemon, the pty, the socket or stdout fails, or a press gets no
+/// Returns a [`Failure`] if the daemon, the pty, the socket or stdout fails, or a press gets no
 /// verdict.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     let io = |what| move |source| Error::Io { what, source };
     let place = Place::new().map_err(io("directory for socket and port"))?;
     let port = place.port();
@@ -141,7 +123,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         name: "demo".to_owned(),
         ..SensorTable::new(port.clone())
     };
-    let layout = Layout::new(&sensor.frame)?;
+    let layout = Layout::new(&sensor.frame).expect("the default layout can be used");
     let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud.get());
     sensor.arm = motion::Settings {
         stiffness_n_per_mm: Some(ARM_N_PER_MM),
@@ -200,7 +182,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         printed
     };
     let (served, printed) = tokio::join!(daemon, printing);
-    printed.and(served.map_err(Error::Daemon))
+    printed?;
+    Ok(served?)
 }
 
 /// Parses `--speed`. Above 100, less than 2 ms would remain between frames, which a busy machine's
@@ -254,7 +237,7 @@ async fn print(
     sequence: SequenceSettings,
     mut shown: Shown,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     let printed = print_events(subscriber, presses, player, sequence, &mut shown, shutdown).await;
     if let Shown::Lines(account) = &shown {
         let last = super::print_apart((account.close() + "\n").into_bytes());
@@ -271,7 +254,7 @@ async fn print_events(
     sequence: SequenceSettings,
     shown: &mut Shown,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     let io = |what| move |source| Error::Io { what, source };
     let mut lines = BufReader::new(subscriber);
     let mut line = Vec::new();
@@ -293,14 +276,14 @@ async fn print_events(
             () = &mut shutdown => return Ok(()),
             printed = maybe::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
-                let printed: io::Result<bool> = printed;
-                if !printed.map_err(io("stdout"))? || Some(finals) == presses {
+                let printed: Result<bool, Stdout> = printed;
+                if !printed? || Some(finals) == presses {
                     return Ok(());
                 }
             }
             read = lines.read_until(b'\n', &mut line), if printing.is_none() => {
                 if read.map_err(io("socket"))? == 0 {
-                    return Err(Error::Closed);
+                    return Err(Error::Closed.into());
                 }
                 let event = serde_json::from_slice(&line).unwrap_or_default();
                 finals += u32::from(is_final(&event));
@@ -318,7 +301,8 @@ async fn print_events(
                 if missed {
                     return Ok(());
                 }
-                return Err(Error::Missed { found: finals, presses: presses.unwrap_or(0) });
+                let presses = presses.unwrap_or(0);
+                return Err(Error::Missed { found: finals, presses }.into());
             }
         }
     }

@@ -8,14 +8,14 @@ mod checks;
 #[cfg(test)]
 mod tests;
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, in_the_way, network, ports, refused};
+use super::exit::Failure;
 use crate::daemon::port::Port;
-use hardnessd_core::exit::{Coded, FAILED, IO};
+use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
 use hardnessd_core::wording::escaped;
 
 /// What `--help` says below the options.
@@ -35,26 +35,17 @@ pub struct Args {
     port: Option<Port>,
 }
 
-/// An error of `doctor`.
+/// Faults were found, and stdout names them.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// Faults were found, and stdout names them.
-    #[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
-    Faults {
-        /// The number of faults.
-        found: usize,
-    },
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
+#[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
+pub struct Faults {
+    /// The number of faults.
+    found: usize,
 }
 
-impl Coded for Error {
+impl Coded for Faults {
     fn exit_code(&self) -> u8 {
-        match self {
-            Error::Faults { .. } => FAILED,
-            Error::Print(_) => IO,
-        }
+        FAILED
     }
 }
 
@@ -80,6 +71,12 @@ pub struct Unavailable {
     obstacle: String,
 }
 
+impl Coded for Unavailable {
+    fn exit_code(&self) -> u8 {
+        UNAVAILABLE
+    }
+}
+
 impl Unavailable {
     /// `reason` is the system's. It counts where no fault is visible.
     pub(super) fn new(sensor: String, port: Port, reason: String) -> Self {
@@ -100,9 +97,8 @@ fn absolute(path: &Path) -> PathBuf {
 ///
 /// # Errors
 ///
-/// Returns [`Error::Faults`] if there is a fault, and [`Error::Print`] if stdout cannot be written
-/// to.
-pub fn run(args: &Args) -> Result<(), Error> {
+/// Returns [`Faults`] if there is a fault, and [`super::Stdout`] if stdout cannot be written to.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let root = Path::new("/");
     let user = User::of_this_process(root);
     let ports = match &args.port {
@@ -139,9 +135,9 @@ pub fn run(args: &Args) -> Result<(), Error> {
         }
     }
     let printed: String = lines.iter().map(|line| escaped(line) + "\n").collect();
-    super::print(printed.as_bytes()).map_err(Error::Print)?;
+    super::print(printed.as_bytes())?;
     match found {
         0 => Ok(()),
-        found => Err(Error::Faults { found }),
+        found => Err(Faults { found }.into()),
     }
 }

@@ -18,6 +18,8 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use self::robots::{ASK, Fleet};
 use self::session::{PATIENCE, Session, WAITING};
+use super::Stdout;
+use super::exit::Failure;
 use super::simulate::positive;
 use crate::daemon::config::Endpoint;
 use crate::daemon::now;
@@ -54,16 +56,13 @@ pub enum Error {
     /// The system gave no thread.
     #[error("no thread for zenoh: {0}")]
     Thread(#[source] io::Error),
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Unavailable { .. } => UNAVAILABLE,
-            Error::Thread(_) | Error::Print(_) => IO,
+            Error::Thread(_) => IO,
         }
     }
 }
@@ -84,8 +83,8 @@ fn endpoint(text: &str) -> Result<Endpoint, String> {
 ///
 /// # Errors
 ///
-/// [`Error`], if no router or peer answers, or stdout cannot be written to.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+/// A [`Failure`], if no router or peer answers, or stdout cannot be written to.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     let mut shutdown = std::pin::pin!(shutdown);
     let (sender, mut news) = mpsc::channel(WAITING);
     let opened = tokio::select! {
@@ -94,7 +93,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     };
     let Some(session) = opened else {
         let connect = args.connect;
-        return Err(Error::Unavailable { connect });
+        return Err(Error::Unavailable { connect }.into());
     };
     let mut fleet = Fleet::default();
     let mut tick = tokio::time::interval_at(Instant::now() + TICK, TICK);
@@ -110,8 +109,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             () = &mut shutdown => return Ok(()),
             printed = maybe::wait(printing.as_mut().as_pin_mut()) => {
                 printing.set(None);
-                let printed: io::Result<bool> = printed;
-                if !printed.map_err(Error::Print)? || is_over {
+                let printed: Result<bool, Stdout> = printed;
+                if !printed? || is_over {
                     return Ok(());
                 }
                 continue;

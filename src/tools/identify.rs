@@ -14,11 +14,12 @@ use std::sync::Arc;
 use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
+use super::exit::Failure;
 use super::replay::{self, feed, no_frame};
-use super::{Unreadable, live, open, print_apart};
-use crate::apart::{self, NoThread};
-use crate::daemon::config::{self, Config, Setup, UnknownSensor};
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use super::{CannotRead, Unplayable, Unreadable, live, open, print_apart};
+use crate::apart;
+use crate::daemon::config::{self, Config, Setup};
+use hardnessd_core::exit::{Coded, FAILED, IO, USAGE};
 use hardnessd_core::motion::Point;
 use hardnessd_core::part::{Part, directory_of};
 use hardnessd_core::pipeline::{Clock, Pipeline};
@@ -104,15 +105,6 @@ impl FromStr for What {
 /// The reason why there are no references.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The configuration or its model cannot be used.
-    #[error(transparent)]
-    Config(#[from] config::Error),
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
-    /// The configuration has no sensor of this name.
-    #[error(transparent)]
-    NoSensor(#[from] UnknownSensor),
     /// Nothing says what is pressed now.
     #[error("--as: found nothing, expected what will be pressed, such as flat:20 or ball:10")]
     Unnamed,
@@ -151,7 +143,7 @@ pub enum Error {
     #[error("{path}: found no press of sensor {sensor:?}, expected at least one")]
     NoPress {
         /// The path of the recording, or words for the recording that was made just now.
-        path: String,
+        path: PathBuf,
         /// The sensor.
         sensor: String,
     },
@@ -160,28 +152,6 @@ pub enum Error {
     Many {
         /// The number of presses, with those of the file.
         found: usize,
-    },
-    /// The presses cannot be recorded.
-    #[error(transparent)]
-    Live(#[from] live::Error),
-    /// A file cannot be opened.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// The path on the command line.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// Raw bytes or positions cannot be used.
-    #[error(transparent)]
-    Raw(#[from] replay::Error),
-    /// A recording cannot be read.
-    #[error("{path}: {source}")]
-    Recording {
-        /// The path of the recording, or words for the recording that was made just now.
-        path: String,
-        /// The error of the recording.
-        source: Unreadable,
     },
     /// The file to add to is none of references.
     #[error("{path}: {source}")]
@@ -205,21 +175,13 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Self::Config(error) => error.exit_code(),
-            Self::Live(error) => error.exit_code(),
-            Self::Raw(error) => error.exit_code(),
-            Self::NoSensor(_) | Self::Unnamed => USAGE,
-            Self::Unreadable { .. } => NO_INPUT,
-            Self::Recording { source, .. } if source.is_io() => IO,
-            Self::Taken { .. } | Self::Out { .. } | Self::Print(_) | Self::Thread(_) => IO,
+            Self::Unnamed => USAGE,
+            Self::Taken { .. } | Self::Out { .. } => IO,
             _ => FAILED,
         }
     }
@@ -243,20 +205,21 @@ pub fn load(path: &Path) -> Result<Setup, config::Error> {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if there are no presses, nothing says what was pressed, or a file cannot be used.
+/// Returns a [`Failure`] if there are no presses, nothing says what was pressed, or a file cannot be
+/// used.
 pub async fn run(
     args: Args,
     setup: Setup,
     config: &Path,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // A file that cannot be made or added to shows before anything is pressed.
     begin(&args)?;
     let levels = setup.hrn.card().levels.clone();
     let file = if args.files.is_empty() {
         let Some(what) = args.what else {
-            return Err(Error::Unnamed);
+            return Err(Error::Unnamed.into());
         };
         let wanted = args.presses;
         let print_next = |seen: u64| match seen {
@@ -268,11 +231,11 @@ pub async fn run(
         let Some(file) = made else {
             return Ok(());
         };
-        let path = "what was recorded".to_owned();
-        let (mut courses, _) = of_recording(file, &path, sensor.name(), hrn)?;
+        let path = Path::new(live::RECORDED);
+        let (mut courses, _) = of_recording(file, path, sensor.name(), hrn)?;
         // Something else may have been pressed before the recording ended.
         courses.truncate(wanted as usize);
-        made_of(courses, piece(what, &levels)?, &path, &sensor)?
+        made_of(courses, piece(what, &levels)?, path, &sensor)?
     } else {
         let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());
         let work = move || of_files(&args, &sensor, &hrn, &levels);
@@ -284,13 +247,13 @@ pub async fn run(
     };
     let all = write(&args, file)?;
     let text = account(&super::as_in(config, &args.out), &all);
-    print_apart(text.into_bytes()).await.map_err(Error::Print)?;
+    print_apart(text.into_bytes()).await?;
     Ok(())
 }
 
 /// Begins the file, and reads the presses that it has already. Fails if there is a file that nothing is to
 /// be added to.
-fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Error> {
+fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
     let path = || args.out.clone();
     let failed = |source| Error::Out {
         path: path(),
@@ -300,9 +263,9 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Error> {
         return match Part::new(&args.out) {
             Ok(part) => Ok((Vec::new(), part)),
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-                Err(Error::Taken { path: path() })
+                Err(Error::Taken { path: path() }.into())
             }
-            Err(error) => Err(failed(error)),
+            Err(error) => Err(failed(error).into()),
         };
     }
     // It refuses a pipe, whose reading might never end.
@@ -315,19 +278,15 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Error> {
     match read {
         Ok(_) => {}
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Vec::new(), part)),
-        Err(source) => {
-            return Err(Error::Unreadable {
-                path: path(),
-                source,
-            });
-        }
+        Err(error) => return Err(CannotRead::at(&args.out)(error).into()),
     }
     match references::read(&bytes) {
         Ok(known) => Ok((known, part)),
         Err(source) => Err(Error::References {
             path: path(),
             source,
-        }),
+        }
+        .into()),
     }
 }
 
@@ -353,26 +312,20 @@ fn of_files(
     sensor: &Sensor,
     hrn: &Arc<Hrn>,
     levels: &[Level],
-) -> Result<Vec<ReferencePress>, Error> {
+) -> Result<Vec<ReferencePress>, Failure> {
     let motion = match &args.motion {
         None => None,
         Some(path) => Some(replay::positions(path)?),
     };
     let mut all = Vec::new();
     for path in &args.files {
-        let unreadable = |source| Error::Unreadable {
-            path: path.clone(),
-            source,
-        };
-        let file = open(path).map_err(unreadable)?;
-        let (kind, file) = FileKind::read(file).map_err(unreadable)?;
-        let shown = path.display().to_string();
+        let (kind, file) = FileKind::read(open(path)?).map_err(CannotRead::at(path))?;
         let (courses, labels) = match kind {
             FileKind::Recording if motion.is_some() => {
                 return Err(replay::Error::OwnMotion { path: path.clone() }.into());
             }
             FileKind::Recording => {
-                of_recording(BufReader::new(file), &shown, sensor.name(), hrn.clone())?
+                of_recording(BufReader::new(file), path, sensor.name(), hrn.clone())?
             }
             FileKind::Raw => {
                 let courses = of_bytes(file, path, sensor, hrn.clone(), motion.clone())?;
@@ -384,7 +337,7 @@ fn of_files(
             None => labelled(&labels, path)?,
         };
         let courses = spread(courses, args.presses as usize);
-        all.extend(made_of(courses, piece(what, levels)?, &shown, sensor)?);
+        all.extend(made_of(courses, piece(what, levels)?, path, sensor)?);
     }
     Ok(all)
 }
@@ -426,7 +379,7 @@ fn labelled(labels: &Labels, path: &Path) -> Result<What, Error> {
 fn made_of(
     courses: Vec<Course>,
     piece: Piece,
-    path: &str,
+    path: &Path,
     sensor: &Sensor,
 ) -> Result<Vec<ReferencePress>, Error> {
     if courses.is_empty() {
@@ -442,10 +395,10 @@ fn made_of(
 /// The courses of the presses in a recording, and its labels.
 fn of_recording(
     file: impl Read,
-    path: &str,
+    path: &Path,
     sensor: &str,
     hrn: Arc<Hrn>,
-) -> Result<(Vec<Course>, Labels), Error> {
+) -> Result<(Vec<Course>, Labels), Unplayable> {
     let read = || -> Result<_, Unreadable> {
         let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
         playback.keep_courses();
@@ -457,10 +410,7 @@ fn of_recording(
         courses.extend(playback.courses(sensor));
         Ok((courses, playback.labels()))
     };
-    read().map_err(|source| Error::Recording {
-        path: path.to_owned(),
-        source,
-    })
+    read().map_err(Unplayable::at(path))
 }
 
 /// The courses of the presses in raw bytes.
@@ -470,7 +420,7 @@ fn of_bytes(
     sensor: &Sensor,
     hrn: Arc<Hrn>,
     motion: Option<Vec<Point>>,
-) -> Result<Vec<Course>, Error> {
+) -> Result<Vec<Course>, Failure> {
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
     pipeline.keep_courses();
     let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
@@ -481,7 +431,7 @@ fn of_bytes(
 }
 
 /// Writes the file, and returns all its presses.
-fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, Error> {
+fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, Failure> {
     let failed = |source| Error::Out {
         path: args.out.clone(),
         source,
@@ -493,7 +443,7 @@ fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, 
     let (mut all, part) = begin(args)?;
     all.extend(made);
     if all.len() > MOST_REFERENCES {
-        return Err(Error::Many { found: all.len() });
+        return Err(Error::Many { found: all.len() }.into());
     }
     let bytes = references::write(&all).map_err(failed)?;
     part.write(&bytes).map_err(failed)?;

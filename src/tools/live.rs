@@ -13,40 +13,29 @@ use std::time::Duration;
 use tokio::sync::watch;
 
 use super::doctor;
+use super::exit::Failure;
 use crate::daemon::config::Setup;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
-use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
+use hardnessd_core::exit::{Coded, IO};
 use hardnessd_core::recording::Labels;
 
-/// The reason why there is no recording.
+/// The temporary file for the recording cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The daemon cannot serve, or has stopped.
-    #[error(transparent)]
-    Daemon(#[from] daemon::Error),
-    /// The sensor's port does not open.
-    #[error(transparent)]
-    Unavailable(#[from] doctor::Unavailable),
-    /// The temporary file for the recording cannot be used.
-    #[error("{path}: {source}")]
-    Temporary {
-        /// The directory of temporary files.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+#[error("{directory}: {source}")]
+struct Temporary {
+    directory: PathBuf,
+    source: io::Error,
 }
 
-impl Coded for Error {
+impl Coded for Temporary {
     fn exit_code(&self) -> u8 {
-        match self {
-            Self::Daemon(error) => error.exit_code(),
-            Self::Unavailable(_) => UNAVAILABLE,
-            Self::Temporary { .. } => IO,
-        }
+        IO
     }
 }
+
+/// What an error calls the recording in place of its path.
+pub(super) const RECORDED: &str = "what was recorded";
 
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
@@ -61,13 +50,13 @@ pub(super) async fn record(
     wanted: u64,
     print_next: impl Fn(u64),
     shutdown: impl Future<Output = ()>,
-) -> Result<Option<File>, Error> {
+) -> Result<Option<File>, Failure> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
     let port = setup.config.sensors[0].port.clone();
     let path = std::env::temp_dir();
-    let temporary = |source| Error::Temporary {
-        path: path.clone(),
+    let temporary = |source| Temporary {
+        directory: path.clone(),
         source,
     };
     // Nobody else needs the file. Without a name, it vanishes when this process ends.

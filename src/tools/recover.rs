@@ -7,7 +7,9 @@ use std::path::PathBuf;
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
 
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT};
+use super::exit::Failure;
+use super::{CannotRead, Unplayable};
+use hardnessd_core::exit::{Coded, FAILED, IO};
 use hardnessd_core::part::Part;
 use hardnessd_core::recording::{self, RecoverError, Recovered};
 
@@ -24,22 +26,6 @@ pub struct Args {
 /// The reason why nothing was saved.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The damaged file cannot be read.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// The path of the damaged file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// Reading the damaged file failed halfway.
-    #[error("{path}: {source}")]
-    Broken {
-        /// The path of the damaged file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
     /// There is nothing to save.
     #[error("{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read)")]
     Nothing {
@@ -85,12 +71,11 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Unreadable { .. } => NO_INPUT,
             Error::Nothing { .. }
             | Error::NothingRead { .. }
             | Error::Foreign { .. }
             | Error::Unread { .. } => FAILED,
-            Error::Broken { .. } | Error::Write { .. } => IO,
+            Error::Write { .. } => IO,
         }
     }
 }
@@ -99,27 +84,23 @@ impl Coded for Error {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if there is nothing to save, or a file cannot be read or written. The new file
-/// does not exist then, except after [`Error::Unread`].
-pub fn run(args: &Args) -> Result<(), Error> {
-    let unreadable = |source| Error::Unreadable {
-        path: args.broken.clone(),
-        source,
-    };
-    let broken = super::open(&args.broken).map_err(unreadable)?;
-    let bytes = broken.metadata().map_err(unreadable)?.len();
+/// Returns a [`Failure`] if there is nothing to save, or a file cannot be read or written. The new
+/// file does not exist then, except after [`Error::Unread`].
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let unreadable = CannotRead::at(&args.broken);
+    let broken = super::open(&args.broken)?;
+    let bytes = broken.metadata().map_err(&unreadable)?.len();
     let unwritten = |source: recording::Error| Error::Write {
         path: args.out.clone(),
         source,
     };
     let part = Part::new(&args.out).map_err(|error| unwritten(error.into()))?;
     let recovered = save(broken, part.as_file()).map_err(|error| match error {
-        RecoverError::Read(error) if error.kind() == ErrorKind::NotSeekable => unreadable(error),
-        RecoverError::Read(source) => Error::Broken {
-            path: args.broken.clone(),
-            source,
-        },
-        RecoverError::Write(error) => unwritten(error),
+        RecoverError::Read(error) if error.kind() == ErrorKind::NotSeekable => {
+            Failure::from(unreadable(error))
+        }
+        RecoverError::Read(error) => Unplayable::at(&args.broken)(error).into(),
+        RecoverError::Write(error) => unwritten(error).into(),
     })?;
     if !has_ours(&recovered) {
         let path = args.broken.clone();
@@ -131,7 +112,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
             },
             (None, 0) => Error::Nothing { path, bytes },
             (None, messages) => Error::Foreign { path, messages },
-        });
+        }
+        .into());
     }
     part.finish().map_err(|error| unwritten(error.into()))?;
     hardnessd_core::stderr_line!("{}", account(&recovered));
@@ -140,7 +122,8 @@ pub fn run(args: &Args) -> Result<(), Error> {
         chunks => Err(Error::Unread {
             path: args.broken.clone(),
             chunks,
-        }),
+        }
+        .into()),
     }
 }
 

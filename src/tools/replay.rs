@@ -14,14 +14,16 @@ use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
 
-use super::configuration::{ModelFile, NoModel};
+use super::configuration::ModelFile;
+use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
-use crate::apart::{self, NoThread};
-use crate::daemon::config::{self, Config, SensorTable, Setup};
+use super::{Stdout, Unplayable};
+use crate::apart;
+use crate::daemon::config::{Config, SensorTable, Setup};
 use crate::daemon::now;
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use hardnessd_core::exit::{Coded, FAILED, NO_INPUT, USAGE};
 use hardnessd_core::motion::Point;
 use hardnessd_core::pipeline::{Clock, Pipeline, Unjudged};
 use hardnessd_core::recording::{self, FileKind, Playback, Reader};
@@ -52,20 +54,6 @@ pub struct Args {
 /// The reason why a recording cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The configuration or its model cannot be used.
-    #[error(transparent)]
-    Config(#[from] config::Error),
-    /// The file of `--model` cannot be read.
-    #[error(transparent)]
-    Model(#[from] NoModel),
-    /// The recording cannot be read.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
     /// The arm's positions cannot be used.
     #[error("--motion {path}:{source}")]
     Motion {
@@ -80,22 +68,6 @@ pub enum Error {
         /// The path of the recording.
         path: PathBuf,
     },
-    /// The recording is damaged, or of another program.
-    #[error("{path}: {source}")]
-    Recording {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The error of the recording.
-        source: recording::Error,
-    },
-    /// The recording describes an impossible sensor.
-    #[error("{path}: {source}")]
-    Sensor {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The error of the description.
-        source: recording::PlaybackError,
-    },
     /// The file has no whole frame of the configured layout.
     #[error(
         "{path}: no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged): the layout is not \
@@ -109,35 +81,14 @@ pub enum Error {
         /// The number of damaged candidates for a frame.
         frames_damaged: u64,
     },
-    /// Reading failed.
-    #[error("{path}: {source}")]
-    Broken {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Config(error) => error.exit_code(),
-            Error::Model(error) => error.exit_code(),
-            Error::Unreadable { .. } => NO_INPUT,
             Error::Motion { source, .. } if source.is_unreadable() => NO_INPUT,
-            Error::Motion { .. }
-            | Error::Recording { .. }
-            | Error::Sensor { .. }
-            | Error::NoFrame { .. } => FAILED,
+            Error::Motion { .. } | Error::NoFrame { .. } => FAILED,
             Error::OwnMotion { .. } => USAGE,
-            Error::Broken { .. } | Error::Print(_) | Error::Thread(_) => IO,
         }
     }
 }
@@ -149,8 +100,8 @@ const CHUNK_BYTES: usize = 64 * 1024;
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the recording or the configuration cannot be used.
-pub async fn run(args: Args) -> Result<(), Error> {
+/// Returns a [`Failure`] if the recording or the configuration cannot be used.
+pub async fn run(args: Args) -> Result<(), Failure> {
     // Dropping this future drops `_stop`, which stops the thread.
     let (_stop, stopped) = mpsc::channel();
     // The replay runs on a thread of its own, so that a signal waits neither for a recording that
@@ -160,7 +111,7 @@ pub async fn run(args: Args) -> Result<(), Error> {
 }
 
 /// Plays to the end, or until the other end of `stopped` is dropped.
-fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
+fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
     let model = args.model.path()?;
     let setup = match &args.config {
         Some(config) => Setup::load(config, model.as_deref())?,
@@ -170,10 +121,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         }
     };
     let path = &args.file;
-    let recording = super::open(path).map_err(|source| Error::Unreadable {
-        path: path.clone(),
-        source,
-    })?;
+    let recording = super::open(path)?;
     let levels = &setup.hrn.card().levels;
     let labels = levels.iter().map(|level| level.label.clone()).collect();
     let printer = Printer::new(args.json || !io::stdout().is_terminal(), labels);
@@ -183,13 +131,10 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Error> {
         stopped,
         printer: &printer,
     };
-    let (kind, recording) = FileKind::read(recording).map_err(|source| Error::Broken {
-        path: path.clone(),
-        source,
-    })?;
+    let (kind, recording) = FileKind::read(recording).map_err(Unplayable::at(path))?;
     let motion = match &args.motion {
         Some(_) if kind == FileKind::Recording => {
-            return Err(Error::OwnMotion { path: path.clone() });
+            return Err(Error::OwnMotion { path: path.clone() }.into());
         }
         Some(path) => Some(positions(path)?),
         None => None,
@@ -234,7 +179,7 @@ impl Pace<'_> {
 
 /// Plays a recording. If it is cut off or damaged, its events end like those of bytes that end
 /// there, and the error follows them.
-fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Result<(), Error> {
+fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Result<(), Failure> {
     let mut playback = Playback::new(setup.hrn.clone());
     for (sensor, hrn) in setup.identified() {
         playback.identify(sensor, hrn.clone());
@@ -266,39 +211,27 @@ fn play_entries(
     mut pace: Pace,
     playback: &mut Playback,
     seq: &mut u64,
-) -> Result<bool, Error> {
-    let failed = |source| match source {
-        recording::Error::Io(source) => Error::Broken {
-            path: path.to_owned(),
-            source,
-        },
-        source => Error::Recording {
-            path: path.to_owned(),
-            source,
-        },
-    };
+) -> Result<bool, Failure> {
     // The moment of the first entry.
     let mut first: Option<Duration> = None;
     for found in Reader::new(file) {
-        let found = found.map_err(failed)?;
+        let found = found.map_err(Unplayable::at(path))?;
         let first = *first.get_or_insert(found.at.mono);
         if !pace.wait(found.at.mono.saturating_sub(first)) {
             return Ok(false);
         }
-        let events = playback.feed(found).map_err(|source| Error::Sensor {
-            path: path.to_owned(),
-            source,
-        })?;
+        let events = playback.feed(found).map_err(Unplayable::at(path))?;
         warn(playback.unjudged());
         if !print(events, seq, pace.printer)? {
             return Ok(false);
         }
     }
     if playback.sensors() == 0 {
-        return Err(failed(recording::Error::Foreign {
+        return Err(Unplayable::at(path)(recording::Error::Foreign {
             found: "no state of a sensor".to_owned(),
             expected: "a recording of hardnessd",
-        }));
+        })
+        .into());
     }
     Ok(true)
 }
@@ -313,7 +246,7 @@ fn play_bytes(
     motion: Option<Vec<Point>>,
     setup: &Setup,
     mut pace: Pace,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     let sensor = setup.sensors.first();
     let sensor = sensor.expect("a configuration has at least one sensor");
     let hrn = setup.hrn_of(sensor.name()).clone();
@@ -333,7 +266,7 @@ fn play_bytes(
     };
     let none = no_frame(path, &end);
     print(end, &mut seq, printer)?;
-    none.map_or(Ok(()), Err)
+    none.map_or(Ok(()), |none| Err(none.into()))
 }
 
 /// Sends raw bytes through a pipeline, with the arm's positions. `each` takes the events of a part
@@ -345,8 +278,8 @@ pub(super) fn feed(
     motion: Option<Vec<Point>>,
     is_paced: bool,
     pipeline: &mut Pipeline,
-    mut each: impl FnMut(Vec<Event>, Duration) -> Result<bool, Error>,
-) -> Result<Option<Vec<Event>>, Error> {
+    mut each: impl FnMut(Vec<Event>, Duration) -> Result<bool, Failure>,
+) -> Result<Option<Vec<Event>>, Failure> {
     let frame_rate_hz = pipeline.sensor().description().frame_rate_hz;
     // No two frames end within this many bytes, so each frame comes at its own moment, between its
     // positions.
@@ -361,10 +294,7 @@ pub(super) fn feed(
         let read = match file.read(&mut chunk) {
             Ok(read) => read,
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(source) => {
-                let path = path.to_owned();
-                return Err(Error::Broken { path, source });
-            }
+            Err(error) => return Err(Unplayable::at(path)(error).into()),
         };
         if read == 0 {
             let end = pipeline.end_of_recording(None);
@@ -428,7 +358,7 @@ fn warn(unjudged: Vec<Unjudged>) {
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
 /// reads stdout.
-fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Error> {
+fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Stdout> {
     let mut lines = String::new();
     for mut event in events {
         if event.kind() != Kind::Frame {
@@ -441,5 +371,5 @@ fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, E
             });
         }
     }
-    super::print(lines.as_bytes()).map_err(Error::Print)
+    super::print(lines.as_bytes())
 }

@@ -11,15 +11,17 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
 
+use super::Stdout;
 use super::arm::{self, Arm};
+use super::exit::Failure;
 use super::faults::{self, Faults, Line};
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
-use crate::apart::{self, NoThread};
+use crate::apart;
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::socket;
 use crate::maybe;
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, USAGE};
+use hardnessd_core::exit::{Coded, IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
@@ -89,12 +91,9 @@ pub struct Args {
 /// The reason why the sensor cannot be simulated.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The script of faults cannot be used.
-    #[error(transparent)]
-    Faults(#[from] faults::Error),
     /// The layout needs more than a preset.
     #[error("--preset: {0}")]
-    Layout(#[from] LayoutError),
+    Layout(#[source] LayoutError),
     /// The frames have more bytes than the line carries.
     #[error(
         "--baud: found {baud}, expected at least {needed} to carry {fps} frames/s of {bytes} bytes"
@@ -117,12 +116,9 @@ pub enum Error {
         /// The system's error.
         source: std::io::Error,
     },
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
     /// The arm's socket cannot be made.
     #[error(transparent)]
-    Arm(#[from] socket::Error),
+    Arm(socket::Error),
     /// The pty or its link failed.
     #[error("{what}: {source}")]
     Pty {
@@ -136,10 +132,8 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Faults(error) if error.is_unreadable() => NO_INPUT,
-            Error::Faults(_) => FAILED,
             Error::Layout(_) | Error::Baud { .. } => USAGE,
-            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) | Error::Thread(_) => IO,
+            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) => IO,
         }
     }
 }
@@ -148,12 +142,13 @@ impl Coded for Error {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the arguments do not fit together, or the pty or a file fails.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+/// Returns a [`Failure`] if the arguments do not fit together, or the pty or a file fails.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     let layout = Layout::new(&Frame {
         preset: args.preset,
         ..Frame::default()
-    })?;
+    })
+    .map_err(Error::Layout)?;
     let mut shutdown = pin!(shutdown);
     let faults = match args.faults.clone() {
         Some(path) => {
@@ -183,9 +178,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             }
         };
         let written = finished.map(|finished| finished.expect("the simulation does not panic"));
-        return written
+        written
             .unwrap_or(Ok(()))
-            .map_err(|source| Error::Recording { path, source });
+            .map_err(|source| Error::Recording { path, source })?;
+        return Ok(());
     }
     let (baud, warning) = baud(&args, &layout)?;
     if let Some(warning) = warning {
@@ -203,7 +199,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
-    let arm = args.arm.as_deref().map(Arm::bind).transpose()?;
+    let arm = args.arm.as_deref().map(Arm::bind).transpose();
+    let arm = arm.map_err(Error::Arm)?;
     let position: Box<dyn Fn(Instant) -> Option<f64>> = match &arm {
         Some(arm) => Box::new(arm.position()),
         None => Box::new(player.position()),
@@ -223,10 +220,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let printed = super::print_apart(line.into_bytes());
+        let printed = async { printed.await.map_err(|Stdout(error)| error) };
         tokio::try_join!(printed, player.play(frames, start)).map(|_| ())
     };
     tokio::select! {
-        played = play => played.map_err(failed),
+        played = play => Ok(played.map_err(failed)?),
         () = robot => Ok(()),
         () = serving => Ok(()),
         () = shutdown => Ok(()),

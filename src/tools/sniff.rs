@@ -36,12 +36,12 @@ pub use self::found::Failure;
 use self::found::{Found, Known, Shown};
 use self::noise::noise_counts;
 use self::picture::draw;
-use super::doctor;
 use super::simulate::positive;
-use crate::apart::{self, NoThread};
+use super::{CannotRead, doctor, exit};
+use crate::apart;
 use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT, UNAVAILABLE};
+use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::{MOST_SIDE, Pitch};
 use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;
@@ -95,14 +95,6 @@ pub struct Args {
 /// The reason why `sniff` proposes nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The recording cannot be read.
-    #[error("{path}: cannot read: {source}")]
-    Unreadable {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
     /// The recording is damaged, or of another program.
     #[error("{path}: {source}")]
     Recording {
@@ -146,21 +138,14 @@ pub enum Error {
         /// The system's error.
         source: io::Error,
     },
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Unreadable { .. } => NO_INPUT,
             Error::Recording { .. } | Error::Unexplained { .. } | Error::Unsure { .. } => FAILED,
             Error::Unavailable { .. } => UNAVAILABLE,
-            Error::Print(_) | Error::Write { .. } | Error::Thread(_) => IO,
+            Error::Write { .. } => IO,
         }
     }
 }
@@ -172,9 +157,9 @@ const MOST_BYTES: usize = 16 << 20;
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if the bytes cannot be read, there is no layout or more than one for them, or the
-/// output fails.
-pub async fn run(args: Args) -> Result<(), Error> {
+/// Returns an [`exit::Failure`] if the bytes cannot be read, there is no layout or more than one for
+/// them, or the output fails.
+pub async fn run(args: Args) -> Result<(), exit::Failure> {
     let listened = match &args.port {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,
@@ -197,7 +182,7 @@ impl Args {
 }
 
 /// Prints or writes the layout that explains `bytes`.
-fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
+fn propose(args: &Args, bytes: &[u8]) -> Result<(), exit::Failure> {
     let path = &args.source();
     let Args {
         rows, cols, cell, ..
@@ -213,13 +198,13 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), Error> {
         return Err(Error::Unsure {
             path: path.to_owned(),
             options: options(&found.best),
-        });
+        }
+        .into());
     }
     let frame = toml(path, bytes.len(), &found);
     let Some(out) = &args.out else {
-        return super::print(frame.as_bytes())
-            .map(drop)
-            .map_err(Error::Print);
+        super::print(frame.as_bytes())?;
+        return Ok(());
     };
     let proposal = &found.best.proposal;
     let listened_s = args.port.as_ref().map(|_| args.seconds);
@@ -301,16 +286,9 @@ fn thresholds(most_counts: u16, noise_counts: u16) -> String {
     text
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Error> {
-    let file = super::open(path).map_err(|source| Error::Unreadable {
-        path: path.to_owned(),
-        source,
-    })?;
-    let unreadable = |source| Error::Unreadable {
-        path: path.to_owned(),
-        source,
-    };
-    let (kind, file) = FileKind::read(file).map_err(unreadable)?;
+fn read(path: &Path) -> Result<Vec<u8>, exit::Failure> {
+    let unreadable = CannotRead::at(path);
+    let (kind, file) = FileKind::read(super::open(path)?).map_err(&unreadable)?;
     let mut bytes = Vec::new();
     if kind == FileKind::Recording {
         // If there are several sensors, take the bytes of the first.

@@ -5,19 +5,19 @@
 //! `hello` is not printed.
 
 use std::future::Future;
-use std::io;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
 use super::answer;
-use super::connect::{self, Address, Connection, Source, WEB_SERVER};
+use super::connect::{Address, Connection, Source, WEB_SERVER};
+use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
 use crate::maybe;
 use hardnessd_core::event::{Kind, PROTOCOL};
-use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
+use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
 use hardnessd_core::wording;
 
 /// What `--help` says below the options.
@@ -65,9 +65,6 @@ pub enum Error {
         /// The number of events after which to end, if it was given.
         count: Option<u64>,
     },
-    /// No daemon answers, or it has ended.
-    #[error(transparent)]
-    Connect(#[from] connect::Error),
     /// The other end accepts the connection and sends nothing.
     #[error(
         "{address}: no answer for {} s: what listens there is no hardnessd, or it hangs",
@@ -99,21 +96,16 @@ pub enum Error {
         /// The daemon's message.
         message: String,
     },
-    /// Stdout cannot be written to.
-    #[error("stdout: {0}")]
-    Print(#[source] io::Error),
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Connect(_)
-            | Error::Mute { .. }
+            Error::Mute { .. }
             | Error::Foreign { .. }
             | Error::Web { .. }
             | Error::Refused { .. } => UNAVAILABLE,
             Error::Timeout { .. } => FAILED,
-            Error::Print(_) => IO,
         }
     }
 }
@@ -136,8 +128,8 @@ fn kind(name: &str) -> Result<Kind, &'static str> {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if no daemon answers, the daemon ends, or the time limit has passed.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+/// Returns a [`Failure`] if no daemon answers, the daemon ends, or the time limit has passed.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     let mut found = 0;
     tokio::select! {
         printed = print(&args, &mut found) => return printed,
@@ -148,10 +140,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
         found,
         seconds: args.timeout.unwrap_or_default(),
         count: args.count,
-    })
+    }
+    .into())
 }
 
-async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
+async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
     let mut daemon = args.source.connect().await?;
     let address = daemon.address().clone();
     let request = json!({"subscribe": args.types}).to_string();
@@ -162,7 +155,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             meet(&hello, address.clone())?;
             answer::labels(&hello)
         }
-        Err(_) => return Err(Error::Mute { address }),
+        Err(_) => return Err(Error::Mute { address }.into()),
     };
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
@@ -182,8 +175,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Error> {
             continue;
         }
         let line = printer.line(line, || event);
-        let printed = super::print_apart(line.into_bytes()).await;
-        if !printed.map_err(Error::Print)? {
+        if !super::print_apart(line.into_bytes()).await? {
             return Ok(());
         }
         *found += u64::from(counts);
@@ -209,17 +201,18 @@ fn meet(hello: &Value, address: Address) -> Result<(), Error> {
 }
 
 /// The daemon's next line, as text and as JSON.
-async fn next(daemon: &mut Connection) -> Result<(String, Value), Error> {
+async fn next(daemon: &mut Connection) -> Result<(String, Value), Failure> {
     let line = daemon.next().await?;
     match serde_json::from_str(&line) {
         Ok(event) => Ok((line, event)),
         Err(_) if line.starts_with("HTTP/") => {
             let address = daemon.address().clone();
-            Err(Error::Web { address })
+            Err(Error::Web { address }.into())
         }
         Err(_) => Err(Error::Foreign {
             address: daemon.address().clone(),
             found: "a line that is no JSON".to_owned(),
-        }),
+        }
+        .into()),
     }
 }

@@ -2,7 +2,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::*;
-use hardnessd_core::exit::{CONFIG, Coded};
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::npy;
 
 fn load(text: &str) -> Result<Config, String> {

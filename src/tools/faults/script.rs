@@ -8,6 +8,7 @@ use super::bytes::{Damage, OfBytes};
 use super::cable::{self, OfCable};
 use super::taxels::{Change, OfTaxels, Region};
 use super::times::{Frames, Span};
+use hardnessd_core::exit::{Coded, FAILED, NO_INPUT};
 use hardnessd_core::frame::Array;
 use hardnessd_core::range::{self, OutOfRange};
 use hardnessd_core::wording;
@@ -61,7 +62,7 @@ const MOST_NEWTONS: f64 = 1e6;
 
 /// The reason why a script cannot be played.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
+pub(crate) enum Error {
     /// The file cannot be read.
     #[error("{path}: cannot read: {source}")]
     Unreadable {
@@ -82,7 +83,7 @@ pub enum Error {
 
 /// A problem in a script.
 #[derive(Debug, thiserror::Error)]
-pub enum Problem {
+pub(crate) enum Problem {
     /// The text is not TOML, or its tables are not those of a script. The field is the parser's
     /// message in plain words.
     #[error("{0}")]
@@ -99,7 +100,7 @@ pub enum Problem {
 
 /// A value that cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum Unfit {
+pub(crate) enum Unfit {
     /// A value is out of its range.
     #[error(transparent)]
     Range(#[from] OutOfRange),
@@ -116,10 +117,12 @@ pub enum Unfit {
     },
 }
 
-impl Error {
-    /// Whether the file cannot be read.
-    pub fn is_unreadable(&self) -> bool {
-        matches!(self, Error::Unreadable { .. })
+impl Coded for Error {
+    fn exit_code(&self) -> u8 {
+        match self {
+            Error::Unreadable { .. } => NO_INPUT,
+            Error::Malformed { .. } => FAILED,
+        }
     }
 }
 
