@@ -25,7 +25,7 @@ use super::relay::Worker;
 use super::ros2;
 use super::sensor::Sensors;
 use super::snapshot::Snapshots;
-use super::socket::{self, Socket};
+use super::socket::{self, Problem, Socket};
 use super::systemd;
 use super::tcp::{self, Tcp};
 #[cfg(feature = "zenoh")]
@@ -88,11 +88,10 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             // The configuration names a path that the daemon cannot use.
-            Error::Socket(
-                socket::Error::NoSocket { .. }
-                | socket::Error::NoDirectory { .. }
-                | socket::Error::TooLong { .. },
-            )
+            Error::Socket(socket::Error {
+                problem: Problem::NoSocket | Problem::NoDirectory | Problem::TooLong,
+                ..
+            })
             | Error::Unasked { .. }
             | Error::Passed(_) => CONFIG,
             // The address is in use, or the system refused. A later try may succeed.

@@ -16,7 +16,7 @@ use tokio::time::Instant;
 use tracing::warn;
 
 pub(crate) use self::place::check;
-use self::place::{Identity, Place, identity};
+use self::place::{Identity, LONGEST_PATH_BYTES, Place, identity};
 use super::accept::{Listener, Stop};
 
 /// How often a socket checks that its file is still there.
@@ -24,55 +24,66 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 /// The reason a socket could not be opened.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
+#[error("{key}: {}", problem.at(path))]
+pub struct Error {
+    /// The key of the configuration.
+    key: &'static str,
+    /// The path of the socket, as configured.
+    path: PathBuf,
+    pub(super) problem: Problem,
+}
+
+impl Error {
+    /// Makes the error of a problem with the socket at `path`. `key` is the key of the path.
+    fn at(key: &'static str, path: &Path) -> impl FnOnce(Problem) -> Self {
+        move |problem| Self {
+            key,
+            path: path.to_owned(),
+            problem,
+        }
+    }
+}
+
+/// A problem with the path of a socket.
+#[derive(Debug)]
+pub(super) enum Problem {
     /// A process already listens at the path.
-    #[error("{key}: {path} is in use by another process: end that process, or set another path")]
-    InUse {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The path of the socket.
-        path: PathBuf,
-    },
+    InUse,
     /// The path has another kind of file.
-    #[error("{key}: {path} is no socket: remove it, or set another path")]
-    NoSocket {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The path of the file.
-        path: PathBuf,
-    },
+    NoSocket,
     /// Neither the directory of the socket nor the directory above it exists.
-    #[error("{key}: {path} is in no directory: make the directory, or set another path")]
-    NoDirectory {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The path of the socket.
-        path: PathBuf,
-    },
+    NoDirectory,
     /// The path is longer than the system allows.
-    #[error("{key}: found {path}, {found} bytes, expected a path of at most {max}")]
-    TooLong {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The path, as configured.
-        path: PathBuf,
-        /// The length of the path in bytes.
-        found: usize,
-        /// The largest length in bytes.
-        max: usize,
-    },
-    /// The system refused.
-    #[error("{key}: {path}: cannot {what}: {source}{}", remedy(source))]
+    TooLong,
+    /// The system refused a step.
     Io {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The path of the socket.
-        path: PathBuf,
-        /// The step that failed.
         what: &'static str,
-        /// The system's error.
         source: io::Error,
     },
+}
+
+impl Problem {
+    /// The problem in words, with the path.
+    fn at(&self, path: &Path) -> String {
+        let (bytes, path) = (path.as_os_str().len(), path.display());
+        match self {
+            Self::InUse => format!(
+                "{path} is in use by another process: end that process, or set another path"
+            ),
+            Self::NoSocket => format!("{path} is no socket: remove it, or set another path"),
+            Self::NoDirectory => {
+                format!("{path} is in no directory: make the directory, or set another path")
+            }
+            Self::TooLong => {
+                format!(
+                    "found {path}, {bytes} bytes, expected a path of at most {LONGEST_PATH_BYTES}"
+                )
+            }
+            Self::Io { what, source } => {
+                format!("{path}: cannot {what}: {source}{}", remedy(source))
+            }
+        }
+    }
 }
 
 /// What to do about an error of the system.
@@ -134,7 +145,7 @@ impl Socket {
         let place = Place { key, path, mode: 0 };
         Some(match adopted {
             Ok(listener) => Ok(Self::new(listener, place, None)),
-            Err(source) => Err(place.failed("listen")(source)),
+            Err(error) => Err(Error::at(key, &place.path)(place::failed("listen")(error))),
         })
     }
 

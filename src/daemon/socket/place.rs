@@ -11,10 +11,11 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use tokio::net::UnixListener;
 
-use super::Error;
+use super::{Error, Problem};
+use hardnessd_core::part::directory_of;
 
 /// The longest path of a Unix socket: `sun_path` of unix(7), without its final NUL.
-const LONGEST_PATH_BYTES: usize = 107;
+pub(super) const LONGEST_PATH_BYTES: usize = 107;
 
 /// The most connections that wait to be accepted, if the system allows as many.
 const BACKLOG: i32 = 4096;
@@ -39,17 +40,21 @@ pub(super) fn identity(path: &Path) -> io::Result<Identity> {
 impl Place {
     /// Listens at the path. A socket at which nobody listens is replaced.
     pub(super) fn listen(&self) -> Result<(UnixListener, Identity), Error> {
-        let Self { key, path, mode } = self;
-        check(key, path)?;
-        match DirBuilder::new().mode(0o755).create(directory(path)) {
+        self.made().map_err(Error::at(self.key, &self.path))
+    }
+
+    fn made(&self) -> Result<(UnixListener, Identity), Problem> {
+        let Self { path, mode, .. } = self;
+        examine(path)?;
+        match DirBuilder::new().mode(0o755).create(directory_of(path)) {
             Err(error) if error.kind() != ErrorKind::AlreadyExists => {
-                return Err(self.failed("make its directory")(error));
+                return Err(failed("make its directory")(error));
             }
             _ => {}
         }
-        if is_there(key, path)? {
-            vacant(key, path)?;
-            fs::remove_file(path).map_err(self.failed("replace it"))?;
+        if is_there(path)? {
+            vacant(path)?;
+            fs::remove_file(path).map_err(failed("replace it"))?;
         }
         let listening = || {
             let socket = socket()?;
@@ -60,68 +65,46 @@ impl Place {
             rustix::net::listen(&socket, BACKLOG)?;
             UnixListener::from_std(StdListener::from(socket))
         };
-        let listener = listening().map_err(self.failed("listen"))?;
-        let identity = identity(path).map_err(self.failed("find"))?;
+        let listener = listening().map_err(failed("listen"))?;
+        let identity = identity(path).map_err(failed("find"))?;
         Ok((listener, identity))
-    }
-
-    pub(super) fn failed(&self, what: &'static str) -> impl FnOnce(io::Error) -> Error {
-        move |source| failed(self.key, &self.path, what, source)
     }
 }
 
-fn failed(key: &'static str, path: &Path, what: &'static str, source: io::Error) -> Error {
-    Error::Io {
-        key,
-        path: path.to_owned(),
-        what,
-        source,
-    }
+/// Makes the problem of a step that the system refused.
+pub(super) fn failed(what: &'static str) -> impl FnOnce(io::Error) -> Problem {
+    move |source| Problem::Io { what, source }
 }
 
 /// Checks that a socket can be made at `path`, without making it.
 pub(crate) fn check(key: &'static str, path: &Path) -> Result<(), Error> {
-    let found = path.as_os_str().len();
-    if found > LONGEST_PATH_BYTES {
-        return Err(Error::TooLong {
-            key,
-            path: path.to_owned(),
-            found,
-            max: LONGEST_PATH_BYTES,
-        });
+    examine(path).map_err(Error::at(key, path))
+}
+
+fn examine(path: &Path) -> Result<(), Problem> {
+    if path.as_os_str().len() > LONGEST_PATH_BYTES {
+        return Err(Problem::TooLong);
     }
-    let parent = directory(path);
+    let parent = directory_of(path);
     let has_directory = match fs::metadata(parent) {
-        Err(error) if error.kind() == ErrorKind::NotFound => directory(parent).is_dir(),
+        Err(error) if error.kind() == ErrorKind::NotFound => directory_of(parent).is_dir(),
         Err(error) if error.kind() == ErrorKind::NotADirectory => false,
-        Err(error) => return Err(failed(key, path, "find its directory", error)),
+        Err(error) => return Err(failed("find its directory")(error)),
         Ok(parent) => parent.is_dir(),
     };
     if !has_directory {
-        let path = path.to_owned();
-        return Err(Error::NoDirectory { key, path });
+        return Err(Problem::NoDirectory);
     }
-    is_there(key, path).map(drop)
-}
-
-/// The directory of a file.
-fn directory(path: &Path) -> &Path {
-    match path.parent() {
-        Some(parent) if parent != Path::new("") => parent,
-        _ => Path::new("."),
-    }
+    is_there(path).map(drop)
 }
 
 /// Whether there is a socket at `path`, alive or dead. Any other file there is an error.
-fn is_there(key: &'static str, path: &Path) -> Result<bool, Error> {
+fn is_there(path: &Path) -> Result<bool, Problem> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
-        Err(error) => Err(failed(key, path, "look at it", error)),
+        Err(error) => Err(failed("look at it")(error)),
         Ok(file) if file.file_type().is_socket() => Ok(true),
-        Ok(_) => {
-            let path = path.to_owned();
-            Err(Error::NoSocket { key, path })
-        }
+        Ok(_) => Err(Problem::NoSocket),
     }
 }
 
@@ -131,18 +114,13 @@ fn socket() -> rustix::io::Result<OwnedFd> {
 }
 
 /// Fails if a process listens at `path`.
-fn vacant(key: &'static str, path: &Path) -> Result<(), Error> {
+fn vacant(path: &Path) -> Result<(), Problem> {
     // A connection to a dead socket is refused. With any other result a process may listen there.
     // The socket does not block, because a full backlog would keep a blocking connect waiting.
     let probe = || rustix::net::connect(&socket()?, &SocketAddrUnix::new(path)?);
     match probe() {
         Err(Errno::CONNREFUSED | Errno::NOENT) => Ok(()),
-        Err(error @ (Errno::ACCESS | Errno::PERM)) => {
-            Err(failed(key, path, "try it", error.into()))
-        }
-        _ => {
-            let path = path.to_owned();
-            Err(Error::InUse { key, path })
-        }
+        Err(error @ (Errno::ACCESS | Errno::PERM)) => Err(failed("try it")(error.into())),
+        _ => Err(Problem::InUse),
     }
 }
