@@ -13,7 +13,6 @@ mod read;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::env;
-use std::net::SocketAddr;
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,7 +23,8 @@ use serde_json::Value;
 
 pub use self::error::Error;
 pub use self::publish::{
-    Endpoint, EndpointError, Foxglove, Mode, ModeError, Publish, Ros2, Tcp, Unix, Zenoh,
+    Endpoint, EndpointError, Foxglove, Http, Listen, Mode, ModeError, Publish, Ros2, Tcp, Unix,
+    Zenoh,
 };
 use self::read::Until;
 use super::log;
@@ -195,22 +195,6 @@ impl Default for Model {
             min_confidence,
             min_force_n,
             early_confidence,
-        }
-    }
-}
-
-/// The `[http]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Http {
-    /// The address and port to listen on.
-    pub listen: SocketAddr,
-}
-
-impl Default for Http {
-    fn default() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 8256)),
         }
     }
 }

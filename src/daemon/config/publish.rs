@@ -43,38 +43,28 @@ impl Publish {
     }
 }
 
+/// A table with the address to listen on. The default is `PORT` of this machine alone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, bound = "")]
+pub struct Listen<const PORT: u16> {
+    /// The address and port to listen on.
+    pub listen: SocketAddr,
+}
+
+impl<const PORT: u16> Default for Listen<PORT> {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], PORT)),
+        }
+    }
+}
+
 /// The `[publish.tcp]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Tcp {
-    /// The address and port to listen on.
-    pub listen: SocketAddr,
-}
-
-impl Default for Tcp {
-    fn default() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 8255)),
-        }
-    }
-}
-
-/// The `[publish.foxglove]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Foxglove {
-    /// The address and port to listen on.
-    pub listen: SocketAddr,
-}
-
-impl Default for Foxglove {
-    fn default() -> Self {
-        // The applications propose this port.
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 8765)),
-        }
-    }
-}
+pub type Tcp = Listen<8255>;
+/// The `[publish.foxglove]` table. The applications propose this port.
+pub type Foxglove = Listen<8765>;
+/// The `[http]` table.
+pub type Http = Listen<8256>;
 
 /// The `[publish.zenoh]` table. A session uses only the endpoints of the table, and does not look
 /// for other peers.
