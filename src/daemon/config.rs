@@ -57,10 +57,10 @@ pub struct Config {
     #[serde(default)]
     pub publish: Publish,
     /// The live page and the other HTTP routes. Without the table, they are off.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub http: Option<Http>,
     /// The daemon's own recording. Without the table, it is off.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub record: Option<Record>,
     /// The format of the log.
     #[serde(default)]
@@ -81,7 +81,6 @@ pub struct SensorTable {
     pub frame_rate_hz: f64,
     /// The silence after which a live sensor is stale, in milliseconds. The default is the larger
     /// of 2.5 periods and 50 ms.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub stale_after_ms: Option<f64>,
     /// The layout of a frame in bytes.
     pub frame: wire::Settings,
@@ -90,7 +89,6 @@ pub struct SensorTable {
     /// The arm that presses with the sensor.
     pub arm: motion::Settings,
     /// The file with presses of known pieces on this sensor, as `identify` makes it.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub references: Option<PathBuf>,
 }
 
@@ -167,10 +165,8 @@ pub struct Model {
     /// The model in the binary that judges, unless a path names another.
     pub built_in: BuiltIn,
     /// The path of the ONNX file. The default is the built-in model.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
     /// The SHA-256 hash that the model must have, in hex.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
     /// A verdict below this confidence is rejected.
     pub min_confidence: f32,
@@ -204,7 +200,6 @@ impl Default for Model {
 #[serde(deny_unknown_fields, default)]
 pub struct Record {
     /// The directory of the recordings. [`Record::dir`] has the default.
-    #[serde(skip_serializing_if = "Option::is_none")]
     dir: Option<PathBuf>,
     /// Whether everything is recorded. If `false`, only the last minute before a fault is recorded.
     pub continuous: bool,

@@ -15,17 +15,13 @@ pub struct Publish {
     /// The Unix socket.
     pub unix: Unix,
     /// The same protocol over TCP. Without the table, it is off.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub tcp: Option<Tcp>,
     /// A server for Foxglove and Lichtblick. Without the table, it is off. It needs the feature
     /// `foxglove`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub foxglove: Option<Foxglove>,
     /// The keys of a zenoh session. Without the table, it is off. It needs the feature `zenoh`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub zenoh: Option<Zenoh>,
     /// The topics of a ROS 2 node. Without the table, it is off. It needs the feature `ros2`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub ros2: Option<Ros2>,
 }
 
@@ -76,10 +72,8 @@ pub struct Zenoh {
     /// Endpoints of routers or peers to connect to. The session retries until they answer.
     pub connect: Vec<Endpoint>,
     /// The part after `tactile/` in every key. The default is the robot's name.
-    #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
     /// The key at which the robot reports the positions of its arms. `None`: it reports none.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub motion: Option<String>,
 }
 
@@ -154,7 +148,6 @@ impl From<Endpoint> for String {
 #[serde(deny_unknown_fields, default)]
 pub struct Ros2 {
     /// The domain ID. The default is `$ROS_DOMAIN_ID`, else 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
     domain_id: Option<u16>,
     /// Namespace of the node and its topics.
     pub namespace: String,
@@ -209,12 +202,10 @@ pub struct Unix {
     /// Whether the daemon opens its Unix sockets.
     pub enabled: bool,
     /// The path of the socket. [`Unix::path`] has the default.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) path: Option<PathBuf>,
     /// The permissions of the socket's file.
     pub mode: Mode,
     /// The path of the control socket. The default is `control.sock` beside the other socket.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) control_path: Option<PathBuf>,
     /// The most subscribers at a time, on each socket and on TCP.
     pub max_clients: usize,
