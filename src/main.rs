@@ -107,15 +107,7 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
         #[cfg(feature = "zenoh")]
         Command::Fleet(args) => fleet::run(args, signals.received()).await,
-        Command::Tare(target) => {
-            finish(signals, control::run(control::Command::Tare(target))).await
-        }
-        Command::Context(context) => {
-            finish(signals, control::run(control::Command::Context(context))).await
-        }
-        Command::Blackbox(target) => {
-            finish(signals, control::run(control::Command::Blackbox(target))).await
-        }
+        Command::Control(command) => finish(signals, control::run(command)).await,
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => calibrate(args, signals).await,
         Command::Identify(args) => identify(args, signals).await,

@@ -44,12 +44,9 @@ pub enum Command {
     /// Show the sensors of every robot behind a zenoh router
     #[cfg(feature = "zenoh")]
     Fleet(fleet::Args),
-    /// Take another tare of a sensor of a running daemon, and print the offsets before and after
-    Tare(control::Target),
-    /// Set what presses and verdicts of a sensor of a running daemon repeat
-    Context(control::Context),
-    /// Write the last minute of a sensor of a running daemon to a file, and print its path
-    Blackbox(control::Target),
+    /// `tare`, `context` and `blackbox`.
+    #[command(flatten)]
+    Control(control::Command),
     /// Check a configuration and its model, and print what would run; opens and creates nothing
     Check(check::Args),
     /// Measure values for the configuration: the arm, newtons, gains of taxels

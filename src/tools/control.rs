@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::Args as ClapArgs;
+use clap::{Args as ClapArgs, Subcommand};
 use serde_json::{Map, Value, json};
 
 use super::connect::{self, Connection};
@@ -36,13 +36,13 @@ pub struct Context {
 }
 
 /// A command to a daemon.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Subcommand)]
 pub enum Command {
-    /// Take another tare.
+    /// Take another tare of a sensor of a running daemon, and print the offsets before and after
     Tare(Target),
-    /// Set the context.
+    /// Set what presses and verdicts of a sensor of a running daemon repeat
     Context(Context),
-    /// Write the black box.
+    /// Write the last minute of a sensor of a running daemon to a file, and print its path
     Blackbox(Target),
 }
 
