@@ -1,16 +1,18 @@
 //! The directory of a demonstration, with its port and its socket, and the search for such sockets.
 
 use std::env;
-use std::fs::{self, DirBuilder};
+use std::fs::{self, Permissions};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
-use std::path::{Path, PathBuf};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::PathBuf;
+
+use tempfile::TempDir;
 
 /// The first part of the name of every demonstration's directory.
 const PREFIX: &str = "hardnessd-demo-";
 
 /// The demonstration's own directory. Dropping this value removes it.
-pub(super) struct Place(PathBuf);
+pub(super) struct Place(TempDir);
 
 impl Place {
     /// Makes a directory in the user's runtime directory, else in the directory for temporary
@@ -18,42 +20,26 @@ impl Place {
     pub(super) fn new() -> io::Result<Self> {
         let mut outcome = Err(ErrorKind::NotFound.into());
         for directory in directories().filter(|one| one.as_os_str().len() <= LONGEST_BYTES) {
-            outcome = Self::within(&directory);
+            // A killed demonstration may have left one, so a part of the name is random.
+            outcome = tempfile::Builder::new()
+                .prefix(PREFIX)
+                .permissions(Permissions::from_mode(0o700))
+                .tempdir_in(directory);
             if outcome.is_ok() {
                 break;
             }
         }
-        outcome
-    }
-
-    fn within(directory: &Path) -> io::Result<Self> {
-        let mut path = directory.join(format!("{PREFIX}{}", std::process::id()));
-        loop {
-            match DirBuilder::new().mode(0o700).create(&path) {
-                // In a restarted container, a killed demonstration may have had the same process
-                // id.
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-                    path.as_mut_os_string().push("-");
-                }
-                made => return made.map(|()| Self(path)),
-            }
-        }
+        outcome.map(Self)
     }
 
     /// The link to the pty.
     pub(super) fn port(&self) -> PathBuf {
-        self.0.join("port")
+        self.0.path().join("port")
     }
 
     /// The daemon's socket.
     pub(super) fn socket(&self) -> PathBuf {
-        self.0.join(SOCKET)
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
+        self.0.path().join(SOCKET)
     }
 }
 
@@ -100,11 +86,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_killed_demonstration_has_left_is_not_in_the_way() {
-        let directory = tempfile::tempdir().unwrap();
-        let left = Place::within(directory.path()).unwrap();
-        let place = Place::within(directory.path()).unwrap();
-        assert_ne!(left.0, place.0);
-        assert!(left.0.is_dir() && place.0.is_dir());
+    fn each_demonstration_has_a_directory_that_only_its_user_may_open() {
+        let (place, other) = (Place::new().unwrap(), Place::new().unwrap());
+        let directory = place.0.path().to_owned();
+        assert_ne!(directory, other.0.path());
+        let mode = fs::metadata(&directory).unwrap().mode();
+        assert_eq!(mode & 0o777, 0o700);
+        drop(place);
+        assert!(!directory.exists());
     }
 }
