@@ -31,3 +31,4 @@ pub use self::settings::{
     Cell, FooterBytes, HexBytes, HexError, LayoutError, LengthField, Order, Packets, Preset,
     Settings,
 };
+pub use self::text::is_separator;

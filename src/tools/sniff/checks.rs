@@ -51,10 +51,6 @@ pub(super) fn holding(spans: &[&[u8]], beside: &[Kind], cell: Cell) -> Option<Ch
 fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<Check> {
     let length = beside.len();
     for &checksum in checksums {
-        let is_big_endian = matches!(
-            checksum,
-            Checksum::Crc32Be | Checksum::Crc16ModbusBe | Checksum::Crc16CcittBe
-        );
         for at in (0..=length.checked_sub(checksum.bytes())?).rev() {
             let at = at..at + checksum.bytes();
             if beside[at.clone()]
@@ -68,8 +64,9 @@ fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<
                     let cells_end = span.len() - length;
                     let end = cells_end + if cells_only { 0 } else { at.start };
                     let found = &span[cells_end..][at.clone()];
-                    let sum = checksum.of(&span[from..end]);
-                    (sum, number(found, is_big_endian) == u64::from(sum))
+                    let sent = checksum.sent(&span[from..end]);
+                    let is_right = *found == sent[..checksum.bytes()];
+                    (u32::from_le_bytes(sent), is_right)
                 };
                 holds(spans, sum)
             };

@@ -10,7 +10,7 @@ use super::checks;
 use super::columns::{Columns, Kind};
 use super::found::{Failure, Found, Known, LEAST_FRAMES, Shown, elongation, is_too_large};
 use super::period::{Frames, periods};
-use super::picture::{Pictures, Presses, Score, cell_bytes, cells, some};
+use super::picture::{Pictures, Presses, Score, cells, some};
 use super::places::{Place, places};
 use super::proposal::{Parts, Proposal, keys};
 use super::text;
@@ -178,8 +178,8 @@ fn candidates(
         };
         let cost = place.cost(columns).expect("a place has a cost");
         for cell in [Cell::U8, Cell::U16le, Cell::U16be] {
-            let count = place.bytes / cell_bytes(cell);
-            if !place.bytes.is_multiple_of(cell_bytes(cell))
+            let count = place.bytes / cell.bytes();
+            if !place.bytes.is_multiple_of(cell.bytes())
                 || known.cell.is_some_and(|known| known != cell)
             {
                 continue;

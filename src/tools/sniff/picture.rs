@@ -80,7 +80,7 @@ pub(super) fn some<T: Clone>(of: &[T], most: usize) -> Vec<T> {
 
 /// The cells in some bytes.
 pub(super) fn cells(bytes: &[u8], cell: Cell) -> impl Iterator<Item = u16> + '_ {
-    bytes.chunks_exact(cell_bytes(cell)).map(move |bytes| {
+    bytes.chunks_exact(cell.bytes()).map(move |bytes| {
         let number = |join: fn([u8; 2]) -> u16| join([bytes[0], bytes[1]]);
         match cell {
             Cell::U8 => bytes[0].into(),
@@ -88,10 +88,6 @@ pub(super) fn cells(bytes: &[u8], cell: Cell) -> impl Iterator<Item = u16> + '_ 
             Cell::U16be => number(u16::from_be_bytes),
         }
     })
-}
-
-pub(super) fn cell_bytes(cell: Cell) -> usize {
-    if cell == Cell::U8 { 1 } else { 2 }
 }
 
 /// How likely an array is, by each press. One more is about a factor of e.

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
-use hardnessd_core::wire::Preset;
+use hardnessd_core::wire::{Preset, is_separator};
 
 use super::found::{Failure, Found, Known, LEAST_FRAMES, Shown, elongation, is_too_large};
 use super::picture::{Pictures, Presses, of_each_cell};
@@ -115,13 +115,8 @@ fn unpacked(packed: &[u8]) -> Option<Vec<f32>> {
 
 /// The numbers that end a line. `None` if it has none.
 fn numbers(line: &[u8]) -> Option<Vec<f32>> {
-    let is_separator = |byte: &u8| {
-        matches!(
-            byte,
-            b' ' | b'\t' | b',' | b';' | b'\r' | b'[' | b']' | b'(' | b')' | b'{' | b'}'
-        )
-    };
-    let words = line.split(is_separator).filter(|word| !word.is_empty());
+    let words = line.split(|&byte| is_separator(byte));
+    let words = words.filter(|word| !word.is_empty());
     let number = |word: &[u8]| -> Option<u16> { std::str::from_utf8(word).ok()?.parse().ok() };
     let words: Vec<Option<f32>> = words.map(|word| number(word).map(f32::from)).collect();
     let from = words

@@ -60,7 +60,7 @@ impl Checksum {
     }
 
     /// The checksum of `bytes` as it is sent. Only the first [`Self::bytes`] of the result count.
-    pub(super) fn sent(self, bytes: &[u8]) -> [u8; 4] {
+    pub fn sent(self, bytes: &[u8]) -> [u8; 4] {
         let sum = self.of(bytes);
         match self {
             Checksum::Crc16ModbusBe | Checksum::Crc16CcittBe | Checksum::Crc32Be => {

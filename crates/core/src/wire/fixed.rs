@@ -47,7 +47,8 @@ struct Packet {
 }
 
 impl Cell {
-    fn bytes(self) -> usize {
+    /// The number of bytes that the cell takes on the wire.
+    pub fn bytes(self) -> usize {
         match self {
             Cell::U8 => 1,
             Cell::U16le | Cell::U16be => 2,

@@ -158,7 +158,8 @@ fn has_most_of_a_frame(text: &[u8], cells: usize) -> bool {
     2 * numbers.count() > cells
 }
 
-fn is_separator(byte: u8) -> bool {
+/// Whether a byte separates the cells of a text.
+pub fn is_separator(byte: u8) -> bool {
     matches!(
         byte,
         b' ' | b'\t' | b',' | b';' | b'\r' | b'[' | b']' | b'(' | b')' | b'{' | b'}'
