@@ -12,11 +12,11 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-use super::doctor;
 use super::exit::Failure;
+use super::record;
+use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
-use crate::daemon::record::{Error as RecordError, Progress};
-use crate::daemon::{self, Daemon, Sockets};
+use crate::daemon::record::Progress;
 use hardnessd_core::exit::{Coded, IO};
 use hardnessd_core::recording::Labels;
 
@@ -53,7 +53,6 @@ pub(super) async fn record(
 ) -> Result<Option<File>, Failure> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
-    let port = setup.config.sensors[0].port.clone();
     let path = std::env::temp_dir();
     let temporary = |source| Temporary {
         directory: path.clone(),
@@ -64,11 +63,8 @@ pub(super) async fn record(
     let mut recorded = file.try_clone().map_err(temporary)?;
 
     let (progress, mut counted) = watch::channel(Progress::default());
-    let labels = Labels::new();
-    let sockets = Sockets::Configured;
-    let daemon = Daemon::recording(setup, path.clone(), file, labels, progress, sockets)?;
-    hardnessd_core::stderr_line!("leave the sensor free until its zero is taken");
     let enough = async {
+        hardnessd_core::stderr_line!("leave the sensor free until its zero is taken");
         // The presses at the last prompt.
         let mut shown = None;
         while shown < Some(wanted) && counted.changed().await.is_ok() {
@@ -88,12 +84,8 @@ pub(super) async fn record(
             () = shutdown => stopped = true,
         }
     };
-    match daemon.run(end, None).await {
-        Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
-            return Err(doctor::Unavailable::new(sensor, port, reason).into());
-        }
-        recorded => recorded?,
-    }
+    let (sockets, labels) = (Sockets::Configured, Labels::new());
+    record::record(setup, sockets, &path, file, labels, progress, end).await?;
     if stopped {
         return Ok(None);
     }

@@ -249,7 +249,7 @@ fn holds_nothing(recorded: &Result<(), Error>, frames: u64) -> bool {
 }
 
 /// Records into `file`, which is at `path`, until `end` comes or no sensor is left.
-async fn record(
+pub(super) async fn record(
     setup: Setup,
     sockets: Sockets,
     path: &Path,
