@@ -27,7 +27,7 @@ use super::hub::{self, Closed, Line};
 use super::lines::{LineRead, Lines};
 use super::record::NoBlackbox;
 use super::request::motion::{Positions, ReportedPoint};
-use super::request::{self, Change, Request, Subscription, motion};
+use super::request::{self, Context, Query, Request, Subscription, motion};
 use super::sensor::{Command, SensorHandle, Sensors};
 use super::snapshot::Snapshots;
 use hardnessd_core::event::{Reply, Tared};
@@ -141,16 +141,16 @@ impl Service {
         }
     }
 
-    /// Carries out a command.
-    async fn change(&self, change: Change) -> Result<Done, Refused> {
-        let key = change.key();
+    /// Carries out a request that changes something. Of all sockets, only the control socket may.
+    async fn change(&self, request: Request) -> Result<Done, Refused> {
+        let key = request.key();
         if self.access == Access::ReadOnly {
             return Err(Refused::ReadOnly(key));
         }
         let sensors = &self.sensors;
         let stopping = |_| Refused::Stopping(key);
-        match change {
-            Change::Tare { sensor } => {
+        match request {
+            Request::Tare(sensor) => {
                 let (reply, outcome) = oneshot::channel();
                 pass_on(sensors, key, &sensor, Command::Tare(reply)).await?;
                 let tared = outcome.await.map_err(stopping)??;
@@ -159,18 +159,18 @@ impl Service {
                     ..Done::default()
                 })
             }
-            Change::Context { sensor, context } => {
+            Request::Context(Context { sensor, context }) => {
                 let (reply, held) = oneshot::channel();
                 let command = Command::Context(context, reply);
                 pass_on(sensors, "context.sensor", &sensor, command).await?;
                 held.await.map_err(stopping)?;
                 Ok(Done::default())
             }
-            Change::Motion(Positions { sensor, points }) => {
+            Request::Motion(Positions { sensor, points }) => {
                 move_arm(sensors, &sensor, &points).await?;
                 Ok(Done::default())
             }
-            Change::Blackbox { sensor } => {
+            Request::Blackbox(sensor) => {
                 let (reply, written) = oneshot::channel();
                 pass_on(sensors, key, &sensor, Command::Blackbox(reply)).await?;
                 let path = written.await.map_err(|_| Refused::Busy)??;
@@ -179,6 +179,7 @@ impl Service {
                     ..Done::default()
                 })
             }
+            Request::Subscribe(_) | Request::Get(_) => unreachable!("it changes nothing"),
         }
     }
 }
@@ -325,18 +326,18 @@ async fn read<I: AsyncRead + Unpin>(
         let id = line.id;
         let request = match line.request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
-            Ok(Request::Status) => {
+            Ok(Request::Get(Query::Status)) => {
                 let mut lines = service.snapshots.current().await?.statuses.clone();
                 lines.push(answer(Ok(Done::default()), id));
                 Asked::Answer(lines)
             }
-            Ok(Request::Last) => {
+            Ok(Request::Get(Query::Last)) => {
                 let finals = service.hub.survey().await?.finals;
                 let mut lines: Vec<Line> = finals.into_values().collect();
                 lines.push(answer(Ok(Done::default()), id));
                 Asked::Answer(lines)
             }
-            Ok(Request::History(sensor)) => {
+            Ok(Request::Get(Query::History(sensor))) => {
                 let history = service.hub.history(sensor.clone()).await?;
                 let done = find(&service.sensors, "history", &sensor).map(|_| Done::default());
                 let lines = history.iter().map(|history| history.line(&sensor));
@@ -345,9 +346,7 @@ async fn read<I: AsyncRead + Unpin>(
                 Asked::Answer(lines)
             }
             // A command may take long, because it may wait for frames or for a file to be written.
-            Ok(Request::Change(change)) => {
-                Asked::Answer(vec![answer(service.change(change).await, id)])
-            }
+            Ok(request) => Asked::Answer(vec![answer(service.change(request).await, id)]),
             Err(unusable) => Asked::Answer(vec![answer(Err(unusable.into()), id)]),
         };
         place.send(request);

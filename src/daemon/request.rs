@@ -1,8 +1,8 @@
 //! The requests of a subscriber: one JSON object per line.
 //!
 //! In: a line as it came. Out: a [`Request`], or an error with what was found and expected, in both
-//! cases with the `id` to echo. This module does not decide whether the connection may send a
-//! [`Change`].
+//! cases with the `id` to echo. This module does not decide whether the connection may change
+//! something.
 
 pub(crate) mod motion;
 
@@ -14,45 +14,46 @@ use serde_json::{Map, Value};
 use self::motion::Positions;
 use hardnessd_core::event::{self, ContextError, Kind};
 
-/// A request that can be used.
-#[derive(Debug, Clone, PartialEq)]
+/// A request as it is written. The first key names it.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub(crate) enum Request {
     /// Set the subscription of the connection.
     Subscribe(Subscription),
-    /// Get every sensor's current status.
-    Status,
-    /// Get every sensor's last final verdict.
-    Last,
-    /// Get the force and contact area of a sensor in the last two minutes.
-    History(String),
-    /// Change something. Of all sockets, only the control socket may do this.
-    Change(Change),
-}
-
-/// A command of the control socket.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Change {
-    /// Take another tare.
-    Tare { sensor: String },
-    /// Set the context that the controller reports of its work. `None` clears it.
-    Context {
-        sensor: String,
-        context: Option<Value>,
-    },
+    /// Get something. It changes nothing.
+    Get(Query),
+    /// Take another tare of this sensor.
+    Tare(String),
+    /// Set the context that the controller reports of its work.
+    Context(Context),
     /// Take positions of the arm that the robot reports.
     Motion(Positions),
     /// Write the last minute of this sensor to a file.
-    Blackbox { sensor: String },
+    Blackbox(String),
 }
 
-impl Change {
-    /// The key of the command in its request.
+/// What a request gets.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Query {
+    /// Every sensor's current status.
+    Status,
+    /// Every sensor's last final verdict.
+    Last,
+    /// The force and contact area of this sensor in the last two minutes.
+    History(String),
+}
+
+impl Request {
+    /// The key that names the request.
     pub(crate) fn key(&self) -> &'static str {
         match self {
-            Change::Tare { .. } => "tare",
-            Change::Context { .. } => "context",
-            Change::Motion(_) => "motion",
-            Change::Blackbox { .. } => "blackbox",
+            Request::Subscribe(_) => "subscribe",
+            Request::Get(_) => "get",
+            Request::Tare(_) => "tare",
+            Request::Context(_) => "context",
+            Request::Motion(_) => "motion",
+            Request::Blackbox(_) => "blackbox",
         }
     }
 }
@@ -125,49 +126,13 @@ impl TryFrom<String> for Since {
     }
 }
 
-/// A request as it is written. The first key names it.
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "lowercase")]
-enum Written {
-    Subscribe(Subscription),
-    Get(Queried),
-    Tare(String),
-    Context(Context),
-    Motion(Positions),
-    Blackbox(String),
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "lowercase")]
-enum Queried {
-    Status,
-    Last,
-    History(String),
-}
-
-impl From<Written> for Request {
-    fn from(written: Written) -> Self {
-        match written {
-            Written::Subscribe(subscription) => Request::Subscribe(subscription),
-            Written::Get(Queried::Status) => Request::Status,
-            Written::Get(Queried::Last) => Request::Last,
-            Written::Get(Queried::History(sensor)) => Request::History(sensor),
-            Written::Tare(sensor) => Request::Change(Change::Tare { sensor }),
-            Written::Context(Context { sensor, context }) => {
-                Request::Change(Change::Context { sensor, context })
-            }
-            Written::Motion(positions) => Request::Change(Change::Motion(positions)),
-            Written::Blackbox(sensor) => Request::Change(Change::Blackbox { sensor }),
-        }
-    }
-}
-
 /// A context as it came. It includes the key `sensor`, and without any other it is none.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(try_from = "Map<String, Value>")]
-struct Context {
-    sensor: String,
-    context: Option<Value>,
+pub(crate) struct Context {
+    pub(crate) sensor: String,
+    /// `None` removes the context.
+    pub(crate) context: Option<Value>,
 }
 
 impl TryFrom<Map<String, Value>> for Context {
@@ -253,8 +218,7 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
         key = "subscribe".to_owned();
         fields = Map::from_iter([(key.clone(), Value::Object(fields))]);
     }
-    let written = serde_json::from_value::<Written>(Value::Object(fields));
-    let request = written.map(Request::from);
+    let request = serde_json::from_value(Value::Object(fields));
     request.map_err(|error| Unusable::Request {
         key,
         problem: error.to_string(),
@@ -294,15 +258,18 @@ mod tests {
                 seq: 7
             })
         );
-        assert_eq!(parse(br#"{"get":"status"}"#).request, Ok(Request::Status));
+        assert_eq!(
+            parse(br#"{"get":"status"}"#).request,
+            Ok(Request::Get(Query::Status))
+        );
         assert_eq!(
             parse(br#"{"get":"last","id":4}"#).request,
-            Ok(Request::Last)
+            Ok(Request::Get(Query::Last))
         );
         let sensor = "forearm".to_owned();
         assert_eq!(
             parse(br#"{"tare":"forearm"}"#).request,
-            Ok(Request::Change(Change::Tare { sensor }))
+            Ok(Request::Tare(sensor))
         );
     }
 
@@ -311,7 +278,7 @@ mod tests {
         let context = |more: &str| {
             let line = format!(r#"{{"context":{{"sensor":"forearm"{more}}}}}"#);
             match parse(line.as_bytes()).request {
-                Ok(Request::Change(Change::Context { context, .. })) => Ok(context),
+                Ok(Request::Context(Context { context, .. })) => Ok(context),
                 other => Err(other.unwrap_err()),
             }
         };

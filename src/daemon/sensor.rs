@@ -297,7 +297,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::daemon::request::{Change, Request, motion, parse};
+    use crate::daemon::request::{Request, motion, parse};
     use hardnessd_core::frame::RawFrame;
     use hardnessd_core::pipeline::Clock;
     use hardnessd_core::test_support as tests;
@@ -323,7 +323,7 @@ mod tests {
             };
             let line = json!({"motion": {"sensor": "forearm", "at": [[moment, 0.02 * ms as f64]]}});
             let request = parse(line.to_string().as_bytes()).request;
-            let Ok(Request::Change(Change::Motion(motion))) = request else {
+            let Ok(Request::Motion(motion)) = request else {
                 panic!("{request:?}");
             };
             let placed = motion::placed(&motion.points, now).unwrap();

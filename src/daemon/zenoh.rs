@@ -25,7 +25,7 @@ use zenoh::{Session, Wait};
 use super::config;
 use super::hub::Line;
 use super::relay::{Door, Worker};
-use super::request::{self, Change, Request};
+use super::request::{self, Request};
 use hardnessd_core::event::{self, Hello, Kind, Reply, Status};
 
 /// The reason the session could not be opened.
@@ -229,7 +229,7 @@ fn take_positions(sample: &Sample, door: &Door) {
         return;
     }
     match request::parse(&bytes).request {
-        Ok(Request::Change(Change::Motion(positions))) => door.put(positions),
+        Ok(Request::Motion(positions)) => door.put(positions),
         Ok(_) => warn!(%key, "found another request on zenoh, expected motion"),
         Err(unusable) => warn!(%key, %unusable, "positions refused"),
     }
