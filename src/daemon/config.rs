@@ -227,16 +227,18 @@ impl Record {
     /// The directory of the recordings: the configured one, else the service's state directory,
     /// else `/var/lib/hardnessd`.
     pub fn dir(&self) -> PathBuf {
-        if let Some(dir) = &self.dir {
-            return dir.clone();
-        }
-        let directories = env::var("STATE_DIRECTORY").unwrap_or_default();
-        // systemd separates several directories by colons.
-        match directories.split(':').next() {
-            Some(first) if !first.is_empty() => PathBuf::from(first),
-            _ => PathBuf::from("/var/lib/hardnessd"),
-        }
+        let configured = self.dir.clone();
+        let dir = configured.or_else(|| directory_of_service("STATE_DIRECTORY"));
+        dir.unwrap_or_else(|| PathBuf::from("/var/lib/hardnessd"))
     }
+}
+
+/// The directory that systemd names in this variable: the first of several, between which it writes
+/// colons.
+fn directory_of_service(variable: &str) -> Option<PathBuf> {
+    let directories = env::var(variable).ok()?;
+    let first = directories.split(':').next()?;
+    (!first.is_empty()).then(|| PathBuf::from(first))
 }
 
 fn host() -> String {

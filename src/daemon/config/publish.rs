@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::directory_of_service;
+
 /// The `[publish]` tables.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -233,14 +235,10 @@ impl Unix {
     /// The default paths of a socket that apply here, the preferred one first: in the service's
     /// runtime directory, in the user's runtime directory, and in `/run/hardnessd`.
     pub fn places() -> Vec<PathBuf> {
-        let named = |variable| env::var(variable).ok().filter(|value| !value.is_empty());
-        // systemd separates several directories by colons.
-        let service = named("RUNTIME_DIRECTORY").map(|directories| {
-            let first = directories.split(':').next().unwrap_or_default();
-            PathBuf::from(first)
-        });
-        let user =
-            named("XDG_RUNTIME_DIR").map(|directory| Path::new(&directory).join("hardnessd"));
+        let service = directory_of_service("RUNTIME_DIRECTORY");
+        let user = env::var("XDG_RUNTIME_DIR").ok();
+        let user = user.filter(|directory| !directory.is_empty());
+        let user = user.map(|directory| Path::new(&directory).join("hardnessd"));
         let directories = service.into_iter().chain(user);
         directories
             .chain([PathBuf::from("/run/hardnessd")])
