@@ -44,10 +44,14 @@ impl Answer {
 
 /// The labels of the levels that a `hello` names.
 pub(super) fn labels(hello: &Value) -> Vec<String> {
-    let levels = hello["model"]["levels"].as_array().into_iter().flatten();
-    levels
+    items(&hello["model"], "levels")
         .filter_map(|level| level["label"].as_str().map(str::to_owned))
         .collect()
+}
+
+/// The items of a list of an event. Without a list there are none.
+pub(super) fn items<'a>(event: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
+    event[key].as_array().into_iter().flatten()
 }
 
 fn named(level: u64, labels: &[String]) -> String {
@@ -58,11 +62,10 @@ fn named(level: u64, labels: &[String]) -> String {
 
 /// The levels that a rejected verdict lies between: its set of levels, otherwise the two likeliest.
 fn between(verdict: &Value, labels: &[String]) -> String {
-    let items = |key: &str| verdict[key].as_array().into_iter().flatten();
-    let mut levels: Vec<u64> = items("levels").filter_map(Value::as_u64).collect();
+    let mut levels: Vec<u64> = items(verdict, "levels").filter_map(Value::as_u64).collect();
     if levels.len() < 2 {
         let mut likely: Vec<(u64, f64)> = (1..)
-            .zip(items("probabilities").filter_map(Value::as_f64))
+            .zip(items(verdict, "probabilities").filter_map(Value::as_f64))
             .collect();
         // The sort is stable: of equal ones, the lower levels come first.
         likely.sort_by(|one, other| other.1.total_cmp(&one.1));

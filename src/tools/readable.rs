@@ -102,7 +102,8 @@ fn clock(time: &str) -> String {
     time.get(11..23).unwrap_or_default().to_owned()
 }
 
-fn number(event: &Value, key: &str) -> u64 {
+/// A whole number of an event. Without one it is 0.
+pub(super) fn number(event: &Value, key: &str) -> u64 {
     event[key].as_u64().unwrap_or_default()
 }
 

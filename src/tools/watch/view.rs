@@ -11,7 +11,9 @@ use jiff::SignedDuration;
 use serde_json::{Value, json};
 
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
-use super::super::connect::WEB_SERVER;
+use crate::tools::answer::items;
+use crate::tools::connect::WEB_SERVER;
+use crate::tools::readable::number;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::wording;
@@ -345,14 +347,6 @@ pub(super) fn age(age: Duration) -> String {
         ..7200.0 => format!("{:.0} min", seconds / 60.0),
         _ => format!("{:.0} h", seconds / 3600.0),
     }
-}
-
-fn items<'a>(event: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
-    event[key].as_array().into_iter().flatten()
-}
-
-fn number(event: &Value, key: &str) -> u64 {
-    event[key].as_u64().unwrap_or_default()
 }
 
 fn text(event: &Value, key: &str) -> String {

@@ -5,8 +5,9 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::{items, number, plain, text};
-use crate::tools::answer::Answer;
+use super::{plain, text};
+use crate::tools::answer::{Answer, items};
+use crate::tools::readable::number;
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::sensor::LATE_PERIODS;
 
