@@ -63,7 +63,7 @@ impl ModelFile {
 }
 
 /// The paths at which a configuration is looked for, in this order.
-const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];
+pub(super) const PLACES: [&str; 2] = ["./hardnessd.toml", "/etc/hardnessd.toml"];
 
 impl Configuration {
     /// The named file, or else the first default path that exists. In the second case, stderr names

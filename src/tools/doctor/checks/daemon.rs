@@ -3,7 +3,7 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rustix::fs::{Mode, OFlags};
 use rustix::termios::tcgetattr;
@@ -11,6 +11,7 @@ use rustix::termios::tcgetattr;
 use super::{Fault, under};
 use crate::daemon::config::{Config, SensorTable};
 use crate::daemon::serial::tty::{Changed, make_plain};
+use crate::tools::configuration::PLACES;
 
 /// A driver rounds a speed to one that its chip can make.
 const ROUNDING: f64 = 0.03;
@@ -29,13 +30,8 @@ pub(super) fn sensor(root: &Path, pid: u32, device: &Path) -> Option<SensorTable
     let path = match given {
         Some(path) => folder.join(path),
         None => {
-            let near = folder.join("hardnessd.toml");
-            let is_near = under(root, &near).exists();
-            if is_near {
-                near
-            } else {
-                PathBuf::from("/etc/hardnessd.toml")
-            }
+            let mut places = PLACES.into_iter().map(|place| folder.join(place));
+            places.find(|path| under(root, path).exists())?
         }
     };
     let config = Config::load(&under(root, &path)).ok()?;
