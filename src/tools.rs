@@ -187,9 +187,13 @@ async fn print_apart(lines: Vec<u8>) -> Result<bool, Stdout> {
     printed.map_err(|ended| Stdout(io::Error::other(ended)))?
 }
 
+/// An absolute path, or the path as it is if the system does not know the current directory.
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
+}
+
 /// A path as the configuration may name it: relative, if it lies beside the configuration.
 fn as_in(config: &Path, path: &Path) -> String {
-    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let (config, path) = (absolute(config), absolute(path));
     let beside = config
         .parent()

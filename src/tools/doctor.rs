@@ -8,11 +8,12 @@ mod checks;
 #[cfg(test)]
 mod tests;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args as ClapArgs;
 
 use self::checks::{User, examine, in_the_way, network, ports, refused};
+use super::absolute;
 use super::exit::Failure;
 use crate::daemon::port::Port;
 use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
@@ -87,10 +88,6 @@ impl Unavailable {
             obstacle,
         }
     }
-}
-
-fn absolute(path: &Path) -> PathBuf {
-    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
 
 /// Prints the faults, each with its remedy.

@@ -37,7 +37,7 @@ use self::found::{Found, Known, Shown};
 use self::noise::noise_counts;
 use self::picture::draw;
 use super::simulate::positive;
-use super::{CannotRead, doctor, exit};
+use super::{CannotRead, absolute, doctor, exit};
 use crate::apart;
 use crate::daemon::port::Port;
 use crate::daemon::serial::{self, Link, Turn};
@@ -234,9 +234,7 @@ fn propose(args: &Args, bytes: &[u8]) -> Result<(), exit::Failure> {
 fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
     let port = match &args.port {
         // The configuration may be in another directory.
-        Some(Port::Device(path)) => std::path::absolute(path)
-            .map_or(path.clone(), |path| path)
-            .into(),
+        Some(Port::Device(path)) => absolute(path).into(),
         Some(port) => port.clone(),
         None => Port::Device("/dev/serial/by-id/...".into()),
     };
