@@ -381,49 +381,17 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         let arguments = [command, &[directory.to_str().unwrap()]].concat();
         fails(&arguments, 66, &["cannot read: Is a directory"]);
     }
-    let empty = bench.path("empty.toml");
-    fs::write(&empty, "").unwrap();
-    fails(
-        &["check", "--config", empty.to_str().unwrap()],
-        78,
-        &["empty.toml: no sensor: add a [[sensor]] with a port"],
-    );
     let config = written("[press]\nend_framse = 2\n");
     fails(
         &["run", "--config", &config],
         78,
         &["bad.toml", "end_framse", "end_frames"],
     );
-    fs::write(bench.path("latin.toml"), b"robot = \"\xe9\"").unwrap();
-    fails(
-        &[
-            "check",
-            "--config",
-            bench.path("latin.toml").to_str().unwrap(),
-        ],
-        78,
-        &["latin.toml: ", "utf-8", "from index 9"],
-    );
     let config = written("[model]\npath = \"none.onnx\"\n");
     fails(
         &["run", "--config", &config],
         78,
         &["none.onnx", "model.path"],
-    );
-    fs::write(bench.path("junk.onnx"), "no model").unwrap();
-    let config = written("[model]\npath = \"junk.onnx\"\n");
-    fails(&["run", "--config", &config], 78, &["junk.onnx"]);
-    // A build without ROS 2 refuses the table; a build with it refuses the value.
-    let config = written("[publish.ros2]\ndomain_id = 300\n");
-    let expected = if cfg!(feature = "ros2") {
-        "expected 0 to 232"
-    } else {
-        "built without ros2: build it with --features ros2, or remove the table"
-    };
-    fails(
-        &["check", "--config", &config],
-        78,
-        &["publish.ros2", expected],
     );
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
@@ -447,12 +415,6 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         78,
         &["frame_rate_hz", "14.58"],
     );
-    let config = written("[log]\nformat = 5\n");
-    fails(
-        &["check", "--config", &config],
-        78,
-        &["bad.toml: line 9, ", "`format = 5`"],
-    );
     fails(&["replay", "/no/such.bin"], 66, &["/no/such.bin"]);
     fails(&["replay"], 2, &["not provided", "<FILE>"]);
     fails(
@@ -460,11 +422,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         2,
         &["steel", "--material", "wood"],
     );
-    for tool in [
-        &["replay", "/"][..],
-        &["sniff", "/"],
-        &["recover", "/", "--out", "x.mcap"],
-    ] {
+    for tool in [&["sniff", "/"][..], &["recover", "/", "--out", "x.mcap"]] {
         fails(tool, 66, &["/: cannot read", "directory"]);
     }
     fails(
@@ -493,16 +451,16 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     ] {
         fails(&beyond_any_sensor, 2, &[beyond_any_sensor[1]]);
     }
-    for (label, found) in [
-        ("object=99999999999", "object: found \"99999999999\""),
-        ("note=\u{202e}7", "found \"\\u{202e}7\""),
-        ("=7", "the label has no key: write KEY=VALUE"),
-    ] {
-        let record = [
-            "record", "--config", "x.toml", "--out", "x", "--label", label,
-        ];
-        fails(&record, 2, &["--label", found]);
-    }
+    let record = [
+        "record",
+        "--config",
+        "x.toml",
+        "--out",
+        "x",
+        "--label",
+        "note=\u{202e}7",
+    ];
+    fails(&record, 2, &["--label", "found \"\\u{202e}7\""]);
     assert_eq!(hardnessd(&["--version"]).status.code(), Some(0));
 }
 
