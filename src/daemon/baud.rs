@@ -99,7 +99,7 @@ impl Load {
 mod tests {
     use super::*;
     use crate::tools::pty::Pty;
-    use hardnessd_core::wire::Settings;
+    use hardnessd_core::wire::{Preset, Settings};
 
     #[test]
     fn only_a_port_that_follows_its_baud_rate_is_certain_to_be_too_slow() {
@@ -126,6 +126,37 @@ mod tests {
         assert_eq!(excess(by_id), (Pace::Unknown, Some(false)));
         for port in ["/dev/ttyUSB99", "/dev/ttyAMA99"] {
             assert_eq!(excess(port), (Pace::Baud, Some(true)), "{port}");
+        }
+    }
+
+    #[test]
+    fn a_rate_that_no_frame_allows_is_certain_to_be_too_high_and_one_that_some_do_not_is_not() {
+        // At 115,200 baud: rows of 784 values have 1,569 to 5,546 bytes, packed zeros 9 to 1,569. A glove's
+        // two packets have 284.
+        for (frame_rate_hz, preset, expected) in [
+            (2.0, Preset::Ascii, None),
+            (5.0, Preset::Ascii, Some((5546, false))),
+            (7.4, Preset::Ascii, Some((1569, true))),
+            (2.0, Preset::Csv, None),
+            (7.4, Preset::Csv, Some((1568, true))),
+            (22.2, Preset::M1616, Some((519, true))),
+            (40.6, Preset::JqGlove, Some((284, true))),
+            (7.3, Preset::ZeroRun, None),
+            (100.0, Preset::ZeroRun, Some((1569, false))),
+            (1300.0, Preset::ZeroRun, Some((9, true))),
+        ] {
+            let settings = Settings {
+                preset,
+                ..Settings::default()
+            };
+            let sensor = SensorTable {
+                frame_rate_hz,
+                ..SensorTable::new("/dev/ttyUSB99".parse::<Port>().unwrap())
+            };
+            let load = Load::of(&sensor, &Layout::new(&settings).unwrap());
+            let excess = load.excess;
+            let found = excess.map(|excess| (excess.frame_bytes, excess.is_certain));
+            assert_eq!(found, expected, "{frame_rate_hz} {preset}");
         }
     }
 }

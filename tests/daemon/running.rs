@@ -465,42 +465,6 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
 }
 
 #[test]
-fn check_refuses_a_rate_that_no_frame_would_allow_and_warns_of_one_that_some_do_not() {
-    let bench = Bench::new();
-    let config = bench.path("varying.toml");
-    let check = |rate: &str, preset: &str| {
-        let text = format!(
-            "[[sensor]]\nport = \"/dev/ttyUSB99\"\nframe_rate_hz = {rate}\n\
-             [sensor.frame]\npreset = \"{preset}\"\n"
-        );
-        fs::write(&config, text).unwrap();
-        let output = hardnessd(&["check", "--config", config.to_str().unwrap()]);
-        let stderr = String::from_utf8(output.stderr).unwrap();
-        (output.status.code(), stderr)
-    };
-    // At 115,200 baud: rows of 784 values have 1,569 to 5,546 bytes, packed zeros 9 to 1,569. A glove's
-    // two packets have 284.
-    for (rate, preset, code, warning) in [
-        ("2.0", "ascii", 0, ""),
-        ("5.0", "ascii", 0, "5 frames/s of 5546 bytes"),
-        ("7.4", "ascii", 78, "7.4 frames/s of 1569 bytes"),
-        ("2.0", "csv", 0, ""),
-        ("7.4", "csv", 78, "7.4 frames/s of 1568 bytes"),
-        ("22.2", "m1616", 78, "22.2 frames/s of 519 bytes"),
-        ("40.6", "jq-glove", 78, "40.6 frames/s of 284 bytes"),
-        ("7.3", "zero-run", 0, ""),
-        ("100.0", "zero-run", 0, "100 frames/s of 1569 bytes"),
-        ("1300.0", "zero-run", 78, "1300 frames/s of 9 bytes"),
-    ] {
-        let (found, stderr) = check(rate, preset);
-        assert_eq!(found, Some(code), "{rate} {preset}: {stderr}");
-        let lines = usize::from(!warning.is_empty());
-        assert_eq!(stderr.lines().count(), lines, "{stderr}");
-        assert!(stderr.contains(warning), "{stderr}");
-    }
-}
-
-#[test]
 fn help_that_cannot_be_written_is_an_io_error() {
     for asked in ["--help", "--version"] {
         let output = Command::new(BINARY)
