@@ -614,14 +614,18 @@ fn a_signal_ends_every_command_that_waits_for_a_file() {
         (&["record", "--config", fifo, "--out", new], 0, ""),
         (&["simulate", "--faults", fifo], 0, ""),
         (&["check", "--config", fifo], 143, unfinished),
+        (&["replay", fifo], 143, unfinished),
+        (&["sniff", fifo], 143, unfinished),
     ] {
         let mut command = Command::new(BINARY);
         command.args(arguments).stderr(Stdio::piped());
         let mut process = Process(command.spawn().unwrap());
         // Opening the pipe for writing succeeds once a process reads.
         let _writer = fs::File::options().write(true).open(fifo).unwrap();
+        let start = Instant::now();
         process.signal(Signal::TERM);
         assert_eq!(process.exit_code(), Some(code), "{arguments:?}");
+        assert!(start.elapsed() < Duration::from_secs(5), "{arguments:?}");
         let mut logged_lines = String::new();
         let mut stderr = process.0.stderr.take().unwrap();
         stderr.read_to_string(&mut logged_lines).unwrap();
