@@ -130,7 +130,9 @@ fn sniff_writes_a_configuration_that_check_takes() {
         stdout,
         stderr,
     } = sniff();
-    assert_eq!(status.code(), Some(0), "{}", text(&stderr));
+    let message = text(&stderr);
+    assert_eq!(status.code(), Some(0), "{message}");
+    assert!(message.contains("press the sensor"), "{message}");
     assert_eq!(text(&stdout), "");
     let written = fs::read_to_string(&config).unwrap();
     let end = "[sensor.frame]\npreset = \"jx255n\"\n\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for \

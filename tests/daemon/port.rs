@@ -75,18 +75,6 @@ fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
 }
 
 #[test]
-fn a_sensor_at_a_port_is_sniffed_while_it_plays() {
-    let bench = Bench::new();
-    let _sensor = bench.sensor(&["--speed", "4"]);
-    let port = bench.path("port").to_str().unwrap().to_owned();
-    let (code, toml, stderr) = run(&["sniff", "--port", &port, "--seconds", "2"]);
-    assert_eq!(code, 0, "{stderr}");
-    assert!(stderr.contains("press the sensor"), "{stderr}");
-    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
-    checked(&bench, &toml);
-}
-
-#[test]
 fn sniff_says_why_it_has_no_proposal() {
     let bench = Bench::new();
     let check = |arguments: &[&str], code: i32, part: &str| {
