@@ -7,16 +7,12 @@
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::shortage::User;
 use crate::bench::pair::Pair;
 use crate::bench::{Bench, Daemon, Process, Subscriber, hardnessd, wait_for};
-use hardnessd_core::frame::{RawFrame, Stamp};
-use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use rustix::fs::{FlockOperation, flock};
@@ -613,58 +609,6 @@ fn pressed_while_it_tares_a_sensor_says_so_and_tares_when_it_is_released() {
         "and no press before it"
     );
     assert_eq!(played.released(1)["frames"], 10);
-}
-
-#[test]
-fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
-    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
-    let play = |jumps_s: &[(usize, i64)]| {
-        let described = Description {
-            frame_rate_hz: 100.0,
-            ..Description::default()
-        };
-        let sensor = Sensor::new(described).unwrap();
-        let layout = sensor.layout().clone();
-        let mut pipeline = Pipeline::new(sensor, hrn.clone(), Clock::Arrival);
-        let mut events = Vec::new();
-        let mut wall = jiff::Timestamp::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
-        for number in 0..120_u32 {
-            if let Some(&(_, by_s)) = jumps_s.iter().find(|(at, _)| *at == number as usize) {
-                wall = wall
-                    .checked_add(jiff::SignedDuration::from_secs(by_s))
-                    .unwrap();
-            }
-            wall += PERIOD;
-            let mono = Duration::from_secs(5) + number * PERIOD;
-            let at = Stamp { mono, wall };
-            let is_pressed = (20..60).contains(&number) || (80..100).contains(&number);
-            let mut bytes = Vec::new();
-            let raw = if is_pressed { pressed() } else { rest() };
-            layout.encode(&raw, &mut bytes);
-            events.extend(pipeline.push(&bytes, at));
-            // The next deadline is as far away as after any other frame.
-            assert_eq!(
-                pipeline.deadline(),
-                Some(mono + Duration::from_millis(50)),
-                "frame {number}"
-            );
-        }
-        let timeless = |event: &hardnessd_core::event::Event| {
-            let mut event = serde_json::to_value(event).unwrap();
-            event.as_object_mut().unwrap().remove("time");
-            event
-        };
-        events.iter().map(timeless).collect::<Vec<Value>>()
-    };
-    let steady = play(&[]);
-    let verdicts = steady.iter().filter(|event| event["phase"] == "final");
-    assert_eq!(verdicts.count(), 2);
-    let year_s = 365 * 86_400;
-    // The calendar jumps during a press, at its last frame, and between presses.
-    assert_eq!(
-        play(&[(30, year_s), (59, -2 * year_s), (70, -1), (90, 3600)]),
-        steady
-    );
 }
 
 /// This test takes minutes: `.ci/peers` runs it.

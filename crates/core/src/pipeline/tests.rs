@@ -462,6 +462,44 @@ fn a_lost_device_that_is_open_again_and_sends_no_frame_says_so() {
         assert_eq!(pipeline.deadline(), None);
     }
     assert_eq!(play(&mut pipeline, 60, &[raw(0, 0)]), ["Live"]);
+#[test]
+fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
+    let play = |jumps_s: &[(u64, i64)]| {
+        let mut pipeline = pipeline(Preset::Jx255n);
+        let mut events = Vec::new();
+        let mut away = jiff::SignedDuration::ZERO;
+        for number in 0..120 {
+            for &(_, by_s) in jumps_s.iter().filter(|jump| jump.0 == number) {
+                away += jiff::SignedDuration::from_secs(by_s);
+            }
+            let is_pressed = (20..60).contains(&number) || (80..100).contains(&number);
+            let raw = if is_pressed { raw(36, 20) } else { raw(0, 0) };
+            let bytes = bytes(&pipeline, &raw);
+            let Stamp { mono, wall } = at(number * 200);
+            let wall = wall.checked_add(away).unwrap();
+            events.extend(pipeline.push(&bytes, Stamp { mono, wall }));
+            // The next deadline is as far away as after any other frame.
+            let deadline = mono + Duration::from_millis(500);
+            assert_eq!(pipeline.deadline(), Some(deadline), "frame {number}");
+        }
+        let timeless = |event: &Event| {
+            let mut event = serde_json::to_value(event).unwrap();
+            event.as_object_mut().unwrap().remove("time");
+            event
+        };
+        events.iter().map(timeless).collect::<Vec<_>>()
+    };
+    let steady = play(&[]);
+    let verdicts = steady.iter().filter(|event| event["phase"] == "final");
+    assert_eq!(verdicts.count(), 2);
+    let year_s = 365 * 86_400;
+    // The calendar jumps during a press, at its last frame, and between presses.
+    assert_eq!(
+        play(&[(30, year_s), (59, -2 * year_s), (70, -1), (90, 3600)]),
+        steady
+    );
+}
+
 }
 
 #[test]
