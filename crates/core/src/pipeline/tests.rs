@@ -76,13 +76,18 @@ fn words(events: &[Event]) -> Vec<String> {
 }
 
 /// Pushes one frame a period, with numbers from `first` on.
-fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
+fn feed(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<Event> {
     let mut events = Vec::new();
     for (number, raw) in (first..).zip(frames) {
         let bytes = bytes(pipeline, raw);
         events.extend(pipeline.push(&bytes, at(number * 200)));
     }
-    words(&events)
+    events
+}
+
+/// The same, with the events in words.
+fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
+    words(&feed(pipeline, first, frames))
 }
 
 #[test]
@@ -113,23 +118,18 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 #[test]
 fn frames_say_whether_they_are_tared() {
     let mut pipeline = pipeline(Preset::Jx255n);
-    let mut tared = |first: u64, frames: u64| {
-        let mut tared = Vec::new();
-        for number in first..first + frames {
-            let bytes = bytes(&pipeline, &raw(0, 0));
-            let events = pipeline.push(&bytes, at(number * 200));
-            tared.extend(events.iter().filter_map(|event| match event {
-                Event::Frame(frame) => Some(frame.tared),
-                _ => None,
-            }));
-        }
-        tared
+    let mut tared = |first: u64, frames: usize| -> Vec<bool> {
+        let events = feed(&mut pipeline, first, &vec![raw(0, 0); frames]);
+        let tared = events.iter().filter_map(|event| match event {
+            Event::Frame(frame) => Some(frame.tared),
+            _ => None,
+        });
+        tared.collect()
     };
     assert_eq!(tared(0, 5), [false; 5], "the tare is made of these");
     assert_eq!(tared(5, 2), [true; 2]);
     pipeline.retare().unwrap();
-    let bytes = bytes(&pipeline, &raw(0, 0));
-    let events = pipeline.push(&bytes, at(1400));
+    let events = feed(&mut pipeline, 7, &[raw(0, 0)]);
     let Some(Event::Frame(frame)) = events.last() else {
         panic!("{events:?}")
     };
@@ -242,14 +242,12 @@ fn the_context_stays_until_it_changes() {
     let context = serde_json::json!({"tag": "pick-17"});
     pipeline.set_context(Some(context.clone()));
     let mut published = Vec::new();
-    for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
-        let bytes = bytes(&pipeline, &raw);
-        for event in pipeline.push(&bytes, at(number * 200)) {
-            match event {
-                Event::Press(press) => published.push(press.context),
-                Event::Hardness(verdict) => published.push(verdict.context),
-                _ => {}
-            }
+    let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
+    for event in feed(&mut pipeline, 5, &press) {
+        match event {
+            Event::Press(press) => published.push(press.context),
+            Event::Hardness(verdict) => published.push(verdict.context),
+            _ => {}
         }
     }
     assert_eq!(published, vec![Some(context); 3]);
@@ -462,6 +460,8 @@ fn a_lost_device_that_is_open_again_and_sends_no_frame_says_so() {
         assert_eq!(pipeline.deadline(), None);
     }
     assert_eq!(play(&mut pipeline, 60, &[raw(0, 0)]), ["Live"]);
+}
+
 #[test]
 fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
     let play = |jumps_s: &[(u64, i64)]| {
@@ -498,8 +498,6 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
         play(&[(30, year_s), (59, -2 * year_s), (70, -1), (90, 3600)]),
         steady
     );
-}
-
 }
 
 #[test]
@@ -571,11 +569,8 @@ fn verdicts_below_the_thresholds_are_rejected() {
             described.min_confidence = min_confidence;
         });
         play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-        let mut events = Vec::new();
-        for (number, raw) in (5..).zip([raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]) {
-            let bytes = bytes(&pipeline, &raw);
-            events.extend(pipeline.push(&bytes, at(number * 200)));
-        }
+        let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
+        let mut events = feed(&mut pipeline, 5, &press);
         let Some(Event::Hardness(verdict)) = events.pop() else {
             panic!("{events:?}")
         };
@@ -623,11 +618,8 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
             held.counts[first..first + 3].fill(50);
         }
         held.counts[place] = count;
-        let mut events = Vec::new();
-        for (number, raw) in (5..).zip([held.clone(), held, raw(0, 0), raw(0, 0)]) {
-            let bytes = bytes(&pipeline, &raw);
-            events.extend(pipeline.push(&bytes, at(number * 200)));
-        }
+        let press = [held.clone(), held, raw(0, 0), raw(0, 0)];
+        let events = feed(&mut pipeline, 5, &press);
         let Some(Event::Hardness(verdict)) = events.last() else {
             panic!("{events:?}")
         };
@@ -664,9 +656,7 @@ fn the_notes_are_of_the_settings_that_the_chosen_frame_came_under() {
             described.calibration.newtons_per_count = newtons_per_count;
             described.press.contact_threshold_n = Some(threshold_n);
         });
-        play(&mut pipeline, 7, &[raw(0, 0)]);
-        let bytes = bytes(&pipeline, &raw(0, 0));
-        let events = pipeline.push(&bytes, at(1600));
+        let events = feed(&mut pipeline, 7, &vec![raw(0, 0); 2]);
         let Some(Event::Hardness(verdict)) = events.last() else {
             panic!("{events:?}")
         };
@@ -815,12 +805,9 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
     let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
     let judged = |pipeline: &mut Pipeline, first: u64| {
         let mut found = None;
-        for (number, raw) in (first..).zip(&press) {
-            let bytes = bytes(pipeline, raw);
-            for event in pipeline.push(&bytes, at(number * 200)) {
-                if let Event::Hardness(verdict) = event {
-                    found = verdict.object.map(|object| (object.name, object.presses));
-                }
+        for event in feed(pipeline, first, &press) {
+            if let Event::Hardness(verdict) = event {
+                found = verdict.object.map(|object| (object.name, object.presses));
             }
         }
         found

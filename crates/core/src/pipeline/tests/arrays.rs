@@ -49,11 +49,9 @@ fn verdict(array: Array, pitch: Pitch) -> Hardness {
         described.calibration.pitch_mm = pitch;
     });
     let (free, held) = (RawFrame::zero(array), contact(array, pitch));
-    let mut events = Vec::new();
-    for (number, raw) in (0..).zip([&free; 5].into_iter().chain([&held; 4]).chain([&free; 2])) {
-        let bytes = bytes(&pipeline, raw);
-        events.extend(pipeline.push(&bytes, at(number * 200)));
-    }
+    let (before, after) = (vec![free.clone(); 5], vec![free; 2]);
+    let frames = [before, vec![held; 4], after].concat();
+    let events = feed(&mut pipeline, 0, &frames);
     let shown = events.iter().rev().find_map(|event| match event {
         Event::Frame(frame) => Some(frame),
         _ => None,

@@ -188,12 +188,8 @@ fn positions_that_say_nothing_of_the_press_are_no_course() {
     let found = |first: RawFrame, until_ms: i64| {
         let mut pipeline = tared(&[], |_| {});
         let _ = pipeline.add_positions(&positions(1000, until_ms));
-        let mut events = Vec::new();
-        for (number, raw) in (6..).zip([first, raw(9, 80), raw(0, 0), raw(0, 0)]) {
-            let bytes = bytes(&pipeline, &raw);
-            events.extend(pipeline.push(&bytes, at(number * 200)));
-        }
-        let last = verdicts(events).pop().unwrap();
+        let press = [first, raw(9, 80), raw(0, 0), raw(0, 0)];
+        let last = verdicts(feed(&mut pipeline, 6, &press)).pop().unwrap();
         (last.frame, last.course, given(&last))
     };
     let known = Some(ApproachSource::Positions);
@@ -314,12 +310,8 @@ fn a_long_press_is_thinned() {
     let held: Vec<RawFrame> = (0..100)
         .map(|n| raw(9 + usize::from(n == 50), 60))
         .collect();
-    let mut events = Vec::new();
-    for (number, raw) in (6..).zip([&held[..], &vec![raw(0, 0); 2]].concat()) {
-        let bytes = bytes(&pipeline, &raw);
-        events.extend(pipeline.push(&bytes, at(number * 200)));
-    }
-    let found = verdicts(events);
+    let press = [&held[..], &vec![raw(0, 0); 2]].concat();
+    let found = verdicts(feed(&mut pipeline, 6, &press));
     let last = found.last().unwrap();
     assert_eq!(last.frame, 55);
     let frames = given(last)[1];
@@ -337,12 +329,7 @@ fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
         pipeline.hrn = test_support::hrn();
         pipeline.add_positions(reported).unwrap();
         let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
-        let mut events = Vec::new();
-        for (number, raw) in (6..).zip(held) {
-            let bytes = bytes(&pipeline, &raw);
-            events.extend(pipeline.push(&bytes, at(number * 200)));
-        }
-        let found = verdicts(events);
+        let found = verdicts(feed(&mut pipeline, 6, &held));
         let phases: Vec<Phase> = found.iter().map(|verdict| verdict.phase).collect();
         assert_eq!(phases, [Phase::Early, Phase::Final]);
         found
