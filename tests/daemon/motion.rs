@@ -1,12 +1,10 @@
 //! Positions of the arm: sent to the real daemon on the control socket, recorded and replayed.
 
 use std::fs;
-use std::io::{Read, Write};
-use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use crate::bench::{Bench, Daemon, Subscriber, hardnessd};
+use crate::bench::{Bench, Daemon, Subscriber, get, hardnessd};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Reader};
 use serde_json::{Value, json};
@@ -95,14 +93,7 @@ fn positions_are_checked_counted_and_recorded() {
     assert_eq!(answer["message"], expected);
 
     let address = daemon.address("http").to_string();
-    let mut stream = TcpStream::connect(&address).unwrap();
-    write!(
-        stream,
-        "GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n"
-    )
-    .unwrap();
-    let mut metrics = String::new();
-    stream.read_to_string(&mut metrics).unwrap();
+    let metrics = get(&address, "/metrics");
     let counter = "hardnessd_motion_points_total{robot=\"arm-7\",sensor=\"forearm\"} 5";
     assert!(metrics.contains(counter), "{metrics}");
 

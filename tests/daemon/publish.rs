@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::bench::{BINARY, Bench, Daemon, Process, Subscriber, wait_for};
+use crate::bench::{BINARY, Bench, Daemon, Process, Subscriber, get, wait_for};
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use serde_json::{Value, json};
 
@@ -412,7 +412,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
     let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nframe_rate_hz = 20.0\n\
                 [http]\nlisten = \"127.0.0.1:0\"\n";
     let mut daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", more));
-    let http = daemon.address("http");
+    let http = daemon.address("http").to_string();
     let mut forearm = bench.sensor(&[]);
     let _wrist = bench.sensor_at("port-2", 20, &["--seed", "2"]);
     let mut subscriber = bench.subscriber();
@@ -447,11 +447,7 @@ fn a_lost_sensor_disturbs_no_other_and_every_word_names_its_sensor() {
         }
     }
 
-    let mut stream = TcpStream::connect(http).unwrap();
-    let request = format!("GET /metrics HTTP/1.1\r\nHost: {http}\r\nConnection: close\r\n\r\n");
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut metrics = String::new();
-    stream.read_to_string(&mut metrics).unwrap();
+    let metrics = get(&http, "/metrics");
     for (sensor, live) in [("forearm", "0.0"), ("wrist", "1.0")] {
         let labels = format!("robot=\"arm-7\",sensor=\"{sensor}\"");
         let state = format!("hardnessd_link_state{{{labels},state=\"live\"}} {live}\n");

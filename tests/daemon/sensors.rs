@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use rustix::process::Signal;
 use serde_json::json;
 
-use crate::bench::{Bench, Daemon, hardnessd, wait_for};
+use crate::bench::{Bench, Daemon, get, hardnessd, wait_for};
 
 /// A configuration with these sensors, each at the port of its name.
 fn configure(bench: &Bench, names: &[&str], more: &str) -> PathBuf {
@@ -42,17 +42,6 @@ fn frames(bench: &Bench, sensor: &str) -> u64 {
         .subscriber()
         .until(&json!({"type": "status", "sensor": sensor}));
     status["frames"].as_u64().unwrap()
-}
-
-fn metrics(daemon: &mut Daemon) -> String {
-    use std::io::{Read, Write};
-    let address = daemon.address("http");
-    let mut stream = std::net::TcpStream::connect(address).unwrap();
-    let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    answer
 }
 
 #[test]
@@ -92,7 +81,7 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
             break;
         }
     }
-    let text = metrics(&mut daemon);
+    let text = get(&daemon.address("http").to_string(), "/metrics");
     assert!(
         text.contains("sensor=\"palm\"") && !text.contains("elbow"),
         "{text}"

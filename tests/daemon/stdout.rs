@@ -3,12 +3,11 @@
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, ErrorKind, PipeReader, PipeWriter, Read, Write};
-use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::bench::{BINARY, Bench, Process, wait_for};
+use crate::bench::{BINARY, Bench, Process, get, wait_for};
 use rustix::io::{ioctl_fionbio, ioctl_fionread};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -94,13 +93,7 @@ fn a_demonstration_that_nobody_reads_goes_on_and_ends_at_a_signal() {
     let (_, address) = message.trim().split_once("http://").unwrap();
     let address = address.trim_end_matches('/');
     let frames = || {
-        let mut page = TcpStream::connect(address).unwrap();
-        page.set_read_timeout(Some(crate::bench::PATIENCE)).unwrap();
-        let ask = "GET /api/status HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n";
-        let ask = ask.replace("{}", address);
-        page.write_all(ask.as_bytes()).unwrap();
-        let mut answer = String::new();
-        page.read_to_string(&mut answer).unwrap();
+        let answer = get(address, "/api/status");
         let (_, body) = answer.split_once("\r\n\r\n").unwrap();
         let status: Value = serde_json::from_str(body).unwrap();
         status["sensors"][0]["status"]["frames"].as_u64().unwrap()

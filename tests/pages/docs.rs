@@ -7,12 +7,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::io::{Read, Write};
-use std::net::TcpStream;
 use std::path::PathBuf;
 use std::process::Command;
 
-use crate::bench::{BINARY, Bench, Daemon};
+use crate::bench::{BINARY, Bench, Daemon, get, wait_for};
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -230,7 +228,7 @@ fn the_page_on_metrics_has_every_metric_and_no_other() {
     daemon.logged("\"live\"");
     let mut found: BTreeMap<String, (String, BTreeSet<String>)> = BTreeMap::new();
     // The measured rate exists from the second frame on.
-    crate::bench::wait_for("two frames", || {
+    wait_for("two frames", || {
         found = scrape(&get(&address.to_string(), "/metrics"));
         found.contains_key("hardnessd_frame_rate_hertz")
     });
@@ -245,15 +243,6 @@ fn the_page_on_metrics_has_every_metric_and_no_other() {
         (name, (row.cells["Type"].clone(), labels))
     });
     assert_eq!(documented.collect::<BTreeMap<_, _>>(), found);
-}
-
-fn get(address: &str, path: &str) -> String {
-    let mut stream = TcpStream::connect(address).unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    answer
 }
 
 /// The name of every series -> its type and the names of its labels.
