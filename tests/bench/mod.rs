@@ -331,6 +331,40 @@ pub fn get(address: &str, path: &str) -> String {
     answer
 }
 
+/// The events in lines of JSON.
+pub fn events(text: &str) -> Vec<Value> {
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
+}
+
+/// An event without the fields that only a live event has.
+pub fn timeless(mut event: Value) -> Value {
+    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
+        if let Some(value) = event.get_mut(key) {
+            *value = Value::Null;
+        }
+    }
+    event
+}
+
+/// The files in a directory whose names begin with `what`, sorted.
+pub fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
+    let Ok(found) = fs::read_dir(directory) else {
+        return Vec::new();
+    };
+    let mut found: Vec<PathBuf> = found.map(|entry| entry.unwrap().path()).collect();
+    found.retain(|path| {
+        path.file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .starts_with(what)
+    });
+    found.sort();
+    found
+}
+
 pub fn hardnessd(arguments: &[&str]) -> Output {
     Command::new(BINARY).args(arguments).output().unwrap()
 }

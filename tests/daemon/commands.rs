@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::process::{Command, Output, Stdio};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, Process, hardnessd};
+use crate::bench::{BINARY, Bench, Process, events, hardnessd};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -257,11 +257,8 @@ fn a_model_of_the_command_line_judges_in_place_of_the_others() {
     let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/foam.5hz.bin");
     let verdict = |arguments: &[&str]| {
         let Output { stdout, stderr, .. } = hardnessd(arguments);
-        let events = text(&stdout);
-        let mut lines = events
-            .lines()
-            .map(|line| serde_json::from_str::<Value>(line).unwrap());
-        let found = lines.find(|event| event["phase"] == "final");
+        let mut events = events(&text(&stdout)).into_iter();
+        let found = events.find(|event| event["phase"] == "final");
         found.unwrap_or_else(|| panic!("{}", text(&stderr)))
     };
     assert_eq!(verdict(&["replay", fixture])["course"], "none");

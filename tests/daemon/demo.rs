@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, Daemon, Process};
+use crate::bench::{BINARY, Bench, Daemon, Process, events};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -104,10 +104,7 @@ fn json_on_a_terminal_is_what_a_subscriber_reads() {
     command.args(["demo", "--presses", "1", "--speed", "8", "--json"]);
     let (shown, code) = on_a_terminal(command, None);
     assert_eq!(code, Some(0), "{shown}");
-    let events: Vec<Value> = shown
-        .lines()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect();
+    let events = events(&shown);
     assert_eq!(events[0]["type"], "hello");
     assert_eq!(events.last().unwrap()["phase"], "final");
 }

@@ -1,10 +1,10 @@
 //! Positions of the arm: sent to the real daemon on the control socket, recorded and replayed.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
-use crate::bench::{Bench, Daemon, Subscriber, get, hardnessd};
+use crate::bench::{Bench, Daemon, Subscriber, events, get, hardnessd, recordings_in, timeless};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Reader};
 use serde_json::{Value, json};
@@ -26,15 +26,6 @@ fn recorded(path: &Path) -> Vec<Vec<(i64, f64)>> {
             _ => None,
         })
         .collect()
-}
-
-/// The recording of a daemon. A black box may be beside it, if the machine was busy.
-fn tape(bench: &Bench) -> PathBuf {
-    let mut files = fs::read_dir(bench.path("tape")).unwrap();
-    let is_tape = |path: &PathBuf| !path.to_string_lossy().contains("blackbox");
-    files
-        .find_map(|file| Some(file.unwrap().path()).filter(is_tape))
-        .unwrap()
 }
 
 #[test]
@@ -99,7 +90,8 @@ fn positions_are_checked_counted_and_recorded() {
 
     daemon.process.signal(rustix::process::Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
-    let tape = tape(&bench);
+    // A black box may be beside it, if the machine was busy.
+    let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
     let lines = recorded(&tape);
     let at = i64::try_from(now).unwrap();
     assert_eq!(lines[0], [(at - 2_000_000, 3.5), (at, 3.75)]);
@@ -142,14 +134,6 @@ fn positions_of_raw_bytes_come_from_a_table() {
     assert_eq!(check(&["--speed", "1e6"], 0, ""), events);
 }
 
-/// An event without the fields that only a live event has.
-fn timeless(mut event: Value) -> Value {
-    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
-        event[key] = Value::Null;
-    }
-    event
-}
-
 #[test]
 fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
     let bench = Bench::new();
@@ -165,7 +149,7 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
     let arm = "frame_rate_hz = 20.0\narm = { stiffness_n_per_mm = 10.0, delay_ms = 34.3 }";
     fs::write(&config, text.replace("frame_rate_hz = 20.0", arm)).unwrap();
     let mut daemon = Daemon::start(&config);
-    let mut events = bench.subscriber();
+    let mut subscriber = bench.subscriber();
     let control = bench.path("control.sock");
     let control = control.to_str().unwrap();
     // At 230,400 baud a frame takes 34.3 ms.
@@ -173,7 +157,7 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
     let mut finals = Vec::new();
     let mut earlies = 0;
     while finals.len() < 2 {
-        let verdict = events.until(&json!({"type": "hardness"}));
+        let verdict = subscriber.until(&json!({"type": "hardness"}));
         assert_eq!(verdict["course"], "positions", "{verdict}");
         if verdict["phase"] == "early" {
             earlies += 1;
@@ -199,7 +183,8 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
     daemon.process.signal(rustix::process::Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
 
-    let tape = tape(&bench);
+    // A black box may be beside it, if the machine was busy.
+    let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
     let replay = |more: &[&str]| {
         let command = [
             "replay",
@@ -209,16 +194,13 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         ];
         let output = hardnessd(&[&command[..], more].concat());
         assert!(output.status.success(), "{output:?}");
-        output.stdout
+        String::from_utf8(output.stdout).unwrap()
     };
     let replayed = replay(&[]);
     assert_eq!(replayed, replay(&["--speed", "1000"]));
-    let lines = replayed
-        .split(|&byte| byte == b'\n')
-        .filter(|line| !line.is_empty());
-    let found: Vec<Value> = lines
-        .map(|line| serde_json::from_slice(line).unwrap())
-        .filter(|event: &Value| event["type"] == "hardness" && event["phase"] == "final")
+    let found: Vec<Value> = events(&replayed)
+        .into_iter()
+        .filter(|event| event["type"] == "hardness" && event["phase"] == "final")
         .take(2)
         .collect();
     assert_eq!(found.len(), 2);

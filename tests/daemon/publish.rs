@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::bench::{BINARY, Bench, Daemon, Process, Subscriber, get, wait_for};
+use crate::bench::{BINARY, Bench, Daemon, Process, Subscriber, events, get, wait_for};
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use serde_json::{Value, json};
 
@@ -152,8 +152,7 @@ fn tail_gives_a_script_the_events_it_counts_or_an_exit_code() {
     assert_eq!(output.status.code(), Some(0));
     let lines = String::from_utf8(output.stdout).unwrap();
     assert_eq!(lines.lines().count(), 5);
-    for line in lines.lines() {
-        let event: Value = serde_json::from_str(line).unwrap();
+    for event in events(&lines) {
         assert!(["press", "hardness"].contains(&event["type"].as_str().unwrap()));
     }
 

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use rustix::process::Signal;
 use serde_json::json;
 
-use crate::bench::{Bench, Daemon, get, hardnessd, wait_for};
+use crate::bench::{Bench, Daemon, events, get, hardnessd, recordings_in, wait_for};
 
 /// A configuration with these sensors, each at the port of its name.
 fn configure(bench: &Bench, names: &[&str], more: &str) -> PathBuf {
@@ -96,18 +96,7 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
     // A recording has the sensors that there were, and can be replayed.
     daemon.process.signal(Signal::TERM);
     assert_eq!(daemon.process.exit_code(), Some(0));
-    let files = || {
-        let files = fs::read_dir(bench.path("records")).unwrap().flatten();
-        let mut files: Vec<PathBuf> = files.map(|file| file.path()).collect();
-        files.retain(|file| {
-            file.file_name()
-                .unwrap()
-                .to_string_lossy()
-                .starts_with("hardnessd-")
-        });
-        files.sort();
-        files
-    };
+    let files = || recordings_in(&bench.path("records"), "hardnessd-");
     wait_for("three recordings", || files().len() == 3);
     for (file, expected) in files().iter().zip([
         ["elbow", "wrist"].as_slice(),
@@ -116,15 +105,12 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
     ]) {
         let replayed = hardnessd(&["replay", file.to_str().unwrap()]);
         assert!(replayed.status.success(), "{replayed:?}");
-        let mut found: Vec<String> = String::from_utf8(replayed.stdout)
-            .unwrap()
-            .lines()
-            .map(|line| {
-                let event: serde_json::Value = serde_json::from_str(line).unwrap();
-                event["sensor"].as_str().unwrap().to_owned()
-            })
+        let replayed = events(&String::from_utf8(replayed.stdout).unwrap());
+        let mut found: Vec<&str> = replayed
+            .iter()
+            .map(|event| event["sensor"].as_str().unwrap())
             .collect();
-        found.sort();
+        found.sort_unstable();
         found.dedup();
         assert_eq!(found, expected, "{}", file.display());
     }

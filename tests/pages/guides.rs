@@ -14,7 +14,7 @@ use std::process::{Command, Stdio};
 
 use super::commands::{Call, blocks, calls, calls_of, names_of};
 use super::docs::has_command;
-use crate::bench::BINARY;
+use crate::bench::{BINARY, events};
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use hardnessd::tools::args::Args;
@@ -210,9 +210,8 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
     let output = run(&script, place.path());
     // A busy machine delays frames. That moves a probability by some points, and may add a level to
     // a set or take one from it. The likeliest level stays.
-    let verdicts: Vec<(&str, String)> = output
-        .lines()
-        .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap())
+    let verdicts: Vec<(&str, String)> = events(&output)
+        .into_iter()
         .filter(|event| event["phase"] == "final")
         .map(|event| {
             let probabilities = event["probabilities"].as_array().unwrap().iter();

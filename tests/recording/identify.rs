@@ -6,7 +6,7 @@ use std::net::TcpListener;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Output, Stdio};
 
-use crate::bench::{BINARY, Bench, Process, by_terminal, wait_for};
+use crate::bench::{BINARY, Bench, Process, by_terminal, events, wait_for};
 use serde_json::{Value, json};
 
 /// Runs a command in the directory of the bench.
@@ -34,10 +34,9 @@ fn refused(bench: &Bench, arguments: &str) -> (String, i32) {
 /// The final verdicts of a replay.
 fn finals(bench: &Bench, arguments: &str) -> Vec<Value> {
     let text = succeed(bench, &format!("replay --json {arguments}"));
-    let events = text.lines().map(|line| serde_json::from_str(line).unwrap());
+    let mut events = events(&text);
+    events.retain(|event| event["phase"] == "final");
     events
-        .filter(|event: &Value| event["phase"] == "final")
-        .collect()
 }
 
 const SENSOR: &str = "[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = 20.0\n";

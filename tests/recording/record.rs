@@ -6,7 +6,8 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::bench::{
-    BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, hardnessd, wait_for,
+    BINARY, Bench, Daemon, PATIENCE, Process, Subscriber, by_terminal, events, hardnessd,
+    recordings_in, timeless, wait_for,
 };
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Found, MAGIC, Reader};
@@ -51,20 +52,7 @@ fn replay(recording: &Path) -> Vec<Value> {
         hardnessd(&["replay", recording.to_str().unwrap(), "--speed", "1000"]).stdout,
         "twice the same, whatever the speed"
     );
-    let text = String::from_utf8(output.stdout).unwrap();
-    text.lines()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect()
-}
-
-/// An event without the fields that only a live event has.
-fn timeless(mut event: Value) -> Value {
-    for key in ["mono_ns", "age_at_publish_ms", "latency_us"] {
-        if let Some(value) = event.get_mut(key) {
-            *value = Value::Null;
-        }
-    }
-    event
+    events(&String::from_utf8(output.stdout).unwrap())
 }
 
 fn entries(recording: &Path) -> Vec<Found> {
@@ -76,22 +64,6 @@ fn entries(recording: &Path) -> Vec<Found> {
 
 fn is_bytes(found: &Found) -> bool {
     matches!(found.entry, Entry::Input(Input::Bytes(_)))
-}
-
-fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
-    let Ok(found) = fs::read_dir(directory) else {
-        return Vec::new();
-    };
-    let mut found: Vec<PathBuf> = found.map(|entry| entry.unwrap().path()).collect();
-    found.retain(|path| {
-        path.file_name()
-            .unwrap()
-            .to_str()
-            .unwrap()
-            .starts_with(what)
-    });
-    found.sort();
-    found
 }
 
 fn mono() -> Duration {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::bench::hardnessd;
+use crate::bench::{events, hardnessd};
 use hardnessd_core::test_support::of_a_press;
 use serde_json::Value;
 
@@ -43,11 +43,6 @@ fn replay(recording: &Path, more: &[&str]) -> String {
 /// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
 /// machines.
 fn assert_same(found: &str, golden: &str, recording: &Path) {
-    let events = |text: &str| -> Vec<Value> {
-        text.lines()
-            .map(|line| serde_json::from_str(line).unwrap())
-            .collect()
-    };
     let (mut found, mut golden) = (events(found), events(golden));
     assert_eq!(found.len(), golden.len(), "{recording:?}");
     for (found, golden) in found.iter_mut().zip(&mut golden) {
@@ -268,11 +263,10 @@ fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
          [sensor.calibration]\nauto_tare = {auto_tare}\n[model]\nbuilt_in = \"hrn\"\n"
     );
     std::fs::write(&config, text).unwrap();
-    let events = replay(recording, &["--config", config.to_str().unwrap()]);
+    let replayed = replay(recording, &["--config", config.to_str().unwrap()]);
     let mut outcome = Outcome::default();
     let mut is_released = false;
-    for line in events.lines() {
-        let event: Value = serde_json::from_str(line).unwrap();
+    for event in events(&replayed) {
         if event["state"] == "end" {
             is_released = event["reason"].is_null();
             outcome.timed_out += usize::from(event["reason"] == "timeout");
@@ -338,12 +332,10 @@ fn the_shore_hardness_is_in_the_range_of_the_level() {
             "[[sensor]]\nname = \"forearm\"\nport = \"p\"\n[model]\nbuilt_in = \"{model}\"\n"
         );
         std::fs::write(&config, text).unwrap();
-        let events = replay(&recording, &["--config", config.to_str().unwrap()]);
-        let events = events
-            .lines()
-            .map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let mut events = events(&replay(&recording, &["--config", config.to_str().unwrap()]));
+        events.retain(|event| event["type"] == "hardness");
         let mut verdicts = 0;
-        for event in events.filter(|event| event["type"] == "hardness") {
+        for event in events {
             let probabilities = event["probabilities"].as_array().unwrap();
             let probability = |place: &usize| probabilities[*place].as_f64().unwrap();
             let place = (0..4).max_by(|a, b| probability(a).total_cmp(&probability(b)));
