@@ -1,7 +1,6 @@
 //! Recorded bytes give exactly the expected events, at any pace.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::bench::{events, hardnessd};
@@ -30,14 +29,14 @@ fn recordings() -> Vec<(PathBuf, PathBuf, PathBuf)> {
 }
 
 fn replay(recording: &Path, more: &[&str]) -> String {
-    let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-        .arg("replay")
-        .arg(recording)
-        .args(more)
-        .output()
-        .unwrap();
+    let output = hardnessd(&[&["replay", recording.to_str().unwrap()], more].concat());
     assert!(output.status.success(), "{recording:?}: {output:?}");
     String::from_utf8(output.stdout).unwrap()
+}
+
+fn simulate(to: &Path, more: &[&str]) {
+    let output = hardnessd(&[&["simulate", "--to", to.to_str().unwrap()], more].concat());
+    assert!(output.status.success(), "{to:?}: {output:?}");
 }
 
 /// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
@@ -132,11 +131,7 @@ fn bytes_without_a_whole_frame_are_said_to_have_none() {
         (frame, "no whole frame in 790 bytes (1 damaged)"),
     ] {
         std::fs::write(&path, bytes).unwrap();
-        let output = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-            .arg("replay")
-            .arg(&path)
-            .output()
-            .unwrap();
+        let output = hardnessd(&["replay", path.to_str().unwrap()]);
         let stderr = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(1), "{stderr}");
         assert_eq!(stderr.lines().count(), 1, "{stderr}");
@@ -166,12 +161,7 @@ fn a_frame_comes_no_earlier_than_its_time_however_long_frames_are() {
     let directory = tempfile::tempdir().unwrap();
     for preset in ["ascii", "csv", "zero-run", "jx255n", "jq-glove", "m1616"] {
         let path = |extension| directory.path().join(preset).with_extension(extension);
-        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-            .args(["simulate", "--presses", "1", "--preset", preset, "--to"])
-            .arg(path("bin"))
-            .status()
-            .unwrap();
-        assert!(simulated.success());
+        simulate(&path("bin"), &["--presses", "1", "--preset", preset]);
         let config =
             format!("[[sensor]]\nport = \"none\"\n[sensor.frame]\npreset = \"{preset}\"\n");
         std::fs::write(path("toml"), config).unwrap();
@@ -285,19 +275,14 @@ fn with_auto_tare_an_hour_of_drift_costs_no_press() {
     let script = directory.path().join("drift.toml");
     let drift = "[[fault]]\nat_s = 0.0\nkind = \"drift\"\nnewtons_per_hour = 0.5\n";
     std::fs::write(&script, drift).unwrap();
-    let simulate = |name: &str, more: &[&str]| {
+    let simulated = |name: &str, more: &[&str]| {
         let path = directory.path().join(name);
-        let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-            .args(["simulate", "--presses", "60", "--rest", "60", "--to"])
-            .arg(&path)
-            .args(more)
-            .status()
-            .unwrap();
-        assert!(simulated.success());
+        let presses = ["--presses", "60", "--rest", "60"];
+        simulate(&path, &[&presses, more].concat());
         path
     };
-    let steady = simulate("steady.bin", &[]);
-    let drifting = simulate("drift.bin", &["--faults", script.to_str().unwrap()]);
+    let steady = simulated("steady.bin", &[]);
+    let drifting = simulated("drift.bin", &["--faults", script.to_str().unwrap()]);
     let frames = std::fs::metadata(&drifting).unwrap().len() / 790;
     assert!(frames > 5 * 3600, "more than an hour: {frames} frames");
 
@@ -320,12 +305,7 @@ fn with_auto_tare_an_hour_of_drift_costs_no_press() {
 fn the_shore_hardness_is_in_the_range_of_the_level() {
     let directory = tempfile::tempdir().unwrap();
     let recording = directory.path().join("presses.bin");
-    let simulated = Command::new(env!("CARGO_BIN_EXE_hardnessd"))
-        .args(["simulate", "--presses", "40", "--fps", "5", "--to"])
-        .arg(&recording)
-        .status()
-        .unwrap();
-    assert!(simulated.success());
+    simulate(&recording, &["--presses", "40", "--fps", "5"]);
     let config = directory.path().join("hardnessd.toml");
     for model in ["hrn", "course"] {
         let text = format!(
