@@ -153,8 +153,7 @@ fn a_reload_from_what_does_not_end_is_given_up_and_the_next_one_works() {
     let mut daemon = bench.daemon();
     let config = bench.path("hardnessd.toml");
     fs::remove_file(&config).unwrap();
-    let made = Command::new("mkfifo").arg(&config).status().unwrap();
-    assert!(made.success());
+    bench.fifo("hardnessd.toml");
     daemon.process.signal(Signal::HUP);
     let line = daemon.logged("refused");
     for part in [
@@ -555,14 +554,7 @@ fn check_looks_and_changes_nothing() {
 #[test]
 fn a_signal_ends_recover_while_it_waits_for_a_writer() {
     let bench = Bench::new();
-    let fifo = bench.path("fifo");
-    assert!(
-        Command::new("mkfifo")
-            .arg(&fifo)
-            .status()
-            .unwrap()
-            .success()
-    );
+    let fifo = bench.fifo("fifo");
     let mut command = Command::new(BINARY);
     command
         .arg("recover")
@@ -600,9 +592,7 @@ fn a_signal_ends_recover_while_it_waits_for_a_writer() {
 #[test]
 fn a_signal_ends_every_command_that_waits_for_a_file() {
     let bench = Bench::new();
-    let fifo = bench.path("fifo");
-    let made = Command::new("mkfifo").arg(&fifo).status().unwrap();
-    assert!(made.success());
+    let fifo = bench.fifo("fifo");
     let fifo = fifo.to_str().unwrap();
     let new = bench.path("new.mcap");
     let new = new.to_str().unwrap();

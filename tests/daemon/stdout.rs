@@ -3,7 +3,7 @@
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, ErrorKind, PipeReader, PipeWriter, Read, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -34,13 +34,6 @@ fn unread(arguments: &[&str]) -> (Command, PipeReader) {
     (command, reader)
 }
 
-fn fifo(bench: &Bench) -> PathBuf {
-    let fifo = bench.path("fifo.bin");
-    let made = Command::new("mkfifo").arg(&fifo).status().unwrap();
-    assert!(made.success());
-    fifo
-}
-
 /// The process must end soon after this signal, with this exit code.
 fn ends_at(signal: Signal, process: &mut Process, code: i32) {
     let start = Instant::now();
@@ -57,7 +50,7 @@ fn a_replay_that_nobody_reads_ends_at_a_signal() {
     File::open(foam).unwrap().read_exact(&mut frame).unwrap();
     for (signal, code) in [(Signal::TERM, 143), (Signal::INT, 130)] {
         let bench = Bench::new();
-        let fifo = fifo(&bench);
+        let fifo = bench.fifo("fifo.bin");
         let (mut command, _reader) = unread(&["replay", fifo.to_str().unwrap()]);
         let mut replay = Process(command.spawn().unwrap());
         // The first frame causes a status, which blocks the output.

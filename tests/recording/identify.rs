@@ -213,8 +213,7 @@ fn presses_after_those_that_were_asked_for_do_not_count() {
 #[test]
 fn a_pipe_is_no_file_of_references() {
     let bench = bench();
-    let made = Command::new("mkfifo").arg(bench.path("pipe.npz")).status();
-    assert!(made.unwrap().success());
+    bench.fifo("pipe.npz");
     for (append, expected) in [
         (None, "pipe.npz exists already"),
         (Some("--append"), "pipe.npz: found no file"),
@@ -238,9 +237,7 @@ fn a_pipe_is_no_file_of_references() {
 fn calls_that_add_at_once_take_nothing_from_each_other() {
     let bench = bench();
     let (link, file) = (bench.path("r.npz"), bench.path("own.npz"));
-    let pipe = bench.path("pipe");
-    let made = Command::new("mkfifo").arg(&pipe).status().unwrap();
-    assert!(made.success());
+    let pipe = bench.fifo("pipe");
     let append = "identify --config plain.toml --append --out r.npz";
     for expected in [2, 4] {
         let mut slow = Command::new(BINARY);
