@@ -10,7 +10,7 @@
 #[path = "../../src/tools/pty/pair.rs"]
 pub mod pair;
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::os::unix::net::UnixStream;
@@ -19,6 +19,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use pair::Pair;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -163,6 +164,48 @@ impl Drop for Process {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+/// Starts a command on a terminal. Returns its process, and what it writes.
+///
+/// The command must be run by `setsid`, which keeps it from using the terminal that the test was
+/// started from.
+pub fn start_on(pair: &Pair, mut command: Command) -> (Process, mpsc::Receiver<Vec<u8>>) {
+    let end = || Stdio::from(pair.device.try_clone().unwrap());
+    command.stdin(end()).stdout(end()).stderr(end());
+    let process = Process(command.spawn().unwrap());
+    let mut output = File::from(pair.master.try_clone().unwrap());
+    let (sender, bytes) = mpsc::channel();
+    std::thread::spawn(move || {
+        let mut read = [0; 4096];
+        while let Ok(length @ 1..) = output.read(&mut read) {
+            if sender.send(read[..length].to_vec()).is_err() {
+                return;
+            }
+        }
+    });
+    (process, bytes)
+}
+
+/// The output of a program on a terminal until the program ends, and its exit code.
+pub fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String, Option<i32>) {
+    let Pair { master, device, .. } = Pair::open().unwrap();
+    command.stdout(Stdio::from(device)).stderr(Stdio::null());
+    let mut process = Process(command.spawn().unwrap());
+    // `command` holds the last descriptor of the device.
+    drop(command);
+    let text = |written: &[u8]| String::from_utf8(written.to_vec()).unwrap();
+    let mut written = Vec::new();
+    let mut master = File::from(master);
+    let mut read = [0; 4096];
+    while let Ok(length @ 1..) = master.read(&mut read) {
+        written.extend(&read[..length]);
+        if stop_after.is_some_and(|part| text(&written).contains(part)) {
+            process.signal(Signal::INT);
+        }
+    }
+    let written = text(&written).replace("\r\n", "\n");
+    (written, process.exit_code())
 }
 
 /// A running daemon and its log.

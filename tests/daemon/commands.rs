@@ -1,12 +1,10 @@
 //! The messages of the commands around the daemon.
 
 use std::fs;
-use std::io::Read;
 use std::os::unix::fs::symlink;
 use std::process::{Command, Output, Stdio};
 
-use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, Process, events, hardnessd};
+use crate::bench::{BINARY, Bench, Process, events, hardnessd, on_a_terminal};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -282,19 +280,11 @@ fn a_model_of_the_command_line_judges_in_place_of_the_others() {
 fn replay_prints_readable_lines_on_a_terminal_and_json_if_asked() {
     let fixture = concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures/foam.5hz.bin");
     let shown = |more: &[&str]| {
-        let Pair { master, device, .. } = Pair::open().unwrap();
         let mut command = Command::new(BINARY);
-        command
-            .args(["replay", fixture])
-            .args(more)
-            .stdout(Stdio::from(device));
-        let mut replay = command.stderr(Stdio::null()).spawn().unwrap();
-        drop(command);
-        let mut shown = Vec::new();
-        // The end of a terminal is an error.
-        let _ = std::fs::File::from(master).read_to_end(&mut shown);
-        assert!(replay.wait().unwrap().success());
-        text(&shown)
+        command.args(["replay", fixture]).args(more);
+        let (shown, code) = on_a_terminal(command, None);
+        assert_eq!(code, Some(0), "{shown}");
+        shown
     };
     let lines = shown(&[]);
     assert!(lines.contains("press     #1    begin"), "{lines}");

@@ -1,14 +1,13 @@
 //! The first minute of a user: `demo` on a terminal, and commands that find a daemon and a
 //! configuration by themselves.
 
-use std::fs::{self, File};
-use std::io::{BufRead, BufReader, Read, Write};
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, Daemon, Process, events};
+use crate::bench::{BINARY, Bench, Daemon, Process, events, on_a_terminal};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -23,26 +22,6 @@ fn program(runtime: &Path) -> Command {
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
-}
-
-/// The output of a program on a terminal until the program ends, and its exit code.
-fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String, Option<i32>) {
-    let Pair { master, device, .. } = Pair::open().unwrap();
-    command.stdout(Stdio::from(device)).stderr(Stdio::null());
-    let mut process = Process(command.spawn().unwrap());
-    // `command` holds the last descriptor of the device.
-    drop(command);
-    let mut written = Vec::new();
-    let mut master = File::from(master);
-    let mut read = [0; 4096];
-    while let Ok(length @ 1..) = master.read(&mut read) {
-        written.extend(&read[..length]);
-        if stop_after.is_some_and(|part| text(&written).contains(part)) {
-            process.signal(Signal::INT);
-        }
-    }
-    let written = text(&written).replace("\r\n", "\n");
-    (written, process.exit_code())
 }
 
 #[test]

@@ -8,19 +8,18 @@ use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::sync::mpsc::{self, Receiver};
+use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
+use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd, start_on};
 use rustix::process::Signal;
 use rustix::termios::{LocalModes, Winsize};
 
 /// A terminal with a `watch` on it.
 struct Terminal {
     watch: Process,
-    master: OwnedFd,
-    device: OwnedFd,
+    pair: Pair,
     bytes: Receiver<Vec<u8>>,
     written: Vec<u8>,
     parser: vt100::Parser,
@@ -28,36 +27,19 @@ struct Terminal {
 
 impl Terminal {
     fn new(socket: &Path, size: (u16, u16), variables: &[(&str, &str)]) -> Self {
-        let Pair { master, device, .. } = Pair::open().unwrap();
-        let end = || Stdio::from(device.try_clone().unwrap());
-        resize(&master, size);
-        // `setsid` keeps the process from using the terminal that the test was started from.
-        let watch = Command::new("setsid")
-            .args([BINARY, "watch", "--socket"])
-            .arg(socket)
+        let pair = Pair::open().unwrap();
+        resize(&pair.master, size);
+        let mut command = Command::new("setsid");
+        command.args([BINARY, "watch", "--socket"]).arg(socket);
+        command
             .env("TERM", "xterm-256color")
             .env("LC_ALL", "C.UTF-8")
             .env_remove("NO_COLOR")
-            .envs(variables.iter().copied())
-            .stdin(end())
-            .stdout(end())
-            .stderr(end())
-            .spawn()
-            .unwrap();
-        let mut output = File::from(master.try_clone().unwrap());
-        let (sender, bytes) = mpsc::channel();
-        std::thread::spawn(move || {
-            let mut read = [0; 4096];
-            while let Ok(length @ 1..) = output.read(&mut read) {
-                if sender.send(read[..length].to_vec()).is_err() {
-                    return;
-                }
-            }
-        });
+            .envs(variables.iter().copied());
+        let (watch, bytes) = start_on(&pair, command);
         Self {
-            watch: Process(watch),
-            master,
-            device,
+            watch,
+            pair,
             bytes,
             written: Vec::new(),
             parser: vt100::Parser::new(nonzero(size.1), nonzero(size.0), 0),
@@ -68,11 +50,11 @@ impl Terminal {
         self.parser
             .screen_mut()
             .set_size(nonzero(size.1), nonzero(size.0));
-        resize(&self.master, size);
+        resize(&self.pair.master, size);
     }
 
     fn press(&self, keys: &[u8]) {
-        rustix::io::write(&self.master, keys).unwrap();
+        rustix::io::write(&self.pair.master, keys).unwrap();
     }
 
     /// Waits until `there` is true for the screen.
@@ -112,7 +94,7 @@ impl Terminal {
         }
         let screen = self.parser.screen();
         assert!(!screen.alternate_screen() && !screen.hide_cursor());
-        let modes = rustix::termios::tcgetattr(&self.device).unwrap();
+        let modes = rustix::termios::tcgetattr(&self.pair.device).unwrap();
         let usual = LocalModes::ECHO | LocalModes::ICANON | LocalModes::ISIG;
         assert!(modes.local_modes.contains(usual), "{modes:?}");
     }
@@ -258,7 +240,7 @@ fn a_terminal_that_takes_nothing_does_not_keep_it() {
     let _sensor = bench.sensor(&[]);
     let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
     terminal.shows("LIVE");
-    rustix::termios::tcflow(&terminal.device, rustix::termios::Action::OOff).unwrap();
+    rustix::termios::tcflow(&terminal.pair.device, rustix::termios::Action::OOff).unwrap();
     std::thread::sleep(Duration::from_secs(1));
     let start = Instant::now();
     terminal.watch.signal(Signal::TERM);

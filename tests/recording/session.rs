@@ -1,16 +1,15 @@
 //! `hardnessd record` on a real pty, with a simulated sensor: the questions and files of
 //! `--session`, and the line of progress.
 
-use std::fs::{self, File};
-use std::io::Read;
+use std::fs;
 use std::os::fd::OwnedFd;
 use std::path::Path;
-use std::process::{Command, Stdio};
-use std::sync::mpsc::{self, Receiver};
+use std::process::Command;
+use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd};
+use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd, start_on};
 use rustix::process::Signal;
 
 /// A recording, and the terminal that it runs on.
@@ -28,31 +27,14 @@ impl Session {
     }
 
     fn record(config: &Path, more: &[&str]) -> Self {
-        let Pair { master, device, .. } = Pair::open().unwrap();
-        let end = || Stdio::from(device.try_clone().unwrap());
-        // `setsid` keeps the process from using the terminal that the test was started from.
-        let process = Command::new("setsid")
-            .args([BINARY, "record", "--config"])
-            .arg(config)
-            .args(more)
-            .stdin(end())
-            .stdout(end())
-            .stderr(end())
-            .spawn()
-            .unwrap();
-        let mut output = File::from(master.try_clone().unwrap());
-        let (sender, bytes) = mpsc::channel();
-        std::thread::spawn(move || {
-            let mut read = [0; 4096];
-            while let Ok(length @ 1..) = output.read(&mut read) {
-                if sender.send(read[..length].to_vec()).is_err() {
-                    return;
-                }
-            }
-        });
+        let pair = Pair::open().unwrap();
+        let mut command = Command::new("setsid");
+        command.args([BINARY, "record", "--config"]).arg(config);
+        command.args(more);
+        let (process, bytes) = start_on(&pair, command);
         Self {
-            process: Process(process),
-            master,
+            process,
+            master: pair.master,
             bytes,
             written: String::new(),
         }
