@@ -208,12 +208,45 @@ pub fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String,
     (written, process.exit_code())
 }
 
+/// The lines that a process writes.
+pub struct Lines {
+    lines: mpsc::Receiver<String>,
+    /// The lines read so far.
+    pub seen: Vec<String>,
+}
+
+impl Lines {
+    pub fn of(output: impl Read + Send + 'static) -> Self {
+        let (sender, lines) = mpsc::channel();
+        std::thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        let seen = Vec::new();
+        Self { lines, seen }
+    }
+
+    /// Waits for a line that has all these parts.
+    pub fn until(&mut self, parts: &[&str]) -> String {
+        loop {
+            let line = self.lines.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+                panic!("{parts:?} was not written, but {:#?}", self.seen);
+            });
+            self.seen.push(line.clone());
+            if parts.iter().all(|part| line.contains(part)) {
+                return line;
+            }
+        }
+    }
+}
+
 /// A running daemon and its log.
 pub struct Daemon {
     pub process: Process,
-    log: mpsc::Receiver<String>,
-    /// The log lines read so far.
-    pub logged_lines: Vec<String>,
+    pub log: Lines,
 }
 
 impl Daemon {
@@ -233,20 +266,8 @@ impl Daemon {
                 .spawn()
                 .unwrap(),
         );
-        let lines = BufReader::new(process.0.stderr.take().unwrap()).lines();
-        let (sender, log) = mpsc::channel();
-        std::thread::spawn(move || {
-            for line in lines.map_while(Result::ok) {
-                if sender.send(line).is_err() {
-                    return;
-                }
-            }
-        });
-        let mut daemon = Self {
-            process,
-            log,
-            logged_lines: Vec::new(),
-        };
+        let log = Lines::of(process.0.stderr.take().unwrap());
+        let mut daemon = Self { process, log };
         daemon.logged("started");
         daemon
     }
@@ -255,7 +276,7 @@ impl Daemon {
     pub fn address(&mut self, way: &str) -> SocketAddr {
         let part = format!("way=\"{way}\"");
         // All addresses are logged before "started".
-        let line = self.logged_lines.iter().find(|line| line.contains(&part));
+        let line = self.log.seen.iter().find(|line| line.contains(&part));
         let line = line.unwrap();
         let (_, address) = line.split_once("address=").unwrap();
         address.trim().parse().unwrap()
@@ -274,21 +295,13 @@ impl Daemon {
 
     /// The whole log, once the daemon has ended.
     pub fn whole_log(&mut self) -> String {
-        self.logged_lines.extend(self.log.iter());
-        self.logged_lines.join("\n")
+        self.log.seen.extend(self.log.lines.iter());
+        self.log.seen.join("\n")
     }
 
     /// Waits for a log line that contains `part`.
     pub fn logged(&mut self, part: &str) -> String {
-        loop {
-            let line = self.log.recv_timeout(PATIENCE).unwrap_or_else(|_| {
-                panic!("{part:?} was not logged, but {:#?}", self.logged_lines);
-            });
-            self.logged_lines.push(line.clone());
-            if line.contains(part) {
-                return line;
-            }
-        }
+        self.log.until(&[part])
     }
 }
 

@@ -286,11 +286,12 @@ fn a_port_held_by_another_process_is_named_as_such_and_logged_once() {
     second.process.signal(Signal::TERM);
     second.logged("stopping");
     let lines = second
-        .logged_lines
+        .log
+        .seen
         .iter()
         .filter(|line| line.contains("held by another"))
         .count();
-    assert_eq!(lines, 1, "{:#?}", second.logged_lines);
+    assert_eq!(lines, 1, "{:#?}", second.log.seen);
 }
 
 #[test]

@@ -90,7 +90,7 @@ fn a_reload_without_a_thread_or_a_process_is_refused_and_the_next_one_is_not() {
         );
     }
     let fault = |line: &&String| line.contains("panicked") || line.contains("without a result");
-    assert_eq!(daemon.logged_lines.iter().find(fault), None);
+    assert_eq!(daemon.log.seen.iter().find(fault), None);
     user.limit(&daemon.process, None);
     daemon.process.signal(Signal::HUP);
     daemon.logged("reloaded");

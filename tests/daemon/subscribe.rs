@@ -1,26 +1,10 @@
 //! The example in Rust, with a daemon that stops and starts again.
 
-use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::sync::mpsc::{self, Receiver};
 
-use crate::bench::{BINARY, Bench, PATIENCE, Process};
+use crate::bench::{BINARY, Bench, Lines, Process};
 use rustix::process::Signal;
-
-/// Waits for a line that has all these parts.
-fn sees(lines: &Receiver<String>, parts: &[&str]) -> String {
-    let mut logged = Vec::new();
-    loop {
-        let line = lines
-            .recv_timeout(PATIENCE)
-            .unwrap_or_else(|_| panic!("{parts:?} is not said, but {logged:#?}"));
-        if parts.iter().all(|part| line.contains(part)) {
-            return line;
-        }
-        logged.push(line);
-    }
-}
 
 #[test]
 fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the_next() {
@@ -35,30 +19,19 @@ fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the
             .spawn()
             .unwrap(),
     );
-    let output = subscribe.0.stdout.take().unwrap();
-    let (sender, lines) = mpsc::channel();
-    std::thread::spawn(move || {
-        for line in BufReader::new(output).lines().map_while(Result::ok) {
-            if sender.send(line).is_err() {
-                return;
-            }
-        }
-    });
-    sees(&lines, &["nothing is known until it is back"]);
+    let mut lines = Lines::of(subscribe.0.stdout.take().unwrap());
+    lines.until(&["nothing is known until it is back"]);
     let daemon = bench.daemon();
     let _sensor = bench.sensor(&[]);
-    sees(&lines, &["\"forearm\" is \"live\""]);
-    let verdict = sees(
-        &lines,
-        &["\"forearm\" press 1 (\"final\"): \"", "\" at ", " %"],
-    );
+    lines.until(&["\"forearm\" is \"live\""]);
+    let verdict = lines.until(&["\"forearm\" press 1 (\"final\"): \"", "\" at ", " %"]);
     assert!(!verdict.contains("null"), "{verdict}");
     daemon.process.signal(Signal::TERM);
-    sees(&lines, &["nothing is known until it is back"]);
+    lines.until(&["nothing is known until it is back"]);
     drop(daemon);
     let _daemon = bench.daemon();
     // A new run begins: its held events are new, and a gap of unknown length is printed.
-    sees(&lines, &["missed null events"]);
-    sees(&lines, &["\"forearm\" is \"live\""]);
-    sees(&lines, &["\"forearm\" press 1 (\"final\"): "]);
+    lines.until(&["missed null events"]);
+    lines.until(&["\"forearm\" is \"live\""]);
+    lines.until(&["\"forearm\" press 1 (\"final\"): "]);
 }

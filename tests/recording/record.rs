@@ -633,7 +633,8 @@ fn a_disk_that_is_full_or_fails_does_not_stop_the_sensor() {
     let mut daemon = Daemon::start(&config);
     // The message may come before or after the daemon serves.
     if !daemon
-        .logged_lines
+        .log
+        .seen
         .iter()
         .any(|line| line.contains("recording stopped"))
     {
