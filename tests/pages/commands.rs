@@ -9,6 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use clap::error::ErrorKind;
+
 /// A command line in a page: the program and its arguments.
 #[derive(Debug)]
 pub(crate) struct Call {
@@ -241,4 +243,24 @@ pub(crate) fn names_of(program: &str) -> Vec<Call> {
         }
     }
     found
+}
+
+/// The calls that are no command line of `P`, each with its error.
+pub(crate) fn wrong_calls<P: clap::Parser>(calls: &[Call]) -> Vec<String> {
+    let wrong = calls.iter().filter_map(|call| {
+        let error = P::try_parse_from(&call.words).err()?;
+        Some(format!("{call}: {error}"))
+    });
+    wrong.collect()
+}
+
+/// The calls that name a command or an option which `P` does not have, each with its error.
+pub(crate) fn unknown_names<P: clap::Parser>(calls: &[Call]) -> Vec<String> {
+    let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
+    let wrong = calls.iter().filter_map(|call| {
+        let error = P::try_parse_from(&call.words).err()?;
+        let is_unknown = unknown.contains(&error.kind());
+        is_unknown.then(|| format!("{call}: {error}"))
+    });
+    wrong.collect()
 }

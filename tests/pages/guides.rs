@@ -12,11 +12,9 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use super::commands::{Call, blocks, calls, calls_of, names_of};
+use super::commands::{Call, blocks, calls, calls_of, names_of, unknown_names, wrong_calls};
 use super::docs::has_command;
 use crate::bench::{BINARY, events};
-use clap::Parser as _;
-use clap::error::ErrorKind;
 use hardnessd::tools::args::Args;
 use hardnessd_core::verdict::argmax;
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -161,33 +159,19 @@ fn is_built(call: &Call) -> bool {
 
 #[test]
 fn every_command_of_the_daemon_in_the_pages_is_a_valid_one() {
-    let calls = calls_of("hardnessd");
+    let mut calls = calls_of("hardnessd");
     assert!(calls.len() > 50, "found {} commands", calls.len());
-    let wrong = calls
-        .iter()
-        .filter(|call| is_built(call))
-        .filter_map(|call| {
-            let error = Args::try_parse_from(&call.words).err()?;
-            Some(format!("{call}: {error}"))
-        });
-    let wrong: Vec<_> = wrong.collect();
+    calls.retain(is_built);
+    let wrong = wrong_calls::<Args>(&calls);
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
 #[test]
 fn every_option_of_the_daemon_in_a_sentence_exists() {
-    let names = names_of("hardnessd");
+    let mut names = names_of("hardnessd");
     assert!(names.len() > 30, "found {} commands", names.len());
-    let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
-    let wrong = names
-        .iter()
-        .filter(|name| is_built(name))
-        .filter_map(|name| {
-            let error = Args::try_parse_from(&name.words).err()?;
-            let is_unknown = unknown.contains(&error.kind());
-            is_unknown.then(|| format!("{name}: {error}"))
-        });
-    let wrong: Vec<_> = wrong.collect();
+    names.retain(is_built);
+    let wrong = unknown_names::<Args>(&names);
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 

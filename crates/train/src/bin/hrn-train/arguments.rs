@@ -517,19 +517,13 @@ mod pages;
 
 #[cfg(test)]
 mod tests {
-    use clap::error::ErrorKind;
-
     use super::*;
 
     #[test]
     fn every_command_of_the_trainer_in_the_pages_is_a_valid_one() {
         let calls = pages::calls_of("hrn-train");
         assert!(calls.len() > 25, "found {} commands", calls.len());
-        let wrong = calls.iter().filter_map(|call| {
-            let error = Arguments::try_parse_from(&call.words).err()?;
-            Some(format!("{call}: {error}"))
-        });
-        let wrong: Vec<_> = wrong.collect();
+        let wrong = pages::wrong_calls::<Arguments>(&calls);
         assert!(wrong.is_empty(), "{wrong:#?}");
     }
 
@@ -537,13 +531,7 @@ mod tests {
     fn every_option_of_the_trainer_in_a_sentence_exists() {
         let names = pages::names_of("hrn-train");
         assert!(names.len() > 15, "found {} commands", names.len());
-        let unknown = [ErrorKind::UnknownArgument, ErrorKind::InvalidSubcommand];
-        let wrong = names.iter().filter_map(|name| {
-            let error = Arguments::try_parse_from(&name.words).err()?;
-            let is_unknown = unknown.contains(&error.kind());
-            is_unknown.then(|| format!("{name}: {error}"))
-        });
-        let wrong: Vec<_> = wrong.collect();
+        let wrong = pages::unknown_names::<Arguments>(&names);
         assert!(wrong.is_empty(), "{wrong:#?}");
     }
 }
