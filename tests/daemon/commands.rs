@@ -216,8 +216,6 @@ fn the_control_socket_has_commands_of_its_own() {
     let (code, _, message) = control(&["tare", "forearm"]);
     assert_eq!((code, message.lines().count()), (1, 1), "{message}");
     assert!(message.contains("not live"), "{message}");
-    let (code, _, message) = control(&["tare", "wrist"]);
-    assert!(code == 1 && message.contains("forearm"), "{message}");
 
     let sets = ["context", "forearm", "tag=pick-17", "speed_mm_s=5.5"];
     assert_eq!(control(&sets), (0, "done\n".to_owned(), String::new()));
@@ -238,15 +236,6 @@ fn the_control_socket_has_commands_of_its_own() {
     );
     let (code, _, message) = control(&["blackbox", "forearm"]);
     assert!(code == 1 && message.contains("[record]"), "{message}");
-
-    // The socket of events changes nothing.
-    let mut command = Command::new(BINARY);
-    command
-        .args(["tare", "forearm", "--socket"])
-        .arg(bench.path("events.sock"));
-    let Output { status, stderr, .. } = command.output().unwrap();
-    assert_eq!(status.code(), Some(1));
-    assert!(text(&stderr).contains("send it to the control socket"));
 }
 
 #[test]
