@@ -88,6 +88,14 @@ fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
         "force_n": 12.34, "shore": {"value": 65.2, "low": 58.8, "high": 71.0}, "notes": []})
 }
 
+/// A view of one sensor that is live.
+fn live_sensor() -> View {
+    view_of(&[
+        (0, hello("a", &["forearm"])),
+        (0, status("forearm", "live")),
+    ])
+}
+
 /// A view of one sensor that is live and has been pressed.
 fn pressed_sensor() -> View {
     view_of(&[
@@ -143,10 +151,7 @@ fn the_model_is_named_with_its_needs_and_the_keys_that_change_no_verdict_of_it()
 
 #[test]
 fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
-    let mut view = view_of(&[
-        (0, hello("a", &["forearm"])),
-        (0, status("forearm", "live")),
-    ]);
+    let mut view = live_sensor();
     let mut late = frame("forearm", 1.0, 5);
     late["time"] = json!(at(1_000).wall.to_string());
     take_event(&mut view, 3_500, late);
@@ -236,10 +241,7 @@ fn what_is_not_live_is_not_shown_as_present() {
 
 #[test]
 fn a_curve_has_holes_where_there_was_no_frame() {
-    let mut view = view_of(&[
-        (0, hello("a", &["forearm"])),
-        (0, status("forearm", "live")),
-    ]);
+    let mut view = live_sensor();
     for (ms, newtons) in [(5_050, 1.0), (10_050, 2.0), (10_150, 3.0)] {
         take_event(&mut view, ms, frame("forearm", newtons, 1));
     }
@@ -262,10 +264,7 @@ fn a_curve_has_holes_where_there_was_no_frame() {
 
 #[test]
 fn a_bar_is_as_high_as_its_share_of_the_highest() {
-    let mut view = view_of(&[
-        (0, hello("a", &["forearm"])),
-        (0, status("forearm", "live")),
-    ]);
+    let mut view = live_sensor();
     for (ms, newtons) in [(10_000, 2.0), (20_000, 1.25), (29_950, 0.5)] {
         take_event(&mut view, ms, frame("forearm", newtons, 1));
     }
@@ -700,10 +699,7 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
 
 #[test]
 fn force_stands_against_approach_where_the_robot_tells_it() {
-    let mut view = view_of(&[
-        (0, hello("r", &["forearm"])),
-        (0, status("forearm", "live")),
-    ]);
+    let mut view = live_sensor();
     let press = |state| json!({"type": "press", "sensor": "forearm", "press": 1, "state": state, "reason": null});
     let at_mm = |newtons, mm: Value| {
         let mut event = frame("forearm", newtons, 9);
