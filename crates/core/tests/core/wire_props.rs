@@ -237,13 +237,16 @@ fn a_frame_that_starts_inside_a_rejected_one_is_found() {
     }
 }
 
+/// A frame whose counts hold a header of jq from `first` on.
+fn with_header_inside(mut raw: RawFrame, first: usize) -> RawFrame {
+    raw.counts[first..first + 4].copy_from_slice(&[0xAA, 0x55, 0x03, 0x99]);
+    raw
+}
+
 #[test]
 fn jq_is_not_misled_by_its_header_in_the_data() {
     let layout = layout("preset = 'jq'");
-    let mut held = frames(&layout, 8, 1).remove(0);
-    for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
-        held.counts[place] = byte;
-    }
+    let held = with_header_inside(frames(&layout, 8, 1).remove(0), 300);
     let sent = vec![held; 6];
     let whole = encode(&layout, &sent);
     assert_eq!(decode(&layout, [whole.as_slice()]), (sent.clone(), 0));
@@ -260,11 +263,9 @@ fn after_a_restart_nothing_is_made_of_the_bytes_before() {
     for (preset, layout) in layouts() {
         // The data contains a header of jq. The place in the stream decides which header begins a
         // frame.
-        let mut held = frames(&layout, 12, 1).remove(0);
+        let held = frames(&layout, 12, 1).remove(0);
         let middle = held.counts.len() / 3;
-        for (place, byte) in (middle..).zip([0xAA, 0x55, 0x03, 0x99]) {
-            held.counts[place] = byte;
-        }
+        let held = with_header_inside(held, middle);
         let whole = encode(&layout, &vec![held; 5]);
         let mut bytes = whole.clone();
         bytes.remove(100);
@@ -296,10 +297,7 @@ fn after_a_restart_nothing_is_made_of_the_bytes_before() {
 #[test]
 fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
     let layout = layout("preset = 'jq'");
-    let mut held = frames(&layout, 8, 1).remove(0);
-    for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
-        held.counts[place] = byte;
-    }
+    let held = with_header_inside(frames(&layout, 8, 1).remove(0), 300);
     let mut bytes = encode(&layout, &vec![held; 4]);
     // The lost byte is after the header in the second frame's data, so no header follows that one.
     bytes.remove(788 + 600);
@@ -325,10 +323,7 @@ fn jq_waits_for_no_header_that_is_farther_from_its_phase() {
 #[test]
 fn of_two_headers_as_near_to_its_phase_jq_takes_the_earlier() {
     let layout = layout("preset = 'jq'");
-    let mut held = frames(&layout, 8, 1).remove(0);
-    for (place, byte) in (300..).zip([0xAA, 0x55, 0x03, 0x99]) {
-        held.counts[place] = byte;
-    }
+    let held = with_header_inside(frames(&layout, 8, 1).remove(0), 300);
     let sent = vec![held; 5];
     let mut bytes = encode(&layout, &sent);
     // Remove half as many bytes as are before the header in the data. The next frame then begins as
