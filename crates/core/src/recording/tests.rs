@@ -70,20 +70,24 @@ fn story() -> Vec<(Stamp, Input<'static>)> {
     story
 }
 
-/// A recording of the story, and its events during recording. It has a state every `states` inputs,
-/// and a chunk ends after every `chunk` inputs. Between the presses, the configuration is read
-/// again.
-fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
-    let hrn = hrn();
-    let about = About {
+/// What begins a recording of the sensor.
+fn about(hrn: &Hrn) -> About {
+    About {
         robot: "arm-7".to_owned(),
         run: "r".to_owned(),
         boot_id: "b".to_owned(),
         reason: None,
         labels: labels(),
-        sensors: vec![RecordedSensor::new(&sensor(), &hrn)],
-    };
-    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+        sensors: vec![RecordedSensor::new(&sensor(), hrn)],
+    }
+}
+
+/// A recording of the story, and its events during recording. It has a state every `states` inputs,
+/// and a chunk ends after every `chunk` inputs. Between the presses, the configuration is read
+/// again.
+fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
+    let hrn = hrn();
+    let mut writer = Writer::new(Vec::new(), &about(&hrn)).unwrap();
     let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
     let mut events = Vec::new();
     for (index, (at, input)) in story().into_iter().enumerate() {
@@ -419,15 +423,7 @@ fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
 fn every_chunk_that_a_daemon_writes_is_within_bounds() {
     // Without a flush, the writer itself ends each chunk.
     let hrn = hrn();
-    let about = About {
-        robot: "arm-7".to_owned(),
-        run: "r".to_owned(),
-        boot_id: "b".to_owned(),
-        reason: None,
-        labels: labels(),
-        sensors: vec![RecordedSensor::new(&sensor(), &hrn)],
-    };
-    let mut writer = Writer::new(Vec::new(), &about).unwrap();
+    let mut writer = Writer::new(Vec::new(), &about(&hrn)).unwrap();
     let pipeline = Pipeline::new(sensor(), hrn, Clock::Arrival);
     let state = Entry::State(Box::new(State::of(&pipeline, labels())));
     for index in 0..3_000 {
