@@ -352,15 +352,15 @@ fn train(
         device,
     };
     let trained = match method {
-        Method::Features => return features::train(dataset, &labelled, description, run),
-        Method::Frame => {
-            let samples = frame::Samples {
-                dataset,
-                train: &train,
-                held_out: &validation,
-            };
-            return frame::train(&samples, description, run, device);
+        Method::Features => {
+            // It holds nothing out.
+            return features::train(&Stages {
+                train: &labelled,
+                validation: &[],
+                ..stages
+            });
         }
+        Method::Frame => return frame::train(&stages),
         Method::Ours | Method::OursSteady => {
             let ustgan = stages.ustgan()?;
             let generated = stages.generated(&ustgan)?;

@@ -271,7 +271,6 @@ impl Stages<'_> {
     /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
     pub fn finish(&self, trained: &Trained) -> anyhow::Result<Option<Evaluated>> {
         let scale = self.scale();
-        self.draw_mistakes(trained)?;
         let (graph, raw_logits) = hrn::graph(&trained.weights, &trained.statistics, scale);
         let recogniser = Recogniser {
             graph,
@@ -279,70 +278,70 @@ impl Stages<'_> {
             shore: None,
             temperature: trained.temperature,
         };
-        let probabilities = |frames: &[&ModelFrame]| {
+        self.export(&recogniser, |frames| {
             let logits = trained.logits(frames.iter().copied(), scale, self.device);
             Ok(temperature::probabilities(
                 &logits,
                 trained.temperature,
                 self.device,
             ))
-        };
+        })
+    }
+
+    /// Writes a model, its evaluation and a picture of its mistakes. `probabilities` computes those of
+    /// frames without the file.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the daemon's loader refuses the model, or the run's directory cannot be written.
+    pub fn export(
+        &self,
+        recogniser: &Recogniser,
+        probabilities: impl Fn(&[&ModelFrame]) -> anyhow::Result<Vec<Vec<f32>>>,
+    ) -> anyhow::Result<Option<Evaluated>> {
+        self.draw_mistakes(&probabilities)?;
         export::finish(
             self.run,
             self.description,
             self.dataset,
             self.train,
-            &recogniser,
+            recogniser,
             probabilities,
         )
     }
 
-    /// Draws mistakes on held-out objects, or on training samples if no objects are held out.
-    fn draw_mistakes(&self, trained: &Trained) -> anyhow::Result<()> {
+    /// Draws the samples of held-out objects that are judged wrongly, or the training samples if no
+    /// objects are held out.
+    fn draw_mistakes(
+        &self,
+        probabilities: impl Fn(&[&ModelFrame]) -> anyhow::Result<Vec<Vec<f32>>>,
+    ) -> anyhow::Result<()> {
         let (kind, indices) = if self.validation.is_empty() {
             ("training", self.train)
         } else {
             ("held-out", self.validation)
         };
-        let frames = indices
-            .iter()
-            .map(|&index| &self.dataset.samples[index].frame);
-        let logits = trained.logits(frames, self.scale(), self.device);
-        let probabilities = temperature::probabilities(&logits, trained.temperature, self.device);
-        draw_mistakes(self.run, self.dataset, (kind, indices), &probabilities)
-    }
-}
-
-/// Draws the labelled samples that are judged wrongly. `probabilities` has one row for each of the
-/// indices; the kind (`training` or `held-out`) appears in the title.
-///
-/// # Errors
-///
-/// Fails if the run's directory cannot be written.
-pub(super) fn draw_mistakes(
-    run: &Run,
-    dataset: &Dataset,
-    (kind, indices): (&str, &[usize]),
-    probabilities: &[Vec<f32>],
-) -> anyhow::Result<()> {
-    let mut rows: Vec<Strip> = (1..=levels())
-        .map(|level| Strip {
-            name: format!("level {level}"),
-            tiles: Vec::new(),
-        })
-        .collect();
-    let mut wrong = 0;
-    for (&index, row) in indices.iter().zip(probabilities) {
-        let sample = &dataset.samples[index];
-        let (judged, confidence) = argmax(row);
-        if judged + 1 != usize::from(sample.level) {
-            wrong += 1;
-            let caption = format!("as {}, {:.0} %", judged + 1, confidence * 100.0);
-            rows[usize::from(sample.level) - 1]
-                .tiles
-                .push((&sample.frame, caption));
+        let samples = indices.iter().map(|&index| &self.dataset.samples[index]);
+        let frames: Vec<&ModelFrame> = samples.clone().map(|sample| &sample.frame).collect();
+        let mut rows: Vec<Strip> = (1..=levels())
+            .map(|level| Strip {
+                name: format!("level {level}"),
+                tiles: Vec::new(),
+            })
+            .collect();
+        let mut wrong = 0;
+        for (sample, row) in samples.zip(probabilities(&frames)?) {
+            let (judged, confidence) = argmax(&row);
+            if judged + 1 != usize::from(sample.level) {
+                wrong += 1;
+                let caption = format!("as {}, {:.0} %", judged + 1, confidence * 100.0);
+                rows[usize::from(sample.level) - 1]
+                    .tiles
+                    .push((&sample.frame, caption));
+            }
         }
+        let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
+        let picture = sheet::strips(&title, &rows)?;
+        self.run.write("samples/mistakes.png", &picture)
     }
-    let title = format!("{wrong} of {} {kind} samples judged wrongly", indices.len());
-    run.write("samples/mistakes.png", &sheet::strips(&title, &rows)?)
 }
