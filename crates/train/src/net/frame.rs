@@ -117,7 +117,7 @@ pub fn graph(
 ) -> (Graph, String, String) {
     let mut b = Builder(Graph::default());
     let pooled = hrn::trunk_nodes(&mut b.0, INPUT, (weights, None), SCALE, true);
-    let (columns, _) = frames::nodes(&mut b, INPUT, 1);
+    let columns = frames::nodes(&mut b, INPUT, 1);
     let columns = standard.nodes(&mut b, &columns);
     let columns = b.reshaped(&columns, &[1, FEATURES], "columns");
     let along = vec![integer("axis", 1)];

@@ -23,8 +23,6 @@ const LITTLE_N: f32 = 0.05;
 const LITTLE_SPREAD: f32 = 0.05;
 const LITTLE_AREA: f32 = 0.5;
 const TINY: f32 = 1e-4;
-/// Index of the feature that is the logarithm of the force.
-const FORCE: usize = 5;
 /// The number of features that are logarithms. The last of them comes after the two shapes.
 const LOGARITHMS: usize = 10;
 /// The number of sums over taxels: of 1, of both factors of three products, and of the products.
@@ -35,9 +33,9 @@ const PRODUCTS: usize = 3;
 /// product with it is exact.
 const STEEP: f32 = (1_u128 << 100) as f32;
 
-/// Adds the nodes from `input`, which is `[1, frames, 28, 28]`, to features. Returns the names of
-/// the features `[FEATURES, frames]`, and of the frames' forces `[1, frames]`.
-pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (String, String) {
+/// Adds the nodes from `input`, which is `[1, frames, 28, 28]`, to features. Returns the name of
+/// the features `[FEATURES, frames]`.
+pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> String {
     let of_taxel = |place: usize| {
         let middle = |length: usize| (length as f32 - 1.0) / 2.0;
         let (row, column) = ((place / COLS) as f32, (place % COLS) as f32);
@@ -93,13 +91,12 @@ pub(super) fn nodes(b: &mut Builder, input: &str, frames: usize) -> (String, Str
     let logarithms = b.node("Log", &[&raised], "logarithms");
     let first = rows(b, &logarithms, 0, LOGARITHMS - 1, "first logarithms");
     let last = rows(b, &logarithms, LOGARITHMS - 1, 1, "last logarithm");
-    let features = b.with(
+    b.with(
         "Concat",
         &[&first, &shapes, &last, &roughness],
         "features",
         along(0),
-    );
-    (features, force)
+    )
 }
 
 /// The least step from the next smaller force to a threshold.
@@ -248,7 +245,7 @@ impl Features {
     /// Returns an error if the inference library cannot run the graph.
     pub fn new() -> anyhow::Result<Self> {
         let mut b = Builder(Graph::default());
-        let (features, _) = nodes(&mut b, "frames", FRAMES_AT_ONCE);
+        let features = nodes(&mut b, "frames", FRAMES_AT_ONCE);
         let by_frame = vec![integers("perm", &[1, 0])];
         let features = b.with("Transpose", &[&features], "by frame", by_frame);
         let input = ("frames", vec![1, FRAMES_AT_ONCE, ROWS, COLS]);
@@ -272,11 +269,6 @@ impl Features {
         }
         Ok(features)
     }
-}
-
-/// Total force of the taxels in contact, from a frame's features.
-pub fn force_n(features: &[f32]) -> f32 {
-    (features[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
 #[cfg(test)]
@@ -340,6 +332,5 @@ mod tests {
             );
         }
         assert_eq!(found[FEATURES - 1], 0.0);
-        assert!((force_n(&found[FEATURES..]) - 4.0).abs() < 1e-4);
     }
 }

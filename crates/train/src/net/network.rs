@@ -138,16 +138,6 @@ impl Weights {
         numbers(&self.entry(name).values)
     }
 
-    /// Replaces the numbers of the weight called `name`, row-major.
-    ///
-    /// # Panics
-    ///
-    /// Panics if there is no such weight. Networks name their weights themselves.
-    pub fn set(&mut self, name: &str, values: Tensor<1>) {
-        let weight = self.entries.iter_mut().find(|weight| weight.name == name);
-        weight.expect("a network sets weights that it made").values = values;
-    }
-
     /// Lengths of the axes of the weight called `name`.
     pub fn dims(&self, name: &str) -> &[usize] {
         &self.entry(name).dims
@@ -272,11 +262,6 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Statistics with these means and variances of the normalised layers, in their order.
-    pub fn of(layers: Vec<(Tensor<1>, Tensor<1>)>) -> Self {
-        Self { layers, batches: 1 }
-    }
-
     /// Mean and biased variance of normalised layer `index`, averaged over the batches seen.
     pub fn layer(&self, index: usize) -> (Tensor<1>, Tensor<1>) {
         let (mean, variance) = self.layers[index].clone();
