@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use serde_json::json;
 
 use super::evaluated::{Case, Evaluated};
-use super::export::{data, metrics, range, validation};
+use super::export::{checked, data, metrics, range, validation};
 use super::file;
 use crate::data::courses::{self, Courses};
 use crate::data::dataset::{self, Source};
@@ -20,9 +20,6 @@ use hardnessd_core::verdict::{
     Hrn, Piece, Range, ReferencePress, Verdict,
 };
 use hardnessd_simulator::Split;
-
-/// Check presses per level (`docs/formats.md`).
-const CHECKS_A_LEVEL: usize = 2;
 
 /// The references of its sensor that a model is given beside a press.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -135,7 +132,7 @@ fn checks(
     });
     let sensor = courses.presses[*identified.unwrap_or(&first)].sensor;
     let references = rigid(courses, sensor, Given::USUAL);
-    let checked = check_presses(courses, train);
+    let checked = checked(train, |press| courses.presses[press].level);
     let of_press = |(number, place): (usize, usize)| {
         let identified = number % 2 == 1 && !references.is_empty();
         let given = references.iter().filter(|_| identified);
@@ -292,23 +289,4 @@ pub fn course_of(courses: &Courses, press: usize) -> Course {
         moments: rows.take(FRAMES).map(moment).collect(),
         arm_n_per_mm: courses.presses[press].arm_n_per_mm,
     }
-}
-
-/// Two presses of each level: those one third and two thirds through its presses.
-fn check_presses(courses: &Courses, train: &[usize]) -> Vec<usize> {
-    let mut checked = Vec::new();
-    for level in dataset::levels() {
-        let of_level = |press: &usize| courses.presses[*press].level == level.level;
-        let presses: Vec<usize> = train.iter().copied().filter(of_level).collect();
-        // A level without presses is checked on presses of other levels.
-        let presses = if presses.is_empty() {
-            train.to_vec()
-        } else {
-            presses
-        };
-        for part in 1..=CHECKS_A_LEVEL {
-            checked.push(presses[presses.len() * part / (CHECKS_A_LEVEL + 1)]);
-        }
-    }
-    checked
 }

@@ -19,8 +19,8 @@ use hardnessd_core::press;
 use hardnessd_core::verdict::{Card, Check, Checks, Hrn, ModelFrame, Range};
 use hardnessd_simulator::Split;
 
-/// Check frames per level (`docs/formats.md`).
-const CHECK_FRAMES_A_LEVEL: usize = 2;
+/// Check frames or presses per level (`docs/formats.md`).
+const CHECKS_A_LEVEL: usize = 2;
 
 /// A recogniser as a graph.
 #[derive(Debug, Clone)]
@@ -156,24 +156,26 @@ fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_j
     Ok(by_source.into())
 }
 
-/// Two frames of each level: those one third and two thirds through its samples.
+/// The frames of the [`checked`] samples.
 pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a ModelFrame> {
-    let mut frames = Vec::new();
+    let checked = checked(train, |index| dataset.samples[index].level);
+    let frames = checked.into_iter();
+    frames.map(|index| &dataset.samples[index].frame).collect()
+}
+
+/// Two indices of each level: those one third and two thirds through its samples or presses.
+pub(super) fn checked(train: &[usize], level_of: impl Fn(usize) -> u8) -> Vec<usize> {
+    let mut checked = Vec::new();
     for level in dataset::levels() {
-        let of_level = |index: &usize| dataset.samples[*index].level == level.level;
-        let samples: Vec<usize> = train.iter().copied().filter(of_level).collect();
-        // A level without samples is checked on samples of other levels.
-        let samples = if samples.is_empty() {
-            train.to_vec()
-        } else {
-            samples
-        };
-        for part in 1..=CHECK_FRAMES_A_LEVEL {
-            let place = samples.len() * part / (CHECK_FRAMES_A_LEVEL + 1);
-            frames.push(&dataset.samples[samples[place]].frame);
+        let of_level = |&index: &usize| level_of(index) == level.level;
+        let own: Vec<usize> = train.iter().copied().filter(of_level).collect();
+        // A level without its own is checked on those of other levels.
+        let own = if own.is_empty() { train } else { &own };
+        for part in 1..=CHECKS_A_LEVEL {
+            checked.push(own[own.len() * part / (CHECKS_A_LEVEL + 1)]);
         }
     }
-    frames
+    checked
 }
 
 /// The value of `hrn.data`: name, seed and hash of the file, or a list of them for several files.
