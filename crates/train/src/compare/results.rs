@@ -12,7 +12,7 @@ use super::digits::thousands;
 use super::sets::{self, FRESH, MATCHED, PAPER_SPLIT, SHIFTS, TestSet, WORLDS};
 use crate::data::dataset::LabelChoice;
 use crate::judge::metrics::{self, Bin, Clusters, Evaluation, Judged, ObjectCount};
-use crate::model::export;
+use crate::model::{evaluated, export};
 use crate::run::disk::write_whole;
 use crate::run::history::History;
 use crate::run::{Description, Run};
@@ -139,7 +139,8 @@ impl Worth {
         // there is no error before the temperature to report.
         let temperature = hrn.card().metrics["temperature"].as_f64().unwrap_or(1.0);
         for set in sets {
-            let judged = export::judge(&hrn, &set.dataset, &set.indices)?;
+            let cases = export::cases(&hrn, &set.dataset, &set.indices)?;
+            let judged = evaluated::judged(&cases);
             let before = |one: &Judged| one.before_temperature(temperature);
             let before: Vec<Judged> = judged.iter().map(before).collect();
             let measured = Measured {

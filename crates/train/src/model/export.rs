@@ -9,10 +9,9 @@ use std::collections::BTreeSet;
 use anyhow::ensure;
 use serde_json::json;
 
-use super::evaluated::{self, Case, Evaluated};
+use super::evaluated::{Case, Evaluated};
 use super::file;
 use crate::data::dataset::{self, Dataset, Kind, Source};
-use crate::judge::metrics::Judged;
 use crate::net::graph::Graph;
 use crate::run::{Description, Run};
 use hardnessd_core::press;
@@ -107,15 +106,6 @@ pub fn metrics(temperature: f32) -> serde_json::Value {
 pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluated> {
     let cases = cases(hrn, dataset, indices)?;
     Ok(Evaluated::of(&cases, hrn.card().levels.len()))
-}
-
-/// Judges labelled samples with a model, in the form that the metrics take.
-///
-/// # Errors
-///
-/// Fails if the model has fewer levels than the data, or fails to judge a frame.
-pub fn judge(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Judged>> {
-    Ok(evaluated::judged(&cases(hrn, dataset, indices)?))
 }
 
 /// Judges labelled samples with a model.
