@@ -9,14 +9,11 @@ use hardnessd_core::tare::Gains;
 use hardnessd_core::wording;
 use toml::{Table, Value};
 
+use super::failure::Unreadable;
+
 /// The error of a configuration that describes no sensor.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ConfigurationError {
-    #[error("{}: {source}", path.display())]
-    Unreadable {
-        path: PathBuf,
-        source: std::io::Error,
-    },
     #[error("{}: {problem}", path.display())]
     Syntax { path: PathBuf, problem: String },
     #[error("{}: has no [[sensor]] table", .0.display())]
@@ -32,8 +29,8 @@ pub(super) enum ConfigurationError {
 }
 
 /// Reads the first `[[sensor]]` table and the `[press]` table. The daemon's `check` checks the rest.
-pub(super) fn first_sensor(path: &Path) -> Result<Sensor, ConfigurationError> {
-    let text = fs::read_to_string(path).map_err(|source| ConfigurationError::Unreadable {
+pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
+    let text = fs::read_to_string(path).map_err(|source| Unreadable {
         path: path.to_owned(),
         source,
     })?;
@@ -46,7 +43,7 @@ pub(super) fn first_sensor(path: &Path) -> Result<Sensor, ConfigurationError> {
     let sensors = sensors.and_then(|sensors| sensors.try_into::<Vec<Table>>().ok());
     let first = sensors.and_then(|sensors| sensors.into_iter().next());
     let Some(mut table) = first else {
-        return Err(ConfigurationError::NoSensor(path.to_owned()));
+        return Err(ConfigurationError::NoSensor(path.to_owned()).into());
     };
     table.retain(|key, _| key != "port" && key != "baud");
     table.extend(
@@ -66,8 +63,9 @@ pub(super) fn first_sensor(path: &Path) -> Result<Sensor, ConfigurationError> {
         let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
         description.calibration.gains = Some(Gains::Taxels(rows));
     }
-    Sensor::new(description).map_err(|source| ConfigurationError::Sensor {
+    let sensor = Sensor::new(description).map_err(|source| ConfigurationError::Sensor {
         path: path.to_owned(),
         source,
-    })
+    })?;
+    Ok(sensor)
 }

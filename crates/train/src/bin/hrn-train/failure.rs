@@ -45,6 +45,10 @@ pub(super) struct NoCuda;
 /// Options that do not go together.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum WrongUsage {
+    #[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
+    NoObjects,
+    #[error("{0}: works with `--materials {1}` only")]
+    OtherMaterials(&'static str, &'static str),
     #[error("--data: found {0} files, expected 1 without --course")]
     ManyFiles(usize),
     #[error("{0}: works with methods of single frames only")]
@@ -58,16 +62,6 @@ pub(super) enum WrongUsage {
 #[error("{0} (to leave out such recordings: --skip-unusable)")]
 pub(super) struct NotCollected(#[source] pub(super) CollectError);
 
-/// The command line asks for no objects at all.
-#[derive(Debug, thiserror::Error)]
-#[error("--objects and --test-objects: found 0 and 0, expected one or more of either")]
-pub(super) struct NoObjects;
-
-/// An option that has no meaning for these materials.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}: works with `--materials {1}` only")]
-pub(super) struct OtherMaterials(pub(super) &'static str, pub(super) &'static str);
-
 fn problem<'e>(error: &'e (dyn std::error::Error + 'static)) -> Option<&'e Problem> {
     match error.downcast_ref()? {
         CollectError::File { problem, .. } => Some(problem),
@@ -80,9 +74,7 @@ fn problem<'e>(error: &'e (dyn std::error::Error + 'static)) -> Option<&'e Probl
 pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {
-        e.is::<NoObjects>()
-            || e.is::<OtherMaterials>()
-            || e.is::<WrongUsage>()
+        e.is::<WrongUsage>()
             || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
             || matches!(problem(e), Some(Problem::NoLevel))
     }) {
@@ -92,10 +84,6 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
             || e.is::<NoRun>()
             || matches!(e.downcast_ref(), Some(DatasetError::Unreadable { .. }))
             || matches!(problem(e), Some(Problem::Unreadable(_)))
-            || matches!(
-                e.downcast_ref(),
-                Some(ConfigurationError::Unreadable { .. })
-            )
     }) {
         exit::NO_INPUT
     } else if has(<dyn std::error::Error>::is::<NoCuda>) {

@@ -12,11 +12,11 @@ use hrn_train::data::simulated;
 use hrn_train::judge::sheet;
 
 use super::arguments::Simulate;
-use super::failure::{NoObjects, OtherMaterials};
+use super::failure::WrongUsage;
 use super::files::{apart, check_new, write};
 
 /// The settings of the simulation.
-fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMaterials> {
+fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, WrongUsage> {
     let is_broad = arguments.materials == Materials::Broad;
     let of_named = [
         ("--swapped-levels", arguments.swapped_levels.is_some()),
@@ -32,7 +32,7 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMate
         (of_broad, "broad")
     };
     if let Some((option, _)) = strange.into_iter().find(|(_, is_given)| *is_given) {
-        return Err(OtherMaterials(option, usual));
+        return Err(WrongUsage::OtherMaterials(option, usual));
     }
     Ok(DatasetSettings {
         seed: arguments.seed,
@@ -65,7 +65,7 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, OtherMate
 pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let settings = simulated_settings(arguments)?;
     if settings.objects == 0 && settings.test_objects == 0 {
-        return Err(NoObjects.into());
+        return Err(WrongUsage::NoObjects.into());
     }
     if let Some(sheet) = &arguments.sheet {
         apart("--sheet", sheet, [arguments.out.as_path()])?;
