@@ -334,18 +334,4 @@ mod tests {
         }
         assert!(sheet(&[], &[]).is_ok());
     }
-
-    #[test]
-    #[ignore = "writes pictures to the directory SHEETS, to be looked at"]
-    fn write_sheets() {
-        let directory = std::path::PathBuf::from(std::env::var("SHEETS").unwrap());
-        let sequences: Vec<_> = Material::ALL[4..].iter().map(|&m| sequence(m)).collect();
-        for (name, shapes) in [
-            ("matched.png", Shapes::Matched),
-            ("paper.png", Shapes::Paper),
-        ] {
-            let bytes = sheet(&small(shapes, 4, 48), &sequences).unwrap();
-            std::fs::write(directory.join(name), bytes).unwrap();
-        }
-    }
 }
