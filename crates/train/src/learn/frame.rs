@@ -18,7 +18,7 @@ use crate::net::shore;
 use crate::net::standard::Standard;
 use crate::run::Run;
 use crate::run::checkpoint::Origin;
-use crate::run::progress::ensure_finite_logits;
+use crate::run::progress::ensure_finite;
 use crate::settings::Training;
 use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
@@ -132,7 +132,9 @@ pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
         task.levels,
         task.device,
     )?;
-    ensure_finite_logits(task.stage, task.settings.epochs, &first)?;
+    for &logit in first.iter().flat_map(|(logits, _)| logits) {
+        ensure_finite(task.stage, task.settings.epochs, "logit", logit.into())?;
+    }
     Ok(trained)
 }
 

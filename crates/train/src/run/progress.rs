@@ -20,22 +20,6 @@ pub(crate) fn ensure_finite(stage: &str, epoch: u32, what: &str, found: f64) -> 
     Ok(())
 }
 
-/// Ends a stage whose network gives a logit that is not finite, as finite weights can.
-///
-/// # Errors
-///
-/// Returns an error if one of the logits is not finite.
-pub(crate) fn ensure_finite_logits(
-    stage: &str,
-    epoch: u32,
-    judged: &[(Vec<f32>, [f32; 3])],
-) -> anyhow::Result<()> {
-    for logit in judged.iter().flat_map(|(logits, _)| logits) {
-        ensure_finite(stage, epoch, "logit", (*logit).into())?;
-    }
-    Ok(())
-}
-
 /// Ends a stage with weights that are NaN or infinite. The loss does not show them yet, because a
 /// step's loss is that of the weights before it.
 ///
