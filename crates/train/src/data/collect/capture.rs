@@ -199,16 +199,18 @@ fn play(bytes: &[u8], hrn: &Arc<Hrn>, selection: &mut Selection) -> Result<(Labe
     let (mut pitch_mm, none) = (None, Track::default());
     for found in Reader::new(bytes) {
         let found = found.map_err(Problem::Recording)?;
-        // A wrong description is an error of the playback.
-        if let Some(Ok(sensor)) = sensor_of(&found).map(RecordedSensor::check) {
-            let found = grid_mm(&sensor);
-            let expected = *pitch_mm.get_or_insert(found);
-            if found != expected {
-                return Err(Problem::Pitches { found, expected });
+        if let Some(described) = sensor_of(&found) {
+            selection.describe(&found.sensor, &described.description);
+            // A wrong description is an error of the playback.
+            if let Ok(sensor) = described.check() {
+                let found = grid_mm(&sensor);
+                let expected = *pitch_mm.get_or_insert(found);
+                if found != expected {
+                    return Err(Problem::Pitches { found, expected });
+                }
             }
         }
         let (at, sensor) = (found.at, found.sensor.clone());
-        selection.note(&found);
         let events = playback.feed(found);
         let events = events.map_err(Problem::Sensor)?;
         selection.take(events, at, playback.track(&sensor).unwrap_or(&none));

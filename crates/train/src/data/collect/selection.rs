@@ -8,7 +8,6 @@ use hardnessd_core::frame::{Array, Frame, Stamp};
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, is_informative};
 use hardnessd_core::press::thinned;
-use hardnessd_core::recording::{Entry, Found};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Laying, ModelFrame, ROWS};
 
@@ -93,15 +92,7 @@ struct Shown {
 }
 
 impl Selection {
-    /// Takes the sensor's description from an entry of a recording.
-    pub(super) fn note(&mut self, found: &Found) {
-        match &found.entry {
-            Entry::Settings(sensor) => self.describe(&found.sensor, &sensor.description),
-            Entry::State(state) => self.describe(&found.sensor, &state.sensor.description),
-            Entry::Input(_) => {}
-        }
-    }
-
+    /// Takes a sensor's description.
     pub(super) fn describe(&mut self, sensor: &str, description: &Description) {
         let held = self.held.entry(sensor.to_owned()).or_default();
         // A wrong description is an error of the playback.
