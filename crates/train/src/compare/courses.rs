@@ -21,6 +21,7 @@ use crate::data::{dataset, simulated};
 use crate::judge::baseline::Baseline;
 use crate::judge::metrics::{self, Clusters, Evaluation, Judged};
 use crate::learn::course::{self, Press};
+use crate::learn::frame::LEVEL_BALANCE;
 use crate::model::course as model;
 use crate::model::evaluated;
 use crate::run::disk::{refuse_foreign, write_whole};
@@ -86,7 +87,7 @@ struct TestSet {
 
 impl TestSet {
     fn read(path: &Path) -> anyhow::Result<Self> {
-        let courses = read(std::slice::from_ref(&path.to_owned()))?;
+        let (courses, _) = Courses::read_all(&[path.to_owned()])?;
         ensure!(
             courses.labelled(Split::Test).next().is_some(),
             "{}: no press of the test split has a level: choose other --test presses",
@@ -100,10 +101,6 @@ impl TestSet {
             courses,
         })
     }
-}
-
-fn read(paths: &[PathBuf]) -> anyhow::Result<Courses> {
-    Ok(Courses::read_all(paths)?.0)
 }
 
 /// Judges every set by every control and model, writes the tables and returns the first as text.
@@ -167,7 +164,7 @@ fn curves(sets: &[TestSet]) -> Option<(&str, Vec<Curve>)> {
 
 /// Fits the controls and judges the sets with them.
 fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>> {
-    let courses = read(data)?;
+    let (courses, _) = Courses::read_all(data)?;
     let presses = course::presses(&courses);
     let learnt: Vec<&Press> = courses
         .labelled(Split::Train)
@@ -182,10 +179,10 @@ fn controls(data: &[PathBuf], sets: &[TestSet]) -> anyhow::Result<Vec<CourseRow>
         .iter()
         .map(|press| usize::from(press.level) - 1)
         .collect();
-    // Raise the weights of levels with few presses halfway, as the method `course` does.
+    // Raise the weights of levels with few presses, as the method `course` does.
     let lifts: Vec<f32> = (0..levels)
         .map(|level| level_of.iter().filter(|&&of| of == level).count())
-        .map(|count| (count.max(1) as f32).powf(-course::LEVEL_BALANCE as f32))
+        .map(|count| (count.max(1) as f32).powf(-LEVEL_BALANCE as f32))
         .collect();
     let row_of = |control: Control| {
         let rows: Vec<Vec<f32>> = learnt.iter().map(|press| control.row(press)).collect();

@@ -11,6 +11,7 @@ use self::lots::Lots;
 use crate::data::courses::{self, Courses};
 use crate::learn::conformal::Calibration;
 use crate::learn::epochs::{self, Batch};
+use crate::learn::frame::LEVEL_BALANCE;
 use crate::learn::learner::Learner;
 use crate::learn::temperature;
 use crate::net::bins::{self, BINS};
@@ -31,10 +32,6 @@ pub use self::lots::Drawn;
 mod lots;
 mod varied;
 
-/// How far the weights of levels with few samples are raised towards equal levels, unless the
-/// settings say otherwise: all the way. Evenly spread Shore hardness gives few samples of the narrow
-/// levels, and without weights a doubtful press would never be of one of them.
-pub const LEVEL_BALANCE: f64 = 1.0;
 /// Groups of presses per pass without gradients.
 const JUDGED_AT_ONCE: usize = 16;
 

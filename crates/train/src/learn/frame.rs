@@ -26,7 +26,7 @@ use hardnessd_simulator::random::Stream;
 /// How far the weights of levels with few samples are raised towards equal levels, unless the
 /// settings say otherwise: 1, wholly. Evenly spread Shore hardness gives few samples of the narrow
 /// levels, and a network that weighs samples alike hardly ever names those levels.
-const LEVEL_BALANCE: f64 = 1.0;
+pub const LEVEL_BALANCE: f64 = 1.0;
 /// Frames per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
