@@ -206,17 +206,14 @@ impl Request {
     pub fn of_method(&self, method: Method, dataset: &Dataset) -> Result<Description, LabelsError> {
         let labels = labels(method, dataset, self.labels)?;
         let mut description = self.of(method.name(), labels, dataset.sources.clone());
+        let labelled = chosen(dataset, &description)?;
+        let share = self.settings.validation.share;
+        let (train, _) = dataset.hold_out(&labelled, share, self.seed);
         if method == Method::Hrn15Long {
-            let labelled = chosen(dataset, &description)?;
-            let share = self.settings.validation.share;
-            let (train, _) = dataset.hold_out(&labelled, share, self.seed);
             description.settings.training.epochs =
                 epochs_as_long_as_ours(&self.settings, train.len());
         }
         if method == Method::Hrn15Strong {
-            let labelled = chosen(dataset, &description)?;
-            let share = self.settings.validation.share;
-            let (train, _) = dataset.hold_out(&labelled, share, self.seed);
             let an_epoch = train.len().div_ceil(self.settings.training.batch).max(1) as u64;
             let epochs = strong_steps(self.profile).div_ceil(an_epoch);
             description.settings.training.epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
