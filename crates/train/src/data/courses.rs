@@ -265,8 +265,7 @@ impl Courses {
         let bytes = file::read(path)?;
         let mut file = File::open(&bytes, path)?;
         let meta = file.meta()?;
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let source = file::source(&bytes, &file, name.into_owned(), &meta)?;
+        let source = file::source(&bytes, &file, &meta)?;
         Ok((Self::parse(&bytes, path)?, source))
     }
 

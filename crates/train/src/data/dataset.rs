@@ -429,13 +429,7 @@ impl Dataset {
     /// shape or content than `docs/formats.md` says. `object`, `material`, `force`, `shore`,
     /// `split` (then all 0) and `meta` may be missing.
     pub fn read(path: &Path) -> Result<Self, DatasetError> {
-        let bytes = file::read(path)?;
-        let name = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        file::parse(&bytes, path, name)
+        file::parse(&file::read(path)?, path)
     }
 
     /// Joins several files into one data set. Objects of different files stay apart.

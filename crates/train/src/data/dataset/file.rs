@@ -32,20 +32,14 @@ const MOST_PACKED: u64 = 256;
 const FREE_BYTES: u64 = 16 << 20;
 
 /// Reads the samples in `bytes`, the content of the file `path`.
-pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, DatasetError> {
+pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Dataset, DatasetError> {
     let mut file = File::open(bytes, path)?;
     if file.is_of_courses() {
         return Err(DatasetError::WholePresses {
             path: path.to_owned(),
         });
     }
-    let frames: Vec<f32> = file.read("frames", &[ROWS, COLS], None)?.ok_or_else(|| {
-        file.error(
-            "frames",
-            "none".to_owned(),
-            format!("f32 [N,{ROWS},{COLS}]"),
-        )
-    })?;
+    let frames: Vec<f32> = file.required("frames", &[ROWS, COLS], None)?;
     let n = frames.len() / TAXELS;
     if n == 0 {
         return Err(file.error("frames", "no frame".to_owned(), "at least one".to_owned()));
@@ -60,9 +54,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
         let expected = format!("newtons from 0 to {MOST_NEWTONS:e}");
         return Err(file.error("frames", found, expected));
     }
-    let level: Vec<u8> = file
-        .read("level", &[], Some(n))?
-        .ok_or_else(|| file.error("level", "none".to_owned(), format!("u8 [{n}]")))?;
+    let level: Vec<u8> = file.required("level", &[], Some(n))?;
     let object: Option<Vec<u32>> = file.read("object", &[], Some(n))?;
     let material: Option<Vec<u8>> = file.read("material", &[], Some(n))?;
     let force: Option<Vec<f32>> = file.read("force", &[], Some(n))?;
@@ -98,7 +90,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path, name: String) -> Result<Dataset, 
             source: 0,
         }
     };
-    let source = source(bytes, &file, name, &meta)?;
+    let source = source(bytes, &file, &meta)?;
     Ok(Dataset {
         samples: (0..n).map(sample).collect(),
         sources: vec![source],
@@ -125,7 +117,6 @@ pub(in crate::data) fn read(path: &Path) -> Result<Vec<u8>, DatasetError> {
 pub(in crate::data) fn source(
     bytes: &[u8],
     file: &File,
-    name: String,
     meta: &serde_json::Value,
 ) -> Result<Source, DatasetError> {
     let refused = |key: &str, expected: &str| {
@@ -151,8 +142,9 @@ pub(in crate::data) fn source(
             "`level`, `label` and `shore` of each level, from 1 on",
         ));
     }
+    let name = file.path.file_name().unwrap_or_default();
     Ok(Source {
-        name,
+        name: name.to_string_lossy().into_owned(),
         seed,
         sha256: sha256_hex(bytes),
         generator: meta["generator"].as_str().map(str::to_owned),
@@ -283,9 +275,6 @@ impl<'a> File<'a> {
             return Ok(None);
         };
         drop(names);
-        let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
-        let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
-        let expected = format!("{} [{count}{lengths}]", T::NAME);
         let free = FREE_BYTES.max(self.largest);
         let read = self
             .zip
@@ -300,7 +289,7 @@ impl<'a> File<'a> {
                 self.largest = self.largest.max(size_of_val(&*values) as u64);
                 Ok(Some(values))
             }
-            Err(found) => Err(self.error(array, found.to_string(), expected)),
+            Err(found) => Err(self.error(array, found.to_string(), shape_of::<T>(inner, n))),
         }
     }
 
@@ -327,7 +316,7 @@ impl<'a> File<'a> {
         n: Option<usize>,
     ) -> Result<Vec<T>, DatasetError> {
         let found = self.read(array, inner, n)?;
-        found.ok_or_else(|| self.error(array, "none".to_owned(), T::NAME.to_owned()))
+        found.ok_or_else(|| self.error(array, "none".to_owned(), shape_of::<T>(inner, n)))
     }
 
     /// The array `meta` as JSON. Null if it is missing.
@@ -370,6 +359,13 @@ impl<'a> File<'a> {
             }
         }
     }
+}
+
+/// The type and the shape of an array, such as `f32 [N,28,28]`.
+fn shape_of<T: Element>(inner: &[usize], n: Option<usize>) -> String {
+    let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
+    let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
+    format!("{} [{count}{lengths}]", T::NAME)
 }
 
 /// The content found in place of an array. Each message continues the word "found".

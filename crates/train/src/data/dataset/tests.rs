@@ -37,7 +37,7 @@ fn bytes_of(samples: &[Sample]) -> Vec<u8> {
 }
 
 fn parse(bytes: &[u8]) -> Result<Dataset, DatasetError> {
-    file::parse(bytes, Path::new("D.npz"), "D.npz".to_owned())
+    file::parse(bytes, Path::new("D.npz"))
 }
 
 #[test]
@@ -413,7 +413,7 @@ fn files_are_joined_while_their_objects_can_be_counted_and_their_pitch_is_one() 
             meta["pitch_mm"] = pitch_mm.into();
         }
         let bytes = write(Cursor::new(Vec::new()), &samples, &meta).unwrap();
-        file::parse(bytes.get_ref(), Path::new(path), path.to_owned()).unwrap()
+        file::parse(bytes.get_ref(), Path::new(path)).unwrap()
     };
     let joined = |parts: [Dataset; 2]| Dataset::joined(parts.to_vec());
     let most = joined([part(2, None, "a"), part(u32::MAX - 3, None, "b")]).unwrap();
