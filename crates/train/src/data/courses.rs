@@ -14,8 +14,8 @@ pub use self::frames::Frames;
 use self::frames::NEWTONS;
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
-    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, object_in_both_splits,
-    objects_after, pitch_mm, warn_of_object_in_both_splits,
+    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, objects_after, pitch_mm,
+    warn_of_object_in_both_splits,
 };
 use hardnessd_core::npz::Writer;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, TAXELS};
@@ -231,9 +231,7 @@ impl Courses {
             let (mut part, source) = Self::read_with_source(path)?;
             let presses = part.presses.iter();
             let presses = presses.map(|press| (press.pressed(), press.split));
-            if let Some(object) = object_in_both_splits(presses) {
-                warn_of_object_in_both_splits(path, object);
-            }
+            warn_of_object_in_both_splits(path, presses);
             sources.push(source);
             let (expected, found) = (pitch_mm(&sources), pitch_mm(&sources[sources.len() - 1..]));
             if found != expected {

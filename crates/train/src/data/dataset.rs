@@ -181,7 +181,7 @@ impl Object {
 }
 
 /// The number of an object that has presses in both splits, if there is one.
-pub(super) fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split)>) -> Option<u32> {
+fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split)>) -> Option<u32> {
     let (mut trained, mut tested) = (BTreeSet::new(), BTreeSet::new());
     for (object, split) in presses {
         match split {
@@ -193,13 +193,18 @@ pub(super) fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split
     trained.iter().find(is_tested).map(|object| object.number)
 }
 
-/// Prints the warning that `object` of a file has presses in both splits.
-pub(super) fn warn_of_object_in_both_splits(path: &Path, object: u32) {
-    hardnessd_core::stderr_line!(
-        "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
-         of them overrates a model that learnt from the others",
-        path.display()
-    );
+/// Prints a warning if an object of a file has presses in both splits.
+pub(super) fn warn_of_object_in_both_splits(
+    path: &Path,
+    presses: impl Iterator<Item = (Object, Split)>,
+) {
+    if let Some(object) = object_in_both_splits(presses) {
+        hardnessd_core::stderr_line!(
+            "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
+             of them overrates a model that learnt from the others",
+            path.display()
+        );
+    }
 }
 
 /// Objects by source and level. Each object is a list of samples.
@@ -490,17 +495,11 @@ impl Dataset {
         pitch_mm(&self.sources)
     }
 
-    /// An object that has samples in both splits, if there is one.
-    fn object_in_both_splits(&self) -> Option<u32> {
-        let samples = self.samples.iter();
-        object_in_both_splits(samples.filter_map(|sample| Some((sample.pressed()?, sample.split))))
-    }
-
     /// Prints a warning if an object has samples in both splits.
     pub fn warn_of_object_in_both_splits(&self) {
-        if let Some(object) = self.object_in_both_splits() {
-            warn_of_object_in_both_splits(&self.path(), object);
-        }
+        let samples = self.samples.iter();
+        let presses = samples.filter_map(|sample| Some((sample.pressed()?, sample.split)));
+        warn_of_object_in_both_splits(&self.path(), presses);
     }
 
     /// The path of the first file.

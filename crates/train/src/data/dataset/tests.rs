@@ -271,12 +271,10 @@ fn an_object_in_both_splits_is_found() {
             material,
             ..sample(level, 0, split)
         };
-        let dataset = Dataset {
-            samples: pair.map(of).to_vec(),
-            sources: Vec::new(),
-            paths: Vec::new(),
-        };
-        assert_eq!(dataset.object_in_both_splits(), expected, "{pair:?}");
+        let samples = pair.map(of);
+        let samples = samples.iter();
+        let presses = samples.filter_map(|sample| Some((sample.pressed()?, sample.split)));
+        assert_eq!(object_in_both_splits(presses), expected, "{pair:?}");
     }
 }
 
