@@ -35,30 +35,11 @@ pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
     }
 }
 
-/// The levels that `meta` of a file states. If it states none, those of [`levels`].
-///
-/// # Errors
-///
-/// Returns an error if the file cannot be read, or `levels` of its `meta` is not as
-/// `docs/formats.md` says.
-pub fn stated_levels(path: &Path) -> Result<Vec<Level>, DatasetError> {
-    let stated = meta(path)?.get_mut("levels").map(serde_json::Value::take);
-    let Some(stated) = stated.filter(|stated| !stated.is_null()) else {
-        return Ok(levels());
-    };
-    serde_json::from_value(stated).map_err(|error| DatasetError::Array {
-        path: path.to_owned(),
-        array: "meta",
-        found: format!("`levels` with {error}"),
-        expected: "`level`, `label` and `shore` of each level".to_owned(),
-    })
-}
-
 /// The levels that a model of these files states: those of the first file that states some, otherwise
 /// those of [`levels`].
 pub fn levels_of(sources: &[Source]) -> Vec<Level> {
-    let mut stated = sources.iter().filter_map(|source| source.levels.clone());
-    stated.next().unwrap_or_else(levels)
+    let mut stated = sources.iter().filter_map(Source::our_levels);
+    stated.next().map_or_else(levels, <[Level]>::to_vec)
 }
 
 /// Prints a warning for each file that states other levels than the model will.
@@ -71,7 +52,7 @@ pub fn warn_of_other_levels(sources: &[Source]) {
     };
     let ours = levels_of(sources);
     for source in sources {
-        if let Some(others) = source.levels.as_ref().filter(|others| **others != ours) {
+        if let Some(others) = source.our_levels().filter(|others| *others != ours) {
             hardnessd_core::stderr_line!(
                 "warning: {}: levels: found {}, expected {}, which the model will state",
                 source.name,
@@ -226,7 +207,7 @@ pub struct Source {
     /// The least and the greatest distance between the taxels of the file's sensors, if they differ.
     #[serde(skip)]
     pub pitches_mm: Option<[f64; 2]>,
-    /// The levels that the file states, if a model can state them.
+    /// The levels that the file states.
     #[serde(skip)]
     pub levels: Option<Vec<Level>>,
     /// The kind of the presses of recorded objects, by number and level.
@@ -251,6 +232,12 @@ pub enum Kind {
 }
 
 impl Source {
+    /// The levels that the file states, if they are as many as those of a model that is trained here.
+    fn our_levels(&self) -> Option<&[Level]> {
+        let stated = self.levels.as_deref();
+        stated.filter(|stated| stated.len() == LEVELS.len())
+    }
+
     /// The kinds of the samples, in the order of the programs that made them.
     pub fn kinds(&self) -> Vec<Kind> {
         let kind = |generator: &str| match generator {

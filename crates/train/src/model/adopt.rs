@@ -50,7 +50,8 @@ pub fn adopt(
     stated: &Stated,
 ) -> anyhow::Result<(Vec<u8>, Vec<String>, Option<Evaluated>)> {
     let mut proto = decode(bytes)?;
-    let levels = dataset::stated_levels(&dataset.path())?;
+    let stated_levels = dataset.sources[0].levels.clone();
+    let levels = stated_levels.unwrap_or_else(dataset::levels);
     let (done, found) = mend(&mut proto, &levels)?;
     let expected = levels.len();
     ensure!(

@@ -150,7 +150,7 @@ pub(in crate::data) fn source(
         generator: meta["generator"].as_str().map(str::to_owned),
         pitch_mm,
         pitches_mm: pitches_mm(meta),
-        levels: stated.filter(|of| of.len() == levels().len()),
+        levels: stated,
         recorded: recorded(&meta["captures"]),
     })
 }

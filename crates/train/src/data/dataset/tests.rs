@@ -370,7 +370,11 @@ fn objects_of_one_number_are_several_if_their_levels_differ() {
 
 #[test]
 fn a_model_states_the_levels_of_its_data() {
-    let stated = |shore: &str| Some(vec![level(&LEVELS[0], shore)]);
+    let stated = |shore: &str| {
+        let mut levels = levels();
+        levels[0].shore = shore.to_owned();
+        Some(levels)
+    };
     let source = |levels| Source {
         name: "a.npz".to_owned(),
         seed: None,
@@ -382,8 +386,10 @@ fn a_model_states_the_levels_of_its_data() {
         pitches_mm: None,
     };
     assert_eq!(levels_of(&[source(None)]), levels());
+    // The second file states other levels than a model that is trained here can have.
     let several = [
         source(None),
+        source(Some(levels()[..3].to_vec())),
         source(stated("70-90")),
         source(stated("60-90")),
     ];
