@@ -11,7 +11,7 @@ use super::body::Body;
 use super::durometer::{self, Durometer};
 use super::level::{self, Borders, LEVELS, level_of};
 use super::substance::{Creep, Law, Substance, Texture};
-use crate::random::Stream;
+use crate::random::{Stream, log_even};
 
 /// A law that materials are drawn from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -225,10 +225,6 @@ fn substance(law: LawName, shore: f64, stream: &mut Stream) -> Substance {
 
 fn even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
     stream.range(low, high)
-}
-
-fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
-    stream.range(low.ln(), high.ln()).exp()
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::texture::Patch;
-use crate::random::Stream;
+use crate::random::{Stream, log_even};
 
 /// The distribution that the objects' shapes are drawn from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -329,10 +329,6 @@ fn block(stream: &mut Stream) -> Solid {
         sides: [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)]
             .map(|(low, high)| stream.range(low, high)),
     }
-}
-
-fn log_even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
-    stream.range(low.ln(), high.ln()).exp()
 }
 
 /// Height of wedges and points, which rest on their base with the tip up.

@@ -83,7 +83,8 @@ impl Stream {
 }
 
 /// Draws a number between two, whose logarithm is uniform.
-pub(crate) fn log_even([low, high]: [f64; 2], stream: &mut Stream) -> f64 {
+pub(crate) fn log_even(range: impl Into<[f64; 2]>, stream: &mut Stream) -> f64 {
+    let [low, high] = range.into();
     stream.range(low.ln(), high.ln()).exp()
 }
 
