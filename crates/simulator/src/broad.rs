@@ -36,16 +36,6 @@ impl LawName {
         LawName::Layered,
     ];
 
-    /// The name used in commands and files.
-    pub fn name(self) -> &'static str {
-        match self {
-            LawName::Solid => "solid",
-            LawName::Plastic => "plastic",
-            LawName::Foam => "foam",
-            LawName::Layered => "layered",
-        }
-    }
-
     /// The name of the law's materials in a data set, where `foam` alone is a named material.
     pub fn material_name(self) -> &'static str {
         match self {
@@ -239,7 +229,7 @@ mod tests {
     #[test]
     fn a_durometer_reads_what_a_drawn_object_is_labelled_with() {
         for law in LawName::ALL {
-            let mut stream = Stream::new(2, law.name());
+            let mut stream = Stream::new(2, &format!("{law:?}").to_lowercase());
             for borders in [Borders::Touching, Borders::Gaps] {
                 for _ in 0..8 {
                     let body = draw(only(law), borders, &mut stream);
