@@ -3,7 +3,7 @@
 //!
 //! The baseline shows how much area, force and spread alone say. Every table includes it.
 
-use crate::judge::features::{FEATURES, feature_graph, moments};
+use crate::judge::features::{FEATURES, Moments, feature_graph};
 use crate::net::graph::Graph;
 
 /// Weight of the squared coefficients relative to the mean loss. It keeps Newton's method solvable
@@ -13,10 +13,8 @@ const RIDGE: f64 = 1e-4;
 /// A fitted baseline.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Baseline {
-    /// Mean of each feature over the training samples.
-    mean: Vec<f64>,
-    /// Standard deviation of each feature over the training samples.
-    deviation: Vec<f64>,
+    /// Of the features over the training samples.
+    moments: Moments,
     /// `[L][features + 1]`: for each level a coefficient per feature, and the bias.
     coefficients: Vec<Vec<f64>>,
     /// Newton steps that the fit took.
@@ -28,11 +26,10 @@ pub struct Baseline {
 impl Baseline {
     /// Fits rows of features to their levels by Newton's method. Levels count from 0.
     pub fn fit(rows: &[Vec<f32>], level_of: &[usize], levels: usize) -> Self {
-        let (mean, deviation) = moments(rows);
-        let coefficients = vec![vec![0.0; mean.len() + 1]; levels];
+        let moments = Moments::of(rows);
+        let coefficients = vec![vec![0.0; moments.mean.len() + 1]; levels];
         let mut baseline = Self {
-            mean,
-            deviation,
+            moments,
             coefficients,
             steps: 0,
             loss: 0.0,
@@ -67,15 +64,11 @@ impl Baseline {
         baseline
     }
 
-    /// Features minus mean, divided by deviation, and a 1 for the bias.
+    /// The standardised features, and a 1 for the bias.
     fn standardised(&self, row: &[f32]) -> Vec<f64> {
-        let one = |((x, mean), deviation): ((&f32, &f64), &f64)| (f64::from(*x) - mean) / deviation;
-        row.iter()
-            .zip(&self.mean)
-            .zip(&self.deviation)
-            .map(one)
-            .chain([1.0])
-            .collect()
+        let mut row = self.moments.standardised(row);
+        row.push(1.0);
+        row
     }
 
     fn probabilities_of(&self, row: &[f64]) -> Vec<f64> {
@@ -108,7 +101,7 @@ impl Baseline {
 
     /// Gradient and Hessian of the loss, solved for the step downhill.
     fn newton_step(&self, rows: &[Vec<f64>], level_of: &[usize]) -> Vec<f64> {
-        let (levels, width) = (self.coefficients.len(), self.mean.len() + 1);
+        let (levels, width) = (self.coefficients.len(), self.moments.mean.len() + 1);
         let size = levels * width;
         let flat: Vec<f64> = self.coefficients.concat();
         let mut gradient: Vec<f64> = flat.iter().map(|c| RIDGE * c).collect();
@@ -153,12 +146,9 @@ impl Baseline {
         let (mut graph, features) = feature_graph();
         let levels = self.coefficients.len();
         let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect::<Vec<f32>>();
-        let mean = graph.constant("mean of features", &[1, FEATURES], &narrow(&self.mean));
-        let deviation = graph.constant(
-            "deviation of features",
-            &[1, FEATURES],
-            &narrow(&self.deviation),
-        );
+        let Moments { mean, deviation } = &self.moments;
+        let mean = graph.constant("mean of features", &[1, FEATURES], &narrow(mean));
+        let deviation = graph.constant("deviation of features", &[1, FEATURES], &narrow(deviation));
         let centred = graph.node("Sub", &[&features, &mean], "centred", Vec::new());
         let standard = graph.node("Div", &[&centred, &deviation], "standardised", Vec::new());
         let matrix: Vec<f64> = (0..FEATURES)

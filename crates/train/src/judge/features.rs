@@ -259,21 +259,40 @@ pub fn features<'a>(frames: impl Iterator<Item = &'a ModelFrame>) -> anyhow::Res
     frames.map(|frame| plan.run(frame)).collect()
 }
 
-/// Mean and standard deviation of each feature over `rows`, which must not be empty.
-pub fn moments(rows: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
-    let (n, width) = (rows.len() as f64, rows[0].len());
-    let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
-    let mean: Vec<f64> = (0..width)
-        .map(|index| column(index).sum::<f64>() / n)
-        .collect();
-    let deviation: Vec<f64> = (0..width)
-        .map(|index| {
+/// Mean and standard deviation of each feature.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Moments {
+    /// The means.
+    pub mean: Vec<f64>,
+    /// The standard deviations.
+    pub deviation: Vec<f64>,
+}
+
+impl Moments {
+    /// The moments over `rows`, which must not be empty.
+    pub fn of(rows: &[Vec<f32>]) -> Self {
+        let (n, width) = (rows.len() as f64, rows[0].len());
+        let column = |index: usize| rows.iter().map(move |row| f64::from(row[index]));
+        let mean: Vec<f64> = (0..width)
+            .map(|index| column(index).sum::<f64>() / n)
+            .collect();
+        let deviation = (0..width).map(|index| {
             let squares = column(index).map(|x| (x - mean[index]).powi(2));
             // The lower limit avoids a division by 0 for a feature that never varies.
             (squares.sum::<f64>() / n).sqrt().max(1e-6)
-        })
-        .collect();
-    (mean, deviation)
+        });
+        let deviation = deviation.collect();
+        Self { mean, deviation }
+    }
+
+    /// Features minus mean, divided by deviation.
+    pub fn standardised(&self, row: &[f32]) -> Vec<f64> {
+        let scale = self.mean.iter().zip(&self.deviation);
+        row.iter()
+            .zip(scale)
+            .map(|(x, (mean, deviation))| (f64::from(*x) - mean) / deviation)
+            .collect()
+    }
 }
 
 #[cfg(test)]

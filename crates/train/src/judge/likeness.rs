@@ -4,7 +4,7 @@
 //! and a distance between their hand-made features, which shows whether they are of the right
 //! size, force and roughness.
 
-use crate::judge::features;
+use crate::judge::features::{self, Moments};
 use crate::net::image::PixelScale;
 use hardnessd_core::verdict::{ModelFrame, TAXELS};
 
@@ -28,8 +28,7 @@ pub struct Likeness {
 /// The real frames of a comparison.
 #[derive(Debug)]
 pub struct Reference {
-    mean: Vec<f64>,
-    deviation: Vec<f64>,
+    moments: Moments,
     /// Standardised features, a row per frame.
     rows: Vec<Vec<f64>>,
     pixel_std: f64,
@@ -44,16 +43,13 @@ impl Reference {
     /// Returns an error if the features cannot be computed.
     pub fn of(frames: &[&ModelFrame], scale: PixelScale) -> anyhow::Result<Self> {
         let rows = features::features(frames.iter().copied())?;
-        let (mean, deviation) = features::moments(&rows);
-        let mut reference = Self {
-            mean,
-            deviation,
-            rows: Vec::new(),
+        let moments = Moments::of(&rows);
+        Ok(Self {
+            rows: rows.iter().map(|row| moments.standardised(row)).collect(),
+            moments,
             pixel_std: pixel_std(frames.iter().copied(), scale),
             scale,
-        };
-        reference.rows = reference.standardised(&rows);
-        Ok(reference)
+        })
     }
 
     /// Compares generated `frames`, of which frame r is of component r mod `components`.
@@ -62,7 +58,11 @@ impl Reference {
     ///
     /// Returns an error if the features cannot be computed.
     pub fn compare(&self, frames: &[ModelFrame], components: usize) -> anyhow::Result<Likeness> {
-        let rows = self.standardised(&features::features(frames.iter())?);
+        let rows = features::features(frames.iter())?;
+        let rows: Vec<Vec<f64>> = rows
+            .iter()
+            .map(|row| self.moments.standardised(row))
+            .collect();
         let across = 2.0 * mean_distance(&self.rows, &rows);
         let within = mean_distance_within(&self.rows) + mean_distance_within(&rows);
         let of_component = |first: usize| {
@@ -80,17 +80,6 @@ impl Reference {
                 0.0
             },
         })
-    }
-
-    fn standardised(&self, rows: &[Vec<f32>]) -> Vec<Vec<f64>> {
-        let one = |row: &Vec<f32>| {
-            let scale = self.mean.iter().zip(&self.deviation);
-            row.iter()
-                .zip(scale)
-                .map(|(x, (mean, deviation))| (f64::from(*x) - mean) / deviation)
-                .collect()
-        };
-        rows.iter().map(one).collect()
     }
 }
 
