@@ -165,21 +165,8 @@ pub(super) struct Simulate {
 }
 
 /// Sensors of `simulate --sequences` other than the usual ones.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum Sensors {
-    /// Many sensors, each of a design of its own, with presses of rigid pieces on each
-    Broad,
-    /// Many instances of the JX255N, with presses of rigid pieces on each
-    Jx255n,
-}
-
-impl From<Sensors> for SensorDesigns {
-    fn from(sensors: Sensors) -> Self {
-        match sensors {
-            Sensors::Broad => Self::Broad,
-            Sensors::Jx255n => Self::Jx255n,
-        }
-    }
+fn sensors() -> impl TypedValueParser<Value = SensorDesigns> {
+    PossibleValuesParser::new(["broad", "jx255n"]).try_map(|name| named(&name))
 }
 
 /// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
@@ -213,9 +200,9 @@ pub(super) struct Courses {
     pub(super) unknown: Option<f64>,
     /// Sensors: broad (each has a design of its own) or jx255n (many of the JX255N), with presses of rigid pieces
     /// too [default: eight of one design in each split]
-    #[arg(long, value_enum, hide_possible_values = true,
+    #[arg(long, value_parser = sensors(), hide_possible_values = true,
           conflicts_with_all = ["sensor_profile", "one_sensor", "cover", "calibrated"])]
-    pub(super) sensors: Option<Sensors>,
+    pub(super) sensors: Option<SensorDesigns>,
     /// With --sensors: covers that training objects are pressed on, at most one for each object of a material
     /// [default: 200]
     #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
@@ -249,8 +236,8 @@ pub(super) struct Collect {
     #[arg(long, value_name = "K")]
     pub(super) object: Option<u32>,
     /// For training or for test
-    #[arg(long, default_value = "train")]
-    pub(super) split: SplitName,
+    #[arg(long, default_value = "train", value_parser = split())]
+    pub(super) split: Split,
     /// Collect whole presses over time, not single frames; with the arm's approach where the recording
     /// has it
     #[arg(long)]
@@ -455,8 +442,8 @@ pub(super) struct Evaluate {
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
     /// Split to evaluate
-    #[arg(long, default_value = "test")]
-    pub(super) split: SplitName,
+    #[arg(long, default_value = "test", value_parser = split())]
+    pub(super) split: Split,
     /// Give the model this many presses of each rigid piece as references of each sensor
     #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) rigid: usize,
@@ -496,19 +483,12 @@ pub(super) struct Adopt {
     pub(super) validation: Option<String>,
 }
 
-#[derive(Debug, Clone, Copy, ValueEnum)]
-pub(super) enum SplitName {
-    Train,
-    Test,
-}
-
-impl From<SplitName> for Split {
-    fn from(name: SplitName) -> Self {
-        match name {
-            SplitName::Train => Split::Train,
-            SplitName::Test => Split::Test,
-        }
-    }
+fn split() -> impl TypedValueParser<Value = Split> {
+    let splits = [Split::Train, Split::Test];
+    PossibleValuesParser::new(splits.map(Split::name)).map(move |name| {
+        let found = splits.into_iter().find(|split| split.name() == name);
+        found.expect("clap lets only these names pass")
+    })
 }
 
 #[cfg(test)]

@@ -36,7 +36,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         labelling: Labelling {
             level: arguments.level,
             object: arguments.object,
-            split: arguments.split.into(),
+            split: arguments.split,
         },
         sequences: arguments.sequences,
         skip_unusable: arguments.skip_unusable,

@@ -36,7 +36,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let dataset = Dataset::read(&arguments.data)?;
     warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
     dataset.warn_of_object_in_both_splits();
-    let indices = dataset.labelled(arguments.split.into())?;
+    let indices = dataset.labelled(arguments.split)?;
     evaluation_of(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
 }
 
@@ -71,9 +71,7 @@ fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
         rigid: arguments.rigid,
         labelled: arguments.labelled,
     };
-    let verdicts = course::verdicts(hrn, &courses, arguments.split.into(), given, |course| {
-        course
-    })?;
+    let verdicts = course::verdicts(hrn, &courses, arguments.split, given, |course| course)?;
     anyhow::ensure!(
         !verdicts.is_empty(),
         "{}: no press of this split has a level: choose the other --split, or other data",

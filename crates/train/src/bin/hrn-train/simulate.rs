@@ -137,7 +137,7 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
     let mut message = String::new();
     for shard in 0..shards {
         let sensors = BroadSensors {
-            designs: designs.into(),
+            designs,
             covers: asked.covers.unwrap_or(usual.covers),
             test_covers: asked.test_covers.unwrap_or(usual.test_covers),
             electronics: asked.electronics.unwrap_or(usual.electronics),
