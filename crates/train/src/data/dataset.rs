@@ -192,7 +192,7 @@ pub(super) fn warn_of_object_in_both_splits(
 type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
 /// A file that samples came from.
-#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Source {
     /// The file's name without its directory.
     pub name: String,

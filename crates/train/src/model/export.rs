@@ -268,14 +268,9 @@ mod tests {
             let dataset = Dataset {
                 samples: [vec![learnt.clone()], judged].concat(),
                 sources: vec![Source {
-                    name: String::new(),
-                    seed: None,
-                    sha256: String::new(),
                     generator: generator.map(str::to_owned),
-                    pitch_mm: None,
-                    levels: None,
                     recorded: recorded.clone(),
-                    pitches_mm: None,
+                    ..Source::default()
                 }],
                 paths: Vec::new(),
             };

@@ -17,13 +17,8 @@ fn description(name: &str, sha256: &str) -> Description {
         settings: Settings::of(Profile::Smoke),
         data: vec![Source {
             name: name.to_owned(),
-            seed: None,
             sha256: sha256.to_owned(),
-            generator: None,
-            pitch_mm: None,
-            levels: None,
-            recorded: std::collections::BTreeMap::new(),
-            pitches_mm: None,
+            ..Source::default()
         }],
     }
 }

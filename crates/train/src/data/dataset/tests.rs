@@ -341,14 +341,9 @@ fn labels_are_chosen_by_object_and_equally_from_each_level() {
 #[test]
 fn objects_of_one_number_are_several_if_their_levels_differ() {
     let sample = |level, object| Sample {
-        frame: ModelFrame::default(),
-        level,
         object,
         material: None,
-        force_n: None,
-        split: Split::Train,
-        shore: None,
-        source: 0,
+        ..sample(level, 0, Split::Train)
     };
     let (known, unknown) = (Some(7), None);
     let samples = [
@@ -376,14 +371,8 @@ fn a_model_states_the_levels_of_its_data() {
         Some(levels)
     };
     let source = |levels| Source {
-        name: "a.npz".to_owned(),
-        seed: None,
-        sha256: String::new(),
-        generator: None,
-        pitch_mm: None,
         levels,
-        recorded: BTreeMap::new(),
-        pitches_mm: None,
+        ..Source::default()
     };
     assert_eq!(levels_of(&[source(None)]), levels());
     // The second file states other levels than a model that is trained here can have.
