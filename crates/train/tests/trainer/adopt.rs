@@ -1,16 +1,16 @@
 //! A model from elsewhere: the report of `hrn-train check-model`, and the result of `adopt`.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Output;
 
 use hardnessd_core::verdict::{Hrn, ModelFrame};
 use hardnessd_simulator::Split;
-use hrn_train::data::dataset::{self, Dataset, Sample};
+use hrn_train::data::dataset::{Dataset, Sample};
 use prost::Message;
 use tract_onnx::pb;
 
-use crate::hrn_train;
+use crate::{errors, few, hrn_train, write_data};
 
 /// What `adopt` says of a foreign model.
 fn adopt(foreign: &str, data: &str, out: &Path) -> Output {
@@ -27,29 +27,6 @@ fn adopt(foreign: &str, data: &str, out: &Path) -> Output {
 
 fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8(output.stderr.clone()).unwrap()
-}
-
-/// A directory with a small data set.
-fn data() -> (tempfile::TempDir, PathBuf) {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("data.npz");
-    let output = hrn_train(&[
-        "simulate",
-        "--out",
-        path.to_str().unwrap(),
-        "--objects",
-        "2",
-        "--test-objects",
-        "1",
-        "--presses",
-        "6",
-    ]);
-    assert!(output.status.success(), "{}", stderr(&output));
-    (directory, path)
 }
 
 /// The linear model's weight of `taxel` for `level`.
@@ -151,7 +128,7 @@ fn write(directory: &Path, name: &str, model: &pb::ModelProto) -> String {
 
 #[test]
 fn a_foreign_model_is_told_all_that_it_lacks_and_adopted() {
-    let (directory, data) = data();
+    let (directory, data) = few();
     let data = data.to_str().unwrap();
     for output in ["logits", "probabilities"] {
         let foreign = write(directory.path(), "foreign.onnx", &model(output, 4, 17));
@@ -192,7 +169,7 @@ fn a_foreign_model_is_told_all_that_it_lacks_and_adopted() {
             ]
             .concat(),
         );
-        assert!(adopted.status.success(), "{}", stderr(&adopted));
+        assert!(adopted.status.success(), "{}", errors(&adopted));
         assert!(
             stdout(&adopted).contains("changed  input \"x\""),
             "{}",
@@ -332,7 +309,7 @@ fn assert_linear(adopted: &Path, data: &str, columns: [usize; 4], of: impl Fn(f3
 
 #[test]
 fn a_classifier_of_skl2onnx_is_adopted_as_it_is_written_by_default() {
-    let (directory, data) = data();
+    let (directory, data) = few();
     let data = data.to_str().unwrap();
     let out = directory.path().join("adopted.onnx");
     // scikit-learn sorts the classes, so its columns are in the order of these texts.
@@ -351,7 +328,7 @@ fn a_classifier_of_skl2onnx_is_adopted_as_it_is_written_by_default() {
             "{lines}"
         );
         let adopted = adopt(&foreign, data, &out);
-        assert!(adopted.status.success(), "{}", stderr(&adopted));
+        assert!(adopted.status.success(), "{}", errors(&adopted));
         assert_linear(&out, data, columns, |n| (f64::from(n) - 0.01) * 2.0);
     }
 }
@@ -392,7 +369,7 @@ fn network(dims: &[i64]) -> pb::ModelProto {
 
 #[test]
 fn a_network_with_any_batch_and_shape_of_frames_is_adopted() {
-    let (directory, data) = data();
+    let (directory, data) = few();
     let data = data.to_str().unwrap();
     let out = directory.path().join("adopted.onnx");
     for dims in [
@@ -405,7 +382,7 @@ fn a_network_with_any_batch_and_shape_of_frames_is_adopted() {
     ] {
         let foreign = write(directory.path(), "foreign.onnx", &network(dims));
         let adopted = adopt(&foreign, data, &out);
-        assert!(adopted.status.success(), "{dims:?}: {}", stderr(&adopted));
+        assert!(adopted.status.success(), "{dims:?}: {}", errors(&adopted));
         assert_linear(&out, data, [0, 1, 2, 3], f64::from);
     }
 }
@@ -430,7 +407,7 @@ fn three_levels_of(path: &Path, meta: &serde_json::Value) {
         source: 0,
     };
     let samples: Vec<Sample> = [1, 2, 3, 3].into_iter().map(sample).collect();
-    dataset::write(fs::File::create(path).unwrap(), &samples, meta).unwrap();
+    write_data(path, &samples, meta);
 }
 
 #[test]
@@ -450,12 +427,12 @@ fn the_levels_of_an_adopted_model_are_those_of_its_data() {
     };
     three_levels(&data, &levels);
     let adopted = adopt();
-    assert!(adopted.status.success(), "{}", stderr(&adopted));
+    assert!(adopted.status.success(), "{}", errors(&adopted));
     let hrn = Hrn::load(&fs::read(&out).unwrap()).unwrap();
     assert_eq!(serde_json::to_value(&hrn.card().levels).unwrap(), levels);
 
     three_levels(&data, &serde_json::json!(["stone", "fruit", "jelly"]));
-    let refused = stderr(&adopt());
+    let refused = errors(&adopt());
     assert!(
         refused.contains("expected `level`, `label` and `shore`"),
         "{refused}"
@@ -467,7 +444,7 @@ fn the_levels_of_an_adopted_model_are_those_of_its_data() {
         serde_json::json!("x"),
     ] {
         three_levels_of(&data, &meta);
-        let refused = stderr(&adopt());
+        let refused = errors(&adopt());
         assert!(refused.contains("found 3 levels, expected 4"), "{refused}");
     }
 }
@@ -490,7 +467,7 @@ fn a_model_of_presses_is_checked_against_its_own_format() {
             entry.value = r#"{"alpha":0.1,"threshold":2}"#.to_owned();
         }
     }
-    let (directory, data) = data();
+    let (directory, data) = few();
     let changed = write(directory.path(), "changed.onnx", &proto);
     let checked = hrn_train(&["check-model", &changed]);
     let lines = stdout(&checked);
@@ -508,7 +485,7 @@ fn a_model_of_presses_is_checked_against_its_own_format() {
     let out = directory.path().join("out.onnx");
     let [data, out] = [&data, &out].map(|path| path.to_str().unwrap());
     let adopted = hrn_train(&["adopt", &changed, "--data", data, "--out", out]);
-    let message = stderr(&adopted);
+    let message = errors(&adopted);
     assert_eq!(adopted.status.code(), Some(78), "{message}");
     assert!(
         message.contains("adopt takes models of one frame"),
@@ -518,7 +495,7 @@ fn a_model_of_presses_is_checked_against_its_own_format() {
 
 #[test]
 fn what_cannot_be_adopted_is_refused_in_a_line() {
-    let (directory, data) = data();
+    let (directory, data) = few();
     let data = data.to_str().unwrap();
     let out = directory.path().join("out.onnx");
     let mut two_inputs = model("logits", 4, 17);
@@ -573,7 +550,7 @@ fn what_cannot_be_adopted_is_refused_in_a_line() {
     ] {
         let path = write(directory.path(), "foreign.onnx", &model);
         let output = adopt(&path, data, &out);
-        let message = stderr(&output);
+        let message = errors(&output);
         assert!(message.contains(expected), "{message}");
         assert_eq!(message.lines().count(), 1, "{message}");
         assert!(

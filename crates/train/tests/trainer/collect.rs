@@ -11,12 +11,12 @@ use hardnessd_core::test_support::of_a_labelled_press;
 use hardnessd_core::verdict::{Card, Hrn};
 use hardnessd_simulator::{self, DatasetSettings, Split};
 use hrn_train::data::courses::Courses;
-use hrn_train::data::dataset::{self, Dataset, Kind, Sample, meta};
+use hrn_train::data::dataset::{Dataset, Kind, Sample, meta};
 use hrn_train::data::simulated;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
 
-use crate::hrn_train;
+use crate::{errors, hrn_train, write_data};
 
 /// Raw bytes of presses, which have no labels.
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fixtures/foam.5hz.bin");
@@ -72,10 +72,6 @@ fn collected(out: &Path, arguments: &[&str]) -> Vec<Sample> {
     let output = collect(out, arguments);
     assert!(output.status.success(), "{arguments:?}: {output:?}");
     Dataset::read(out).unwrap().samples
-}
-
-fn errors(output: &Output) -> String {
-    String::from_utf8(output.stderr.clone()).unwrap()
 }
 
 /// Asserts that the command is refused with this exit code and one line that contains `part`, and
@@ -472,8 +468,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     let write = |change: fn(&mut Sample)| {
         let mut samples = samples.clone();
         samples.iter_mut().for_each(change);
-        let file = fs::File::create(&out).unwrap();
-        dataset::write(file, &samples, &json!({})).unwrap();
+        write_data(&out, &samples, &json!({}));
     };
     let own = out.display();
     write(|sample| sample.object = None);

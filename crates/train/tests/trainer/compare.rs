@@ -6,11 +6,11 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime};
 
-use hrn_train::data::dataset::{self, Dataset};
+use hrn_train::data::dataset::Dataset;
 use hrn_train::judge::paper;
 use serde_json::Value;
 
-use crate::{data, hrn_train, succeed, succeeded, trainer};
+use crate::{data, hrn_train, succeed, succeeded, trainer, write_data};
 
 /// A comparison in its own directory.
 struct Comparison {
@@ -418,8 +418,7 @@ fn data_that_will_not_do_is_refused_before_anything_is_made() {
     let path = |name: &str| data().0.path().join(name);
     let samples = Dataset::read(&data().1).unwrap().samples;
     let write = |name: &str, meta: Value| {
-        let file = std::fs::File::create(path(name)).unwrap();
-        dataset::write(file, &samples, &meta).unwrap();
+        write_data(&path(name), &samples, &meta);
     };
     write("unsaid.npz", serde_json::json!({}));
     // This is a seed of the fresh test objects.
@@ -458,8 +457,7 @@ fn data_that_a_comparison_is_no_measure_of_is_warned_of() {
     for sample in of_level {
         (sample.object, sample.material) = (object, material);
     }
-    let file = std::fs::File::create(&path).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({"pitch_mm": 2.0})).unwrap();
+    write_data(&path, &samples, &serde_json::json!({"pitch_mm": 2.0}));
     // The warning comes before anything is made. Making the directory fails here.
     let mut command = trainer(&["compare", "--profile", "smoke", "--out", "/dev/null/no"]);
     let output = command.arg("--data").arg(&path).output().unwrap();

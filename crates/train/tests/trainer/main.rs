@@ -4,9 +4,13 @@
     reason = "clippy knows no helper of a test as a test"
 )]
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
+
+use hrn_train::data::dataset::{self, Sample};
+use serde_json::Value;
 
 mod adopt;
 mod collect;
@@ -53,6 +57,24 @@ fn succeeded(output: &Output) -> String {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{errors}");
     String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+fn errors(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+fn write_data(path: &Path, samples: &[Sample], meta: &Value) {
+    let file = File::create(path).unwrap();
+    dataset::write(file, samples, meta).unwrap();
+}
+
+/// A directory with a data set of few presses, `d.npz`.
+fn few() -> (tempfile::TempDir, PathBuf) {
+    let directory = tempfile::tempdir().unwrap();
+    let simulate = "simulate --objects 2 --test-objects 1 --presses 6 --out d.npz";
+    succeed_in(directory.path(), simulate);
+    let path = directory.path().join("d.npz");
+    (directory, path)
 }
 
 /// A directory for the whole process, with a small data set of rigid and soft objects.

@@ -9,12 +9,12 @@ use std::process::Command;
 
 use burn::tensor::Device;
 use hardnessd_core::verdict::BUILT_IN_HRN;
-use hrn_train::data::dataset::{self, Dataset, Sample};
+use hrn_train::data::dataset::{Dataset, Sample};
 use hrn_train::data::simulated;
 use hrn_train::run::checkpoint::Checkpoint;
 use serde_json::{Value, json};
 
-use crate::{hrn_train_in, succeed_in};
+use crate::{few, hrn_train_in, succeed_in, write_data};
 
 /// The last line of stderr says `expected`, and the exit code is `code`.
 fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
@@ -27,9 +27,7 @@ fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
 
 /// A directory with `d.npz`, the single frames of a few presses, and the built-in model `m.onnx`.
 fn bench() -> tempfile::TempDir {
-    let directory = tempfile::tempdir().unwrap();
-    let simulate = "simulate --objects 2 --test-objects 1 --presses 6 --out d.npz";
-    succeed_in(directory.path(), simulate);
+    let (directory, _) = few();
     fs::write(directory.path().join("m.onnx"), BUILT_IN_HRN).unwrap();
     directory
 }
@@ -132,10 +130,7 @@ fn what_a_model_could_not_state_is_refused_before_the_training() {
     let directory = bench();
     let at = directory.path();
     let samples = Dataset::read(&at.join("d.npz")).unwrap().samples;
-    let write = |samples: &[Sample], meta: &Value| {
-        let file = fs::File::create(at.join("bad.npz")).unwrap();
-        dataset::write(file, samples, meta).unwrap();
-    };
+    let write = |samples: &[Sample], meta: &Value| write_data(&at.join("bad.npz"), samples, meta);
     let train = "train --method features --profile smoke --data bad.npz --out run";
     for (meta, expected) in [
         (json!({"pitch_mm": 1e300}), "array `meta`: found pitch_mm"),

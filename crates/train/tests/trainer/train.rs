@@ -10,9 +10,9 @@ use hardnessd_simulator::{Material, Split};
 use hrn_train::data::courses::Courses;
 use hrn_train::data::dataset::{self, Dataset};
 use rustix::process::{Pid, Signal};
-use serde_json::Value;
+use serde_json::{Value, json};
 
-use crate::{data, hrn_train, succeed};
+use crate::{data, hrn_train, succeed, write_data};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
@@ -449,8 +449,7 @@ fn presses_are_counted_by_level_and_levels_counted_from_0_are_warned_of() {
     }
     let shifted = trial.out.with_extension("npz");
     let samples = std::mem::take(&mut dataset.samples);
-    let file = std::fs::File::create(&shifted).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    write_data(&shifted, &samples, &json!({}));
     let out = trial.out.with_extension("shifted");
     let (data, out) = (shifted.to_str().unwrap(), out.to_str().unwrap());
     let arguments = ["train", "--method", "features", "--profile", "smoke"];
@@ -504,8 +503,7 @@ fn a_discriminator_learns_from_unlabelled_samples_too() {
         sample.level *= u8::from(number % 10 > 1);
     }
     let path = data().0.path().join("unlabelled.npz");
-    let file = std::fs::File::create(&path).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    write_data(&path, &samples, &json!({}));
     for method in ["sgan", "igan"] {
         let trial = Trial {
             data: path.clone(),
@@ -749,10 +747,7 @@ fn broad_data_say_their_levels_and_laws() {
     ];
     let (samples, meta) = simulate(&sheet);
     assert_eq!(meta["levels"][1]["shore"], "61-70");
-    assert_eq!(
-        meta["settings"]["laws"],
-        serde_json::json!(["solid", "foam"])
-    );
+    assert_eq!(meta["settings"]["laws"], json!(["solid", "foam"]));
     assert!(
         samples
             .iter()
@@ -865,18 +860,16 @@ fn bad_input_has_its_exit_code_and_one_line() {
     let mut samples = Dataset::read(Path::new(&data)).unwrap().samples;
     samples[0].frame.newtons[0] = 1e38;
     let file = std::fs::File::create(&heavy).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    dataset::write(file, &samples, &json!({})).unwrap();
     samples.retain(|sample| sample.split == Split::Train);
     samples[0].frame.newtons[0] = 0.0;
     let untested = path("untested.npz");
-    let file = std::fs::File::create(&untested).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    write_data(Path::new(&untested), &samples, &json!({}));
     for sample in &mut samples {
         sample.level *= u8::from(sample.level != 3);
     }
     let without_level_3 = path("without level 3.npz");
-    let file = std::fs::File::create(&without_level_3).unwrap();
-    dataset::write(file, &samples, &serde_json::json!({})).unwrap();
+    write_data(Path::new(&without_level_3), &samples, &json!({}));
     let empty_split = format!("{untested}: no sample of the test split has a level: add some");
     let corrupt = path("corrupt");
     std::fs::create_dir(&corrupt).unwrap();
