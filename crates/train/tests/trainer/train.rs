@@ -855,14 +855,10 @@ fn bad_input_has_its_exit_code_and_one_line() {
         let force = format!("--lowest-force={force}");
         hrn_train(&["simulate", &force, "--out", &out])
     };
-    let (model, heavy) = (path("model.onnx"), path("heavy.npz"));
+    let model = path("model.onnx");
     std::fs::write(&model, hardnessd_core::verdict::BUILT_IN_HRN).unwrap();
     let mut samples = Dataset::read(Path::new(&data)).unwrap().samples;
-    samples[0].frame.newtons[0] = 1e38;
-    let file = std::fs::File::create(&heavy).unwrap();
-    dataset::write(file, &samples, &json!({})).unwrap();
     samples.retain(|sample| sample.split == Split::Train);
-    samples[0].frame.newtons[0] = 0.0;
     let untested = path("untested.npz");
     write_data(Path::new(&untested), &samples, &json!({}));
     for sample in &mut samples {
@@ -968,11 +964,6 @@ fn bad_input_has_its_exit_code_and_one_line() {
         (lowest("inf"), 2, "expected newtons from 0.01 to 25"),
         (lowest("-5"), 2, "expected newtons from 0.01 to 25"),
         (lowest("1e9"), 2, "expected newtons from 0.01 to 25"),
-        (
-            hrn_train(&["evaluate", "--model", &model, "--data", &heavy]),
-            1,
-            "heavy.npz: array `frames`: found 1e38 at [0,0,0]",
-        ),
         (hrn_train(&["inspect", &text]), 78, "not an ONNX model"),
         (hrn_train(&["inspect", &missing]), 66, "missing"),
         (hrn_train(&["export", &missing, "--out", &out]), 66, &no_run),
