@@ -790,12 +790,6 @@ fn presses_over_time_are_data_too() {
             "{times:?}"
         );
     }
-    // This data set cannot be read as single frames.
-    let error = Dataset::read(&path).unwrap_err().to_string();
-    assert!(
-        error.contains("has whole presses, not single frames"),
-        "{error}"
-    );
 }
 
 #[test]
