@@ -365,16 +365,21 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     assert_refused(&desk.path("mixed.npz"), &mixed, 1, expected);
 
     // A model can be evaluated on data of another pitch, with a warning.
-    let model = desk.path("run/hrn.onnx");
     let warning = "wide.npz: taxel pitch: found 3.5 mm, expected 2 mm, that of the model\n";
     for (data, expected) in [(&out, ""), (&wide, warning)] {
-        let of = ["--model", text(&model), "--data", text(data)];
-        let output = hrn_train(&[&["evaluate", "--split", "train"], &of[..]].concat());
-        assert!(output.status.success(), "{output:?}");
-        let errors = errors(&output);
-        assert!(errors.ends_with(expected), "{errors}");
-        assert_eq!(errors.starts_with("warning: "), !expected.is_empty());
+        assert_warned(&desk.path("run/hrn.onnx"), data, expected);
     }
+}
+
+/// Asserts that a model is evaluated on the data with this warning, or with none.
+fn assert_warned(model: &Path, data: &Path, expected: &str) {
+    let of = ["--model", text(model), "--data", text(data)];
+    let output = hrn_train(&[&["evaluate", "--split", "train"], &of[..]].concat());
+    let errors = errors(&output);
+    assert!(output.status.success(), "{errors}");
+    assert_eq!(errors.is_empty(), expected.is_empty(), "{errors}");
+    assert!(errors.ends_with(expected), "{errors}");
+    assert_eq!(errors.starts_with("warning: "), !expected.is_empty());
 }
 
 #[test]
@@ -402,12 +407,7 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
 
     let warning = "coarse.npz: taxel pitch: found 3.5 mm, expected 2 mm, that of the model\n";
     for (data, expected) in [(&fine, ""), (&coarse, warning)] {
-        let of = ["--model", text(&model), "--data", text(data)];
-        let output = hrn_train(&[&["evaluate", "--split", "train"], &of[..]].concat());
-        let errors = errors(&output);
-        assert!(output.status.success(), "{errors}");
-        assert_eq!(errors.is_empty(), expected.is_empty(), "{errors}");
-        assert!(errors.ends_with(expected), "{errors}");
+        assert_warned(&model, data, expected);
     }
     // Single frames are no presses.
     let frames = desk.path("frames.npz");
