@@ -14,7 +14,7 @@ pub use self::frames::Frames;
 use self::frames::NEWTONS;
 use super::dataset::file::{self, FORCES_N, File, SHORE};
 use super::dataset::{
-    self, Dataset, DatasetError, Kind, Object, Sample, Source, levels, objects_after, pitch_mm,
+    self, Dataset, DatasetError, Joining, Kind, Object, Sample, Source, levels,
     warn_of_object_in_both_splits,
 };
 use hardnessd_core::npz::Writer;
@@ -225,38 +225,24 @@ impl Courses {
     /// Returns the errors of [`Courses::read`]. Also returns an error if the sensors of the files
     /// have different pitches, or the files have more objects than a u32 can number.
     pub fn read_all(paths: &[PathBuf]) -> Result<(Self, Vec<Source>), DatasetError> {
-        let (mut all, mut sources) = (Self::default(), Vec::new());
-        let (mut first_object, mut first_sensor) = (0, 0);
+        let (mut all, mut joining) = (Self::default(), Joining::default());
+        let mut first_sensor = 0;
         for path in paths {
             let (mut part, source) = Self::read_with_source(path)?;
             let presses = part.presses.iter();
             let presses = presses.map(|press| (press.pressed(), press.split));
             warn_of_object_in_both_splits(path, presses);
-            sources.push(source);
-            let (expected, found) = (pitch_mm(&sources), pitch_mm(&sources[sources.len() - 1..]));
-            if found != expected {
-                return Err(DatasetError::Pitch {
-                    path: path.clone(),
-                    found,
-                    expected,
-                    first: paths[0].clone(),
-                });
-            }
             let last = part.presses.iter().map(|press| press.object).max();
-            let before;
-            (before, first_object) = objects_after(first_object, last, path.clone())?;
+            let before = joining.add(source, path.clone(), last)?;
             // Sensors of different files are different ones.
             let sensors = part.presses.iter().map(|press| press.sensor).max();
             for press in &mut part.presses {
                 press.sensor = press.sensor.saturating_add(first_sensor);
             }
             first_sensor = sensors.map_or(0, |last| last.saturating_add(first_sensor + 1));
-            if let Some(source) = sources.last_mut() {
-                source.shift_objects(before);
-            }
             all.append(part, before);
         }
-        Ok((all, sources))
+        Ok((all, joining.sources))
     }
 
     fn read_with_source(path: &Path) -> Result<(Self, Source), DatasetError> {
@@ -555,18 +541,9 @@ mod tests {
     }
 
     #[test]
-    fn sensors_of_different_files_stay_apart() {
-        let directory = tempfile::tempdir().unwrap();
-        let one = written(directory.path(), "one", &[0, 4], 3.5);
-        let (all, _) = Courses::read_all(&[one.clone(), one]).unwrap();
-        let sensors: Vec<u32> = all.presses.iter().map(|press| press.sensor).collect();
-        assert_eq!(sensors, [0, 0, 1, 1]);
-    }
-
-    /// Writes a file with these objects and this pitch into a directory.
-    fn written(directory: &Path, name: &str, objects: &[u32], pitch_mm: f64) -> PathBuf {
+    fn objects_and_sensors_of_different_files_stay_apart() {
         let mut courses = Courses::default();
-        for &object in objects {
+        for object in [0, 4] {
             let press = Press {
                 level: 1,
                 object,
@@ -581,46 +558,14 @@ mod tests {
             };
             courses.push(press, [(0.0, None, &ModelFrame::default())].into_iter());
         }
-        let path = directory.join(name);
-        let bytes = courses.write(Cursor::new(Vec::new()), &json!({"pitch_mm": pitch_mm}));
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("one");
+        let bytes = courses.write(Cursor::new(Vec::new()), &json!({}));
         std::fs::write(&path, bytes.unwrap().into_inner()).unwrap();
-        path
-    }
-
-    #[test]
-    fn objects_of_different_files_stay_apart_or_are_refused() {
-        let directory = tempfile::tempdir().unwrap();
-        let written = |name, objects: &[u32]| written(directory.path(), name, objects, 2.0);
-        let (few, most) = (written("few", &[0, 4]), written("most", &[0, u32::MAX]));
-        let (all, sources) = Courses::read_all(&[few.clone(), few.clone()]).unwrap();
-        let objects: Vec<u32> = all.presses.iter().map(|press| press.object).collect();
-        assert_eq!(objects, [0, 4, 5, 9]);
-        assert_eq!(pitch_mm(&sources), 2.0);
-        assert_eq!(
-            Courses::read_all(std::slice::from_ref(&most))
-                .unwrap()
-                .0
-                .presses
-                .len(),
-            2
-        );
-        for files in [[most.clone(), few.clone()], [few, most]] {
-            let error = Courses::read_all(&files).unwrap_err().to_string();
-            assert!(error.contains("array `object`: found"), "{error}");
-        }
-    }
-
-    #[test]
-    fn files_of_different_pitches_are_not_joined() {
-        let directory = tempfile::tempdir().unwrap();
-        let fine = written(directory.path(), "fine", &[0], 2.0);
-        let coarse = written(directory.path(), "coarse", &[0], 3.5);
-        let error = Courses::read_all(&[fine.clone(), fine, coarse]).unwrap_err();
-        let error = error.to_string();
-        assert!(
-            error.contains("coarse: taxel pitch: found 3.5 mm, expected 2 mm, that of "),
-            "{error}"
-        );
+        let (all, _) = Courses::read_all(&[path.clone(), path]).unwrap();
+        let presses = all.presses.iter();
+        let found: Vec<_> = presses.map(|press| (press.object, press.sensor)).collect();
+        assert_eq!(found, [(0, 0), (4, 0), (5, 1), (9, 1)]);
     }
 
     #[test]

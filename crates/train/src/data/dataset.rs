@@ -8,6 +8,7 @@ pub(super) mod file;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::slice;
 
 pub use self::file::{meta, write};
 use hardnessd_core::frame::{Frame, Pitch};
@@ -250,7 +251,7 @@ impl Source {
     }
 
     /// Adds `before` to the numbers of recorded objects, as to those of the file's presses.
-    pub(super) fn shift_objects(&mut self, before: u32) {
+    fn shift_objects(&mut self, before: u32) {
         let recorded = std::mem::take(&mut self.recorded).into_iter();
         self.recorded = recorded
             .map(|((object, level), kind)| ((object + before, level), kind))
@@ -389,26 +390,56 @@ pub fn pitch_mm(sources: &[Source]) -> f64 {
     stated.unwrap_or(PITCH_MM)
 }
 
-/// Numbers the objects of a file after those of other files, which have the numbers below `first`.
-/// `last` is the greatest number in the file. Gives what to add to its numbers, and the first
-/// number after them.
-pub(super) fn objects_after(
-    first: u64,
-    last: Option<u32>,
-    path: PathBuf,
-) -> Result<(u32, u64), DatasetError> {
-    let next = last.map_or(first, |last| first + u64::from(last) + 1);
-    match u32::try_from(first) {
-        Ok(before) if next <= u64::from(u32::MAX) + 1 => Ok((before, next)),
-        _ => Err(DatasetError::Array {
-            path,
-            array: "object",
-            found: last.unwrap_or_default().to_string(),
-            expected: format!(
-                "no number that, after {first} of other files, is beyond {}",
-                u32::MAX
-            ),
-        }),
+/// Files that are joined: their pitch is the same, and their objects stay apart.
+#[derive(Debug, Default)]
+pub(super) struct Joining {
+    /// The files so far.
+    pub(super) sources: Vec<Source>,
+    paths: Vec<PathBuf>,
+    /// The first number after those of their objects.
+    next_object: u64,
+}
+
+impl Joining {
+    /// Adds a file. `last` is the greatest number of its objects. Gives what to add to their numbers.
+    pub(super) fn add(
+        &mut self,
+        mut source: Source,
+        path: PathBuf,
+        last: Option<u32>,
+    ) -> Result<u32, DatasetError> {
+        let (found, expected) = (pitch_mm(slice::from_ref(&source)), pitch_mm(&self.sources));
+        if let Some(first) = self.paths.first()
+            && found != expected
+        {
+            let first = first.clone();
+            return Err(DatasetError::Pitch {
+                path,
+                found,
+                expected,
+                first,
+            });
+        }
+        let first = self.next_object;
+        self.next_object = last.map_or(first, |last| first + u64::from(last) + 1);
+        let before = match u32::try_from(first) {
+            Ok(before) if self.next_object <= u64::from(u32::MAX) + 1 => before,
+            _ => {
+                return Err(DatasetError::Array {
+                    path,
+                    array: "object",
+                    found: last.unwrap_or_default().to_string(),
+                    expected: format!(
+                        "no number that, after {first} of other files, is beyond {}",
+                        u32::MAX
+                    ),
+                });
+            }
+        };
+        source.shift_objects(before);
+        self.sources.push(source);
+        self.paths.push(path);
+        Ok(before)
     }
 }
 
@@ -431,47 +462,28 @@ impl Dataset {
     /// Returns an error if the sensors of the files have different pitches, or the files have more
     /// objects than a u32 can number.
     pub fn joined(parts: Vec<Self>) -> Result<Self, DatasetError> {
-        let mut all = Self {
-            samples: Vec::new(),
-            sources: Vec::new(),
-            paths: Vec::new(),
-        };
-        let mut first_object = 0_u64;
+        let (mut samples, mut joining) = (Vec::new(), Joining::default());
         for part in parts {
-            let (source, path) = (all.sources.len(), part.path());
-            let (found, expected) = (part.pitch_mm(), all.pitch_mm());
-            if source > 0 && found != expected {
-                let first = all.path();
-                return Err(DatasetError::Pitch {
-                    path,
-                    found,
-                    expected,
-                    first,
-                });
-            }
             let last = part.samples.iter().filter_map(|sample| sample.object).max();
-            let before;
-            (before, first_object) = objects_after(first_object, last, path)?;
-            all.samples
-                .extend(part.samples.into_iter().map(|sample| Sample {
-                    object: sample.object.map(|object| object + before),
-                    source,
-                    ..sample
-                }));
-            all.sources
-                .extend(part.sources.into_iter().map(|mut source| {
-                    source.shift_objects(before);
-                    source
-                }));
-            all.paths.extend(part.paths);
+            let source = joining.sources.len();
+            let before = joining.add(part.sources[0].clone(), part.path(), last)?;
+            samples.extend(part.samples.into_iter().map(|sample| Sample {
+                object: sample.object.map(|object| object + before),
+                source,
+                ..sample
+            }));
         }
-        Ok(all)
+        Ok(Self {
+            samples,
+            sources: joining.sources,
+            paths: joining.paths,
+        })
     }
 
     /// The kinds of the labelled test samples whose objects were not learnt.
     pub fn validated(&self) -> BTreeSet<Kind> {
         let judged = |sample: &Sample| {
-            let source = std::slice::from_ref(&self.sources[sample.source]);
+            let source = slice::from_ref(&self.sources[sample.source]);
             (source, sample.pressed(), sample.level, sample.split)
         };
         validated(self.samples.iter().map(judged))
