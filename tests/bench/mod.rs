@@ -1,10 +1,8 @@
 //! The real binary on a real pty, with sockets and configurations: shared by the tests of the
 //! daemon.
 #![allow(
-    dead_code,
     unreachable_pub,
-    clippy::unwrap_used,
-    reason = "every test file is a crate of its own and uses a part of this"
+    reason = "the binary of the tests has it as a module of its own"
 )]
 
 #[path = "../../src/tools/pty/pair.rs"]
