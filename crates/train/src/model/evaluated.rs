@@ -143,3 +143,47 @@ fn sets(cases: &[Case]) -> Option<SetEvaluation> {
         accuracy_of_others: (!single.is_empty()).then(|| right as f64 / single.len() as f64),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shore_is_evaluated_over_all_over_each_level_and_near_the_borders() {
+        let case = |(level, truth, value): (u8, f32, f32)| Case {
+            level,
+            shore: Some(truth),
+            object: None,
+            verdict: Verdict {
+                level,
+                logits: Vec::new(),
+                probabilities: Vec::new(),
+                confidence: 1.0,
+                shore: Some(Shore {
+                    value,
+                    low: value - 4.0,
+                    high: value + 5.0,
+                }),
+                levels: None,
+            },
+        };
+        // The borders are 50, 60 and 70. The second verdict alone does not hold the truth.
+        let cases = [
+            (1, 80.0, 83.0),
+            (2, 63.0, 57.0),
+            (2, 65.0, 63.0),
+            (4, 30.0, 30.0),
+        ]
+        .map(case);
+        let found = shore(&cases, 4).unwrap();
+        let expected = ShoreEvaluation {
+            rmse: (49.0_f64 / 4.0).sqrt(),
+            rmse_by_level: vec![Some(3.0), Some(20.0_f64.sqrt()), None, Some(0.0)],
+            rmse_near_borders: Some(6.0),
+            coverage: 0.75,
+            width: 9.0,
+        };
+        assert_eq!(found, expected);
+        assert_eq!(shore(&cases[3..], 4).unwrap().rmse_near_borders, None);
+    }
+}
