@@ -182,7 +182,7 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
         view.take_line("HTTP/1.1 400 Bad Request", at(5_000));
         view.lose(Loss::Closed);
         let page = text(&view, 5_100);
-        assert!(page.contains("NO DAEMON  a web server answers"), "{page}");
+        assert!(page.contains("a web server answers there"), "{page}");
     }
 }
 
