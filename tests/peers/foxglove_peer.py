@@ -107,7 +107,8 @@ def same_as_the_socket(binary):
         assert sorted(viewer.topics) == [f"/tactile/forearm/{topic}" for topic in TOPICS], viewer.topics
         sensor = bench.sensor("forearm", "--presses", "2", "--force", "15", "--seed", "3", "--motion", bench.path("control.sock"))
         sensor.wait(timeout=60)
-        got = viewer.until(lambda topic, message: topic == "status" and message.state == "lost")
+        # The last status says why the sensor stays lost.
+        got = viewer.until(lambda topic, message: topic == "status" and (message.state, message.reason) == ("lost", "no such device"))
         late = Viewer(address)
         greeted = {}
         while set(greeted) < {"hardness", "status"}:
