@@ -141,6 +141,26 @@ impl Service {
         }
     }
 
+    /// The lines that a query gets, and how it ended.
+    async fn get(&self, query: Query) -> Result<(Vec<Line>, Result<Done, Refused>), End> {
+        Ok(match query {
+            Query::Status => {
+                let statuses = self.snapshots.current().await?.statuses.clone();
+                (statuses, Ok(Done::default()))
+            }
+            Query::Last => {
+                let finals = self.hub.survey().await?.finals;
+                (finals.into_values().collect(), Ok(Done::default()))
+            }
+            Query::History(sensor) => {
+                let history = self.hub.history(sensor.clone()).await?;
+                let lines = history.iter().map(|history| history.line(&sensor));
+                let found = find(&self.sensors, "history", &sensor);
+                (lines.collect(), found.map(|_| Done::default()))
+            }
+        })
+    }
+
     /// Carries out a request that changes something. Of all sockets, only the control socket may.
     async fn change(&self, request: Request) -> Result<Done, Refused> {
         let key = request.key();
@@ -179,7 +199,8 @@ impl Service {
                     ..Done::default()
                 })
             }
-            Request::Subscribe(_) | Request::Get(_) => unreachable!("it changes nothing"),
+            // They change nothing.
+            Request::Subscribe(_) | Request::Get(_) => Ok(Done::default()),
         }
     }
 }
@@ -326,22 +347,8 @@ async fn read<I: AsyncRead + Unpin>(
         let id = line.id;
         let request = match line.request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
-            Ok(Request::Get(Query::Status)) => {
-                let mut lines = service.snapshots.current().await?.statuses.clone();
-                lines.push(answer(Ok(Done::default()), id));
-                Asked::Answer(lines)
-            }
-            Ok(Request::Get(Query::Last)) => {
-                let finals = service.hub.survey().await?.finals;
-                let mut lines: Vec<Line> = finals.into_values().collect();
-                lines.push(answer(Ok(Done::default()), id));
-                Asked::Answer(lines)
-            }
-            Ok(Request::Get(Query::History(sensor))) => {
-                let history = service.hub.history(sensor.clone()).await?;
-                let done = find(&service.sensors, "history", &sensor).map(|_| Done::default());
-                let lines = history.iter().map(|history| history.line(&sensor));
-                let mut lines: Vec<Line> = lines.collect();
+            Ok(Request::Get(query)) => {
+                let (mut lines, done) = service.get(query).await?;
                 lines.push(answer(done, id));
                 Asked::Answer(lines)
             }

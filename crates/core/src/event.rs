@@ -174,8 +174,8 @@ impl Event {
         }
     }
 
-    /// Whether whoever comes later gets this event too, until the next one of its kind: a status, or a
-    /// final verdict.
+    /// Whether this event holds until the next one of its kind, so that a late viewer gets it. A status
+    /// does, and a final verdict.
     pub fn lasts(&self) -> bool {
         match self {
             Event::Hardness(verdict) => verdict.phase == Phase::Final,
