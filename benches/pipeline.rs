@@ -13,7 +13,7 @@ use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
 use hardnessd_core::event::{Event, Phase};
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{self, Decoder, Layout};
@@ -95,9 +95,10 @@ fn bytes_to_events(bencher: Bencher) {
         wall: jiff::Timestamp::UNIX_EPOCH,
     };
     let events = |pipeline: &mut Pipeline| {
-        let mut events = pipeline.opened(at);
+        let mut take = |input| pipeline.take(input, at).expect("bytes are taken");
+        let mut events = take(Input::Opened);
         for chunk in bytes.chunks(CHUNK_BYTES) {
-            events.extend(pipeline.push(chunk, at));
+            events.extend(take(Input::Bytes(chunk.into())));
         }
         events.extend(pipeline.end_of_recording(None));
         events

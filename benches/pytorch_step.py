@@ -34,9 +34,9 @@ class Trunk(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(1, 16, 5, 2)
         self.conv2 = nn.Conv2d(16, 32, 5, 2)
-        self.norm2 = nn.BatchNorm2d(32, eps=1e-3)
+        self.norm2 = nn.BatchNorm2d(32, eps=1e-8)
         self.conv3 = nn.Conv2d(32, 64, 3, 2, padding=1)
-        self.norm3 = nn.BatchNorm2d(64, eps=1e-3)
+        self.norm3 = nn.BatchNorm2d(64, eps=1e-8)
 
     def forward(self, images):
         x = images + 1

@@ -3,7 +3,7 @@
 
     pip install matplotlib
     cargo build --release && cargo build --release --example latency
-    python3 benches/scale.py --out docs/scale.png
+    python3 benches/scale.py --out results/scale.png
 
 Every sensor sends 100 frames/s. Run it as root, or where you may use real-time scheduling: the simulated sensors
 then run at a higher priority than the daemon. `--lines FILE` plots the lines that `latency` printed before.

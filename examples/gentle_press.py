@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Presses an object no harder than its level needs: the arm withdraws when the level is known, or at a force.
+"""Presses an object no harder than its level needs: the arm withdraws when the level is known, or at a force. It
+presses harder, or again, where the verdict's `advice` asks for it.
 
 ARM is the socket of `hardnessd simulate --arm`; docs/motion.md shows how to start it. For a robot of yours, replace
 the class `Arm`. `hardnessd.py` must be beside this file or installed.
@@ -13,6 +14,7 @@ import time
 import hardnessd
 
 FAR_MM, SPEED_MM_S, LONGEST_S = 20.0, 5.0, 20.0
+MOST_PRESSES, MOST_N = 4, 30.0
 
 
 class Arm:
@@ -45,7 +47,7 @@ def press(arm, events, sensor, limit_n=15.0, sure=0.0):
         if event["type"] in ("status", "disconnected"):
             live = event.get("state") == "live"
         elif event["type"] == "frame":
-            live, greatest_n = True, max(greatest_n, sum(event["newtons"]))
+            live, greatest_n = True, max(greatest_n, event["force_n"] or 0.0)
         elif event["type"] == "hardness" and event["phase"] == "final":
             return early, event, greatest_n
         elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
@@ -67,13 +69,19 @@ def main():
     events = hardnessd.Client(types=["frame", "hardness", "press", "status"])
     try:
         arm = Arm(args.arm)
-        early, final, greatest_n = press(arm, events, args.sensor, args.limit)
+        limit_n = args.limit
+        for _ in range(MOST_PRESSES):
+            early, final, greatest_n = press(arm, events, args.sensor, limit_n)
+            why = f"an early verdict ({early['confidence']:.0%})" if early else "no early verdict"
+            print(f"{final}\n{why}, greatest force {greatest_n:.1f} N, advice: {final['advice']}")
+            while arm.order(to_mm=0.0)["at_mm"] > 0:
+                time.sleep(0.05)
+            if final["advice"] is None:
+                break
+            if final["advice"] == "press_harder":
+                limit_n = min(2 * limit_n, MOST_N)
     except (OSError, RuntimeError) as error:
         raise SystemExit(f"{args.arm}: {error}")
-    why = f"an early verdict ({early['confidence']:.0%})" if early else "no early verdict"
-    print(f"{final}\n{why}, greatest force {greatest_n:.1f} N")
-    while arm.order(to_mm=0.0)["at_mm"] > 0:
-        time.sleep(0.05)
 
 
 if __name__ == "__main__":

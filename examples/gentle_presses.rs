@@ -1,8 +1,7 @@
 //! Measures what a controller gains that withdraws at the early verdict, as
 //! `examples/gentle_press.py` does, beside one that always presses to 15 N.
 //!
-//!     cargo run --release --example gentle_presses -- MODEL [--materials training] [--seed S]
-//!         [--confidence C]... [--min-force N]...
+//!     cargo run --release --example gentle_presses -- MODEL [--fps F] [--seed S]
 //!
 //! Each object is pressed once for each row of the table that it prints, with the same noise. Time is
 //! simulated: a frame reaches the daemon after the scan and the line, and the arm obeys after
@@ -16,9 +15,8 @@ use std::time::Duration;
 use clap::Parser;
 use hardnessd_core::event::{Event, Hardness, Phase};
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::motion::{self, Point};
-use hardnessd_core::pipeline::{Clock, Pipeline};
-
+use hardnessd_core::motion::Point;
+use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::{ARM_N_PER_MM, Material, Rig, SequenceSettings};
@@ -34,19 +32,10 @@ struct Args {
     seed: u64,
     #[arg(long, default_value_t = 400)]
     presses: u32,
-    /// The paper's materials: training or test
-    #[arg(long, default_value = "test")]
-    materials: String,
-    /// `early_confidence` of the daemon
-    #[arg(long = "confidence", default_values_t = [0.9])]
-    confidences: Vec<f32>,
-    /// `early_min_force_n` of the daemon
-    #[arg(long = "min-force", default_values_t = [3.0])]
-    min_forces_n: Vec<f64>,
 }
 
 /// The controller withdraws at this force, as the sensor reads it.
-const LIMIT_N: f32 = 15.0;
+const LIMIT_N: f64 = 15.0;
 const SPEED_MM_S: f64 = 5.0;
 /// The rest before the arm moves, for the tare.
 const REST_S: f64 = 0.5;
@@ -59,12 +48,9 @@ const REACTION_S: f64 = 0.01;
 /// A press that takes longer has failed.
 const LONGEST_S: f64 = 20.0;
 
-/// When the daemon gives its early verdict, at which the controller withdraws.
-#[derive(Clone, Copy)]
-struct Early {
-    confidence: f32,
-    min_force_n: f64,
-}
+/// `early_confidence` and `early_min_force_n` of the daemon.
+const EARLY_CONFIDENCE: f32 = 0.9;
+const EARLY_MIN_FORCE_N: f64 = 3.0;
 
 /// What a press came to.
 #[derive(Default)]
@@ -86,20 +72,16 @@ fn main() {
     let args = Args::parse();
     let model = std::fs::read(&args.model).expect("the model is readable");
     let hrn = Arc::new(Hrn::load(&model).expect("the model is one"));
-    let materials = match args.materials.as_str() {
-        "training" => &Material::ALL[..4],
-        _ => &Material::ALL[4..],
-    };
     let threads = std::thread::available_parallelism().map_or(1, usize::from) as u32;
-    let presses = |early: Option<Early>| -> Vec<Press> {
+    let presses = |withdraws: bool| -> Vec<Press> {
         let work = |thread: u32| {
             let mut rig = Rig::new(SequenceSettings {
                 seed: args.seed,
-                materials: materials.to_vec(),
+                materials: Material::ALL[4..].to_vec(),
                 ..SequenceSettings::default()
             });
             let objects = (1..=args.presses).filter(|object| object % threads == thread);
-            let pressed = objects.map(|object| press(&mut rig, object, &hrn, args.fps, early));
+            let pressed = objects.map(|object| press(&mut rig, object, &hrn, args.fps, withdraws));
             pressed.collect::<Vec<_>>()
         };
         std::thread::scope(|scope| {
@@ -116,41 +98,22 @@ fn main() {
         args.presses
     );
     println!(
-        "| Withdraws at | Right | Named | Right if named | Greatest force, median | mean | 90 % below | In contact | \
-         At an early verdict |"
+        "| Withdraws at | Right | Named | Greatest force, mean | In contact | At an early verdict |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|");
-    row("15 N", &presses(None));
-    for &confidence in &args.confidences {
-        for &min_force_n in &args.min_forces_n {
-            let early = Early {
-                confidence,
-                min_force_n,
-            };
-            row(
-                &format!("{confidence} from {min_force_n} N, or 15 N"),
-                &presses(Some(early)),
-            );
-        }
-    }
+    println!("|---|---|---|---|---|---|");
+    row("15 N", &presses(false));
+    row("an early verdict, or 15 N", &presses(true));
 }
 
-/// Presses an object. Without `early`, the controller withdraws at [`LIMIT_N`] only.
-fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, early: Option<Early>) -> Press {
+/// Presses an object. Unless the controller `withdraws` at an early verdict, it does so at [`LIMIT_N`] only.
+fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, withdraws: bool) -> Press {
     let delay_s = SCAN_S + LINE_PERIODS / fps;
-    let mut described = Description {
-        frame_rate_hz: fps,
-        arm: motion::Settings {
-            stiffness_n_per_mm: Some(ARM_N_PER_MM),
-            delay_ms: 1e3 * delay_s,
-            ..motion::Settings::default()
-        },
-        ..Description::default()
-    };
-    if let Some(early) = early {
-        described.early_confidence = early.confidence;
-        described.press.early_min_force_n = early.min_force_n;
-    }
+    let mut described = Description::default();
+    described.sensor.frame_rate_hz = fps;
+    described.sensor.arm.stiffness_n_per_mm = Some(ARM_N_PER_MM);
+    described.sensor.arm.delay_ms = 1e3 * delay_s;
+    described.model.early_confidence = EARLY_CONFIDENCE;
+    described.press.early_min_force_n = EARLY_MIN_FORCE_N;
     let sensor = Sensor::new(described).expect("a sensor may be like this");
     let layout = sensor.layout().clone();
     let mut pipeline = Pipeline::new(sensor, Arc::clone(hrn), Clock::Arrival);
@@ -175,9 +138,6 @@ fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, early: Option<Ear
             released_s = time_s;
         }
         let at_ns = (1e9 * time_s) as i64;
-        pipeline
-            .add_positions(&[Point { at_ns, mm }])
-            .expect("time goes on");
         bytes.clear();
         layout.encode(&rig.read(), &mut bytes);
         let arrived_s = time_s + delay_s;
@@ -185,9 +145,16 @@ fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, early: Option<Ear
             mono: Duration::from_secs_f64(arrived_s),
             wall: jiff::Timestamp::UNIX_EPOCH,
         };
-        for event in pipeline.push(&bytes, at) {
+        let position = vec![Point { at_ns, mm }];
+        pipeline
+            .take(Input::Motion(position.into()), at)
+            .expect("time goes on");
+        for event in pipeline
+            .take(Input::Bytes((&bytes).into()), at)
+            .expect("bytes are taken")
+        {
             let is_enough = match event {
-                Event::Frame(frame) => frame.newtons.iter().sum::<f32>() >= LIMIT_N,
+                Event::Frame(frame) => frame.force_n.is_some_and(|force_n| force_n >= LIMIT_N),
                 Event::Hardness(verdict) if verdict.phase == Phase::Final => {
                     return Press {
                         level,
@@ -199,7 +166,7 @@ fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, early: Option<Ear
                     };
                 }
                 Event::Hardness(_) => {
-                    is_early |= early.is_some() && turn_s.is_infinite();
+                    is_early |= withdraws && turn_s.is_infinite();
                     is_early
                 }
                 _ => false,
@@ -222,28 +189,22 @@ fn most_probable(verdict: &Hardness) -> u8 {
 }
 
 fn row(name: &str, presses: &[Press]) {
-    let quantile = |of: fn(&Press) -> f64, q: f64| {
-        let mut values: Vec<f64> = presses.iter().map(of).collect();
+    let median = |of: fn(&Press) -> f64, presses: &[&Press]| {
+        let mut values: Vec<f64> = presses.iter().map(|press| of(press)).collect();
         values.sort_by(f64::total_cmp);
-        values[(q * (values.len() - 1) as f64).round() as usize]
+        values[values.len() / 2]
     };
-    let count = |is: fn(&Press) -> bool| presses.iter().filter(|press| is(press)).count() as f64;
-    let percent = |part: f64| 100.0 * part / presses.len() as f64;
+    let percent = |is: fn(&Press) -> bool| {
+        100.0 * presses.iter().filter(|press| is(press)).count() as f64 / presses.len() as f64
+    };
     let right = |press: &Press| press.found == press.level;
-    let (named, both) = (
-        count(|press| press.is_named),
-        count(|press| press.is_named && press.found == press.level),
-    );
     println!(
-        "| {name} | {:.1} % | {:.1} % | {:.1} % | {:.1} N | {:.1} N | {:.1} N | {:.2} s | {:.1} % |",
-        percent(count(right)),
-        percent(named),
-        100.0 * both / named,
-        quantile(|press| press.greatest_n, 0.5),
+        "| {name} | {:.1} % | {:.1} % | {:.1} N | {:.2} s | {:.1} % |",
+        percent(right),
+        percent(|press| press.is_named),
         presses.iter().map(|press| press.greatest_n).sum::<f64>() / presses.len() as f64,
-        quantile(|press| press.greatest_n, 0.9),
-        quantile(|press| press.contact_s, 0.5),
-        percent(count(|press| press.is_early)),
+        median(|press| press.contact_s, &presses.iter().collect::<Vec<_>>()),
+        percent(|press| press.is_early),
     );
     let of_level = |level: u8| {
         let own: Vec<&Press> = presses
@@ -251,9 +212,7 @@ fn row(name: &str, presses: &[Press]) {
             .filter(|press| press.level == level)
             .collect();
         let count = |is: fn(&Press) -> bool| own.iter().filter(|press| is(press)).count();
-        let mut forces_n: Vec<f64> = own.iter().map(|press| press.greatest_n).collect();
-        forces_n.sort_by(f64::total_cmp);
-        let median_n = forces_n[forces_n.len() / 2];
+        let median_n = median(|press| press.greatest_n, &own);
         format!(
             "level {level}: {} of {}, {median_n:.1} N, {} early",
             count(right),

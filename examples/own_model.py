@@ -1,8 +1,7 @@
 """A model of your own, from the first press to the daemon's verdicts.
 
     python3 -m venv venv
-    venv/bin/pip install numpy scikit-learn onnx torch onnxscript matplotlib \
-        './clients/python[dataset,recording]'
+    venv/bin/pip install scikit-learn torch onnxscript matplotlib './clients/python[adopt,dataset,recording]'
     cargo build --release --workspace
     PATH=$PWD/target/release:$PATH venv/bin/python examples/own_model.py DIRECTORY
 
@@ -315,7 +314,8 @@ else:
 # `adopt` adds levels, pitch, range and check frames from the data set. The daemon's inference library must recognise
 # as many of the test presses as Python did.
 for name, score in scores.items():
-    run("hrn-train", "adopt", f"{name}.onnx", "--data", "own.npz", "--out", f"own-{name}.onnx", "--method", name)
+    out = ["--out", f"own-{name}.onnx", "--method", name]
+    run(sys.executable, "-m", "hardnessd.adopt", f"{name}.onnx", "--data", "own.npz", *out)
     run("hrn-train", "check-model", f"own-{name}.onnx")
     evaluated = json.loads(run("hrn-train", "evaluate", "--model", f"own-{name}.onnx", "--data", "own.npz", "--json"))
     assert abs(evaluated["accuracy"] - score) < 0.002, (evaluated["accuracy"], score)

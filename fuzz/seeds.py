@@ -39,15 +39,13 @@ def wire():
     # Three sizes of chunks, then the preset: see `layout` in tests/daemon/properties.rs.
     keep("wire", "jx255n", bytes([7, 63, 255, 0]) + fixture[: 2 * FRAME_BYTES])
     cells = bytes([1, 2, 3, 250])
-    for number, name in enumerate("jx255n jx255n-u16 jq jq-tail jq-u16 ff-tail ascii zero-run".split()):
+    for number, name in enumerate("jx255n jx255n-u16 jq jq-tail jq-u16 csv flexitac m1616".split()):
         for two in (2 + 5 * 2, 4 + 5 * 4):
             keep("wire", f"small-{name}-{two}", bytes([1, 2, 5, number | 8, two]) + cells * 8)
     keep("wire", "jq-2x2", bytes([1, 9, 2, 2 | 8, 12]) + (b"\xaa\x55\x03\x99" + cells) * 3)
     keep("wire", "jq-tail-2x2", bytes([1, 9, 2, 3 | 8, 12]) + (cells + b"\xaa\x55\x03\x99") * 3)
-    keep("wire", "ff-tail-2x2", bytes([1, 9, 2, 5 | 8, 12]) + (b"\1\2\3\4\xff") * 3)
-    keep("wire", "ascii-2x2", bytes([1, 9, 2, 6 | 8, 12]) + b"1 2\n30 4\n\n" * 3)
-    keep("wire", "zero-run-2x2", bytes([1, 9, 2, 7 | 8, 12]) + b"\1\0\3\xff" * 3)
-    keep("wire", "csv-2x2", bytes([1, 9, 2, 32 | 8, 3, 12]) + b"t 5: 1,2;30 [4]\nready\n" * 3)
+    keep("wire", "rows-2x2", bytes([1, 9, 2, 5 | 8, 12]) + b"1 2\n30 4\n\n" * 3)
+    keep("wire", "csv-2x2", bytes([1, 9, 2, 5 | 8, 12]) + b"t 5: 1,2;30 [4]\nready\n" * 3)
     packets = bytes([32 | 64 | 8, 0, 1, 0, 0, 2, 0, 1, 12])
     keep("wire", "packets-2x2", bytes([1, 9, 2]) + packets + b"\xaa\x55\1\1\2\xaa\x55\2\3\4" * 3)
     free = bytes([8 | 16, 12, 2, 0xBB, 0xAA, 1, 0xEE, 1, 0, 2, 0, 0xFF, 0xFF, 0])
@@ -193,7 +191,7 @@ def references():
         "time_s": numpy.array([0, 0.1, 0], dtype=numpy.float32),
         "approach_mm": numpy.array([0, 0.5, 0], dtype=numpy.float32),
         "known": numpy.array([1, 1, 0], dtype=numpy.uint8),
-        "frames_mn": numpy.zeros((3, 28, 28), dtype=numpy.uint16),
+        "frames": numpy.zeros((3, 28, 28), dtype=numpy.float32),
     }
     for name, save in (("stored", numpy.savez), ("deflated", numpy.savez_compressed)):
         out = io.BytesIO()

@@ -4,7 +4,7 @@
     cargo build --release
     python3 results/force.py target/release/hardnessd
 
-Prints the figures of docs/simulator.md. It simulates 240 presses of 15 N: ten seeds, the eight materials in turn.
+Prints the figures of results/simulator.md. It simulates 240 presses of 15 N: ten seeds, the eight materials in turn.
 """
 
 import json

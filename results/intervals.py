@@ -2,23 +2,21 @@
 """Accuracies or their differences, with 95 % intervals, computed again from the committed counts of objects.
 
     pip install numpy scipy
-    python3 results/intervals.py results/quick                            # accuracies, set `matched`
-    python3 results/intervals.py results/quick --less hrn15               # each accuracy minus that of hrn15
-    python3 results/intervals.py results/quick --set fresh                # another set of objects.csv
-    python3 results/intervals.py results/course --set others-matched      # a set of course.json
+    python3 results/intervals.py results/paper                            # accuracies, set `matched`
+    python3 results/intervals.py results/paper --less hrn15               # each accuracy minus that of hrn15
+    python3 results/intervals.py results/paper --set fresh                # another set of objects.csv
 
 A difference is taken object by object under the same seed, so what is hard for both methods cancels out.
 
 With one seed, the interval is that of a bootstrap over the geometries, or over the objects of each level where the
 set has no geometries. With several seeds, the variance of the mean over the seeds is added, and the interval is
-Student's, with the degrees of freedom of Welch and Satterthwaite. The draws are not those of hrn-train, so the ends
-may differ by some tenths of a point.
+Student's, with the degrees of freedom of Welch and Satterthwaite. Draws of n units out of n vary less than new units
+would, by (n - 1) / n: their spread is widened by the root of n / (n - 1).
 """
 
 import argparse
 import collections
 import csv
-import json
 import math
 import pathlib
 import re
@@ -27,28 +25,6 @@ import numpy
 import scipy.stats
 
 DRAWS = 20_000
-
-
-def of_objects(objects, geometries):
-    """[right, samples] by cluster. Objects whose numbers are equal modulo `geometries` are pressed alike."""
-    sums = {}
-    for number, right, samples in objects:
-        own = sums.setdefault(("", number % geometries), [0, 0])
-        own[0] += right
-        own[1] += samples
-    return sums
-
-
-def read_course(path, wanted):
-    """Right and all samples, by model, seed and cluster. Each shape has four objects, whose numbers are equal modulo a
-    quarter of the number of objects."""
-    counts = {}
-    for model in json.loads(path.read_text()):
-        for found in model["sets"]:
-            if found["set"] == wanted:
-                objects = [(one["object"], one["right"], one["samples"]) for one in found["objects"]]
-                counts[model["name"]] = {1: of_objects(objects, len(objects) // 4)}
-    return counts
 
 
 def read(path, wanted):
@@ -78,6 +54,13 @@ def less(seeds, others):
     ]
 
 
+def redrawn(draw, units):
+    """Sums of as many units, drawn at random, of [unit, right and samples]."""
+    count, whole = len(units), units.sum(0)
+    sums = units[draw.integers(count, size=(DRAWS, count))].sum(1)
+    return whole + math.sqrt(count / max(count - 1, 1)) * (sums - whole)
+
+
 def interval(seeds, least):
     """The share over all seeds, and its interval, from `least` to 1. `seeds` has [right, samples] by cluster."""
     clusters = sorted(seeds[0])
@@ -89,9 +72,7 @@ def interval(seeds, least):
         strata[stratum].append(place)
     draw = numpy.random.default_rng(0)
     joined = sums.sum(0)
-    drawn = sum(
-        joined[draw.choice(places, (DRAWS, len(places)))].sum(1) for places in strata.values()
-    )
+    drawn = sum(redrawn(draw, joined[places]) for places in strata.values())
     draws = drawn[:, 0] / drawn[:, 1]
     if len(seeds) == 1:
         return mean, *numpy.quantile(draws, [0.025, 0.975])
@@ -120,9 +101,7 @@ def main():
     parser.add_argument("--set", default="matched")
     parser.add_argument("--less", metavar="METHOD")
     options = parser.parse_args()
-    course = options.folder / "course.json"
-    is_course = course.exists()
-    methods = read_course(course, options.set) if is_course else read(options.folder / "objects.csv", options.set)
+    methods = read(options.folder / "objects.csv", options.set)
     if not methods:
         parser.error(f"there is no set {options.set}")
     if options.less and options.less not in methods:

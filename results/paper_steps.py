@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/paper-steps.png from results/paper/results.json: accuracy with the paper's own number of steps.
+"""Draws results/paper-steps.png from results/paper/results.json: accuracy with the paper's own number of steps.
 
     pip install matplotlib && python results/paper_steps.py
 """
@@ -69,7 +69,7 @@ def main():
     axes.set_xlabel("accuracy, per cent (strokes: seeds; mark: mean)")
     axes.grid(axis="x", alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-    figure.savefig(HERE.parent / "docs/paper-steps.png", dpi=110)
+    figure.savefig(HERE.parent / "results/paper-steps.png", dpi=110)
 
 
 if __name__ == "__main__":

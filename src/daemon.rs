@@ -8,7 +8,6 @@
 
 pub(crate) mod accept;
 pub(crate) mod baud;
-pub mod busy;
 mod client;
 mod clients;
 pub mod config;
@@ -23,7 +22,11 @@ pub mod port;
 pub mod publish;
 pub mod realtime;
 pub mod record;
-#[cfg(any(feature = "foxglove", feature = "ros2", feature = "zenoh"))]
+mod own;
+#[cfg_attr(
+    not(any(feature = "foxglove", feature = "ros2", feature = "zenoh")),
+    allow(dead_code, reason = "no library in this build has a thread of its own")
+)]
 mod relay;
 mod reload;
 mod request;
@@ -32,7 +35,6 @@ pub mod ros2;
 mod running;
 mod sensor;
 pub(crate) mod serial;
-mod snapshot;
 pub mod socket;
 mod systemd;
 pub mod tcp;
@@ -46,7 +48,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use jiff::Timestamp;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -54,20 +55,22 @@ use tracing::{debug, info, warn};
 
 use self::baud::Load;
 use self::clients::Clients;
-use self::config::{Config, Publish, SensorTable, Setup};
+use self::config::{Config, Publish, Setup};
+use self::hub::Hub;
+use self::own::Store;
 use self::publish::Publishers;
-use self::realtime::Standing;
-use self::record::{EventRecorder, Progress, Recorder, SensorRecorder, Target};
+use self::realtime::Scheduling;
+use self::record::{Progress, Recorder, Target};
 pub use self::reload::Reload;
 use self::running::Running;
-use self::sensor::{SensorHandle, Sensors};
-use self::serial::Link;
-use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard, Status};
+use self::sensor::{SensorCore, SensorHandle, Sensors};
+use self::serial::{Source, Sources};
+use crate::thread::NoThread;
+use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
 use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
-use hardnessd_core::sensor::Sensor;
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;
@@ -87,9 +90,9 @@ pub enum Error {
     /// The thread for the clients cannot be started.
     #[error("cannot start a thread for the clients: {0}")]
     Clients(#[source] std::io::Error),
-    /// The log cannot be written as configured.
-    #[error(transparent)]
-    Log(#[from] log::Error),
+    /// The thread that writes own presses cannot be started.
+    #[error("cannot start a thread for own presses: {0}")]
+    Own(#[from] NoThread),
     /// A task ended by itself, which is a fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
@@ -99,9 +102,8 @@ impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
             Error::Publish(error) => error.exit_code(),
-            Error::Random(_) | Error::Clients(_) => IO,
+            Error::Random(_) | Error::Clients(_) | Error::Own(_) => IO,
             Error::Record(error) => error.exit_code(),
-            Error::Log(error) => error.exit_code(),
             Error::Stopped(_) => FAILED,
         }
     }
@@ -129,6 +131,7 @@ pub enum Sockets {
 pub struct Daemon {
     setup: Setup,
     hello: Hello,
+    hub: Hub,
     clients: Clients,
     publishers: Publishers,
     /// The target of the recording, if there is one.
@@ -162,19 +165,14 @@ const READING: Duration = Duration::from_micros(100);
 /// How often the clocks are read again.
 const MOST_READINGS: usize = 3;
 
-/// Checks that a daemon can write where `config` says. The check binds nothing, so it cannot detect
-/// a path that another process uses or an address that the network refuses.
+/// Checks that a daemon can make its sockets where `config` says. The check binds nothing, so it cannot
+/// detect a path that another process uses or an address that the network refuses.
 ///
 /// # Errors
 ///
-/// Fails if a socket, the log or a recording cannot be written where `config` says.
+/// Fails if a socket cannot be made where `config` says.
 pub fn check(config: &Config) -> Result<(), Error> {
-    log::check(config.log)?;
-    publish::check(&config.publish.unix)?;
-    if let Some(settings) = &config.record {
-        record::check(settings)?;
-    }
-    Ok(())
+    Ok(publish::check(&config.publish.unix)?)
 }
 
 impl Daemon {
@@ -186,13 +184,15 @@ impl Daemon {
     /// address is in use, the path holds another file, or the system refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
         let hello = hello(&setup, run_token().map_err(Error::Random)?);
+        let hub = Hub::new(hello.clone());
         let clients = Clients::start().map_err(Error::Clients)?;
-        let publishers = Publishers::bind(&setup.config, &clients)?;
+        let publishers = Publishers::bind(&setup.config, &hub, &clients)?;
         Ok(Self {
             clients,
             target: setup.config.record.clone().map(Target::Directory),
             setup,
             hello,
+            hub,
             publishers,
         })
     }
@@ -261,6 +261,7 @@ impl Daemon {
         let Self {
             setup,
             hello,
+            hub,
             clients,
             publishers,
             target,
@@ -271,24 +272,30 @@ impl Daemon {
         let recorder = target
             .map(|target| Recorder::start(target, about(&setup, &hello)))
             .transpose()?;
-        let events = recorder
-            .as_ref()
-            .map_or(EventRecorder::default(), Recorder::of_hub);
-        let hub = hub::start(hello, events);
-        let viewers = publishers.viewers();
+        if let Some(recorder) = &recorder {
+            hub.record(recorder.of_hub());
+        }
+        let viewers = publishers.viewers.clone();
+        let store = Store::of_environment()?;
         let mut tasks = JoinSet::new();
+        let mut sources = Sources::default();
         let started = (0..setup.sensors.len()).map(|index| {
             let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
             let recorder = recorder.unwrap_or_default().with_viewers(viewers.clone());
-            start_sensor(&setup, index, recorder, &hub, &mut tasks)
+            let core = SensorCore {
+                pipeline: pipeline_of(&setup, index, None, &store),
+                recorder,
+                unjudged: 0,
+            };
+            let source = sources.take(&setup.sensors, index);
+            start_sensor(&setup, index, (core, source), (&hub, &store), &mut tasks)
         });
         let (changed_sensors, sensors) = Sensors::new(started.collect());
-        let (orders, receiver) = watch::channel(());
+        let (listening, stop) = watch::channel(());
         publishers.announce();
-        let publishers = publishers.serve(&hub, &sensors, &receiver, &clients);
+        let publishers = publishers.serve(&sensors, &stop, &clients);
         announce(&setup, &run);
         systemd::ready();
-        busy::forget();
         Ok(Running {
             setup,
             run,
@@ -298,8 +305,10 @@ impl Daemon {
             tasks,
             publishers,
             clients,
+            store,
             recorder,
-            orders,
+            former: Vec::new(),
+            listening,
         })
     }
 }
@@ -319,79 +328,68 @@ fn raise_descriptors() {
     }
 }
 
-/// Starts the task of the sensor with this `index`. The task's result is the sensor's name.
+/// The pipeline of the sensor with this `index`, which goes on with the numbers of `former`.
+fn pipeline_of(setup: &Setup, index: usize, former: Option<Pipeline>, store: &Store) -> Pipeline {
+    let sensor = setup.sensors[index].clone();
+    let hrn = setup.hrn_of(sensor.name()).clone();
+    let Some(former) = former else {
+        let mut pipeline = Pipeline::new(sensor, hrn, Clock::Arrival);
+        store.load(&mut pipeline);
+        return pipeline;
+    };
+    former.restarted(sensor, hrn)
+}
+
+/// Starts the task of the sensor with this `index`.
 fn start_sensor(
     setup: &Setup,
     index: usize,
-    recorder: SensorRecorder,
-    hub: &hub::Handle,
-    tasks: &mut JoinSet<String>,
+    (core, source): (SensorCore, Source),
+    (hub, store): (&Hub, &Store),
+    tasks: &mut JoinSet<SensorCore>,
 ) -> SensorHandle {
-    let (port, sensor) = (&setup.config.sensors[index], &setup.sensors[index]);
+    let table = &setup.config.sensors[index];
     let (commands, inbox) = mpsc::channel(QUESTIONS);
-    let hrn = setup.hrn_of(sensor.name()).clone();
-    let pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
-    let link = Link::new(&port.port, port.baud.get(), serial::Settings::of(sensor));
-    let (name, hub) = (port.name.clone(), hub.clone());
-    let ended = name.clone();
-    tasks.spawn(async move {
-        sensor::serve(pipeline, link, recorder, hub, inbox).await;
-        ended
-    });
-    SensorHandle { name, commands }
-}
-
-/// The status of every sensor, if every sensor's task and the hub answer. The answer feeds the
-/// watchdog.
-async fn alive(hub: &hub::Handle, sensors: &Sensors) -> Option<Vec<Status>> {
-    let (statuses, is_whole) = sensors.statuses().await;
-    (is_whole && hub.survey().await.is_ok()).then_some(statuses)
+    // Whoever connects before the task runs gets a status too.
+    hub.report(sensor::state(&core.pipeline, core.unjudged));
+    tasks.spawn(sensor::serve(
+        core,
+        source,
+        (hub.clone(), store.clone()),
+        inbox,
+    ));
+    SensorHandle {
+        name: table.name.clone(),
+        commands,
+    }
 }
 
 fn announce(setup: &Setup, run: &str) {
-    let standing = Standing::of(Path::new("/proc/self")).map(|standing| standing.to_string());
+    let scheduling = Scheduling::of(Path::new("/proc/self")).map(|found| found.to_string());
     info!(
         version = env!("CARGO_PKG_VERSION"),
         robot = setup.config.robot.as_str(),
         run,
         model = short(setup),
         validation = setup.hrn.card().validation.as_str(),
-        scheduling = standing,
+        scheduling,
         "started"
     );
-    for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
-        announce_sensor(sensor, checked);
-    }
-    let clock = now().wall;
-    if let Some(fault) = fault_of(clock) {
-        warn!(%clock, "{fault}");
-    }
+    (0..setup.sensors.len()).for_each(|index| announce_sensor(setup, index));
 }
 
-fn announce_sensor(sensor: &SensorTable, checked: &Sensor) {
+fn announce_sensor(setup: &Setup, index: usize) {
+    let (sensor, checked) = (&setup.config.sensors[index], &setup.sensors[index]);
     let name = sensor.name.as_str();
     info!(sensor = name, port = %sensor.port, "sensor");
     if let Some(excess) = Load::of(sensor, checked.layout()).excess {
         warn!(sensor = name, %excess, "the line cannot carry frame_rate_hz");
     }
-}
-
-/// The last second that a ROS 2 header can hold: it counts them in 32 bits (builtin_interfaces/msg/Time).
-const ROS_END: i64 = (1 << 31) - 1;
-
-/// What cannot hold the time of this machine's clock.
-fn fault_of(clock: Timestamp) -> Option<&'static str> {
-    if clock < Timestamp::UNIX_EPOCH {
-        Some(
-            "a recording and Foxglove cannot hold a time before 1970: they have the beginning of 1970",
-        )
-    } else if clock.as_second() > ROS_END {
-        Some(
-            "the header of a ROS 2 message cannot hold the time of this machine's clock: it has the \
-             nearest that it can",
-        )
-    } else {
-        None
+    if setup.ignores_references_of(name) {
+        warn!(
+            sensor = name,
+            "references are not used: they make verdicts on each other worse"
+        );
     }
 }
 
@@ -407,7 +405,7 @@ fn about(setup: &Setup, hello: &Hello) -> About {
         .config
         .sensors
         .iter()
-        .any(|one| one.port.is_simulated())
+        .any(|one| port::is_simulated(&one.port))
     {
         labels.insert("simulated".to_owned(), "true".to_owned());
     }
@@ -442,7 +440,7 @@ fn hello(setup: &Setup, run: String) -> Hello {
                 name: sensor.name().to_owned(),
                 rows: sensor.layout().array().rows,
                 cols: sensor.layout().array().cols,
-                pitch_mm: sensor.description().calibration.pitch_mm,
+                pitch_mm: sensor.calibration().pitch_mm,
             })
             .collect(),
         model: ModelCard {
@@ -462,27 +460,4 @@ fn run_token() -> std::io::Result<String> {
     let mut bytes = [0; 8];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;
     Ok(hex::encode(bytes))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_clock_whose_time_not_every_output_can_hold_is_a_warning() {
-        for (clock, expected) in [
-            ("1969-12-31T23:59:59.9Z", Some("before 1970")),
-            ("1900-01-01T00:00:00Z", Some("before 1970")),
-            ("1970-01-01T00:00:00Z", None),
-            ("2038-01-19T03:14:07.9Z", None),
-            ("2038-01-19T03:14:08Z", Some("ROS 2")),
-        ] {
-            let fault = fault_of(clock.parse().unwrap());
-            let is_expected = match (fault, expected) {
-                (Some(fault), Some(part)) => fault.contains(part),
-                (fault, expected) => fault == expected,
-            };
-            assert!(is_expected, "{clock}: {fault:?}");
-        }
-    }
 }

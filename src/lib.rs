@@ -1,6 +1,7 @@
 //! `hardnessd`: the daemon and the tools around it, the two ends of the core that touch the world.
 
-pub mod apart;
+pub mod thread;
 mod maybe;
+mod holders;
 pub mod daemon;
 pub mod tools;

@@ -3,19 +3,17 @@
 use std::future::Future;
 use std::io::{self, IsTerminal};
 use std::path::PathBuf;
-use std::pin::pin;
+use std::pin::{Pin, pin};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
-use hardnessd::apart;
-use hardnessd::daemon::config::Setup;
+use hardnessd::daemon::config::{self, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
-use hardnessd::daemon::{Daemon, Reload, busy};
+use hardnessd::daemon::{Daemon, Reload};
+use hardnessd::thread::{self, spawn_thread};
 use hardnessd::tools::args::{Args, Command};
-use hardnessd::tools::exit::{self, Failure, Stop};
-#[cfg(feature = "zenoh")]
-use hardnessd::tools::fleet;
+use hardnessd::tools::exit::{self, Failure};
 #[cfg(feature = "watch")]
 use hardnessd::tools::watch;
 use hardnessd::tools::{
@@ -23,6 +21,7 @@ use hardnessd::tools::{
     sniff, tail,
 };
 use hardnessd_core::trial;
+use rustix::process;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -35,8 +34,6 @@ fn main() -> ExitCode {
     }
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
-        .on_thread_unpark(busy::begins)
-        .on_thread_park(busy::ends)
         .build()
     {
         Ok(runtime) => runtime,
@@ -67,7 +64,7 @@ fn main() -> ExitCode {
     // A thread may still wait for a port's driver or for the reader of stdout.
     runtime.shutdown_background();
     if prints {
-        apart::finish(LAST_LINES);
+        thread::finish(LAST_LINES);
     }
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -98,57 +95,55 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             if is_shown {
                 log.clear_progress();
             }
-            Ok(record::run(args, setup, &log, end).await?)
+            record::run(args, setup, &log, end).await
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
         Command::Replay(args) => finish(signals, replay::run(args)).await,
         Command::Tail(args) => tail::run(args, signals.received()).await,
         #[cfg(feature = "watch")]
-        Command::Watch(args) => Ok(watch::run(args, signals.received()).await?),
-        #[cfg(feature = "zenoh")]
-        Command::Fleet(args) => fleet::run(args, signals.received()).await,
+        Command::Watch(args) => watch::run(args, signals.received()).await,
         Command::Control(command) => finish(signals, control::run(command)).await,
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
-        Command::Calibrate(args) => calibrate(args, signals).await,
-        Command::Identify(args) => identify(args, signals).await,
+        Command::Calibrate(args) => {
+            let path = args.config.path()?;
+            let named = path.clone();
+            let load = move || Setup::load(&named, None);
+            let command = async |setup, end: End<'_>| calibrate::run(args, setup, &path, end).await;
+            attend(signals, load, command).await
+        }
+        Command::Identify(args) => {
+            let path = args.config.path()?;
+            let named = path.clone();
+            let load = move || identify::load(&named);
+            let command = async |setup, end: End<'_>| identify::run(args, setup, &path, end).await;
+            attend(signals, load, command).await
+        }
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
         Command::Sniff(args) => finish(signals, sniff::run(args)).await,
     }
 }
 
-/// Calibrates. At a signal, the daemon inside ends in order, and the command fails.
-async fn calibrate(args: calibrate::Args, signals: Signals) -> Result<(), Failure> {
-    let path = args.config.path()?;
-    let mut end = pin!(signals.end());
-    let setup = tokio::select! {
-        loaded = load(path.clone(), None, std::future::pending()) => loaded?,
-        stop = &mut end => return Err(stop.into()),
-    };
-    let Some(setup) = setup else {
-        return Ok(());
-    };
-    let _log = Log::start(setup.config.log, "warn")?;
-    let mut stopped = None;
-    let shutdown = async { stopped = Some(end.await) };
-    calibrate::run(args, setup, &path, shutdown).await?;
-    stopped.map_or(Ok(()), |stop| Err(stop.into()))
-}
+/// It is over when a command is to end in order.
+type End<'a> = Pin<&'a mut dyn Future<Output = ()>>;
 
-/// Makes references. At a signal, the daemon inside ends in order, and the command fails.
-async fn identify(args: identify::Args, signals: Signals) -> Result<(), Failure> {
-    let path = args.config.path()?;
+/// Runs a command that serves a sensor. At a signal, the daemon inside ends in order, and the command
+/// fails.
+async fn attend(
+    signals: Signals,
+    load: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
+    command: impl AsyncFnOnce(Setup, End<'_>) -> Result<(), Failure>,
+) -> Result<(), Failure> {
     let mut end = pin!(signals.end());
-    let named = path.clone();
-    let load = apart::start("load", move || identify::load(&named))?;
+    let loaded = spawn_thread("load", load)?;
     let setup = tokio::select! {
-        loaded = load => loaded.expect("a configuration is read without a panic")?,
-        stop = &mut end => return Err(stop.into()),
+        loaded = loaded => loaded.expect("a configuration is read without a panic")?,
+        signal = &mut end => return Err(Failure::interrupted(signal)),
     };
     let _log = Log::start(setup.config.log, "warn")?;
     let mut stopped = None;
-    let shutdown = async { stopped = Some(end.await) };
-    identify::run(args, setup, &path, shutdown).await?;
-    stopped.map_or(Ok(()), |stop| Err(stop.into()))
+    let shutdown = pin!(async { stopped = Some(end.await) });
+    command(setup, shutdown).await?;
+    stopped.map_or(Ok(()), |signal| Err(Failure::interrupted(signal)))
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.
@@ -158,7 +153,7 @@ async fn finish(
 ) -> Result<(), Failure> {
     tokio::select! {
         done = work => done,
-        stop = signals.end() => Err(stop.into()),
+        signal = signals.end() => Err(Failure::interrupted(signal)),
     }
 }
 
@@ -167,7 +162,7 @@ async fn finish_blocking(
     signals: Signals,
     work: impl FnOnce() -> Result<(), Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let done = apart::start("work", work)?;
+    let done = spawn_thread("work", work)?;
     finish(signals, async {
         done.await.expect("the work does not panic")
     })
@@ -181,7 +176,7 @@ async fn load(
     model: Option<PathBuf>,
     end: impl Future<Output = ()>,
 ) -> Result<Option<Setup>, Failure> {
-    let load = apart::start("load", move || Setup::load(&path, model.as_deref()))?;
+    let load = spawn_thread("load", move || Setup::load(&path, model.as_deref()))?;
     tokio::select! {
         loaded = load => Ok(Some(loaded.expect("a configuration is read without a panic")?)),
         () = end => Ok(None),
@@ -235,7 +230,7 @@ impl Signals {
         // At the limit of a file's size, the write fails as on a full disk, and SIGXFSZ does not
         // end the process.
         drop(signal(SignalKind::from_raw(
-            rustix::process::Signal::XFSZ.as_raw(),
+            process::Signal::XFSZ.as_raw(),
         ))?);
         Ok(Self {
             interrupt: signal(SignalKind::interrupt())?,
@@ -246,12 +241,12 @@ impl Signals {
     }
 
     /// Waits for SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
-    async fn end(self) -> Stop {
+    async fn end(self) -> process::Signal {
         let outlives_terminal = self.outlives_terminal;
         let (shutdown, mut hangup) = self.apart();
         tokio::select! {
-            stop = shutdown => stop,
-            _ = hangup.recv(), if !outlives_terminal => Stop::Hangup,
+            signal = shutdown => signal,
+            _ = hangup.recv(), if !outlives_terminal => process::Signal::HUP,
         }
     }
 
@@ -261,7 +256,7 @@ impl Signals {
     }
 
     /// A future that waits for SIGINT or SIGTERM, and the signal SIGHUP by itself.
-    fn apart(self) -> (impl Future<Output = Stop>, Signal) {
+    fn apart(self) -> (impl Future<Output = process::Signal>, Signal) {
         let Self {
             mut interrupt,
             mut terminate,
@@ -270,8 +265,8 @@ impl Signals {
         } = self;
         let shutdown = async move {
             tokio::select! {
-                _ = interrupt.recv() => Stop::Interrupt,
-                _ = terminate.recv() => Stop::Terminate,
+                _ = interrupt.recv() => process::Signal::INT,
+                _ = terminate.recv() => process::Signal::TERM,
             }
         };
         (shutdown, hangup)

@@ -13,8 +13,6 @@ pub mod demo;
 pub mod doctor;
 pub mod exit;
 mod faults;
-#[cfg(feature = "zenoh")]
-pub mod fleet;
 pub mod identify;
 pub mod live;
 mod player;
@@ -24,6 +22,8 @@ pub mod recover;
 pub mod replay;
 mod readable;
 mod robot;
+#[cfg(feature = "watch")]
+mod score;
 pub mod simulate;
 pub mod sniff;
 pub mod tail;
@@ -36,91 +36,22 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+use tokio::sync::{mpsc, oneshot};
 
-use crate::apart;
-use hardnessd_core::exit::{Coded, FAILED, IO, NO_INPUT};
-use hardnessd_core::recording::{self, PlaybackError};
+use self::exit::{Fail, Failure};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::{FAILED, IO, NO_INPUT};
+use hardnessd_core::recording;
 use hardnessd_core::wording;
-pub use hardnessd_core::wording::{line, lines};
 
-/// The error of a file of the command line that cannot be read.
-#[derive(Debug, thiserror::Error)]
-#[error("{path}: cannot read: {source}")]
-pub struct CannotRead {
-    path: PathBuf,
-    source: io::Error,
-}
-
-impl CannotRead {
-    /// Makes the error of the file at `path`.
-    fn at(path: &Path) -> impl Fn(io::Error) -> Self {
-        move |source| Self {
-            path: path.to_owned(),
-            source,
-        }
-    }
-}
-
-impl Coded for CannotRead {
-    fn exit_code(&self) -> u8 {
-        NO_INPUT
-    }
-}
-
-/// A recording cannot be played to its end.
-#[derive(Debug, thiserror::Error)]
-#[error("{path}: {source}")]
-pub struct Unplayable {
-    /// The path of the recording, or words for one that has none.
-    path: PathBuf,
-    source: Unreadable,
-}
-
-impl Unplayable {
-    /// Makes the error of the recording at `path`.
-    fn at<E: Into<Unreadable>>(path: &Path) -> impl Fn(E) -> Self {
-        move |source| Self {
-            path: path.to_owned(),
-            source: source.into(),
-        }
-    }
-}
-
-impl Coded for Unplayable {
-    fn exit_code(&self) -> u8 {
-        match self.source {
-            // The system could not read the file, whatever the file holds.
-            Unreadable::Recording(recording::Error::Io(_)) => IO,
-            _ => FAILED,
-        }
-    }
-}
-
-/// The reason why a recording cannot be played.
-#[derive(Debug, thiserror::Error)]
-pub enum Unreadable {
-    /// The recording is damaged, or of another program.
-    #[error(transparent)]
-    Recording(#[from] recording::Error),
-    /// The recording describes an impossible sensor.
-    #[error(transparent)]
-    Playback(#[from] PlaybackError),
-}
-
-impl From<io::Error> for Unreadable {
-    fn from(error: io::Error) -> Self {
-        Self::Recording(error.into())
-    }
-}
-
-/// Stdout cannot be written to.
-#[derive(Debug, thiserror::Error)]
-#[error("stdout: {0}")]
-pub struct Stdout(#[source] io::Error);
-
-impl Coded for Stdout {
-    fn exit_code(&self) -> u8 {
-        IO
+/// The failure of a recording that cannot be played to its end. If the system could not read the file,
+/// the exit code does not depend on what the file holds.
+fn unplayable<E: Into<anyhow::Error>>(path: &Path) -> impl Fn(E) -> Failure + '_ {
+    move |error| {
+        let error = error.into();
+        let is_io = error.is::<io::Error>()
+            || matches!(error.downcast_ref(), Some(recording::Error::Io(_)));
+        Failure::of(if is_io { IO } else { FAILED }, path.display(), error)
     }
 }
 
@@ -139,8 +70,8 @@ pub fn usage(error: &clap::Error) -> ExitCode {
     match print(error.to_string().as_bytes()) {
         Ok(_) => ExitCode::SUCCESS,
         Err(failure) => {
-            hardnessd_core::stderr_line!("hardnessd: {failure}");
-            ExitCode::from(IO)
+            hardnessd_core::stderr_line!("hardnessd: {}", failure.line());
+            ExitCode::from(failure.code())
         }
     }
 }
@@ -148,21 +79,28 @@ pub fn usage(error: &clap::Error) -> ExitCode {
 /// Opens a file to read from. Refuses a directory at once, because the system would refuse it only
 /// at the first read, after the work has begun. Refuses a serial port, because reading one waits
 /// for bytes and never ends.
-fn open(path: &Path) -> Result<File, CannotRead> {
-    let open = || -> io::Result<File> {
-        let file = File::open(path)?;
-        if file.metadata()?.is_dir() {
-            // In the system's words, as for a configuration that is a directory.
-            return Err(rustix::io::Errno::ISDIR.into());
-        }
-        if rustix::termios::isatty(&file) {
-            return Err(io::Error::other(
-                "found a serial port or a terminal, expected a file (`hardnessd sniff --port` listens to a port)",
-            ));
-        }
-        Ok(file)
-    };
-    open().map_err(CannotRead::at(path))
+fn open_file(path: &Path) -> io::Result<File> {
+    let file = File::open(path)?;
+    if file.metadata()?.is_dir() {
+        // In the system's words, as for a configuration that is a directory.
+        return Err(rustix::io::Errno::ISDIR.into());
+    }
+    if rustix::termios::isatty(&file) {
+        return Err(io::Error::other(
+            "found a serial port or a terminal, expected a file (`hardnessd sniff --port` listens to a port)",
+        ));
+    }
+    Ok(file)
+}
+
+/// Like [`open_file`], for a file of the command line.
+fn open(path: &Path) -> Result<File, Failure> {
+    open_file(path).map_err(cannot_read(path))
+}
+
+/// The failure of a file of the command line that cannot be read.
+fn cannot_read(path: &Path) -> impl Fn(io::Error) -> Failure + '_ {
+    move |error| Failure::of(NO_INPUT, format!("{}: cannot read", path.display()), error)
 }
 
 /// Writes lines to stdout at once, and blocks until there is room for them. Do not call it on a
@@ -172,19 +110,55 @@ fn open(path: &Path) -> Result<File, CannotRead> {
 /// # Errors
 ///
 /// Fails if stdout cannot be written to for another reason.
-pub fn print(lines: &[u8]) -> Result<bool, Stdout> {
+pub fn print(lines: &[u8]) -> Result<bool, Failure> {
     let mut out = io::stdout().lock();
     match out.write_all(lines).and_then(|()| out.flush()) {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
-        written => written.map(|()| true).map_err(Stdout),
+        written => written.map(|()| true).of("stdout", IO),
     }
 }
 
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
-async fn print_apart(lines: Vec<u8>) -> Result<bool, Stdout> {
-    let printed = apart::start("stdout", move || print(&lines));
-    let printed = printed.map_err(|error| Stdout(error.into()))?.await;
-    printed.map_err(|ended| Stdout(io::Error::other(ended)))?
+async fn print_apart(lines: Vec<u8>) -> Result<bool, Failure> {
+    let mut stdout = Stdout::open()?;
+    stdout.print(lines).await?;
+    stdout.finish().await
+}
+
+/// A thread that writes to stdout.
+struct Stdout {
+    waiting: mpsc::Sender<Vec<u8>>,
+    ended: oneshot::Receiver<Result<bool, Failure>>,
+}
+
+impl Stdout {
+    fn open() -> Result<Self, Failure> {
+        let (waiting, mut lines) = mpsc::channel::<Vec<u8>>(1);
+        let write = move || {
+            while let Some(lines) = lines.blocking_recv() {
+                if !print(&lines)? {
+                    return Ok(false);
+                }
+            }
+            Ok(true)
+        };
+        let ended = spawn_thread("stdout", write).of("stdout", IO)?;
+        Ok(Self { waiting, ended })
+    }
+
+    /// Waits until there is room for the lines. Returns `Ok(false)` if nobody reads any more.
+    async fn print(&mut self, lines: Vec<u8>) -> Result<bool, Failure> {
+        match self.waiting.send(lines).await {
+            Ok(()) => Ok(true),
+            Err(_) => (&mut self.ended).await.of("stdout", IO)?,
+        }
+    }
+
+    /// Waits until all lines are written. Returns `Ok(false)` if nobody reads any more.
+    async fn finish(self) -> Result<bool, Failure> {
+        drop(self.waiting);
+        self.ended.await.of("stdout", IO)?
+    }
 }
 
 /// An absolute path, or the path as it is if the system does not know the current directory.
@@ -209,6 +183,6 @@ mod tests {
     fn a_directory_is_refused_in_the_system_s_words() {
         let directory = tempfile::tempdir().unwrap();
         let refused = open(directory.path()).unwrap_err();
-        assert_eq!(line(&refused.source), "Is a directory");
+        assert!(refused.line().ends_with(": cannot read: Is a directory"));
     }
 }

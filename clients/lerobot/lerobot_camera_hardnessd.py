@@ -7,16 +7,18 @@
         print(camera.observation())
 
 `read`, `async_read` and `read_latest` give an image to look at. `observation` gives what a policy learns from:
-newtons on each taxel, force, contact area, the arm's approach and the last verdict with its age.
+newtons on each taxel, force, contact area, the arm's approach and the last verdict with its age. A sensor of 150
+frames/s has several frames between two pictures of 30: with `window`, `observation` gives them all.
 
 A frame is given only while it is fresh: when the sensor is stale or lost, or the daemon is gone, each of them raises
 TimeoutError and says why.
 """
 
+import collections
 import threading
 import time
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import hardnessd
@@ -50,6 +52,10 @@ class HardnessdCameraConfig(CameraConfig):
     """Newtons on a taxel that the image shows brightest."""
     max_age_ms: int = 500
     """An older frame is not given. Raise it for a sensor of fewer than 3 frames/s."""
+    window: int = 1
+    """How many of the newest frames `observation` gives, the oldest first: features then have this as their first
+    axis, and the feature `fresh` says how many came since the last observation. Until there are so many, the first
+    one stands in for those before it."""
     keys: dict[str, str] = field(default_factory=dict)
     """Keys of features in place of `hardnessd.observation.KEYS`. An empty key leaves the quantity out."""
     image_key: str = ""
@@ -60,6 +66,8 @@ class HardnessdCameraConfig(CameraConfig):
         observation.keys_of("sensor", self.keys)
         if self.brightest_n <= 0:
             raise ValueError(f"brightest_n: found {self.brightest_n}, expected more than 0")
+        if self.window < 1:
+            raise ValueError(f"window: found {self.window}, expected 1 or more")
 
 
 class HardnessdCamera(Camera):
@@ -73,6 +81,9 @@ class HardnessdCamera(Camera):
         # Everything below is guarded by this condition, which is notified of every change.
         self._changed = threading.Condition()
         self._frame: hardnessd.Frame | None = None
+        # The newest frames with what was known at each, and how many of them no observation has had.
+        self._recent: collections.deque[dict[str, NDArray[Any]]] = collections.deque(maxlen=config.window)
+        self._fresh_count = 0
         self._arrived_s = 0.0
         self._taken = True
         self._why = "not connected"
@@ -109,7 +120,9 @@ class HardnessdCamera(Camera):
         if self.config.image_key in self._keys.values():
             raise ValueError(f"image_key: found {self.config.image_key!r}, which another quantity has too")
         self._why = "no frame has arrived yet"
-        self._client = hardnessd.Client(address, hardnessd.TYPES, policy="latest")
+        # Of a slow reader's frames only the newest counts, unless it wants several.
+        policy: Literal["latest", "queue"] = "latest" if self.config.window == 1 else "queue"
+        self._client = hardnessd.Client(address, hardnessd.TYPES, policy=policy)
         self._thread = threading.Thread(target=self._follow, args=(self._client,), daemon=True)
         self._thread.start()
         if warmup:
@@ -147,23 +160,42 @@ class HardnessdCamera(Camera):
         if self._client is None:
             raise DeviceNotConnectedError(f"{self} is not connected")
         found = observation.features(self._keys, self._rows, self._cols)
+        if self.config.window > 1:
+            for feature in found.values():
+                feature["shape"] = (self.config.window, *feature["shape"])
+                feature["names"] = ["frames", *feature["names"]] if len(feature["shape"]) > 2 else None
+            found[self._fresh_key()] = {"dtype": "int64", "shape": (1,), "names": ["fresh"]}
         if self.config.image_key:
             shape, names = (self.height, self.width, 3), ["height", "width", "channels"]
             found[self.config.image_key] = {"dtype": "video", "shape": shape, "names": names}
         return found
 
     def observation(self, max_age_ms: int | None = None) -> dict[str, NDArray[Any]]:
-        """The newest frame with the last verdict. `max_age_ms` goes before that of the configuration."""
+        """The newest frames with the last verdict. `max_age_ms` goes before that of the configuration."""
         with self._changed:
             frame = self._fresh(max_age_ms)
-            verdict, age_s = self._verdict, time.monotonic() - self._verdict_s
-        newtons = np.array(frame["newtons"]).reshape(self._rows, self._cols)
-        known = verdict and observation.Verdict(verdict["level"], verdict["confidence"], age_s)
-        area, approach_mm = frame["contact_area_taxels"], frame["approach_mm"]
-        found = observation.values(self._keys, newtons, area, approach_mm, known)
+            if self.config.window == 1:
+                found = self._values(frame)
+            else:
+                recent = list(self._recent)
+                whole = [recent[0]] * (self.config.window - len(recent)) + recent
+                found = {key: np.stack([values[key] for values in whole]) for key in recent[0]}
+                found[self._fresh_key()] = np.array([self._fresh_count], np.int64)
+                self._fresh_count = 0
         if self.config.image_key:
             found[self.config.image_key] = self._image(frame)
         return found
+
+    def _fresh_key(self) -> str:
+        return f"observation.tactile.{self._name}.fresh"
+
+    def _values(self, frame: hardnessd.Frame) -> dict[str, NDArray[Any]]:
+        """What is known at a frame that has just come."""
+        verdict, age_s = self._verdict, time.monotonic() - self._verdict_s
+        newtons = np.array(frame["newtons"]).reshape(self._rows, self._cols)
+        known = verdict and observation.Verdict(verdict["level"], verdict["confidence"], age_s)
+        touched = (frame["force_n"] or 0.0, frame["contact_area_taxels"])
+        return observation.values(self._keys, newtons, *touched, frame["approach_mm"], known)
 
     def _follow(self, client: hardnessd.Client) -> None:
         try:
@@ -191,12 +223,17 @@ class HardnessdCamera(Camera):
             else:
                 with self._changed:
                     self._frame, self._arrived_s, self._taken = event, time.monotonic(), False
+                    if self.config.window > 1:
+                        self._recent.append(self._values(event))
+                        self._fresh_count += 1
                     self._changed.notify_all()
 
     def _lose(self, why: str) -> None:
         """From now on there is no frame."""
         with self._changed:
             self._frame, self._why = None, why
+            self._recent.clear()
+            self._fresh_count = 0
             self._changed.notify_all()
 
     def _fresh(self, max_age_ms: int | None = None) -> hardnessd.Frame:

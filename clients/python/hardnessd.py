@@ -40,9 +40,11 @@ import argparse
 import asyncio
 import datetime
 import errno
+import functools
 import glob
 import io
 import json
+import math
 import os
 import re
 import socket
@@ -64,6 +66,9 @@ from typing import (
     TypedDict,
     Union,
     cast,
+    get_args,
+    get_origin,
+    get_type_hints,
 )
 
 __all__ = [
@@ -173,7 +178,8 @@ class Hardness(_Numbered):
     levels: Optional[List[int]]
     course: Optional[Literal["positions", "speed", "none"]]
     stiffness_n_per_mm: Optional[float]
-    references: Literal["none", "rigid", "labelled", "both"]
+    references: str
+    advice: Optional[Literal["press_harder", "press_again"]]
     object: Optional[ObjectVerdict]
 
 
@@ -199,14 +205,17 @@ class Status(_Numbered):
     time: str
     state: Literal["connecting", "live", "stale", "lost"]
     reason: Optional[str]
+    detail: Optional[str]
     frames: int
     frames_damaged: int
+    frames_dropped: int
     bytes_skipped: int
     frame_rate_hz: Optional[float]
 
 
 class Frame(TypedDict):
-    """One frame: `rows` x `cols` newtons, row by row. `tared` is false until the first tare is taken."""
+    """One frame: `rows` x `cols` newtons, row by row. Until the first tare is taken, `tared` is false and `force_n`
+    None."""
 
     type: Literal["frame"]
     sensor: str
@@ -216,6 +225,7 @@ class Frame(TypedDict):
     cols: int
     newtons: List[float]
     contact_area_taxels: int
+    force_n: Optional[float]
     tared: bool
     approach_mm: Optional[float]
 
@@ -235,6 +245,10 @@ class Disconnected(TypedDict):
 
 
 Event = Union[Hardness, Press, Status, Frame, Gap, Disconnected]
+
+
+_EVENTS = {"hardness": Hardness, "press": Press, "status": Status, "frame": Frame}
+"""The events whose fields are checked."""
 
 
 class Offsets(TypedDict):
@@ -323,17 +337,52 @@ def _destination(address: Address) -> Union[str, Tuple[str, int]]:
 
 def _parse(line: bytes) -> Message:
     try:
-        message = json.loads(line.decode(), parse_constant=_no_number)
+        message = json.loads(line.decode(), parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise ProtocolError(f"a line is not JSON: {_short(line)}") from error
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         raise ProtocolError(f"a line is not an object with a type: {_short(line)}")
     if not isinstance(message.get("seq", 0), int):
         raise ProtocolError(f"seq is not a whole number: {_short(line)}")
+    kind = message["type"]
+    for key, field in _fields(_EVENTS[kind]).items() if kind in _EVENTS else ():
+        if key != "seq" and not (key in message and _fits(message[key], field)):
+            raise ProtocolError(f"{key} of a {kind} is missing or of another type: {_short(line)}")
+    if kind == "frame" and len(message["newtons"]) != message["rows"] * message["cols"]:
+        raise ProtocolError(f"a frame has more or fewer newtons than taxels: {_short(line)}")
     return message
 
 
-def _no_number(text: str) -> None:
+def _fits(value: object, field: Any) -> bool:
+    """Whether a value of JSON is one of this field's type. A text may be one that a later version adds."""
+    origin, parts = get_origin(field), get_args(field)
+    if origin is Union:
+        return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str)
+    if origin is list:
+        # Frames have many numbers.
+        wanted = {int, float} if parts[0] is float else {parts[0]}
+        return isinstance(value, list) and set(map(type, value)) <= wanted
+    if origin is dict:
+        return isinstance(value, dict)
+    if isinstance(field, type) and issubclass(field, dict):
+        fields = _fields(field)
+        return isinstance(value, dict) and all(key in value and _fits(value[key], fields[key]) for key in fields)
+    return type(value) in ((int, float) if field is float else (field,))
+
+
+@functools.lru_cache(maxsize=None)
+def _fields(event: Any) -> Dict[str, Any]:
+    return get_type_hints(event)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    return number if math.isfinite(number) else _no_number(text)
+
+
+def _no_number(text: str) -> Any:
     raise ValueError(f"{text} is not a number of JSON")
 
 
@@ -866,11 +915,14 @@ def _readable(event: Event, hello: Optional[Message]) -> str:
     elif event["type"] == "status":
         clock = event["time"][11:23]
         text = f"{event['state']:<10}  {event['frames']} frames, {event['frames_damaged']} damaged"
+        text += f", {event['frames_dropped']} dropped" if event["frames_dropped"] else ""
         text += "" if event["frame_rate_hz"] is None else f", {event['frame_rate_hz']:.1f} frames/s"
-        text += _reason(event["reason"])
+        reason, detail = event["reason"], event["detail"]
+        text += _reason(f"{reason}: {detail}" if detail else reason)
     else:
-        clock, newtons = event["time"][11:23], event["newtons"]
-        text = f"#{event['frame']:<13}  {sum(newtons):>6.2f} N, highest taxel {max(newtons):.2f} N"
+        clock, force_n = event["time"][11:23], event["force_n"]
+        text = f"#{event['frame']:<13}  "
+        text += "no zero yet" if force_n is None else f"{force_n:>6.2f} N, highest taxel {max(0, *event['newtons']):.2f} N"
     return f"{clock}  {event['sensor']:<12}  {event['type']:<8}  {text}".rstrip()
 
 
@@ -886,12 +938,12 @@ def _published(event: Hardness) -> str:
 
 def _verdict(event: Hardness, hello: Optional[Message]) -> str:
     probabilities = " ".join(f"{100 * p:.0f}" for p in event["probabilities"])
-    text = f"#{event['press']:<4} {event['phase']:<8}  {answer(event, hello):<20} {100 * event['confidence']:>3.0f} %"
+    text = f"#{event['press']:<4} {event['phase']:<8}  {_with_shore(event, hello):<32} {100 * event['confidence']:>3.0f} %"
     text += f" [{probabilities}]  {event['contact_area_taxels']:>3} taxels  {event['force_n']:>6.2f} N"
-    # An older daemon sends no Shore hardness.
-    shore = event.get("shore")
-    if shore is not None:
-        text += f"  Shore {shore['value']:.0f} ({shore['low']:.0f} to {shore['high']:.0f})"
+    # An older daemon sends no advice.
+    advice = event.get("advice")
+    if advice is not None:
+        text += f"  {advice.replace('_', ' ')}"
     of_object = event.get("object")
     if of_object is not None and of_object["presses"] > 1:
         most = max(of_object["probabilities"])
@@ -899,6 +951,16 @@ def _verdict(event: Hardness, hello: Optional[Message]) -> str:
     if event["age_at_publish_ms"] is not None:
         text += f"  frame {event['frame']} at {event['time'][11:23]}"
     return text + _reason(", ".join(event["notes"])) + _context(event["context"])
+
+
+def _with_shore(event: Hardness, hello: Optional[Message]) -> str:
+    """The answer with the Shore hardness first. The interval of 90 % lies within its limits."""
+    # An older daemon sends no Shore hardness.
+    shore = event.get("shore")
+    if shore is None:
+        return answer(event, hello)
+    wide = max(shore["value"] - shore["low"], shore["high"] - shore["value"])
+    return f"{shore['value']:.0f} +- {wide:.0f} OO, {answer(event, hello)}"
 
 
 def _reason(text: Optional[str]) -> str:

@@ -60,9 +60,6 @@ struct Args {
     /// How the server is scheduled
     #[arg(long, value_enum, default_value_t = Scheduling::Other)]
     scheduling: Scheduling,
-    /// Also reload hardnessd every second
-    #[arg(long)]
-    reload: bool,
     /// Seconds to measure, after 2 s to warm up
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
@@ -140,10 +137,6 @@ fn measure(args: &Args) -> Result<(), Failure> {
     thread::sleep(WARM);
     received.begin();
     let (before, start) = (server.processor_time()?, Instant::now());
-    while args.reload && !player.is_finished() {
-        server.reload();
-        thread::sleep(Duration::from_secs(1));
-    }
     // The sensors stay plugged in until all events are read.
     let (_sensors, late) = player.join().map_err(|_| "the sensors stopped")??;
     let taken = start.elapsed();
@@ -151,7 +144,6 @@ fn measure(args: &Args) -> Result<(), Failure> {
     // Wait for the last events, which are on their way.
     thread::sleep(Duration::from_millis(300));
     let memory = server.anonymous_kb()?;
-    let longest = server.longest_work(args.server)?;
     drop(server);
     let problems = listeners.join().map_err(|_| "the clients stopped")?;
     let figures = received.figures(args, &sent);
@@ -159,7 +151,7 @@ fn measure(args: &Args) -> Result<(), Failure> {
     println!(
         "{:?} sensors {} side {} rate {} clients {} {:?} scheduling {:?} s {:.0}: {figures}; \
          processor {:.1} us a frame, {:.1} % of a core; anonymous memory {memory} kB; \
-         the sensors were at most {:.2} ms late{}",
+         the sensors were at most {:.2} ms late",
         args.server,
         args.sensors,
         args.side,
@@ -171,10 +163,6 @@ fn measure(args: &Args) -> Result<(), Failure> {
         busy.as_secs_f64() * 1e6 / frames,
         100.0 * busy.as_secs_f64() / taken.as_secs_f64(),
         late.as_secs_f64() * 1e3,
-        longest.map_or(String::new(), |longest| format!(
-            "; longest work without a wait {:.2} ms",
-            longest.as_secs_f64() * 1e3
-        )),
     );
     problems.map_or(Ok(()), |problem| Err(problem.into()))
 }

@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{Layout, Settings};
-use rustix::termios::OptionalActions;
 
 use crate::pair::Pair;
 use crate::{Args, Failure, Kind, What};
@@ -82,7 +81,7 @@ impl Sensors {
     pub(crate) fn plug(args: &Args, length: Duration) -> Result<Self, Failure> {
         let frames = (length.as_secs_f64() * args.rate) as usize + 1;
         let list = || (0..frames).map(|_| AtomicU64::new(0)).collect();
-        let pairs: io::Result<Vec<Pair>> = (0..args.sensors).map(|_| plug()).collect();
+        let pairs: io::Result<Vec<Pair>> = (0..args.sensors).map(|_| Pair::raw()).collect();
         Ok(Self {
             pairs: pairs?,
             sent: Arc::new(Sent((0..args.sensors).map(|_| list()).collect())),
@@ -149,14 +148,6 @@ impl Sensors {
     }
 }
 
-fn plug() -> io::Result<Pair> {
-    let pair = Pair::open()?;
-    let mut settings = rustix::termios::tcgetattr(&pair.device)?;
-    settings.make_raw();
-    rustix::termios::tcsetattr(&pair.device, OptionalActions::Now, &settings)?;
-    Ok(pair)
-}
-
 /// Frame `number` of an array of `side` rows and columns. Its first taxels carry the number. They
 /// are too few for a contact. The load is on a seventh of the rows and of the columns.
 fn frame(side: usize, number: i32, is_loaded: bool) -> RawFrame {
@@ -166,13 +157,13 @@ fn frame(side: usize, number: i32, is_loaded: bool) -> RawFrame {
     };
     let mut frame = RawFrame::zero(array);
     for (count, byte) in frame.counts.iter_mut().zip(number.to_le_bytes()) {
-        *count = u16::from(byte);
+        *count = byte.into();
     }
     if is_loaded {
         let loaded = side * 3 / 7..side * 4 / 7;
         for row in loaded.clone() {
             for col in loaded.clone() {
-                frame.counts[array.place(row, col)] = 60;
+                frame.counts[array.place(row, col)] = 60.0;
             }
         }
     }

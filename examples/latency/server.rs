@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::io::{Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::io::Write;
+use std::net::TcpListener;
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -30,19 +30,16 @@ pub(crate) enum Place {
 pub(crate) struct Server {
     child: Child,
     place: Place,
-    /// Where hardnessd serves its metrics.
-    metrics: u16,
     _directory: tempfile::TempDir,
 }
 
 impl Server {
     pub(crate) fn start(args: &Args, devices: &[PathBuf]) -> Result<Self, Failure> {
         let directory = tempfile::tempdir()?;
-        // The ports are free now, and nothing else here takes them before the server does.
-        let listener = || TcpListener::bind(("127.0.0.1", 0));
-        let (events, pages) = (listener()?, listener()?);
-        let (port, metrics) = (events.local_addr()?.port(), pages.local_addr()?.port());
-        drop((events, pages));
+        // The port is free now, and nothing else here takes it before the server does.
+        let listener = TcpListener::bind(("127.0.0.1", 0))?;
+        let port = listener.local_addr()?.port();
+        drop(listener);
         let place = if args.tcp || args.server == Kind::Gpsd {
             Place::Tcp(port)
         } else {
@@ -56,7 +53,7 @@ impl Server {
         match args.server {
             Kind::Hardnessd => {
                 let path = directory.path().join("hardnessd.toml");
-                fs::write(&path, configuration(args, devices, port, metrics))?;
+                fs::write(&path, configuration(args, devices, port))?;
                 command.arg(&args.program).args(["run", "--config"]);
                 command.arg(path);
             }
@@ -83,7 +80,6 @@ impl Server {
         Ok(Self {
             child,
             place,
-            metrics,
             _directory: directory,
         })
     }
@@ -136,29 +132,6 @@ impl Server {
         Ok(Duration::from_nanos(taken))
     }
 
-    /// The longest time that hardnessd worked without a wait. Another server does not say.
-    pub(crate) fn longest_work(&self, kind: Kind) -> Result<Option<Duration>, Failure> {
-        if kind != Kind::Hardnessd {
-            return Ok(None);
-        }
-        let mut stream = TcpStream::connect(("127.0.0.1", self.metrics))?;
-        write!(stream, "GET /metrics HTTP/1.0\r\nHost: localhost\r\n\r\n")?;
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer)?;
-        let mut lines = answer.lines();
-        let line = lines.find(|line| line.starts_with("hardnessd_longest_work_seconds"));
-        let value = line.and_then(|line| line.split_whitespace().nth(1));
-        let seconds = value.ok_or("no longest work in /metrics")?.parse()?;
-        Ok(Some(Duration::from_secs_f64(seconds)))
-    }
-
-    /// Lets hardnessd read its configuration and its model again.
-    pub(crate) fn reload(&self) {
-        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()) {
-            let _ = kill_process(pid, Signal::HUP);
-        }
-    }
-
     pub(crate) fn anonymous_kb(&self) -> Result<u64, Failure> {
         let status = fs::read_to_string(self.proc("status"))?;
         let line = status
@@ -180,7 +153,7 @@ impl Drop for Server {
     }
 }
 
-fn configuration(args: &Args, devices: &[PathBuf], port: u16, metrics: u16) -> String {
+fn configuration(args: &Args, devices: &[PathBuf], port: u16) -> String {
     let mut text = String::from("robot = \"bench\"\n");
     let (side, pitch_mm) = (args.side, 3.5 * 28.0 / args.side as f64);
     for (index, device) in devices.iter().enumerate() {
@@ -201,7 +174,6 @@ fn configuration(args: &Args, devices: &[PathBuf], port: u16, metrics: u16) -> S
     if args.tcp {
         let _ = write!(text, "[publish.tcp]\nlisten = \"127.0.0.1:{port}\"\n");
     }
-    let _ = write!(text, "[http]\nlisten = \"127.0.0.1:{metrics}\"\n");
     // The first taxels carry a number, and must not count as a contact.
     text += "[press]\nbegin_area_taxels = 6\nend_area_taxels = 5\n";
     text + &args.configuration + "\n"

@@ -5,21 +5,17 @@
     git clone https://github.com/peter-kiechle/tactile-sensors
     python3 examples/real_presses stamp tactile-sensors --hardnessd target/release/hardnessd
 
-    git clone https://github.com/YoussifAmin/Object_Hardness_Classification
-    python3 examples/real_presses grasps Object_Hardness_Classification
-
     git clone https://github.com/GelSight-lab/EstimateModulus
     git clone https://github.com/GelSight-lab/TactileEstimateModulus
     python3 examples/real_presses squeezes EstimateModulus TactileEstimateModulus
 
-The daemon judges the presses of `stamp`. The other two have no frames that it could judge, so the programs here judge
-them. docs/results.md says what came out, and results/real-presses.md has the commits and more tables.
+The daemon judges the presses of `stamp`. The other recordings have no frames that it could judge. `results/real` has
+those of real grasps. docs/results.md says what came out, and results/real-presses.md has the commits and more tables.
 """
 
 import argparse
 import pathlib
 
-import grasps
 import squeezes
 import stamp
 
@@ -27,12 +23,11 @@ import stamp
 def arguments():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(dest="part", required=True)
-    of_stamp, of_grasps, of_squeezes = (parts.add_parser(part) for part in ("stamp", "grasps", "squeezes"))
+    of_stamp, of_squeezes = (parts.add_parser(part) for part in ("stamp", "squeezes"))
     of_stamp.add_argument("clone", type=pathlib.Path, help="of tactile-sensors")
     of_stamp.add_argument("--hardnessd", type=pathlib.Path, required=True, help="the daemon's binary")
     of_stamp.add_argument("--model", type=pathlib.Path, help="an ONNX model in place of the built-in one")
     of_stamp.add_argument("--newtons-per-count", type=float, default=stamp.NEWTONS_PER_COUNT, help="of the array")
-    of_grasps.add_argument("clone", type=pathlib.Path, help="of Object_Hardness_Classification")
     of_squeezes.add_argument("clone", type=pathlib.Path, help="of EstimateModulus")
     of_squeezes.add_argument("table", type=pathlib.Path, help="clone of TactileEstimateModulus")
     return parser.parse_args()
@@ -42,8 +37,6 @@ def main():
     given = arguments()
     if given.part == "stamp":
         stamp.report(given.clone, given.hardnessd, given.model, given.newtons_per_count)
-    elif given.part == "grasps":
-        grasps.report(given.clone)
     else:
         squeezes.report(given.clone, given.table)
 

@@ -32,6 +32,7 @@ CONFIG = """
 [[sensor]]
 name = "pad"
 port = "/dev/null"
+baud = 921600
 frame_rate_hz = %(rate_hz)d
 %(of_sensor)s
 [sensor.frame]

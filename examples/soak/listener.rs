@@ -13,12 +13,11 @@ use serde_json::Value;
 
 use crate::Failure;
 
-/// How often a subscriber has read that a sensor is live, and that it is lost, and whether it is stale.
+/// How often a subscriber has read that a sensor is live, and that it is lost.
 #[derive(Default)]
 pub(crate) struct Link {
     pub(crate) lives: AtomicU64,
     pub(crate) losses: AtomicU64,
-    pub(crate) is_stale: AtomicBool,
 }
 
 /// The record of a subscriber.
@@ -48,7 +47,6 @@ pub(crate) fn receive(connection: UnixStream, links: &[Arc<Link>]) -> Result<Rec
         let sensor = name.and_then(|number| number.parse::<usize>().ok());
         if let (Some(sensor), "status") = (sensor, event["type"].as_str().unwrap_or_default()) {
             let link = &links[sensor];
-            link.is_stale.store(event["state"] == "stale", Relaxed);
             link.lives
                 .fetch_add(u64::from(event["state"] == "live"), Relaxed);
             link.losses

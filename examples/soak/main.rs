@@ -3,12 +3,10 @@
 //!     cargo run --release --example soak -- --minutes 120
 //!
 //! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated
-//! presses over a pty, a TCP connection or datagrams, with a fault in every second press. Arrays
-//! are 28x28 to 64x64. There are subscribers of all
-//! kinds, recordings, and a reload every ten seconds. At the end, every press must have its
-//! verdict, or must be lost with the link, by its number. A datagram that finds no room at the daemon
-//! may cost its frame and no press; how many there were is printed. Memory, descriptors and threads must
-//! not have grown. Otherwise the exit code is 1.
+//! presses over a pty, with a fault in every second press. Arrays are 28x28 to
+//! 64x64. There are subscribers of all kinds, recordings, and a reload every ten seconds. At the end,
+//! every press must have its verdict, or must be lost with the link, by its number. Memory,
+//! descriptors and threads must not have grown. Otherwise the exit code is 1.
 
 mod account;
 mod line;
@@ -59,9 +57,6 @@ struct Args {
     /// Sensors
     #[arg(long, default_value_t = 8)]
     sensors: usize,
-    /// References of the second half of the sensors
-    #[arg(long)]
-    references: Option<PathBuf>,
     /// Seed of the faults
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -120,18 +115,8 @@ fn serve(config: &Path) -> Result<(), Failure> {
 /// The sides of the arrays, in taxels, which the sensors have in turn.
 const SIDES: [usize; 4] = [28, 28, 48, 64];
 
-/// The line of a sensor: every second one is on the network, and half of these send datagrams. Each kind has
-/// the smallest and the largest array.
-fn line(index: usize, port: PathBuf) -> io::Result<Line> {
-    match index % 8 {
-        1 | 7 => Line::tcp(),
-        3 | 5 => Line::udp(),
-        _ => Line::pty(port),
-    }
-}
-
 /// The `[[sensor]]` tables of the configuration.
-fn tables(players: &[Player], references: Option<&Path>) -> String {
+fn tables(players: &[Player]) -> String {
     let mut text = String::new();
     for (index, player) in players.iter().enumerate() {
         let side = SIDES[index % SIDES.len()];
@@ -141,11 +126,8 @@ fn tables(players: &[Player], references: Option<&Path>) -> String {
             "[[sensor]]\nname = \"{}\"\nport = \"{}\"\nbaud = 3000000\n\
              frame_rate_hz = {FRAMES_PER_S:.1}\n",
             player.name,
-            player.line.port()
+            player.line.port.display()
         );
-        if let Some(path) = references.filter(|_| index >= players.len() / 2) {
-            let _ = writeln!(text, "references = \"{}\"", path.display());
-        }
         let _ = write!(
             text,
             "[sensor.frame]\nrows = {side}\ncols = {side}\n[sensor.calibration]\n\
@@ -193,7 +175,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
         let name = format!("s{index}");
         let library = libraries[index % SIDES.len()].as_ref();
         players.push(Player {
-            line: line(index, at(&name))?,
+            line: Line::new(at(&name))?,
             name,
             library: Arc::clone(library.map_err(ToString::to_string)?),
             stream: root.child(index as u64),
@@ -203,12 +185,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
             due: Instant::now(),
         });
     }
-    let references = args
-        .references
-        .as_deref()
-        .map(fs::canonicalize)
-        .transpose()?;
-    let tables = tables(&players, references.as_deref());
+    let tables = tables(&players);
     let (config, socket) = (at("soak.toml"), at("events.sock"));
     configure(&config, &tables, 0.0)?;
     let mut daemon = Command::new(std::env::current_exe()?)
@@ -358,8 +335,6 @@ struct Played {
     reloads: u64,
     /// The number of recordings that were removed.
     removed: u64,
-    /// The number of datagrams that found no room at the daemon.
-    dropped: u64,
 }
 
 impl Played {
@@ -397,9 +372,7 @@ impl Played {
         for player in playing {
             sent.push(player.join().map_err(|_| "a player panicked")??);
         }
-        let dropped = sent.iter().map(|player| player.line.dropped());
         Ok(Self {
-            dropped: dropped.sum::<io::Result<u64>>()?,
             sent,
             usages,
             reloads,
@@ -417,7 +390,6 @@ impl Played {
             "reloads: {}; recordings removed meanwhile: {}",
             self.reloads, self.removed
         );
-        println!("datagrams without room: {}", self.dropped);
     }
 }
 

@@ -75,9 +75,6 @@ pub(crate) fn library(side: usize) -> Result<Library, Failure> {
     Ok(Library { presses, rest })
 }
 
-/// The time in which a subscriber reads what has happened.
-const SETTLED: Duration = Duration::from_secs(1);
-
 pub(crate) const FAULTS: [&str; 7] = [
     "unplug", "silence", "stall", "flip", "drop", "noise", "double",
 ];
@@ -119,7 +116,7 @@ impl Player {
             let mut bytes = frame.clone();
             match fault {
                 "unplug" if index == middle => {
-                    self.sent.push(!self.line.has_end());
+                    self.sent.push(false);
                     return self.unplug(&bytes);
                 }
                 "silence" if index == middle => self.due += Duration::from_millis(400),
@@ -129,9 +126,7 @@ impl Player {
                 }
                 "flip" if struck => bytes[self.stream.below(frame.len())] ^= 1,
                 "drop" if struck => {
-                    let unit = self.line.unit();
-                    let start = self.stream.below(frame.len()) / unit * unit;
-                    bytes.drain(start..(start + unit).min(frame.len()));
+                    bytes.remove(self.stream.below(frame.len()));
                 }
                 "noise" if struck => {
                     let noise = (0..300).map(|_| self.stream.next_u64() as u8);
@@ -151,21 +146,14 @@ impl Player {
         Ok(())
     }
 
-    /// Pulls the cable in the middle of a frame, and plugs it in again. Datagrams only stop, so the press
-    /// stays open until the sensor is there again.
+    /// Pulls the cable in the middle of a frame, and plugs it in again.
     fn unplug(&mut self, frame: &[u8]) -> Result<(), Failure> {
         let part = self.stream.below(frame.len());
         self.write(&frame[..part])?;
         self.drain()?;
         let losses = self.link.losses.load(Relaxed);
         self.line.unplug()?;
-        if self.line.has_end() {
-            self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
-        } else {
-            // By then, the subscriber has read what an earlier silence has caused.
-            sleep(SETTLED);
-            self.wait("stale", || Ok(self.link.is_stale.load(Relaxed)))?;
-        }
+        self.wait("lost", || Ok(self.link.losses.load(Relaxed) > losses))?;
         let lives = self.link.lives.load(Relaxed);
         sleep(Duration::from_secs_f64(self.stream.range(0.0, 1.5)));
         self.line.plug()?;

@@ -20,51 +20,66 @@ HERE = pathlib.Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 import trainer as training  # noqa: E402
+from wrong_newtons import wrong_newtons  # noqa: E402
 
 MODEL = HERE.parent.parent / "models/course.onnx"
 COMMON = "--sequences --objects 0 --test-objects 100 --test-covers 25 --electronics 4 --presses 4"
 ELECTRONICS = 4
 SETS = {
-    "Unseen sensors, `matched` shapes": "--sensors broad --materials broad --shapes matched --seed 3101",
-    "Unseen sensors, `wide` shapes": "--sensors broad --materials broad --shapes wide --seed 3102",
-    "The simulated JX255N, `matched`": "--sensors jx255n --materials broad --shapes matched --seed 3103",
-    "The simulated JX255N, `wide`": "--sensors jx255n --materials broad --shapes wide --seed 3104",
-    "Unseen sensors, the eight named materials, `matched`": "--sensors broad --all-test --shapes matched --seed 3105",
-    "Unseen sensors, the eight named materials, `wide`": "--sensors broad --all-test --shapes wide --seed 3106",
+    "Unseen sensors, `matched` shapes": "--sensors broad --materials broad --shapes matched --seed 5101",
+    "Unseen sensors, `wide` shapes": "--sensors broad --materials broad --shapes wide --seed 5102",
+    "Unseen sensors, `flat` shapes": "--sensors broad --materials broad --shapes flat --seed 5103",
+    "The simulated JX255N, `matched`": "--sensors jx255n --materials broad --shapes matched --seed 5104",
+    "The simulated JX255N, `wide`": "--sensors jx255n --materials broad --shapes wide --seed 5105",
+    "The simulated JX255N, `flat`": "--sensors jx255n --materials broad --shapes flat --seed 5106",
+    "Unseen sensors, the eight named materials, `matched`": "--sensors broad --all-test --shapes matched --seed 5107",
+    "Unseen sensors, the eight named materials, `wide`": "--sensors broad --all-test --shapes wide --seed 5108",
 }
 TOLD = {
     "nothing known": (),
+    "16 own presses": ("--own", "16"),
     "2 + 2": ("--rigid", "2"),
-    "5 + 5": ("--rigid", "5"),
+    "2 + 2 and 16 own": ("--rigid", "2", "--own", "16"),
     "4 labelled": ("--labelled", "1"),
-    "2 + 2 and 4 labelled": ("--rigid", "2", "--labelled", "1"),
 }
-# The factors of the wrong newtons are spread evenly over their logarithm.
-WRONG_NEWTONS = (0.5, 2.0)
+# What the second and third table are about.
+USUAL = "16 own presses"
+# The ways in which the positions of the arm, or the newtons of an unseen sensor, are left out or wrong.
+WITHOUT = ("nothing known", USUAL, "2 + 2 and 16 own")
+UNSEEN = 3
 BOOTSTRAPS = 1000
+# What is kept of what `evaluate --json` prints.
+KEPT = ("n", "accuracy", "category_accuracy", "confusion", "ece", "nll", "beyond_neighbour", "shore", "sets")
+SURE = 0.7
+# The levels above 70, of 50 to 70 and up to 50 OO.
+THREE = {1: 1, 2: 2, 3: 2, 4: 3}
 
 
 def verdicts_of(path):
-    """Object, level, named level and the probabilities of the levels, a row each."""
+    """Object, level, named level, the probabilities of the levels, and the error of the Shore hardness, a row each."""
     with open(path, newline="") as file:
         for row in csv.DictReader(file):
             shares = [float(row[f"probability_{level}"]) for level in (1, 2, 3, 4)]
-            yield int(row["object"]), int(row["level"]), int(row["judged"]), shares
+            error = abs(float(row["shore"]) - float(row["true_shore"]))
+            yield int(row["object"]), int(row["level"]), int(row["judged"]), shares, error
 
 
-def sensors_of(rows, data):
-    """The sensor of each verdict."""
+def judged_presses(rows, data):
+    """The places in the data set of the presses that the verdicts are of."""
     import numpy
 
     # Objects that serve as references have no verdict.
     has_verdict = (data["level"] > 0) & numpy.isin(data["object"], [row[0] for row in rows])
     assert data["object"][has_verdict].tolist() == [row[0] for row in rows]
-    return data["sensor"][has_verdict].tolist()
+    return numpy.flatnonzero(has_verdict)
 
 
 def balanced(counts):
     """The mean over the levels of the share of right presses. `counts` is [..., level, (right, presses)]."""
-    return (counts[..., 0] / counts[..., 1]).mean(axis=-1)
+    import numpy
+
+    with numpy.errstate(invalid="ignore"):
+        return numpy.nanmean(counts[..., 0] / counts[..., 1], axis=-1)
 
 
 def interval(of_cover):
@@ -75,40 +90,59 @@ def interval(of_cover):
     return numpy.percentile(balanced(of_cover[drawn].sum(axis=1)), [2.5, 97.5]).tolist()
 
 
+def counted(pairs, levels=4):
+    """Balanced accuracy of pairs of true and named level."""
+    import numpy
+
+    counts = numpy.zeros((levels, 2))
+    for level, named in pairs:
+        counts[level - 1] += [named == level, 1]
+    return float(balanced(counts))
+
+
+def of_objects(rows, sensors, presses):
+    """True and named level of each object by its first `presses` presses, as the daemon judges an object by several."""
+    import numpy
+
+    of_object = {}
+    for sensor, (key, level, _, shares, _) in zip(sensors, rows):
+        of_object.setdefault((key, sensor, level), []).append(shares)
+    for (_, _, level), shares in of_object.items():
+        yield level, numpy.log(numpy.maximum(shares[:presses], 1e-4)).sum(axis=0).argmax() + 1
+
+
 def figures(evaluated, verdicts, data):
     """What the tables show of one set and one way to be told."""
     import numpy
 
     rows = list(verdicts_of(verdicts))
-    sensors = sensors_of(rows, data)
+    places = judged_presses(rows, data)
+    sensors = data["sensor"][places].tolist()
     covers = sorted({sensor // ELECTRONICS for sensor in sensors})
-    single, together = (numpy.zeros((len(covers), 4, 2)) for _ in range(2))
-    of_object = {}
-    for sensor, (key, level, named, shares) in zip(sensors, rows):
-        single[covers.index(sensor // ELECTRONICS), level - 1] += [named == level, 1]
-        of_object.setdefault((key, sensor, level), []).append(shares)
-    for (_, sensor, level), presses in of_object.items():
-        # As the daemon judges an object by several presses.
-        likeliest = numpy.log(numpy.maximum(presses, 1e-4)).sum(axis=0).argmax() + 1
-        together[covers.index(sensor // ELECTRONICS), level - 1] += [likeliest == level, 1]
-    own = {"balanced": float(balanced(single.sum(axis=0))), "interval": interval(single)}
-    own["object_of_4"] = float(balanced(together.sum(axis=0)))
-    share = single.sum(axis=1)
-    own["worst_cover"] = float((share[:, 0] / share[:, 1]).min())
-    return own | {"evaluation": evaluated}
-
-
-def with_wrong_newtons(path, out):
-    """The same presses with the newtons of each sensor times a factor of its own."""
-    import numpy
-
-    data = dict(numpy.load(path))
-    least, most = numpy.log(WRONG_NEWTONS)
-    factors = numpy.exp(numpy.random.default_rng(2).uniform(least, most, data["sensor"].max() + 1))
-    frames = data["frames_mn"] * factors[data["sensor"][data["press"]]][:, None, None]
-    data["frames_mn"] = numpy.minimum(numpy.round(frames), 65535).astype(numpy.uint16)
-    numpy.savez(out, **data)
-    return out
+    counts = numpy.zeros((len(covers), 4, 2))
+    for sensor, (_, level, named, _, _) in zip(sensors, rows):
+        counts[covers.index(sensor // ELECTRONICS), level - 1] += [named == level, 1]
+    share = counts.sum(axis=1)
+    is_layered = data["layered"][places] == 1
+    pairs = [(level, named) for _, level, named, _, _ in rows]
+    sure = [level == named for _, level, named, shares, _ in rows if max(shares) > SURE]
+    return {
+        "balanced": float(balanced(counts.sum(axis=0))),
+        "interval": interval(counts),
+        "worst_cover": float((share[:, 0] / share[:, 1]).min()),
+        "object_of_3": counted(of_objects(rows, sensors, 3)),
+        "three_levels": counted(((THREE[level], THREE[named]) for level, named in pairs), levels=3),
+        "sure": len(sure) / len(rows),
+        "sure_and_wrong": 1 - sum(sure) / max(len(sure), 1),
+        "layered": {"share": float(is_layered.mean())}
+        | {
+            name: counted(pair for pair, of_kind in zip(pairs, kind) if of_kind)
+            for name, kind in (("balanced", is_layered), ("others_balanced", ~is_layered))
+            if kind.any()
+        },
+        "median_shore_error": float(numpy.median([row[-1] for row in rows])),
+        "evaluation": {key: evaluated[key] for key in KEPT},
+    }
 
 
 def measure(trainer, work):
@@ -118,50 +152,70 @@ def measure(trainer, work):
     verdicts = work / "verdicts.csv"
 
     def judged(path, told):
-        evaluated = trainer.judged(MODEL, path, verdicts, *told)
+        evaluated = trainer.judged(MODEL, path, verdicts, *TOLD[told])
         return figures(evaluated, verdicts, numpy.load(path))
 
     for number, (name, options) in enumerate(SETS.items()):
         path = trainer.simulated(work / f"set-{number}.npz", f"{COMMON} {options}")
-        ways = {told: judged(path, arguments) for told, arguments in TOLD.items()}
-        # The same presses of a robot that does not say where its arm is.
-        unknown = trainer.simulated(work / f"unknown-{number}.npz", f"{COMMON} {options} --unknown 1")
-        for told in ("nothing known", "2 + 2"):
-            ways[f"{told}, no positions"] = judged(unknown, TOLD[told])
-        if number < 2:
-            wrong = with_wrong_newtons(path, work / "wrong.npz")
-            for told in ("nothing known", "2 + 2"):
-                ways[f"{told}, wrong newtons"] = judged(wrong, TOLD[told])
+        ways = {told: judged(path, told) for told in TOLD}
+        if number < UNSEEN:
+            # The same presses of a robot that does not say where its arm is.
+            unknown = trainer.simulated(work / f"unknown-{number}.npz", f"{COMMON} {options} --unknown 1")
+            ways |= {f"{told}, no positions": judged(unknown, told) for told in WITHOUT}
+            wrong = wrong_newtons(path, work / "wrong.npz")
+            ways |= {f"{told}, wrong newtons": judged(wrong, told) for told in WITHOUT}
         found["sets"][name] = {"simulate": options, "ways": ways}
     training.write(HERE / "evaluations.json", trainer, found)
+
+
+def row(*cells):
+    print("|", " | ".join(cells), "|")
+
+
+def head(*cells):
+    print()
+    row(*cells)
+    print("|" + "---|" * len(cells))
 
 
 def table():
     found = json.loads((HERE / "evaluations.json").read_text())["sets"]
 
-    def shown(own):
-        low, high = own["interval"]
-        return f"{100 * own['balanced']:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+    def percent(share, places=0):
+        return f"{100 * share:.{places}f} %"
 
-    print("| Test presses |", " | ".join(TOLD), "|")
+    def shown(of_way):
+        low, high = of_way["interval"]
+        return f"{percent(of_way['balanced'], 1)} ({100 * low:.1f} to {100 * high:.1f})"
+
+    head("Test presses", *TOLD)
     for name, of_set in found.items():
-        print("|", " | ".join([name, *(shown(of_set["ways"][told]) for told in TOLD)]), "|")
-    print("\nWith 2 + 2\n\n| Test presses | 4 presses of an object | Worst cover | Shore RMSE | Interval holds |", end=" ")
-    print("Set holds | Ambiguous | Right if named | Calibration error |")
+        row(name, *(shown(of_set["ways"][told]) for told in TOLD))
+    print(f"\nWith {USUAL}")
+    head("Test presses", "Three presses", "Three levels", "Layered", "Others", "Worst cover", "Sure", "Sure and wrong")
     for name, of_set in found.items():
-        own = of_set["ways"]["2 + 2"]
-        all_of = own["evaluation"]
+        of_way = of_set["ways"][USUAL]
+        layered = of_way["layered"]
+        shares = [of_way["object_of_3"], of_way["three_levels"], layered.get("balanced"), layered["others_balanced"]]
+        shares += [of_way["worst_cover"], of_way["sure"], of_way["sure_and_wrong"]]
+        row(name, *("-" if share is None else percent(share) for share in shares))
+    head("Test presses", "Shore error", "Interval holds", "Set holds", "Ambiguous", "Right if named", "Confidence off by")
+    for name, of_set in found.items():
+        of_way = of_set["ways"][USUAL]
+        all_of = of_way["evaluation"]
         shore, sets = all_of["shore"], all_of["sets"]
-        cells = [f"{100 * own['object_of_4']:.1f} %", f"{100 * own['worst_cover']:.0f} %", f"{shore['rmse']:.1f}"]
         shares = [shore["coverage"], sets["coverage"], sets["ambiguous"], sets["accuracy_of_others"]]
-        cells += [f"{100 * share:.1f} %" for share in shares]
-        print("|", " | ".join([name, *cells, f"{all_of['ece']:.3f}"]), "|")
+        row(name, f"{of_way['median_shore_error']:.1f}", *(percent(share) for share in shares), f"{all_of['ece']:.2f}")
+    print(f"\nOver {SURE} and wrong, and the share of presses whose set holds the level")
+    head("Test presses", *TOLD)
+    for name, of_set in found.items():
+        ways = [of_set["ways"][told] for told in TOLD]
+        row(name, *(f"{percent(way['sure_and_wrong'])}, {percent(way['evaluation']['sets']['coverage'])}" for way in ways))
     for title, way in (("Newtons that are wrong by 0.5 to 2", "wrong newtons"), ("No positions of the arm", "no positions")):
-        print(f"\n{title}\n\n| Test presses | nothing known | 2 + 2 |")
-        for name, of_set in found.items():
-            ways = of_set["ways"]
-            if f"2 + 2, {way}" in ways:
-                print("|", name, "|", shown(ways[f"nothing known, {way}"]), "|", shown(ways[f"2 + 2, {way}"]), "|")
+        print(f"\n{title}")
+        head("Test presses", *WITHOUT)
+        for name, of_set in list(found.items())[:UNSEEN]:
+            row(name, *(shown(of_set["ways"][f"{told}, {way}"]) for told in WITHOUT))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ use tracing::warn;
 /// The pause after the system had no room for a connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Orders to listeners. Each value orders the listeners to check that they can still be reached.
-/// When the sender is dropped, the listeners stop.
+/// Whether to stop: the sender is dropped then.
 pub(crate) type Stop = watch::Receiver<()>;
 
 /// Waits for the order to stop.

@@ -4,19 +4,15 @@
 //! that ask without end delay other clients, and no sensor.
 
 use std::io;
-use std::sync::Arc;
 use std::thread;
 
 use tokio::runtime::{Builder, Handle};
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::oneshot;
 
 /// The thread. When this is dropped, its tasks are dropped, and the thread ends.
 #[derive(Debug)]
 pub(crate) struct Clients {
     pub(super) runtime: Handle,
-    /// A client that asks the sensors' thread for something needs the one permit. So that thread
-    /// has one request at a time to answer, and between two requests it waits for this thread.
-    pub(super) turns: Arc<Semaphore>,
     /// Ends the thread when it is dropped.
     ending: Option<oneshot::Sender<()>>,
     thread: Option<thread::JoinHandle<()>>,
@@ -40,7 +36,6 @@ impl Clients {
             })?;
         Ok(Self {
             runtime: handle,
-            turns: Arc::new(Semaphore::new(1)),
             ending: Some(ending),
             thread: Some(thread),
         })

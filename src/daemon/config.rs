@@ -2,128 +2,61 @@
 //!
 //! In: a TOML file. Out: a [`Setup`], which has the checked [`Config`], the sensors that it
 //! describes, and its model. An unknown key is an error, and so is a table of a feature that this
-//! program was built without. Each error names the file and the key, and what was found and
-//! expected. Paths in the file are relative to the file's directory.
+//! program was built without. Each error names the file, the line and the key, and what was found and
+//! expected. Paths in the file are relative to the file's directory. The core has the tables that
+//! describe a sensor.
 
 mod error;
 mod publish;
 mod check;
 mod parse;
-mod read;
+mod in_force;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::env;
-use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub use self::error::Error;
+use self::error::Problem;
+pub use self::error::{Error, Text};
 pub use self::publish::{
     Endpoint, EndpointError, Foxglove, Http, Listen, Mode, ModeError, Publish, Ros2, Tcp, Unix,
     Zenoh,
 };
-use self::read::Until;
 use super::log;
-use super::port::Port;
 use hardnessd_core::exit::{Coded, USAGE};
-use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{self, Format, Hrn};
-use hardnessd_core::{motion, press, tare, trial, wire};
+use hardnessd_core::range::from_to;
+use hardnessd_core::sensor::{self, Description, Sensor};
+use hardnessd_core::settings;
+use hardnessd_core::verdict::{self, BuiltIn, Format, Hrn};
+use hardnessd_core::{motion, press, trial};
 
-/// The whole configuration file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Config {
-    /// The name of the robot. The default is the name of the host.
-    #[serde(default = "host")]
-    pub robot: String,
-    /// The sensors that the daemon serves.
-    #[serde(default, rename = "sensor")]
-    pub sensors: Vec<SensorTable>,
-    /// The thresholds that begin and end a press.
-    #[serde(default)]
-    pub press: press::Settings,
-    /// The model that gives verdicts.
-    #[serde(default)]
-    pub model: Model,
-    /// The hardness levels, in place of the model's own. Without a table, they are the model's.
-    #[serde(default, rename = "level", skip_serializing_if = "Vec::is_empty")]
-    pub levels: Vec<LevelTable>,
-    /// All ways to publish events, except HTTP.
-    #[serde(default)]
-    pub publish: Publish,
-    /// The live page and the other HTTP routes. Without the table, they are off.
-    #[serde(default)]
-    pub http: Option<Http>,
-    /// The daemon's own recording. Without the table, it is off.
-    #[serde(default)]
-    pub record: Option<Record>,
-    /// The format of the log.
-    #[serde(default)]
-    pub log: log::Settings,
-}
-
-/// A `[[sensor]]` table. [`Description`] has the defaults of the keys that both have.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SensorTable {
-    /// The sensor's name: unique, and `[a-z][a-z0-9_]*`.
-    pub name: String,
-    /// The sensor's port. It has no default: [`Config::load`] refuses an empty path.
-    pub port: Port,
-    /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
-    pub baud: NonZeroU32,
-    /// The number of frames that the sensor is expected to send in a second.
-    pub frame_rate_hz: f64,
-    /// The silence after which a live sensor is stale, in milliseconds. The default is the larger
-    /// of 2.5 periods and 50 ms.
-    pub stale_after_ms: Option<f64>,
-    /// The layout of a frame in bytes.
-    pub frame: wire::Settings,
-    /// The calibration, which converts counts to newtons.
-    pub calibration: tare::Settings,
-    /// The arm that presses with the sensor.
-    pub arm: motion::Settings,
-    /// The file with presses of known pieces on this sensor, as `identify` makes it.
-    pub references: Option<PathBuf>,
-}
-
-impl Default for SensorTable {
-    fn default() -> Self {
-        let Description {
-            name,
-            frame_rate_hz,
-            stale_after_ms,
-            frame,
-            calibration,
-            arm,
-            ..
-        } = Description::default();
-        Self {
-            name,
-            port: PathBuf::new().into(),
-            baud: const { NonZeroU32::new(115_200).unwrap() },
-            frame_rate_hz,
-            stale_after_ms,
-            frame,
-            calibration,
-            arm,
-            references: None,
-        }
-    }
-}
-
-impl SensorTable {
-    /// A sensor at `port`, with the defaults of all other keys.
-    pub fn new(port: impl Into<Port>) -> Self {
-        Self {
-            port: port.into(),
-            ..Self::default()
-        }
+settings! {
+    /// The whole configuration file.
+    pub struct Config {
+        /// The name of the robot. The default is the name of the host.
+        pub robot: String = host();
+        /// The sensors that the daemon serves.
+        #[serde(rename = "sensor")]
+        pub sensors: Vec<sensor::Settings> = Vec::new();
+        /// The thresholds that begin and end a press.
+        pub press: press::Settings = press::Settings::default();
+        /// The model that gives verdicts.
+        pub model: verdict::Settings = verdict::Settings::default();
+        /// The hardness levels, in place of the model's own. Without a table, they are the model's.
+        #[serde(rename = "level", skip_serializing_if = "Vec::is_empty")]
+        pub levels: Vec<LevelTable> = Vec::new();
+        /// All ways to publish events, except HTTP.
+        pub publish: Publish = Publish::default();
+        /// The live page and the other HTTP routes. Without the table, they are off.
+        pub http: Option<Http>;
+        /// The daemon's own recording. Without the table, it is off.
+        pub record: Option<Record>;
+        /// The format of the log.
+        pub log: log::Settings = log::Settings::default();
     }
 }
 
@@ -137,89 +70,23 @@ pub struct LevelTable {
     pub shore: [f32; 2],
 }
 
-/// The models in the binary.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum BuiltIn {
-    /// The model of courses and references.
-    #[default]
-    Course,
-    /// The model that judges one frame, that of the largest contact area, as the paper does.
-    Hrn,
-}
+/// The largest number in `[record]`. As megabytes it is more than any disk has, and the number of
+/// bytes still fits in a `u64`. As seconds it is 31 years.
+const MOST: f64 = 1e9;
 
-impl BuiltIn {
-    /// The bytes of the model.
-    pub fn bytes(self) -> &'static [u8] {
-        match self {
-            Self::Course => verdict::BUILT_IN,
-            Self::Hrn => verdict::BUILT_IN_HRN,
-        }
-    }
-}
-
-/// The `[model]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Model {
-    /// The model in the binary that judges, unless a path names another.
-    pub built_in: BuiltIn,
-    /// The path of the ONNX file. The default is the built-in model.
-    pub path: Option<PathBuf>,
-    /// The SHA-256 hash that the model must have, in hex.
-    pub sha256: Option<String>,
-    /// A verdict below this confidence is rejected.
-    pub min_confidence: f32,
-    /// A verdict on a frame with less total force, in newtons, is rejected.
-    pub min_force_n: f64,
-    /// A model of the course gives an early verdict when its confidence reaches this value.
-    pub early_confidence: f32,
-}
-
-impl Default for Model {
-    fn default() -> Self {
-        let Description {
-            min_confidence,
-            min_force_n,
-            early_confidence,
-            ..
-        } = Description::default();
-        Self {
-            built_in: BuiltIn::default(),
-            path: None,
-            sha256: None,
-            min_confidence,
-            min_force_n,
-            early_confidence,
-        }
-    }
-}
-
-/// The `[record]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Record {
-    /// The directory of the recordings. [`Record::dir`] has the default.
-    dir: Option<PathBuf>,
-    /// Whether everything is recorded. If `false`, only the last minute before a fault is recorded.
-    pub continuous: bool,
-    /// When a file has this many million bytes, the next one begins.
-    pub rotate_mb: u64,
-    /// When a file is this many seconds old, the next one begins.
-    pub rotate_s: u64,
-    /// This many million bytes stay free on the disk. If fewer are free, nothing is written.
-    pub keep_free_mb: u64,
-}
-
-impl Default for Record {
-    fn default() -> Self {
-        Self {
-            dir: None,
-            continuous: true,
-            rotate_mb: 256,
-            rotate_s: 3600,
-            keep_free_mb: 1024,
-        }
+settings! {
+    /// The `[record]` table.
+    pub struct Record {
+        /// The directory of the recordings. [`Record::dir`] has the default.
+        dir: Option<PathBuf>;
+        /// Whether everything is recorded. If `false`, only the last minute before a fault is recorded.
+        pub continuous: bool = true;
+        /// When a file has this many million bytes, the next one begins.
+        pub rotate_mb: u64 = 256, in from_to((1.0, MOST), "");
+        /// When a file is this many seconds old, the next one begins.
+        pub rotate_s: u64 = 3600, in from_to((1.0, MOST), "");
+        /// This many million bytes stay free on the disk. If fewer are free, nothing is written.
+        pub keep_free_mb: u64 = 1024, in from_to((0.0, MOST), "");
     }
 }
 
@@ -235,7 +102,7 @@ impl Record {
 
 /// The directory that systemd names in this variable: the first of several, between which it writes
 /// colons.
-fn directory_of_service(variable: &str) -> Option<PathBuf> {
+pub(super) fn directory_of_service(variable: &str) -> Option<PathBuf> {
     let directories = env::var(variable).ok()?;
     let first = directories.split(':').next()?;
     (!first.is_empty()).then(|| PathBuf::from(first))
@@ -250,17 +117,10 @@ fn host() -> String {
 
 impl Config {
     /// The default configuration with `sensors`.
-    pub fn new(sensors: Vec<SensorTable>) -> Self {
+    pub fn new(sensors: Vec<sensor::Settings>) -> Self {
         Self {
-            robot: host(),
             sensors,
-            press: press::Settings::default(),
-            model: Model::default(),
-            levels: Vec::new(),
-            publish: Publish::default(),
-            http: None,
-            record: None,
-            log: log::Settings::default(),
+            ..Self::default()
         }
     }
 
@@ -274,83 +134,46 @@ impl Config {
         self
     }
 
-    /// Reads a file, but does not check its values. [`Self::check`] does.
+    /// Reads a file and checks every value.
     ///
     /// # Errors
     ///
-    /// Returns an [`Error`] if the file cannot be read or is not TOML, if it has an unknown key, a
-    /// value of another type or a path that cannot be used, or if a file of gains cannot be used.
+    /// Returns an [`Error`] if the file cannot be read or is not TOML, if it has an unknown key, or a
+    /// value that cannot be used, or if a file of gains cannot be used.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        parse::load(path, None).map_err(Error::at(path))
-    }
-
-    /// Checks every value, and whether the values fit together. Returns the sensors in their order.
-    /// `path` is only for messages.
-    ///
-    /// # Errors
-    ///
-    /// Returns an [`Error`] for the first value that cannot be used.
-    pub fn check(&self, path: &Path) -> Result<Vec<Sensor>, Error> {
-        check::check(self).map_err(Error::at(path))
+        let (config, text) = parse::load(path)?;
+        let checked = check::check(&config);
+        checked.map(|_| config).map_err(Error::at(path, &text))
     }
 
     /// The description of `sensor`, composed from all tables of the file.
-    pub(crate) fn describe(&self, sensor: &SensorTable) -> Description {
+    fn describe(&self, sensor: &sensor::Settings) -> Description {
         Description {
-            name: sensor.name.clone(),
-            frame_rate_hz: sensor.frame_rate_hz,
-            stale_after_ms: sensor.stale_after_ms,
-            frame: sensor.frame.clone(),
-            calibration: sensor.calibration.clone(),
+            sensor: sensor.clone(),
             press: self.press.clone(),
-            arm: sensor.arm.clone(),
-            min_confidence: self.model.min_confidence,
-            min_force_n: self.model.min_force_n,
-            early_confidence: self.model.early_confidence,
+            model: self.model.clone(),
         }
     }
 
     /// The first key that differs between `self` and `other` and that only a restart can change. This
-    /// is any key but those that are named here as taken over by a running daemon.
+    /// is any key but those of the tables that are named here.
     pub fn fixed_difference(&self, other: &Self) -> Option<String> {
-        let fixed = |config: &Self, others: &Self| Self {
-            press: others.press.clone(),
-            model: others.model.clone(),
-            levels: others.levels.clone(),
-            log: others.log,
+        let fixed = |config: &Self| Self {
             sensors: Vec::new(),
+            press: press::Settings::default(),
+            model: verdict::Settings::default(),
+            levels: Vec::new(),
+            log: log::Settings::default(),
             ..config.clone()
         };
-        let fixed_of_sensor = |sensor: &SensorTable, others: &SensorTable| SensorTable {
-            stale_after_ms: others.stale_after_ms,
-            calibration: others.calibration.clone(),
-            arm: others.arm.clone(),
-            references: others.references.clone(),
-            ..sensor.clone()
-        };
-        let mut of_sensors = self.sensors.iter().filter_map(|ours| {
-            let theirs = other
-                .sensors
-                .iter()
-                .find(|theirs| theirs.name == ours.name)?;
-            let key = difference(ours, &fixed_of_sensor(theirs, ours))?;
-            Some(format!("sensor.{key} of {:?}", ours.name))
-        });
-        let of_tables = difference(&fixed(self, self), &fixed(other, self));
-        of_sensors
-            .next()
-            .or(of_tables)
-            .or_else(|| self.fixed_names(other))
+        difference(&fixed(self), &fixed(other)).or_else(|| self.fixed_names(other))
     }
 
     /// The key of a publisher that announces the names of the sensors once, if they differ.
     fn fixed_names(&self, other: &Self) -> Option<String> {
         let names = |config: &Self| -> BTreeSet<String> {
-            config
-                .sensors
-                .iter()
-                .map(|sensor| sensor.name.clone())
-                .collect()
+            let sensors = config.sensors.iter();
+            sensors.map(|sensor| sensor.name.clone()).collect()
         };
         let publish = &self.publish;
         let announcing = [
@@ -390,6 +213,8 @@ pub struct Setup {
     pub sensors: Vec<Sensor>,
     /// The model that the configuration names.
     pub hrn: Arc<Hrn>,
+    /// The text of the configuration.
+    pub text: Text,
     /// The model with the references of the sensors that have some.
     identified: BTreeMap<String, Arc<Hrn>>,
 }
@@ -441,6 +266,7 @@ impl Setup {
     pub fn model_needs(&self) -> &'static str {
         match self.hrn.format() {
             Format::Frame => "judges single frames, needs no arm",
+            Format::Parts => "judges whole presses on the sensor's own grid, needs no arm",
             Format::Course { .. } if self.hrn.most_references() > 0 => {
                 "judges whole presses, best with the arm's positions and with references of each sensor"
             }
@@ -453,14 +279,16 @@ impl Setup {
     /// The keys of the configuration that are set and change no verdict of this model.
     pub fn without_effect(&self) -> Vec<String> {
         let Config { press, model, .. } = &self.config;
-        let (press_default, model_default) = (press::Settings::default(), Model::default());
+        let (press_default, model_default) =
+            (press::Settings::default(), verdict::Settings::default());
         let takes_none = self.hrn.most_references() == 0;
         let sensors = self.config.sensors.iter();
         let given = sensors.filter(|sensor| takes_none && sensor.references.is_some());
         let references = given.map(|sensor| format!("sensor.references of {:?}", sensor.name));
         match self.hrn.format() {
-            Format::Frame => {
-                let described = |sensor: &&SensorTable| sensor.arm != motion::Settings::default();
+            Format::Frame | Format::Parts => {
+                let described =
+                    |sensor: &&sensor::Settings| sensor.arm != motion::Settings::default();
                 let arms = self.config.sensors.iter().filter(described);
                 let arms = arms.map(|sensor| format!("sensor.arm of {:?}", sensor.name));
                 let early = model.early_confidence != model_default.early_confidence;
@@ -481,42 +309,48 @@ impl Setup {
     ///
     /// Returns the errors of [`Config::load`] and [`Self::of`].
     pub fn load(path: &Path, model: Option<&Path>) -> Result<Self, Error> {
-        let config = Config::load(path)?;
-        Self::of(config.with_model(model), path)
+        let (config, text) = parse::load(path)?;
+        Self::of_text(config.with_model(model), path, text)?.checked(path)
     }
 
-    /// Reads a configuration and its model, but does not wait longer than `until` for a program that
-    /// writes a file of them.
-    pub(super) fn load_until(
-        path: &Path,
-        model: Option<&Path>,
-        until: Instant,
-    ) -> Result<Self, Error> {
-        let config = parse::load(path, Some(until)).map_err(Error::at(path))?;
-        Self::of_until(config.with_model(model), path, Some(until))
+    /// Refuses a sensor of another array than that of a model with a grid of its own. The sensors of a
+    /// recording are not those of the configuration, so [`Self::of`] does not.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error that names the first such sensor.
+    pub fn checked(self, path: &Path) -> Result<Self, Error> {
+        for sensor in &self.sensors {
+            let checked = self.hrn.card().check_array(sensor.layout().array());
+            checked.map_err(|error| {
+                let problem = format!("sensor {:?}: {error}", sensor.name());
+                Error::at(path, &self.text)(Problem::because("model.path", problem))
+            })?;
+        }
+        Ok(self)
     }
 
     /// Checks `config` and loads its model. `path` is only for messages.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Config::check`], and an error if the model cannot be read or is
-    /// refused.
+    /// Returns an [`Error`] for the first value that cannot be used, and an error if the model cannot
+    /// be read or is refused.
     pub fn of(config: Config, path: &Path) -> Result<Self, Error> {
-        Self::of_until(config, path, None)
+        Self::of_text(config, path, Text::default())
     }
 
-    fn of_until(config: Config, path: &Path, until: Until) -> Result<Self, Error> {
-        let sensors = config.check(path)?;
+    fn of_text(config: Config, path: &Path, text: Text) -> Result<Self, Error> {
+        let sensors = check::check(&config).map_err(Error::at(path, &text))?;
         let rates = config.sensors.iter().map(|sensor| sensor.frame_rate_hz);
         let most = trial::verdict_most(rates.fold(0.0, f64::max));
-        let hrn = parse::model(&config, most, until).map_err(Error::at(path))?;
+        let hrn = parse::model(&config, most).map_err(Error::at(path, &text))?;
         let hrn = Arc::new(hrn);
         let mut identified = BTreeMap::new();
-        for sensor in &config.sensors {
+        for (index, sensor) in config.sensors.iter().enumerate() {
             if let Some(file) = &sensor.references {
-                let own = parse::identified(&hrn, file, &sensor.name, until);
-                let own = own.map_err(Error::at(path))?;
+                let own = parse::identified(&hrn, file, (index, sensor));
+                let own = own.map_err(Error::at(path, &text))?;
                 identified.insert(sensor.name.clone(), Arc::new(own));
             }
         }
@@ -524,6 +358,7 @@ impl Setup {
             config,
             sensors,
             hrn,
+            text,
             identified,
         })
     }
@@ -533,6 +368,26 @@ impl Setup {
         self.identified
             .iter()
             .map(|(name, hrn)| (name.as_str(), hrn))
+    }
+
+    /// Whether a sensor runs on with the tables of `other`: its own and `[press]` are the same.
+    pub(super) fn is_same(&self, other: &Self, sensor: &str) -> bool {
+        let table = |setup: &Self| {
+            let mut sensors = setup.config.sensors.iter();
+            let own = sensors.find(|table| table.name == sensor)?;
+            let at_its_port = setup
+                .config
+                .sensors
+                .iter()
+                .filter(|one| one.port == own.port);
+            Some((own.clone(), at_its_port.cloned().collect::<Vec<_>>()))
+        };
+        self.config.press == other.config.press && table(self) == table(other)
+    }
+
+    /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.
+    pub fn ignores_references_of(&self, sensor: &str) -> bool {
+        self.hrn_of(sensor).known_references().are_ignored()
     }
 
     /// The model for the presses of a sensor.

@@ -8,7 +8,7 @@
 //! accepts data from a viewer, so a viewer cannot change anything. One thread does all this.
 
 use std::collections::BTreeMap;
-use std::io;
+use std::fmt::Display;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,31 +22,13 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
-use super::config;
+use super::config::{self, Config};
 use super::hub::Line;
+use super::publish::Error;
 use super::relay::Worker;
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Entry, Found, MOTION};
-use hardnessd_core::ros;
-
-/// The reason the server could not start.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The daemon cannot listen on the address.
-    #[error("publish.foxglove.listen: cannot listen on {address}: {source}")]
-    Listen {
-        /// The configured address.
-        address: SocketAddr,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// The library failed. The message is the library's own.
-    #[error("publish.foxglove: {0}")]
-    Server(#[from] FoxgloveError),
-    /// The system could not start the thread or its runtime.
-    #[error("no thread for publish.foxglove: {0}")]
-    Thread(#[from] io::Error),
-}
+use hardnessd_core::{ros, sensor};
 
 /// The most messages that wait for a viewer, about 1 MB. When there are more, the oldest are
 /// dropped.
@@ -56,7 +38,7 @@ const BACKLOG: usize = 512;
 /// the next event.
 const NEWCOMERS: usize = 64;
 
-/// The most lines of positions and new settings that wait for the thread. When there are more, they are
+/// The most lines of positions that wait for the thread. When there are more, they are
 /// dropped.
 const ENTRIES: usize = 256;
 
@@ -68,28 +50,23 @@ const LAST_MESSAGES: Duration = Duration::from_millis(50);
 /// cannot be notified, and would keep the server waiting.
 const FAREWELL: Duration = Duration::from_millis(200);
 
-/// The name and the taxel distance of a sensor, which its topics need.
-pub(super) struct Sensor {
-    pub(super) name: String,
-    pub(super) pitch: Pitch,
-}
-
 /// Listens as `settings` say and announces the topics of `sensors`. Also returns the queue for the
-/// positions of the arm and for new settings.
+/// positions of the arm.
 ///
 /// # Errors
 ///
 /// Fails if the daemon cannot listen on the address, or the library fails.
 pub(super) fn open(
     settings: &config::Foxglove,
-    robot: &str,
-    sensors: Vec<Sensor>,
-) -> Result<(Worker<Vec<Line>>, mpsc::Sender<Found>), Error> {
-    let (address, robot) = (settings.listen, robot.to_owned());
+    config: &Config,
+) -> Result<(Worker, mpsc::Sender<Found>), Error> {
+    let (address, robot) = (settings.listen, config.robot.clone());
+    let pitch = |sensor: &sensor::Settings| (sensor.name.clone(), sensor.calibration.pitch_mm);
+    let pitches: BTreeMap<_, _> = config.sensors.iter().map(pitch).collect();
     let (viewers, entries) = mpsc::channel(ENTRIES);
     let worker = Worker::start(
         "foxglove",
-        move |_, _| Foxglove::open(address, &robot, &sensors),
+        move |_| Foxglove::open(address, &robot, pitches),
         |foxglove: Foxglove, lines| foxglove.work(lines, entries),
     )?;
     Ok((worker, viewers))
@@ -122,26 +99,33 @@ struct Foxglove {
 }
 
 impl Foxglove {
-    fn open(address: SocketAddr, robot: &str, sensors: &[Sensor]) -> Result<Self, Error> {
+    fn open(
+        address: SocketAddr,
+        robot: &str,
+        pitches: BTreeMap<String, Pitch>,
+    ) -> Result<Self, Error> {
         let context = Context::new();
-        let topics = Topics::new(&context, sensors)?;
-        let (door, newcomers) = mpsc::channel(NEWCOMERS);
+        let topics = Topics::new(&context, pitches).map_err(failed)?;
+        let (queue, newcomers) = mpsc::channel(NEWCOMERS);
         let host = match address.ip() {
             IpAddr::V4(ip) => ip.to_string(),
             IpAddr::V6(ip) => format!("[{ip}]"),
         };
-        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let runtime = Builder::new_current_thread().enable_all().build();
+        let runtime = runtime.map_err(failed)?;
         let server = WebSocketServer::new()
             .name(format!("hardnessd of {robot}"))
             .bind(host, address.port())
             .context(&context)
             .message_backlog_size(BACKLOG)
-            .listener(Arc::new(Door(door)));
+            .listener(Arc::new(Newcomers(queue)));
         let server = runtime
             .block_on(server.start())
             .map_err(|error| match error {
-                FoxgloveError::Bind(source) => Error::Listen { address, source },
-                other => other.into(),
+                FoxgloveError::Bind(error) => Error::io(format!(
+                    "publish.foxglove.listen: cannot listen on {address}: {error}"
+                )),
+                other => failed(other),
             })?;
         let address = SocketAddr::new(address.ip(), server.port());
         info!(way = "foxglove", %address, "listening");
@@ -154,7 +138,7 @@ impl Foxglove {
         })
     }
 
-    fn work(self, mut lines: mpsc::Receiver<Vec<Line>>, mut entries: mpsc::Receiver<Found>) {
+    fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>, mut entries: mpsc::Receiver<Found>) {
         let Self {
             mut topics,
             mut newcomers,
@@ -184,10 +168,17 @@ impl Foxglove {
     }
 }
 
+fn failed(error: impl Display) -> Error {
+    Error::io(format!("publish.foxglove: {error}"))
+}
+
 impl Topics {
-    fn new(context: &Arc<Context>, sensors: &[Sensor]) -> Result<Self, FoxgloveError> {
+    fn new(
+        context: &Arc<Context>,
+        pitches: BTreeMap<String, Pitch>,
+    ) -> Result<Self, FoxgloveError> {
         let mut channels = BTreeMap::new();
-        for sensor in sensors {
+        for sensor in pitches.keys() {
             for topic in [
                 ros::FRAME,
                 ros::GRID,
@@ -197,7 +188,7 @@ impl Topics {
                 ros::STATUS,
                 MOTION,
             ] {
-                let name = topic.of(&sensor.name);
+                let name = topic.of(sensor);
                 let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
                 let channel = ChannelBuilder::new(name.clone())
                     .message_encoding("cdr")
@@ -207,17 +198,16 @@ impl Topics {
                 channels.insert(name, channel);
             }
         }
-        let pitches = sensors.iter().map(|s| (s.name.clone(), s.pitch));
         Ok(Self {
             channels,
             last: BTreeMap::new(),
-            pitches: pitches.collect(),
+            pitches,
         })
     }
 
     fn publish(&mut self, line: &Line) {
         let Some(event) = &line.event else {
-            warn!(gap = line.json.trim_end(), "foxglove is too slow");
+            warn!(gap = line.json().trim_end(), "foxglove is too slow");
             return;
         };
         let Some(&pitch) = self.pitches.get(event.sensor()) else {
@@ -236,11 +226,11 @@ impl Topics {
         }
     }
 
-    /// Sends positions of the arm, or uses the taxel distance of new settings from now on.
+    /// Sends positions of the arm, or learns the distance of the taxels of a sensor that began anew.
     fn follow(&mut self, found: &Found) {
-        if let Entry::Settings(settings) = &found.entry {
-            let pitch = settings.description.calibration.pitch_mm;
-            self.pitches.insert(found.sensor.clone(), pitch);
+        if let Entry::State(state) = &found.entry {
+            let pitch_mm = state.sensor.description.sensor.calibration.pitch_mm;
+            self.pitches.insert(found.sensor.clone(), pitch_mm);
             return;
         }
         let (topic, bytes) = found.message();
@@ -269,9 +259,9 @@ impl Message {
 }
 
 /// The listener that passes new subscriptions of viewers on to the thread.
-struct Door(mpsc::Sender<(String, SinkId)>);
+struct Newcomers(mpsc::Sender<(String, SinkId)>);
 
-impl ServerListener for Door {
+impl ServerListener for Newcomers {
     fn on_subscribe(&self, client: Client, channel: ChannelView<'_>) {
         if let Some(viewer) = client.sink_id() {
             // When too many wait, the viewer begins with the next event.

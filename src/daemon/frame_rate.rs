@@ -1,8 +1,7 @@
 //! Notices a sensor that sends frames at another rate than its configuration says.
 //!
-//! In: the moments at which frames arrive, and what the pipeline knows of a slow sensor. Out: the rate, once,
-//! if it differs much. A wrong rate makes
-//! the sensor stale too early or too late, and the time of a press wrong for a model of whole presses.
+//! In: the moments at which frames arrive. Out: the rate, once, if it differs much. A wrong rate makes the
+//! sensor stale too early or too late, and the time of a press wrong for a model of whole presses.
 
 use std::time::Duration;
 
@@ -24,21 +23,15 @@ pub(super) struct FrameRate {
 
 impl FrameRate {
     /// Takes in `frames` frames that arrived at `now`. Returns the measured rate in frames/s if it is
-    /// not `configured_hz`, the first time only. `slow_hz` is the rate of a sensor that is known to be
-    /// slow, after a few frames already.
+    /// not `configured_hz`, the first time only.
     pub(super) fn differs(
         &mut self,
         frames: u32,
         now: Duration,
         configured_hz: f64,
-        slow_hz: Option<f64>,
     ) -> Option<f64> {
         if self.is_reported || frames == 0 {
             return None;
-        }
-        if slow_hz.is_some() {
-            self.is_reported = true;
-            return slow_hz;
         }
         let pause = self.last.replace(now).map(|last| now.saturating_sub(last));
         match pause {
@@ -73,7 +66,7 @@ mod tests {
             if number % 20 == 0 {
                 now += Duration::from_secs(5);
             }
-            frame_rate.differs(at_once, now, configured_hz, None)
+            frame_rate.differs(at_once, now, configured_hz)
         });
         chunks.collect()
     }
@@ -92,9 +85,5 @@ mod tests {
                 assert!((reported[0] / real_hz - 1.0).abs() < 0.01, "{reported:?}");
             }
         }
-        // A sensor that is known to be slow is reported at once.
-        let mut frame_rate = FrameRate::default();
-        let mut reported = || frame_rate.differs(1, Duration::ZERO, 100.0, Some(10.0));
-        assert_eq!([reported(), reported()], [Some(10.0), None]);
     }
 }

@@ -1,8 +1,9 @@
-//! The read-only HTTP server: the live page, server-sent events, status, metrics and health.
+//! The HTTP server: the live page, server-sent events, status, metrics and health.
 //!
 //! Every request passes the same checks: its Host header names this machine by an address, its
-//! target is short, and its method only reads. No route changes anything or waits for a slow
-//! reader, and the number of connections is bounded. `/events` subscribes to the hub as any
+//! target is short, and its method only reads. No route waits for a slow reader, and the number of
+//! connections is bounded. No route changes anything, but for the context of a sensor, where the
+//! configuration allows it. `/events` subscribes to the hub as any
 //! subscriber does.
 
 mod events;
@@ -12,37 +13,32 @@ mod status;
 
 use std::convert::Infallible;
 use std::fmt::Display;
-use std::io::{self, ErrorKind, Write as _};
+use std::io::Write as _;
 use std::net::SocketAddr;
-use std::os::fd::AsFd as _;
 use std::pin::pin;
-use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use axum::Router;
-use axum::extract::State;
+use axum::body::Bytes;
+use axum::extract::{DefaultBodyLimit, State};
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use base64::prelude::{BASE64_STANDARD, Engine};
-use bytes::Bytes;
 use hyper::body::Incoming;
-use hyper::header::{self, HeaderName, HeaderValue};
+use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
 use hyper::{Method, Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
-use rustix::net::sockopt;
 use sha2::{Digest, Sha256};
-use tokio::io::Interest;
 use tokio::net::TcpStream;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
-use super::hub::{self, Closed};
-use super::sensor::{Sensors, Vitals};
-use super::snapshot::{Snapshot, Snapshots};
+use super::client::set_context;
+use super::hub::{Closed, Hub};
+use super::sensor::Sensors;
 use hardnessd_core::event::LinkState;
 
 /// The live page: one file, which loads nothing from elsewhere.
@@ -55,12 +51,11 @@ const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 /// The most bytes that wait in a connection, in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
 
-/// The most bytes of texts that connections may keep waiting together. All who ask at about the same
-/// time share one text, so a client that reads never needs much of this.
-const MOST_TEXT_BYTES: usize = 16 << 20;
+/// The path at which the page sets a context.
+const CONTEXT: &str = "/api/context";
 
-/// A connection whose other end takes nothing for this long is closed.
-const UNREAD_PATIENCE: Duration = Duration::from_secs(30);
+/// The longest body of a request: a context has less than 1 KiB.
+const BODY_BYTES: usize = 2048;
 
 /// How long the pipelines may take to answer.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -86,39 +81,24 @@ pub(crate) struct Http {
     /// The address that the server listens on.
     listen: SocketAddr,
     routes: TowerToHyperService<Router>,
+    /// Whether the page may set a context.
+    sets_context: bool,
     stop: Stop,
-}
-
-/// The sources of the answers.
-#[derive(Debug, Clone)]
-struct Sources {
-    hub: hub::Handle,
-    snapshots: Snapshots,
-    turns: Arc<Semaphore>,
-    /// The snapshots of `/metrics` and `/api/status`.
-    texts: Snapshots,
-    /// One permit for each byte of the texts that exist.
-    text_bytes: Arc<Semaphore>,
 }
 
 impl Http {
     /// The most connections at a time. A page has two or three.
     pub(crate) const MOST_CONNECTIONS: usize = 128;
 
-    pub(crate) fn new(
-        listen: SocketAddr,
-        hub: hub::Handle,
-        sensors: Sensors,
-        snapshots: Snapshots,
-        turns: Arc<Semaphore>,
-        stop: Stop,
-    ) -> Self {
+    /// The server at `listen`. The page may set the context of `sensors`, if they are given.
+    pub(crate) fn new(listen: SocketAddr, hub: Hub, sensors: Option<Sensors>, stop: Stop) -> Self {
+        let sets_context = sensors.is_some();
         let policy = HeaderValue::try_from(page_policy(PAGE)).expect("base64 is ASCII");
         let page = ([(header::CONTENT_SECURITY_POLICY, policy)], Html(PAGE));
-        let routes = Router::new()
+        let mut routes = Router::new()
             .route("/", get(async || page))
             .route("/events", get(events::answer))
-            .route("/api/status", get(status))
+            .route("/api/status", get(async move |hub| status(hub, sets_context).await))
             .route("/api/history", get(history))
             .route("/metrics", get(metrics))
             .route("/livez", get(live))
@@ -128,17 +108,15 @@ impl Http {
                     StatusCode::NOT_FOUND,
                     "not found: the paths are /, /events, /api/status, /api/history, /metrics, /livez and /readyz",
                 )
-            })
-            .with_state(Sources {
-                texts: Snapshots::new(hub.clone(), sensors),
-                hub,
-                snapshots,
-                turns,
-                text_bytes: Arc::new(Semaphore::new(MOST_TEXT_BYTES)),
             });
+        if let Some(sensors) = sensors {
+            let set = post(async move |headers, body| context(&sensors, headers, body).await);
+            routes = routes.route(CONTEXT, set.layer(DefaultBodyLimit::max(BODY_BYTES)));
+        }
         Self {
             listen,
-            routes: TowerToHyperService::new(routes),
+            routes: TowerToHyperService::new(routes.with_state(hub)),
+            sets_context,
             stop,
         }
     }
@@ -152,7 +130,7 @@ impl Http {
         } else if head_bytes(&request) > BUFFER_BYTES {
             let message = format!("the head is longer than {BUFFER_BYTES} bytes");
             refusal(StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE, message)
-        } else if ![Method::GET, Method::HEAD].contains(request.method()) {
+        } else if !self.allows(&request) {
             let message = "method not allowed: this server is read-only: use GET or HEAD";
             let allow = [(header::ALLOW, "GET, HEAD")];
             (allow, refusal(StatusCode::METHOD_NOT_ALLOWED, message)).into_response()
@@ -169,6 +147,33 @@ impl Http {
             .or_insert(HeaderValue::from_static(POLICY));
         response
     }
+
+    fn allows(&self, request: &Request<Incoming>) -> bool {
+        let is_context = self.sets_context && request.uri().path() == CONTEXT;
+        match *request.method() {
+            Method::GET | Method::HEAD => true,
+            Method::POST => is_context,
+            _ => false,
+        }
+    }
+}
+
+/// Sets the context of a sensor. A page from elsewhere cannot send this type of content without a question
+/// first, and gets no answer to that.
+async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response {
+    if headers
+        .get(header::CONTENT_TYPE)
+        .is_none_or(|kind| kind != "application/json")
+    {
+        let why = "Content-Type: expected application/json";
+        return refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, why);
+    }
+    let read = serde_json::from_slice(&body).map_err(|error| error.to_string());
+    let set = async { set_context(sensors, read?).await }.await;
+    match set {
+        Ok(()) => text("application/json", "{}".to_owned()),
+        Err(why) => refusal(StatusCode::BAD_REQUEST, why),
+    }
 }
 
 /// The bytes of a request's head. hyper's own bound holds for what it has not parsed yet, so a head
@@ -182,32 +187,6 @@ fn head_bytes(request: &Request<Incoming>) -> usize {
     target + headers.sum::<usize>()
 }
 
-/// A second handle of the socket of a request's connection. An answer without end watches it.
-#[derive(Debug, Clone)]
-struct Client(Arc<TcpStream>);
-
-impl Client {
-    fn of(stream: &TcpStream) -> io::Result<Self> {
-        let socket = stream.as_fd().try_clone_to_owned()?;
-        Ok(Self(Arc::new(TcpStream::from_std(socket.into())?)))
-    }
-
-    /// Waits until the client has closed its end. hyper does not notice it while bytes of a further
-    /// request wait in its buffer.
-    async fn gone(&self) -> io::Error {
-        loop {
-            match self.0.ready(Interest::READABLE).await {
-                Ok(ready) if ready.is_read_closed() => return ErrorKind::ConnectionAborted.into(),
-                Ok(_) => {}
-                Err(error) => return error,
-            }
-            // These bytes are for hyper. This waits for the next change of the socket.
-            let pass = || Err::<(), _>(ErrorKind::WouldBlock.into());
-            let _ = self.0.try_io(Interest::READABLE, pass);
-        }
-    }
-}
-
 /// An answer with an error code and one line with the reason.
 fn refusal(code: StatusCode, why: impl Display) -> Response {
     (code, format!("{why}\n")).into_response()
@@ -219,132 +198,60 @@ impl IntoResponse for Closed {
     }
 }
 
-/// A text that all who asked for it at about the same time share.
-#[derive(Debug)]
-pub(super) struct Text {
-    text: String,
-    /// The text's share of [`MOST_TEXT_BYTES`].
-    _bytes: OwnedSemaphorePermit,
+fn text(content_type: &'static str, text: String) -> Response {
+    ([(header::CONTENT_TYPE, content_type)], text).into_response()
 }
 
-impl Text {
-    /// Returns `None` if the connections keep too many texts waiting.
-    fn new(text: String, text_bytes: &Arc<Semaphore>) -> Option<Self> {
-        let bytes = reserve(text.len(), text_bytes)?;
-        Some(Self {
-            text,
-            _bytes: bytes,
-        })
-    }
-}
-
-/// The share of a text of this length. `None` if the connections keep too many texts waiting.
-fn reserve(bytes: usize, text_bytes: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
-    let bytes = u32::try_from(bytes).ok()?;
-    Arc::clone(text_bytes).try_acquire_many_owned(bytes).ok()
-}
-
-impl AsRef<[u8]> for Text {
-    fn as_ref(&self) -> &[u8] {
-        self.text.as_bytes()
-    }
-}
-
-/// An answer with the text in `place`, which `encode` makes of the snapshot once.
-fn shared(
-    content_type: &'static str,
-    snapshot: &Snapshot,
-    place: &OnceLock<Option<Bytes>>,
-    encode: fn(&Snapshot) -> String,
-    text_bytes: &Arc<Semaphore>,
-) -> Response {
-    let made = place.get_or_init(|| Text::new(encode(snapshot), text_bytes).map(Bytes::from_owner));
-    match made {
-        Some(text) => ([(header::CONTENT_TYPE, content_type)], text.clone()).into_response(),
-        None => full(),
-    }
-}
-
-async fn status(State(of): State<Sources>) -> Result<Response, Closed> {
-    let now = of.texts.recent().await?;
-    let encode = |now: &Snapshot| status::json(&now.survey, &now.vitals);
-    Ok(shared(
-        "application/json",
-        &now,
-        &now.status,
-        encode,
-        &of.text_bytes,
-    ))
+async fn status(State(hub): State<Hub>, sets_context: bool) -> Result<Response, Closed> {
+    let now = hub.snapshot().await?;
+    Ok(text("application/json", status::json(&now, sets_context)))
 }
 
 /// The force and contact area of one sensor in the last two minutes. The query names the sensor.
 async fn history(
-    State(of): State<Sources>,
+    State(hub): State<Hub>,
     request: axum::extract::Request,
 ) -> Result<Response, Closed> {
     let query = request.uri().query().unwrap_or_default();
     let mut pairs = form_urlencoded::parse(query.as_bytes());
     let sensor = pairs.find(|(key, _)| key == "sensor");
     let sensor = sensor.map_or(String::new(), |(_, sensor)| sensor.into_owned());
-    let _turn = of.turns.acquire().await;
-    let Some(history) = of.hub.history(sensor.clone()).await? else {
+    let Some(history) = hub.history(sensor.clone()).await? else {
         let why = format!("sensor: found {sensor:?}, expected the name of a sensor");
         return Ok(refusal(StatusCode::NOT_FOUND, why));
     };
-    let line = history.line(&sensor).json.to_string();
-    let text = Text::new(line, &of.text_bytes).map(Bytes::from_owner);
-    let content_type = [(header::CONTENT_TYPE, "application/json")];
-    Ok(match text {
-        Some(text) => (content_type, text).into_response(),
-        None => full(),
-    })
+    let line = history.line(&sensor).json().to_owned();
+    Ok(text("application/json", line))
 }
 
-/// The refusal when the connections keep too many texts waiting.
-fn full() -> Response {
-    refusal(
-        StatusCode::SERVICE_UNAVAILABLE,
-        "too many answers wait to be read: try later",
-    )
+async fn metrics(State(hub): State<Hub>) -> Result<Response, Closed> {
+    let now = hub.snapshot().await?;
+    Ok(text(metrics::CONTENT_TYPE, metrics::encode(&now)))
 }
 
-async fn metrics(State(of): State<Sources>) -> Result<Response, Closed> {
-    let now = of.texts.recent().await?;
-    let encode = |now: &Snapshot| metrics::encode(&now.survey, &now.vitals);
-    Ok(shared(
-        metrics::CONTENT_TYPE,
-        &now,
-        &now.metrics,
-        encode,
-        &of.text_bytes,
-    ))
-}
-
-/// Makes the same check as the watchdog.
-async fn live(State(of): State<Sources>) -> Response {
-    match tokio::time::timeout(PATIENCE, of.snapshots.current()).await {
-        Ok(Ok(now)) if now.is_whole => "ok: every pipeline answers\n".into_response(),
+/// Makes the same check as the watchdog: the sensors' thread works.
+async fn live(State(hub): State<Hub>) -> Response {
+    match tokio::time::timeout(PATIENCE, hub.snapshot()).await {
+        Ok(Ok(_)) => "ok: the pipelines answer\n".into_response(),
         _ => refusal(
             StatusCode::SERVICE_UNAVAILABLE,
-            "a pipeline does not answer",
+            "the pipelines do not answer",
         ),
     }
 }
 
-async fn ready(State(of): State<Sources>) -> Result<impl IntoResponse, Closed> {
-    let now = of.snapshots.current().await?;
+async fn ready(State(hub): State<Hub>) -> Result<impl IntoResponse, Closed> {
+    let now = hub.snapshot().await?;
     let mut lines = String::new();
-    let mut ready = now.is_whole;
-    for Vitals { status, .. } in &now.vitals {
-        ready &= status.state == LinkState::Live;
+    let mut code = StatusCode::OK;
+    for sensor in &now.sensors {
+        let status = &sensor.state.status;
+        if status.state != LinkState::Live {
+            code = StatusCode::SERVICE_UNAVAILABLE;
+        }
         let state = hardnessd_core::event::name(&status.state);
         lines += &format!("{} {state}\n", status.sensor);
     }
-    let code = if ready {
-        StatusCode::OK
-    } else {
-        StatusCode::SERVICE_UNAVAILABLE
-    };
     Ok((code, lines))
 }
 
@@ -352,16 +259,12 @@ impl Serve<TcpStream> for Http {
     fn serve(&self, stream: TcpStream) -> impl Future<Output = ()> + Send + 'static {
         let http = self.clone();
         async move {
-            let (Ok(local), Ok(client)) = (stream.local_addr(), Client::of(&stream)) else {
+            let Ok(local) = stream.local_addr() else {
                 return;
             };
-            // The system closes it then. On failure it stays open.
-            let _ = sockopt::set_tcp_user_timeout(&stream, UNREAD_PATIENCE.as_millis() as u32);
             let mut stop = http.stop.clone();
-            let service = service_fn(async |mut request: Request<Incoming>| {
-                request.extensions_mut().insert(client.clone());
-                Ok::<_, Infallible>(http.respond(request, local).await)
-            });
+            let service =
+                service_fn(async |request| Ok::<_, Infallible>(http.respond(request, local).await));
             let mut connection = pin!(
                 http1::Builder::new()
                     .timer(TokioTimer::new())

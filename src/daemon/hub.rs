@@ -1,302 +1,217 @@
-//! The hub, which numbers events, holds them and hands them to subscribers.
+//! The hub: a log of events that subscribers read, each from its own place on.
 //!
-//! In: events of the sensors, in the order in which they happen. Out: lines. Each line is
-//! serialised once and shared by all subscribers that want it. Subscribers fetch their lines, so a
-//! slow subscriber costs a bounded queue and does not delay the others. When its queue is full, the
-//! oldest event is dropped and counted, and a `gap` reports the number before the next event. This
-//! file has no clock and no channel: [`task`] has both.
+//! In: events of the sensors, in the order in which they happen, and the current state of each
+//! sensor. Out: lines, each formatted once and shared by all who read it. Nothing is queued for
+//! anyone. A subscriber is a [`Cursor`] in the log: a slow one finds that the log has moved on, and
+//! a `gap` says by how many events.
+//!
+//! The log belongs to the sensors' thread. Other threads have their questions answered there, so that
+//! no thread with ordinary scheduling holds the log while a sensor needs it.
 
+mod cursor;
 mod history;
+mod log;
+mod quota;
 mod subscriber;
 mod tally;
-mod task;
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+#[cfg(feature = "zenoh")]
+use std::{sync::mpsc, time::Duration};
+
+use tokio::runtime::Handle;
 
 pub(crate) use self::history::History;
-use self::subscriber::Subscriber;
-pub(crate) use self::tally::{Counts, Tally, Verdicts};
-pub(crate) use self::task::{Closed, Handle, start};
-use super::log;
+use self::log::Log;
+pub(crate) use self::log::{SensorSnapshot, Snapshot};
+pub(crate) use self::subscriber::Subscriber;
+pub(crate) use self::tally::Verdicts;
+use super::now;
 use super::record::EventRecorder;
 use super::request::Subscription;
-use hardnessd_core::event::{Event, Hello, Kind, Reply, Status};
+use super::sensor::SensorState;
+use hardnessd_core::event::{Event, Hello, Reply, Status};
+use hardnessd_core::judge::Unjudged;
+
+/// How long a thread without a runtime waits for an answer.
+#[cfg(feature = "zenoh")]
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// A line to send.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug)]
 pub(crate) struct Line {
-    /// The number of the event, if it has one. In a `hello`, the number of the latest event.
+    /// The number of the event, if it has one.
     pub(crate) seq: Option<u64>,
-    /// The JSON of the line, with its newline.
-    pub(crate) json: Arc<str>,
-    /// The event that the line was made from. A reply has none, and neither has a line that is
-    /// held.
-    pub(crate) event: Option<Arc<Event>>,
-}
-
-impl From<Reply> for Line {
-    fn from(reply: Reply) -> Self {
-        Self {
-            seq: None,
-            json: reply.to_line().into(),
-            event: None,
-        }
-    }
-}
-
-impl From<Arc<Event>> for Line {
-    fn from(event: Arc<Event>) -> Self {
-        Self {
-            seq: event.seq(),
-            json: event.to_line().into(),
-            event: Some(event),
-        }
-    }
-}
-
-impl From<Status> for Line {
-    fn from(status: Status) -> Self {
-        Arc::new(Event::Status(status)).into()
-    }
+    /// The event that the line was made from. A reply has none, and neither has a numbered event
+    /// in a program without a library that needs it.
+    pub(crate) event: Option<Box<Event>>,
+    /// The JSON with its newline, once somebody needs it.
+    text: OnceLock<Box<str>>,
 }
 
 impl Line {
-    /// The kind and the sensor of the line's event.
-    fn about(&self) -> Option<(Kind, &str)> {
-        let event = self.event.as_deref()?;
-        Some((event.kind(), event.sensor()))
+    /// The JSON of the line, with its newline.
+    pub(crate) fn json(&self) -> &str {
+        self.text.get_or_init(|| {
+            let event = self.event.as_ref();
+            event
+                .expect("a line without an event has its text")
+                .to_line()
+                .into()
+        })
     }
 
-    /// The same line to hold for a long time, with its text but without its event.
-    pub(crate) fn to_hold(&self) -> Self {
-        Self {
+    fn of_text(text: String) -> Arc<Self> {
+        Arc::new(Self {
+            seq: None,
             event: None,
-            ..self.clone()
-        }
+            text: OnceLock::from(text.into_boxed_str()),
+        })
+    }
+
+    fn of_event(event: Event) -> Arc<Self> {
+        Arc::new(Self {
+            seq: event.seq(),
+            event: Some(Box::new(event)),
+            text: OnceLock::new(),
+        })
+    }
+
+    /// The line of a reply.
+    pub(crate) fn reply(reply: &Reply) -> Arc<Self> {
+        Self::of_text(reply.to_line())
+    }
+
+    /// The line of a status that is not an event: it has no number.
+    pub(crate) fn status(status: Status) -> Arc<Self> {
+        let line = Self::of_event(Event::Status(status));
+        // Whoever makes it also formats it, because the sensors' thread has no time for it.
+        line.json();
+        line
     }
 }
 
-/// The number of events that are held for `since` (`docs/controller.md`).
-const HELD: usize = 4096;
+/// The error that the daemon is stopping, and its sensors' thread answers no more.
+#[derive(Debug, thiserror::Error)]
+#[error("the daemon is stopping")]
+pub(crate) struct Closed;
 
-/// A numbered event as it was sent.
-#[derive(Debug, Clone)]
-struct Held {
-    kind: Kind,
-    line: Line,
+/// The error of a `since` that this run has not reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("since: found {found}, expected at most {latest}")]
+pub(crate) struct SinceInFuture {
+    found: u64,
+    latest: u64,
 }
 
-/// The whole state of the hub. It has no clock.
-struct Hub {
-    hello: Hello,
-    /// The last [`HELD`] events. The newest has the number `hello.seq`.
-    held: VecDeque<Held>,
-    /// The number of events that are no longer held, by kind.
-    forgotten: [u64; Kind::NUMBERED.len()],
-    /// The last final verdict of each sensor.
-    finals: BTreeMap<String, Line>,
-    /// The force and contact area of each sensor.
-    histories: BTreeMap<String, History>,
-    tally: Tally,
-    recorder: EventRecorder,
-    subscribers: BTreeMap<u64, Subscriber>,
-    joined: u64,
+/// A handle to the log.
+#[derive(Debug, Clone)]
+pub(crate) struct Hub {
+    log: Arc<Mutex<Log>>,
+    thread: Handle,
 }
 
 impl Hub {
-    fn new(hello: Hello) -> Self {
+    /// An empty log that describes the daemon with `hello`. Call it on the sensors' thread, inside
+    /// its runtime.
+    pub(crate) fn new(hello: Hello) -> Self {
         Self {
-            hello,
-            held: VecDeque::new(),
-            forgotten: [0; Kind::NUMBERED.len()],
-            finals: BTreeMap::new(),
-            histories: BTreeMap::new(),
-            tally: Tally::default(),
-            recorder: EventRecorder::default(),
-            subscribers: BTreeMap::new(),
-            joined: 0,
+            log: Arc::new(Mutex::new(Log::new(hello))),
+            thread: Handle::current(),
         }
     }
 
-    /// Numbers `event` and offers it to every subscriber that wants it. Returns whether there was
-    /// anything to offer. `now` is a time of CLOCK_MONOTONIC.
-    fn publish(&mut self, mut event: Event, now: Duration) -> bool {
-        let kind = event.kind();
-        if let Event::Hardness(verdict) = &mut event {
-            // Round to microseconds, because further digits are noise of the clock.
-            verdict.age_at_publish_ms = verdict.mono_ns.map(|at| {
-                let age = now.saturating_sub(Duration::from_nanos(at));
-                (age.as_secs_f64() * 1e6).round() / 1e3
-            });
-            let latency = now.saturating_sub(verdict.arrival).as_micros();
-            verdict.latency_us = Some(u64::try_from(latency).unwrap_or(u64::MAX));
-        }
-        if kind != Kind::Frame {
-            self.hello.seq += 1;
-            event.number(self.hello.seq);
-        }
-        self.recorder.event(&event);
-        if let Event::Frame(frame) = &event {
-            match self.histories.get_mut(&frame.sensor) {
-                Some(history) => history.add(frame),
-                None => self
-                    .histories
-                    .entry(frame.sensor.clone())
-                    .or_default()
-                    .add(frame),
-            }
-        }
-        let mut subscribers = self.subscribers.values();
-        if kind == Kind::Frame && !subscribers.any(|subscriber| subscriber.wants(kind)) {
-            return false;
-        }
-        let event = Arc::new(event);
-        let line = Line::from(event.clone());
-        if line.seq.is_some() {
-            log::event(&event);
-            self.tally.count(&event);
-            self.keep(Held {
-                kind,
-                line: line.to_hold(),
-            });
-        }
-        if let Event::Hardness(verdict) = &*event
-            && verdict.phase == hardnessd_core::event::Phase::Final
-        {
-            self.finals.insert(verdict.sensor.clone(), line.to_hold());
-        }
-        for subscriber in self.subscribers.values_mut() {
-            self.tally.dropped += subscriber.offer(&line);
-        }
-        true
+    /// The log, on the sensors' thread.
+    fn log(&self) -> MutexGuard<'_, Log> {
+        // A panic ends the process. In a test, it ends the test.
+        self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Describes the daemon with `hello` from now on. The run and the numbers stay. What was counted and
-    /// kept of sensors that `hello` lacks is forgotten.
-    fn describe(&mut self, hello: Hello) {
-        self.hello = Hello {
-            seq: self.hello.seq,
-            run: std::mem::take(&mut self.hello.run),
-            ..hello
-        };
-        let sensors = &self.hello.sensors;
-        let is_there = |name: &str| sensors.iter().any(|sensor| sensor.name == name);
-        self.finals.retain(|name, _| is_there(name));
-        self.histories.retain(|name, _| is_there(name));
-        self.tally.sensors.retain(|name, _| is_there(name));
-    }
-
-    fn keep(&mut self, held: Held) {
-        if self.held.len() == HELD {
-            let oldest = self.held.pop_front().expect("HELD is not 0");
-            self.forgotten[oldest.kind as usize] += 1;
+    /// Publishes events of one sensor, which is now in `state`. Call it on the sensors' thread.
+    pub(crate) fn publish(&self, events: Vec<Event>) {
+        let mut log = self.log();
+        for event in events {
+            log.publish(event, now().mono);
         }
-        self.held.push_back(held);
     }
 
-    /// The number of the oldest event that is held.
-    fn oldest(&self) -> u64 {
-        self.hello.seq + 1 - self.held.len() as u64
+    /// Logs that the model failed on a press. Call it on the sensors' thread.
+    pub(crate) fn unjudged(&self, failed: &Unjudged) {
+        self.log().unjudged(failed, now().mono);
     }
 
-    /// Adds a subscriber, with the default subscription from now on.
-    fn join(&mut self) -> (u64, Line) {
-        self.joined += 1;
-        self.subscribers.insert(self.joined, Subscriber::default());
-        let hello = Line {
-            seq: Some(self.hello.seq),
-            ..Reply::Hello(self.hello.clone()).into()
-        };
-        (self.joined, hello)
+    /// Takes over the current state of a sensor. Call it on the sensors' thread.
+    pub(crate) fn report(&self, state: SensorState) {
+        self.log().report(state);
     }
 
-    /// Changes what a subscriber gets from now on.
-    fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), Ahead> {
-        let (latest, oldest) = (self.hello.seq, self.oldest());
-        let Some(subscriber) = self.subscribers.get_mut(&id) else {
-            return Ok(());
-        };
-        let Some(since) = &wanted.since else {
-            subscriber.change(wanted.kinds.clone(), wanted.policy);
-            return Ok(());
-        };
-        let known = since.run == self.hello.run;
-        if known && since.seq > latest {
-            let found = since.seq;
-            return Err(Ahead { found, latest });
-        }
-        subscriber.change(wanted.kinds.clone(), wanted.policy);
-        let first = if known { since.seq + 1 } else { oldest };
-        let is_wanted = |kind: &Kind| wanted.kinds.contains(kind);
-        let missing = match first.max(oldest) - first {
-            0 if known => Some(0),
-            // Every numbered event is wanted, so each number that is no longer held is a missed
-            // event.
-            gone if known && Kind::NUMBERED.iter().all(is_wanted) => Some(gone),
-            // From the start of the run, every event that is no longer held was missed.
-            _ if known && since.seq == 0 => {
-                let wanted = Kind::NUMBERED.into_iter().filter(is_wanted);
-                Some(wanted.map(|kind| self.forgotten[kind as usize]).sum())
-            }
-            // The kinds of the missed events are no longer known.
-            _ => None,
-        };
-        let held = (first.max(oldest)..=latest).zip(
-            self.held
-                .iter()
-                .skip(usize::try_from(first.max(oldest) - oldest).expect("HELD fits in a usize")),
-        );
-        subscriber.replay(held.map(|(seq, held)| (seq, held.kind)), missing);
-        Ok(())
+    /// The number of sensors that are live, and of all. Call it on the sensors' thread.
+    pub(crate) fn live(&self) -> (usize, usize) {
+        self.log().live()
+    }
+
+    /// Changes the `hello` of new subscribers. The run and the numbers stay. Call it on the sensors'
+    /// thread.
+    pub(crate) fn describe(&self, hello: Hello) {
+        self.log().describe(hello);
+    }
+
+    /// Passes every event on to `recorder` from now on. Call it on the sensors' thread.
+    pub(crate) fn record(&self, recorder: EventRecorder) {
+        self.log().record(recorder);
+    }
+
+    /// Closes the log after its last event. Subscribers get the remaining lines, and then no more.
+    /// Call it on the sensors' thread.
+    pub(crate) fn close(&self) {
+        self.log().close();
+    }
+
+    /// Adds a subscriber, and returns what is true where its lines begin. The inner error is for the
+    /// subscriber.
+    pub(crate) async fn join(
+        &self,
+        wanted: Subscription,
+    ) -> Result<Result<(Subscriber, Snapshot), SinceInFuture>, Closed> {
+        let hub = self.clone();
+        self.ask(move |log| {
+            let now = log.snapshot();
+            let id = log.join(&wanted)?;
+            Ok((Subscriber::new(hub, id), now))
+        })
+        .await
+    }
+
+    /// The current state of the log and of all sensors.
+    pub(crate) async fn snapshot(&self) -> Result<Snapshot, Closed> {
+        self.ask(|log| log.snapshot()).await
+    }
+
+    /// Like [`Hub::snapshot`], for a thread without a runtime.
+    #[cfg(feature = "zenoh")]
+    pub(crate) fn snapshot_blocking(&self) -> Result<Snapshot, Closed> {
+        let (answer, answered) = mpsc::channel();
+        let hub = self.clone();
+        self.thread
+            .spawn(async move { answer.send(hub.log().snapshot()) });
+        answered.recv_timeout(PATIENCE).map_err(|_| Closed)
     }
 
     /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
-    /// sensor.
-    fn history(&self, sensor: &str) -> Option<History> {
-        let known = self.hello.sensors.iter().any(|one| one.name == sensor);
-        known.then(|| self.histories.get(sensor).cloned().unwrap_or_default())
+    /// sensor. Its line is made by the caller, because the sensors' thread has no time for it.
+    pub(crate) async fn history(&self, sensor: String) -> Result<Option<History>, Closed> {
+        self.ask(move |log| log.history(&sensor)).await
     }
 
-    /// Whether lines wait for a subscriber.
-    fn has_lines(&self, id: u64) -> bool {
-        let subscriber = self.subscribers.get(&id);
-        subscriber.is_some_and(Subscriber::has_lines)
+    /// Has a question answered on the sensors' thread.
+    async fn ask<T: Send + 'static>(
+        &self,
+        question: impl FnOnce(&mut Log) -> T + Send + 'static,
+    ) -> Result<T, Closed> {
+        let hub = self.clone();
+        let answered = self.thread.spawn(async move { question(&mut hub.log()) });
+        answered.await.map_err(|_| Closed)
     }
-
-    /// The next lines of a subscriber; empty if there are none.
-    fn take(&mut self, id: u64) -> Vec<Line> {
-        let oldest = self.oldest();
-        let Some(subscriber) = self.subscribers.get_mut(&id) else {
-            return Vec::new();
-        };
-        let lines = subscriber.take(|seq| {
-            let place = usize::try_from(seq.checked_sub(oldest)?).ok()?;
-            Some(self.held.get(place)?.line.clone())
-        });
-        self.tally.gaps += std::mem::take(&mut subscriber.gaps);
-        lines
-    }
-}
-
-/// The current state of the hub.
-#[derive(Debug)]
-pub(crate) struct Survey {
-    /// The `hello` with the number of the latest event.
-    pub(crate) hello: Hello,
-    /// The last final verdict of each sensor.
-    pub(crate) finals: BTreeMap<String, Line>,
-    pub(crate) tally: Tally,
-    pub(crate) subscribers: usize,
-}
-
-/// The error of a `since` that this run has not reached.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("since: found {found}, expected at most {latest}")]
-pub(crate) struct Ahead {
-    found: u64,
-    latest: u64,
 }
 
 #[cfg(test)]

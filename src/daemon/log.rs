@@ -1,30 +1,30 @@
-//! The log for the operator: one line for each event, on stderr or in the journal.
+//! The log for the operator, on stderr: a line for each status, verdict and aborted press. The level
+//! `debug` also has the other events of a press.
 //!
 //! Field names are stable: they are those of the published events. `RUST_LOG` sets the level, as
 //! levels and `TARGET=LEVEL` separated by commas. Without it, the level is `info` for the daemon.
 //! Nothing here is written to stdout, which is for events.
 
-mod journal;
-mod limit;
 mod lines;
 
+use std::fmt;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tracing::{error, info, warn};
+use tracing::{Level, Subscriber, debug, error, info, warn};
 use tracing_subscriber::filter::Targets;
+use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::layer::{Layer, SubscriberExt};
+use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Registry, reload};
 
-use self::journal::Journal;
-use self::limit::Limit;
 use self::lines::Lines;
-use super::serial::tty::Changed;
-use hardnessd_core::event::{Event, LinkState, PressState, Tared, name, round_3};
-use hardnessd_core::pipeline::Unjudged;
+use hardnessd_core::event::{Event, LinkState, Phase, PressState, Tared, name, round_3};
+use hardnessd_core::judge::Unjudged;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::wording;
 
@@ -45,7 +45,7 @@ pub enum Format {
     Text,
     /// One JSON object per line, on stderr.
     Json,
-    /// Entries of the journal, whose fields have the prefix `HARDNESSD_`.
+    /// Text on stderr as journald reads it: each line begins with its priority, and has no time.
     Journald,
 }
 
@@ -58,13 +58,11 @@ type Output = Box<dyn Layer<Registry> + Send + Sync>;
 pub struct Log {
     output: reload::Handle<Output, Registry>,
     lines: Lines,
-    limit: Limit,
 }
 
 /// Writes the last lines before the process ends.
 impl Drop for Log {
     fn drop(&mut self) {
-        self.limit.report_all();
         self.lines.flush(LAST_LINES);
     }
 }
@@ -72,12 +70,6 @@ impl Drop for Log {
 /// The reason there is no log in the configured format.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// There is no journal.
-    #[error(
-        "log.format: there is no journal at {} for \"journald\": set \"text\" or \"json\"",
-        journal::SOCKET
-    )]
-    Journal(#[source] std::io::Error),
     /// `RUST_LOG` is malformed.
     #[error(
         "RUST_LOG: found {found:?}, expected off, error, warn, info, debug or trace, or TARGET=LEVEL, \
@@ -100,26 +92,20 @@ impl Log {
     ///
     /// # Errors
     ///
-    /// Fails if `RUST_LOG` is malformed, the journal is configured and cannot be reached, the
-    /// thread of the log cannot be started, or a log has been started before.
+    /// Fails if `RUST_LOG` is malformed, the thread of the log cannot be started, or a log has been
+    /// started before.
     pub fn start(settings: Settings, level: &str) -> Result<Self, Error> {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
         // The filter is a layer beside the output: a filter inside the output would be lost when
         // the output is exchanged.
-        let limit = Limit::default();
-        let lines = Lines::start(limit.clone()).map_err(Error::Thread)?;
-        let (layer, output) = reload::Layer::new(output(settings, &lines)?);
+        let lines = Lines::start().map_err(Error::Thread)?;
+        let (layer, output) = reload::Layer::new(output(settings, &lines));
         tracing_subscriber::registry()
             .with(layer)
             .with(filter)
-            .with(limit.clone())
             .try_init()
             .map_err(|_| Error::Twice)?;
-        Ok(Self {
-            output,
-            lines,
-            limit,
-        })
+        Ok(Self { output, lines })
     }
 
     /// From now on, each line on stderr first clears the line that the cursor is in. Call this if
@@ -134,14 +120,9 @@ impl Log {
     }
 
     /// Writes in the format of `settings` from now on.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the journal is configured and cannot be reached. The log then stays as it is.
-    pub fn change(&self, settings: Settings) -> Result<(), Error> {
-        self.output
-            .reload(output(settings, &self.lines)?)
-            .map_err(|_| Error::Twice)
+    pub fn change(&self, settings: Settings) {
+        // It fails only after the log has ended.
+        let _ = self.output.reload(output(settings, &self.lines));
     }
 }
 
@@ -172,82 +153,119 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     Ok(parsed.expect("a list of sound parts is sound"))
 }
 
-/// Checks that the log can be written: that the journal is there if it is configured.
-pub(crate) fn check(settings: Settings) -> Result<(), Error> {
-    match settings.format {
-        Format::Text | Format::Json => Ok(()),
-        Format::Journald => journal::find().map_err(Error::Journal),
-    }
-}
-
-fn output(settings: Settings, lines: &Lines) -> Result<Output, Error> {
+fn output(settings: Settings, lines: &Lines) -> Output {
     let text = tracing_subscriber::fmt::layer()
         .with_writer(lines.clone())
         .with_target(false);
-    Ok(match settings.format {
+    match settings.format {
         Format::Text => text.with_ansi(std::io::stderr().is_terminal()).boxed(),
         // Fields are in an object of their own, because a verdict has a `level` and so has the
         // line.
         Format::Json => text.json().boxed(),
-        Format::Journald => {
-            journal::find().map_err(Error::Journal)?;
-            let lines = lines.clone();
-            Journal(move |entry| lines.enter(entry)).boxed()
+        Format::Journald => text
+            .with_ansi(false)
+            .with_level(false)
+            .without_time()
+            .map_event_format(Prioritised)
+            .boxed(),
+    }
+}
+
+/// Writes the priority of a line before the line, as journald reads it on stderr (sd-daemon(3)).
+struct Prioritised<F>(F);
+
+impl<S, N, F> FormatEvent<S, N> for Prioritised<F>
+where
+    S: Subscriber + for<'a> LookupSpan<'a>,
+    N: for<'a> FormatFields<'a> + 'static,
+    F: FormatEvent<S, N>,
+{
+    fn format_event(
+        &self,
+        context: &FmtContext<'_, S, N>,
+        mut line: Writer<'_>,
+        event: &tracing::Event<'_>,
+    ) -> fmt::Result {
+        // syslog(3): 3 error, 4 warning, 6 informational, 7 debug.
+        let priority = match *event.metadata().level() {
+            Level::ERROR => 3,
+            Level::WARN => 4,
+            Level::INFO => 6,
+            Level::DEBUG | Level::TRACE => 7,
+        };
+        write!(line, "<{priority}>")?;
+        self.0.format_event(context, line, event)
+    }
+}
+
+/// A line of this level: `warn` if something is wrong, `info` or `debug`.
+macro_rules! line {
+    ($level:expr, $($fields:tt)*) => {
+        match $level {
+            Level::WARN => warn!($($fields)*),
+            Level::INFO => info!($($fields)*),
+            _ => debug!($($fields)*),
         }
-    })
+    };
+}
+
+/// The level of the line of an event.
+fn level_of(event: &Event) -> Level {
+    let is_wrong = match event {
+        Event::Status(status) => {
+            let is_gone = matches!(status.state, LinkState::Lost | LinkState::Stale);
+            is_gone || status.reason.is_some()
+        }
+        Event::Press(press) if press.state != PressState::Aborted => return Level::DEBUG,
+        Event::Press(_) => true,
+        Event::Hardness(verdict) if verdict.phase == Phase::Early => return Level::DEBUG,
+        Event::Hardness(_) | Event::Frame(_) => false,
+    };
+    if is_wrong { Level::WARN } else { Level::INFO }
+}
+
+/// Whether the line of an event is only for the level `debug`.
+pub(crate) fn is_routine(event: &Event) -> bool {
+    level_of(event) == Level::DEBUG
+}
+
+/// Logs that lines of a sensor were left out.
+pub(crate) fn left_out(sensor: &str, lines: u64) {
+    warn!(
+        sensor,
+        lines, "left out of the log: too many lines of this sensor"
+    );
 }
 
 /// Writes one line for a numbered event.
 pub(crate) fn event(event: &Event) {
     match event {
-        Event::Status(status) => {
-            let state = name(&status.state);
-            let reason = status.reason.as_deref();
-            let (sensor, frames) = (status.sensor.as_str(), status.frames);
-            let (frames_damaged, bytes_skipped) = (status.frames_damaged, status.bytes_skipped);
-            let seq = status.seq;
-            if matches!(status.state, LinkState::Lost | LinkState::Stale) || reason.is_some() {
-                warn!(
-                    seq,
-                    sensor, state, reason, frames, frames_damaged, bytes_skipped, "status"
-                );
-            } else {
-                info!(
-                    seq,
-                    sensor, state, frames, frames_damaged, bytes_skipped, "status"
-                );
-            }
-        }
-        Event::Press(press) => {
-            let state = name(&press.state);
-            let (sensor, number, reason) = (press.sensor.as_str(), press.press, press.reason);
-            let (seq, frame, frames) = (press.seq, press.frame, press.frames);
-            if press.state == PressState::Aborted {
-                warn!(
-                    seq,
-                    sensor,
-                    press = number,
-                    state,
-                    reason,
-                    frame,
-                    frames,
-                    "press"
-                );
-            } else {
-                info!(
-                    seq,
-                    sensor,
-                    press = number,
-                    state,
-                    reason,
-                    frame,
-                    frames,
-                    "press"
-                );
-            }
-        }
+        Event::Status(status) => line!(
+            level_of(event),
+            seq = status.seq,
+            sensor = status.sensor.as_str(),
+            state = name(&status.state),
+            reason = status.reason.as_deref(),
+            frames = status.frames,
+            frames_damaged = status.frames_damaged,
+            frames_dropped = status.frames_dropped,
+            bytes_skipped = status.bytes_skipped,
+            "status"
+        ),
+        Event::Press(press) => line!(
+            level_of(event),
+            seq = press.seq,
+            sensor = press.sensor.as_str(),
+            press = press.press,
+            state = name(&press.state),
+            reason = press.reason,
+            frame = press.frame,
+            frames = press.frames,
+            "press"
+        ),
         // The numbers are rounded for the reader. The event itself has every digit.
-        Event::Hardness(verdict) => info!(
+        Event::Hardness(verdict) => line!(
+            level_of(event),
             seq = verdict.seq,
             sensor = verdict.sensor.as_str(),
             press = verdict.press,
@@ -314,16 +332,6 @@ pub(crate) fn frame_rate(sensor: &str, frame_rate_hz: f64, measured_hz: f64) {
     );
 }
 
-/// Logs that another program had changed the settings of a serial line.
-pub(crate) fn line_settings(sensor: &str, changed: &Changed) {
-    warn!(
-        sensor,
-        found = changed.found,
-        expected = changed.expected,
-        "another program changed the settings of the line: they are set again"
-    );
-}
-
 /// Logs that a second sender sends datagrams for a sensor.
 pub(crate) fn stranger(sensor: &str, address: SocketAddr) {
     warn!(
@@ -331,6 +339,11 @@ pub(crate) fn stranger(sensor: &str, address: SocketAddr) {
         %address,
         "ignored: another sender sends for this sensor, and one at a time may"
     );
+}
+
+/// Logs that the other end of a sensor's port is a telnet server, which changes some bytes.
+pub(crate) fn telnet(sensor: &str) {
+    warn!(sensor, "{}", hardnessd_core::wire::TELNET);
 }
 
 /// Logs the context that a controller reports of its work.
@@ -344,8 +357,6 @@ pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
 
 #[cfg(test)]
 mod tests {
-    use tracing::Level;
-
     use super::*;
 
     #[test]

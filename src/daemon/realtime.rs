@@ -1,4 +1,4 @@
-//! How the kernel runs a process: its scheduling, and whether its memory is locked.
+//! How the kernel runs a process: its scheduling, its sleep, and whether its memory is locked.
 //!
 //! The daemon does not ask for real-time scheduling. systemd sets it before it starts the daemon
 //! (`CPUSchedulingPolicy=` of the unit), and the sandbox then refuses any change. Threads that the
@@ -6,13 +6,44 @@
 //! log, record and load models. The daemon locks its memory itself, because systemd cannot. It does so where the
 //! unit has removed the limit (`LimitMEMLOCK=`), or where the daemon may ignore the limit.
 
+use std::cell::Cell;
 use std::path::Path;
+use std::time::Duration;
 use std::{fmt, fs};
 
 use rustix::mm::MlockAllFlags;
 use rustix::process::{Resource, getrlimit};
+use rustix::time::{ClockId, clock_gettime};
 use serde::Serialize;
 use tracing::warn;
+
+/// Work for this long is followed by a pause. `LimitRTTIME` in the unit is 500 ms.
+const MOST: Duration = Duration::from_millis(20);
+const PAUSE: Duration = Duration::from_micros(100);
+/// One of so many calls of [`rest`] reads the thread's clock, which takes a system call. What lies
+/// between two calls takes some milliseconds at most.
+const CALLS_A_READING: u32 = 16;
+
+/// Pauses this thread for a moment after each 20 ms of work. In real-time scheduling the system kills
+/// a process whose thread never sleeps. Clients that subscribe again and again, each time since the
+/// start, or a sensor that sends without end could leave it no sleep of its own: where something is
+/// there, a wait returns at once. Call it between two pieces of work for others.
+pub(super) fn rest() {
+    thread_local! {
+        static CALLS: Cell<u32> = const { Cell::new(0) };
+        /// The processor time of this thread at its last pause.
+        static RESTED: Cell<Duration> = const { Cell::new(Duration::ZERO) };
+    }
+    CALLS.set((CALLS.get() + 1) % CALLS_A_READING);
+    if CALLS.get() != 0 {
+        return;
+    }
+    let used = Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default();
+    if used.saturating_sub(RESTED.get()) > MOST {
+        RESTED.set(used);
+        std::thread::sleep(PAUSE);
+    }
+}
 
 /// Keeps the pages of this process in memory, each from its first use on. This takes no more memory
 /// than before. If the memory that the process may lock is limited, this locks nothing: at the
@@ -39,9 +70,10 @@ fn may_lock(status: &str) -> bool {
 
 /// The scheduling of a process, and whether its memory is locked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Standing {
-    /// The scheduling of its main thread.
-    pub scheduling: Scheduling,
+pub struct Scheduling {
+    /// The policy of its main thread.
+    #[serde(rename = "scheduling")]
+    pub policy: Policy,
     /// Its real-time priority; 0 for ordinary scheduling.
     pub priority: u32,
     /// Whether its pages stay in memory once they are there.
@@ -51,7 +83,7 @@ pub struct Standing {
 /// A scheduling policy of sched(7).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Scheduling {
+pub enum Policy {
     /// Ordinary scheduling: SCHED_OTHER.
     Other,
     /// Real time, until the thread waits: SCHED_FIFO.
@@ -66,7 +98,7 @@ pub enum Scheduling {
     Deadline,
 }
 
-impl Standing {
+impl Scheduling {
     /// Reads the scheduling of a process from its directory in /proc. Returns `None` if the
     /// directory does not have it.
     pub fn of(process: &Path) -> Option<Self> {
@@ -82,35 +114,35 @@ impl Standing {
         let (_, fields) = stat.rsplit_once(") ")?;
         let mut fields = fields.split_whitespace().skip(40 - 3);
         let priority = fields.next()?.parse().ok()?;
-        let scheduling = match fields.next()? {
-            "0" => Scheduling::Other,
-            "1" => Scheduling::Fifo,
-            "2" => Scheduling::Rr,
-            "3" => Scheduling::Batch,
-            "5" => Scheduling::Idle,
-            "6" => Scheduling::Deadline,
+        let policy = match fields.next()? {
+            "0" => Policy::Other,
+            "1" => Policy::Fifo,
+            "2" => Policy::Rr,
+            "3" => Policy::Batch,
+            "5" => Policy::Idle,
+            "6" => Policy::Deadline,
             _ => return None,
         };
         let locked = status
             .lines()
             .find_map(|line| line.strip_prefix("VmLck:"))?;
         Some(Self {
-            scheduling,
+            policy,
             priority,
             memory_locked: locked.split_whitespace().next()? != "0",
         })
     }
 }
 
-impl fmt::Display for Standing {
+impl fmt::Display for Scheduling {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.scheduling {
-            Scheduling::Fifo => write!(out, "real time (fifo, priority {})", self.priority)?,
-            Scheduling::Rr => write!(out, "real time (rr, priority {})", self.priority)?,
-            Scheduling::Deadline => out.write_str("real time (deadline)")?,
-            Scheduling::Other => out.write_str("ordinary")?,
-            Scheduling::Batch => out.write_str("batch")?,
-            Scheduling::Idle => out.write_str("idle")?,
+        match self.policy {
+            Policy::Fifo => write!(out, "real time (fifo, priority {})", self.priority)?,
+            Policy::Rr => write!(out, "real time (rr, priority {})", self.priority)?,
+            Policy::Deadline => out.write_str("real time (deadline)")?,
+            Policy::Other => out.write_str("ordinary")?,
+            Policy::Batch => out.write_str("batch")?,
+            Policy::Idle => out.write_str("idle")?,
         }
         if self.memory_locked {
             out.write_str(", memory locked")?;
@@ -145,30 +177,30 @@ mod tests {
             format!("7 (a ) S b) S {}\n", fields.join(" "))
         };
         let status = |locked: &str| format!("VmPeak:\t 9 kB\nVmLck:\t{locked} kB\n");
-        let expected = Standing {
-            scheduling: Scheduling::Rr,
+        let expected = Scheduling {
+            policy: Policy::Rr,
             priority: 10,
             memory_locked: true,
         };
         assert_eq!(
-            Standing::read(&stat("10", "2"), &status("  4096")),
+            Scheduling::read(&stat("10", "2"), &status("  4096")),
             Some(expected)
         );
-        let expected = Standing {
-            scheduling: Scheduling::Other,
+        let expected = Scheduling {
+            policy: Policy::Other,
             priority: 0,
             memory_locked: false,
         };
         assert_eq!(
-            Standing::read(&stat("0", "0"), &status("     0")),
+            Scheduling::read(&stat("0", "0"), &status("     0")),
             Some(expected)
         );
-        assert_eq!(Standing::read("7 (cut) S 1", &status("0")), None);
+        assert_eq!(Scheduling::read("7 (cut) S 1", &status("0")), None);
         // /proc also exists where tests run.
-        assert!(Standing::of(Path::new("/proc/self")).is_some());
+        assert!(Scheduling::of(Path::new("/proc/self")).is_some());
         assert_eq!(expected.to_string(), "ordinary");
-        let locked = Standing {
-            scheduling: Scheduling::Rr,
+        let locked = Scheduling {
+            policy: Policy::Rr,
             priority: 10,
             memory_locked: true,
         };

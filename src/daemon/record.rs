@@ -1,8 +1,8 @@
 //! Recording: a separate thread writes what the sensors' tasks and the hub send to it.
 //!
 //! In: the sensors' inputs, and events, through a bounded queue. Out: files. Nothing waits for the
-//! thread. When the queue is full, entries are dropped and counted. The sensor's next entry is then
-//! a state, from which a replay can continue. A disk that fails or is full stops the recording, not
+//! thread. A sensor's first entry is its state at rest, from which a replay can begin. When the queue
+//! is full, entries are dropped and counted, up to the sensor's next rest. A disk that fails or is full stops the recording, not
 //! the daemon. The recording continues when there is room again.
 
 mod file;
@@ -11,35 +11,37 @@ mod worker;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::Duration;
 
 use rustix::fs::{Access, AtFlags, CWD};
 use rustix::io::Errno;
 use tokio::sync::{mpsc, oneshot, watch};
-use tracing::warn;
+use tracing::{info, warn};
 
 use self::worker::Worker;
 use super::config;
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
+use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Input, Pipeline};
-use hardnessd_core::recording::{About, Entry, Found, Labels, RecordedSensor, State};
-use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::recording::{About, Entry, Found, Labels, State};
 
 /// The most entries and events that wait: about 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
-/// How often a sensor's state is noted. A new file begins with the last state and the entries
-/// since, and a damaged chunk costs a replay no more than this time.
-const STATE_EVERY: Duration = Duration::from_secs(10);
+/// The most bytes of memory that wait.
+const QUEUED_BYTES: usize = 32 << 20;
+/// How often a sensor's state is noted while it is at rest. It is also noted after each press, so a
+/// clip of a recording and the part after a damaged chunk begin with the next press.
+const STATE_EVERY: Duration = Duration::from_secs(5);
 /// A state is also noted after this many bytes of entries, so that a flood of entries cannot make
 /// the black box much larger than its bound.
 const STATE_EVERY_BYTES: usize = 4 << 20;
+/// How often the damage is looked at.
+const DAMAGE_EVERY: Duration = Duration::from_secs(10);
 /// A sensor has a fault if at least [`DAMAGED_FRAMES`] frames, and more than [`DAMAGED_SHARE`] of
-/// all its frames, were damaged between two states.
+/// all its frames, were damaged since the last look.
 const DAMAGED_FRAMES: u64 = 5;
 const DAMAGED_SHARE: f64 = 0.1;
 
@@ -67,6 +69,12 @@ pub struct Progress {
     pub tared: u64,
     /// The number of presses that were not aborted, so that they have a verdict.
     pub presses: u64,
+    /// The number of final verdicts, and how many of them have the level of the label `level`.
+    pub verdicts: u64,
+    /// See [`Self::verdicts`].
+    pub right: u64,
+    /// The level of the last verdict. `None` if it was rejected.
+    pub said: Option<u8>,
 }
 
 /// The reason a recording failed.
@@ -96,14 +104,6 @@ pub enum Error {
         /// The reason its port was lost.
         reason: String,
     },
-    /// The directory of the configuration cannot be written to.
-    #[error("record.dir: cannot write to {path}: {source}: set a directory that can be written to")]
-    Directory {
-        /// The directory, or the nearest path above it that exists.
-        path: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
     /// The thread could not be started.
     #[error("no thread for the recording: {0}")]
     Thread(#[source] std::io::Error),
@@ -112,12 +112,16 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Directory { .. } => CONFIG,
             Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
             Error::Write { .. } | Error::Thread(_) => IO,
         }
     }
 }
+
+/// So many black boxes of faults are kept, with so many megabytes. A sender that comes and goes would
+/// fill the disk.
+const MOST_BLACKBOXES: usize = 200;
+const MOST_BLACKBOX_MB: u64 = 1000;
 
 /// The reason a black box was not written.
 #[derive(Debug, thiserror::Error)]
@@ -128,12 +132,30 @@ pub(crate) enum NoBlackbox {
     OneFile,
     #[error("one was written less than a second ago: ask again in a second")]
     TooSoon,
+    #[error("the press under way takes more memory than is kept: ask again after its release")]
+    LongPress,
+    #[error(
+        "found {count} black boxes of {mb} MB in record.dir, expected fewer than {MOST_BLACKBOXES} and \
+         {MOST_BLACKBOX_MB} MB for another one of a fault: move old ones away"
+    )]
+    Full { count: usize, mb: u64 },
     #[error(transparent)]
     Write(#[from] hardnessd_core::recording::Error),
 }
 
-/// Checks that this process may write to the directory of the recordings, or make it.
-pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
+/// The directory of the recordings cannot be written to.
+#[derive(Debug, thiserror::Error)]
+#[error("record.dir: cannot write to {path}: {source}: set a directory that can be written to")]
+pub(crate) struct NoDirectory {
+    /// The directory, or the nearest path above it that exists.
+    path: PathBuf,
+    /// The system's error.
+    source: std::io::Error,
+}
+
+/// Checks that this process may write to the directory of the recordings, or make it. A daemon runs on
+/// without it.
+pub(crate) fn check(settings: &config::Record) -> Result<(), NoDirectory> {
     let directory = settings.dir();
     // Missing directories will be made, so check the nearest path that exists.
     let there = directory.ancestors().find(|place| place.exists());
@@ -144,7 +166,7 @@ pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     } else {
         Err(Errno::NOTDIR.into())
     };
-    found.map_err(|source| Error::Directory {
+    found.map_err(|source| NoDirectory {
         path: there.to_owned(),
         source,
     })
@@ -170,22 +192,58 @@ enum Job {
     },
 }
 
+impl Job {
+    /// The approximate memory of the job in bytes.
+    fn weight(&self) -> usize {
+        let beside = match self {
+            Self::Entry { entry, .. } => entry.weight(),
+            Self::Event(event) => match &**event {
+                Event::Frame(frame) => size_of::<Event>() + size_of_val(&*frame.newtons),
+                _ => EVENT_BYTES,
+            },
+            Self::Damage { .. } | Self::Blackbox { .. } => 0,
+        };
+        size_of::<Self>() + beside
+    }
+}
+
+/// More memory than a numbered event takes: a context has up to 1 KiB of text.
+const EVENT_BYTES: usize = 4 << 10;
+
 /// The queue to the thread.
 #[derive(Debug, Clone)]
 struct Jobs {
     sender: SyncSender<Job>,
-    dropped: Arc<AtomicU64>,
+    load: Arc<Load>,
+}
+
+/// How full the queue is, and what had no room in it.
+#[derive(Debug, Default)]
+struct Load {
+    /// The bytes of memory that wait.
+    bytes: AtomicUsize,
+    /// The number of jobs that were dropped.
+    dropped: AtomicU64,
 }
 
 impl Jobs {
     /// Sends a job. Returns `false` if there was no room for it.
     fn send(&self, job: Job) -> bool {
-        match self.sender.try_send(job) {
+        let bytes = job.weight();
+        let queued = self.load.bytes.fetch_add(bytes, Ordering::Relaxed);
+        let sent = match queued.saturating_add(bytes) <= QUEUED_BYTES {
+            true => self.sender.try_send(job),
+            false => Err(TrySendError::Full(job)),
+        };
+        if sent.is_err() {
+            self.load.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        }
+        match sent {
             Ok(()) => true,
             // The recording has ended, which is reported elsewhere.
             Err(TrySendError::Disconnected(_)) => true,
             Err(TrySendError::Full(_)) => {
-                self.dropped.fetch_add(1, Ordering::Relaxed);
+                self.load.dropped.fetch_add(1, Ordering::Relaxed);
                 false
             }
         }
@@ -215,9 +273,9 @@ impl Recorder {
         };
         let labels = about.labels.clone();
         let (sender, inbox) = sync_channel(QUEUED);
-        let dropped = Arc::new(AtomicU64::new(0));
+        let load = Arc::new(Load::default());
         let (stopping, stop) = oneshot::channel();
-        let worker = Worker::new(target, about, dropped.clone(), stopping);
+        let worker = Worker::new(target, about, load.clone(), stopping);
         let (end, ended) = oneshot::channel();
         std::thread::Builder::new()
             .name("recorder".to_owned())
@@ -227,7 +285,7 @@ impl Recorder {
             })
             .map_err(Error::Thread)?;
         Ok(Self {
-            jobs: Jobs { sender, dropped },
+            jobs: Jobs { sender, load },
             labels,
             frames,
             stop,
@@ -242,7 +300,10 @@ impl Recorder {
             index,
             labels: self.labels.clone(),
             noted: None,
+            was_busy: false,
             bytes: 0,
+            left_out: 0,
+            looked: None,
             counted: (0, 0),
         };
         SensorRecorder {
@@ -275,7 +336,7 @@ impl Recorder {
 #[derive(Debug, Default)]
 pub(crate) struct SensorRecorder {
     active: Option<Box<Active>>,
-    /// The viewers of the arm's positions and of new settings.
+    /// The viewers of the arm's positions and of new beginnings.
     viewers: Option<mpsc::Sender<Found>>,
 }
 
@@ -287,17 +348,28 @@ struct Active {
     /// The time of the last noted state. `None`: there is none yet, or entries after it were
     /// dropped.
     noted: Option<Duration>,
+    /// Whether a press or a tare was under way since that state.
+    was_busy: bool,
     /// The bytes of memory that the entries since that state take.
     bytes: usize,
-    /// The numbers of whole and of damaged frames up to that state.
+    /// The number of entries that came before the sensor was at rest.
+    left_out: u64,
+    /// When the damage was looked at last.
+    looked: Option<Duration>,
+    /// The numbers of whole and of damaged frames up to then.
     counted: (u64, u64),
 }
 
 impl SensorRecorder {
-    /// Also passes the positions of the arm and the settings after a reload on to `viewers`, as a
-    /// recording has them.
+    /// Also passes the positions of the arm and each new beginning on to `viewers`, as a recording has
+    /// them.
     pub(crate) fn with_viewers(self, viewers: Option<mpsc::Sender<Found>>) -> Self {
         Self { viewers, ..self }
+    }
+
+    /// Records with `next` from now on. The viewers stay.
+    pub(crate) fn replace(&mut self, next: Self) {
+        self.active = next.active;
     }
 
     /// Records `input`, which `pipeline` is about to take.
@@ -322,19 +394,22 @@ impl SensorRecorder {
         };
         if let Err(mpsc::error::TrySendError::Full(found)) = viewers.try_send(found) {
             let lost = match found.entry {
-                Entry::Settings(_) => "the sensor's new settings",
+                Entry::State(_) => "the sensor's new beginning",
                 _ => "the positions of the arm",
             };
             warn!("viewers are too slow for {lost}");
         }
     }
 
-    /// Records that `pipeline` will use `sensor` and `hrn` from now on.
-    pub(crate) fn reload(&mut self, pipeline: &Pipeline, sensor: &Sensor, hrn: &Hrn, at: Stamp) {
-        let settings = || Entry::Settings(Box::new(RecordedSensor::new(sensor, hrn)));
-        self.show(pipeline, at, settings);
+    /// Records that `pipeline`, which is at rest, begins anew or has another model.
+    pub(crate) fn begin_anew(&mut self, pipeline: &Pipeline, at: Stamp) {
+        let Some(state) = State::of(pipeline, &Labels::new()) else {
+            return;
+        };
+        self.show(pipeline, at, || Entry::State(Box::new(state)));
         if let Some(active) = &mut self.active {
-            active.follow(pipeline, at, settings());
+            active.noted = None;
+            active.begin(pipeline, at);
         }
     }
 
@@ -354,12 +429,13 @@ impl SensorRecorder {
 }
 
 impl Active {
-    /// Sends `entry`, after a state if one is due. If there is no room for the state, `entry` is
-    /// dropped even if there is room again: a replay could not use it without the state.
+    /// Sends `entry`, after a state if one is due. Before the first state, entries are left out: a
+    /// replay could not use them.
     fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
+        self.look_for_damage(pipeline, at);
         self.begin(pipeline, at);
         if self.noted.is_none() {
-            self.jobs.dropped.fetch_add(1, Ordering::Relaxed);
+            self.left_out += 1;
             return;
         }
         self.bytes += entry.weight();
@@ -367,22 +443,42 @@ impl Active {
     }
 
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
-        let due =
-            |noted| at.mono.saturating_sub(noted) >= STATE_EVERY || self.bytes >= STATE_EVERY_BYTES;
+        self.was_busy |= !pipeline.is_at_rest();
+        let due = |noted| {
+            let is_old = at.mono.saturating_sub(noted) >= STATE_EVERY;
+            is_old || self.was_busy || self.bytes >= STATE_EVERY_BYTES
+        };
         if !self.noted.is_none_or(due) {
+            return;
+        }
+        let Some(state) = State::of(pipeline, &self.labels) else {
+            return;
+        };
+        if self.left_out > 0 {
+            let (sensor, entries) = (pipeline.sensor().name(), self.left_out);
+            info!(
+                sensor,
+                entries, "recording begins at rest: what came before is left out"
+            );
+        }
+        (self.noted, self.was_busy) = (Some(at.mono), false);
+        (self.bytes, self.left_out) = (0, 0);
+        self.queue(at, Entry::State(Box::new(state)));
+    }
+
+    fn look_for_damage(&mut self, pipeline: &Pipeline, at: Stamp) {
+        let looked = *self.looked.get_or_insert(at.mono);
+        if at.mono.saturating_sub(looked) < DAMAGE_EVERY {
             return;
         }
         let counts = pipeline.frame_counts();
         let (whole, damaged) = (counts.0 - self.counted.0, counts.1 - self.counted.1);
         let share = damaged as f64 / (whole + damaged).max(1) as f64;
-        if self.noted.is_some() && damaged >= DAMAGED_FRAMES && share > DAMAGED_SHARE {
+        if damaged >= DAMAGED_FRAMES && share > DAMAGED_SHARE {
             let sensor = self.index;
             self.jobs.send(Job::Damage { sensor });
         }
-        self.counted = counts;
-        (self.noted, self.bytes) = (Some(at.mono), 0);
-        let state = State::of(pipeline, self.labels.clone());
-        self.queue(at, Entry::State(Box::new(state)));
+        (self.looked, self.counted) = (Some(at.mono), counts);
     }
 
     fn queue(&mut self, at: Stamp, entry: Entry) {

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use self::motion::Positions;
-use hardnessd_core::event::{self, ContextError, Kind};
+use hardnessd_core::event::{self, Kind};
 
 /// A request as it is written. The first key names it.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -115,14 +115,10 @@ impl Since {
 }
 
 impl TryFrom<String> for Since {
-    type Error = Unusable;
+    type Error = String;
 
-    fn try_from(token: String) -> Result<Self, Unusable> {
-        Self::parse(&token).ok_or_else(|| Unusable::Value {
-            key: "since",
-            found: short(&token),
-            expected: "\"RUN:SEQ\"",
-        })
+    fn try_from(token: String) -> Result<Self, String> {
+        Self::parse(&token).ok_or_else(|| unusable("since", &token, "\"RUN:SEQ\""))
     }
 }
 
@@ -136,20 +132,16 @@ pub(crate) struct Context {
 }
 
 impl TryFrom<Map<String, Value>> for Context {
-    type Error = Unusable;
+    type Error = String;
 
-    fn try_from(fields: Map<String, Value>) -> Result<Self, Unusable> {
+    fn try_from(fields: Map<String, Value>) -> Result<Self, String> {
         let sensor = fields.get("sensor");
         let Some(Value::String(name)) = sensor else {
-            return Err(Unusable::Value {
-                key: "sensor",
-                found: short(&sensor),
-                expected: "a sensor's name",
-            });
+            return Err(unusable("sensor", &sensor, "a sensor's name"));
         };
         let (sensor, is_empty) = (name.clone(), fields.len() == 1);
         let context = Value::Object(fields);
-        event::check_context(&context)?;
+        event::check_context(&context).map_err(|error| error.to_string())?;
         Ok(Self {
             sensor,
             context: (!is_empty).then_some(context),
@@ -157,36 +149,13 @@ impl TryFrom<Map<String, Value>> for Context {
     }
 }
 
-/// The reason a line cannot be used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum Unusable {
-    #[error("found no JSON object ({0})")]
-    NoObject(String),
-    /// The request's key, and the reader's message.
-    #[error("{key}: {problem}")]
-    Request { key: String, problem: String },
-    #[error("found {found}, expected {expected}")]
-    Key {
-        found: String,
-        expected: &'static str,
-    },
-    #[error("{key}: found {found}, expected {expected}")]
-    Value {
-        key: &'static str,
-        found: String,
-        expected: &'static str,
-    },
-    #[error(transparent)]
-    Context(#[from] ContextError),
-}
-
 /// A line that was read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Line {
     /// The `id` to echo in the answer.
     pub(crate) id: Option<Value>,
-    /// The request, or the reason the line cannot be used.
-    pub(crate) request: Result<Request, Unusable>,
+    /// The request, or the reason the line cannot be used, in words.
+    pub(crate) request: Result<Request, String>,
 }
 
 /// Reads one line, without its newline.
@@ -196,7 +165,7 @@ pub(crate) fn parse(line: &[u8]) -> Line {
         Err(error) => {
             return Line {
                 id: None,
-                request: Err(Unusable::NoObject(error.to_string())),
+                request: Err(format!("found no JSON object ({error})")),
             };
         }
     };
@@ -207,7 +176,7 @@ pub(crate) fn parse(line: &[u8]) -> Line {
     }
 }
 
-fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
+fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
     let mut key = fields
         .keys()
         .next()
@@ -219,10 +188,12 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, Unusable> {
         fields = Map::from_iter([(key.clone(), Value::Object(fields))]);
     }
     let request = serde_json::from_value(Value::Object(fields));
-    request.map_err(|error| Unusable::Request {
-        key,
-        problem: error.to_string(),
-    })
+    request.map_err(|error| format!("{key}: {error}"))
+}
+
+/// The message of a value that cannot be used.
+pub(crate) fn unusable(key: &str, found: &(impl Serialize + ?Sized), expected: &str) -> String {
+    format!("{key}: found {}, expected {expected}", short(found))
 }
 
 /// The value found as JSON, cut to a length that fits in a message.
@@ -290,7 +261,7 @@ mod tests {
             context(&format!(r#","tag":"{}""#, "x".repeat(bytes - around)))
         };
         assert!(long(1023).is_ok());
-        let error = long(1024).unwrap_err().to_string();
+        let error = long(1024).unwrap_err();
         assert!(
             error.ends_with("found 1024 bytes, expected fewer than 1024"),
             "{error}"
@@ -304,7 +275,7 @@ mod tests {
             ))
         };
         assert!(deep(15).is_ok());
-        let error = deep(16).unwrap_err().to_string();
+        let error = deep(16).unwrap_err();
         assert!(
             error.ends_with("found 17 levels, expected at most 16"),
             "{error}"
@@ -368,7 +339,7 @@ mod tests {
             ),
         ] {
             let read = parse(line);
-            let message = read.request.unwrap_err().to_string();
+            let message = read.request.unwrap_err();
             assert!(message.contains(found), "{message}");
             assert_eq!(read.id, Some(Value::from("a")));
         }

@@ -7,43 +7,32 @@
 //! them. The node has no service and no parameter, so nothing else comes in.
 
 use std::collections::BTreeMap;
-use std::io;
+use std::sync::Arc;
+use std::time::Duration;
 
 use ros2_client::dds::rustdds::DomainParticipantBuilder;
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
 use ros2_client::{
-    Context, CreateError, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher,
-    Subscription, WriteResult,
+    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Subscription,
+    WriteResult,
 };
 use serde::ser::SerializeTuple;
 use serde::{Serialize, Serializer};
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
+use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 
-use super::config;
-use super::hub::Line;
-use super::relay::{Door, Worker};
+use super::config::{self, Config};
+use super::hub::{Hub, Line};
+use super::publish::Error;
+use super::relay::{PositionQueue, Worker};
 use super::request::motion::{Positions, ReportedPoint};
 use hardnessd_core::event::{Event, FrameEvent, Status};
 use hardnessd_core::ros::{self, Topic, tools};
 
-/// The reason the node could not start.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The domain or a topic could not be made.
-    #[error("publish.ros2: {0}")]
-    Create(#[from] CreateError),
-    /// The node could not be made.
-    #[error("publish.ros2: {0}")]
-    Node(#[from] ros2_client::NodeCreateError),
-    /// ROS does not allow a name.
-    #[error("publish.ros2.namespace: {0}")]
-    Name(#[from] ros2_client::names::NameError),
-    /// The system could not start the thread or its runtime.
-    #[error("no thread for publish.ros2: {0}")]
-    Thread(#[from] io::Error),
-}
+/// An error of the library.
+type Failure = Box<dyn std::error::Error>;
 
 /// The number of press events that are kept for a subscriber that missed some.
 const PRESSES_KEPT: usize = 16;
@@ -52,6 +41,9 @@ const PRESSES_KEPT: usize = 16;
 /// that needs more misses them, because publishing does not wait for it.
 const PICTURES_KEPT: usize = 5;
 
+/// How often the state of the sensors is published for the usual tools.
+const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
+
 /// The number of positions that are kept until the thread reads them.
 const POSITIONS_KEPT: usize = 256;
 
@@ -59,41 +51,30 @@ const POSITIONS_KEPT: usize = 256;
 /// dark.
 const LEAST_SCALE_N: f32 = 0.2;
 
-/// A job for the thread.
-pub(super) enum Job {
-    Lines(Vec<Line>),
-    Vitals(Vec<Status>),
-}
-
-impl From<Vec<Line>> for Job {
-    fn from(lines: Vec<Line>) -> Self {
-        Self::Lines(lines)
-    }
-}
-
 /// Joins the domain as `settings` say and makes the topics of `sensors`.
 ///
 /// # Errors
 ///
 /// Fails if the domain cannot be joined, for example because no port is free.
-pub(super) fn open(
-    settings: &config::Ros2,
-    robot: &str,
-    sensors: Vec<String>,
-) -> Result<Worker<Job>, Error> {
+pub(super) fn open(settings: &config::Ros2, config: &Config, hub: &Hub) -> Result<Worker, Error> {
     let (domain, namespace) = (settings.domain_id(), &settings.namespace);
     info!(way = "ros2", domain, namespace, "publishing");
-    let (settings, robot) = (settings.clone(), robot.to_owned());
-    let worker = Worker::start(
+    let (settings, robot) = (settings.clone(), config.robot.clone());
+    let sensors = config.sensors.iter().map(|sensor| sensor.name.clone());
+    let sensors: Vec<String> = sensors.collect();
+    let hub = hub.clone();
+    Worker::start(
         "ros2",
-        move |_, door| Ros2::open(&settings, robot, &sensors, &door),
-        |(runtime, mut ros2), jobs| {
-            runtime.block_on(ros2.work(jobs));
+        move |positions| {
+            let opened = Ros2::open(&settings, robot, &sensors, &positions);
+            opened.map_err(|error| Error::io(format!("publish.ros2: {error}")))
+        },
+        move |(runtime, mut ros2), lines| {
+            runtime.block_on(ros2.work(lines, &hub));
             // The tasks that read positions must end before their node.
             drop(runtime);
         },
-    );
-    Ok(worker?.with_vitals(|_, statuses| Job::Vitals(statuses)))
+    )
 }
 
 /// A node and its topics.
@@ -113,13 +94,13 @@ impl Ros2 {
         settings: &config::Ros2,
         robot: String,
         sensors: &[String],
-        door: &Door,
-    ) -> Result<(Runtime, Self), Error> {
+        queue: &PositionQueue,
+    ) -> Result<(Runtime, Self), Failure> {
         let mut domain = DomainParticipantBuilder::new(settings.domain_id());
         if !settings.networks.is_empty() {
             domain = domain.with_only_networks(settings.networks.iter().copied());
         }
-        let context = Context::from_domain_participant(domain.build().map_err(CreateError::from)?)?;
+        let context = Context::from_domain_participant(domain.build()?)?;
         let name = NodeName::new(&settings.namespace, "hardnessd")?;
         let options = NodeOptions::new()
             .enable_rosout(false)
@@ -146,10 +127,10 @@ impl Ros2 {
         }
         // By convention, the name of this topic is the same everywhere.
         let diagnostics = publisher(&mut node, "/", tools::DIAGNOSTICS, &kept(PRESSES_KEPT))?;
-        let runtime = Builder::new_current_thread().build()?;
+        let runtime = Builder::new_current_thread().enable_time().build()?;
         for (sensor, topic) in &settings.motion {
             let positions = subscription(&mut node, topic)?;
-            runtime.spawn(take_positions(sensor.clone(), positions, door.clone()));
+            runtime.spawn(take_positions(sensor.clone(), positions, queue.clone()));
         }
         let ros2 = Self {
             robot,
@@ -161,12 +142,20 @@ impl Ros2 {
         Ok((runtime, ros2))
     }
 
-    /// Does the jobs. Between two jobs, the runtime reads positions.
-    async fn work(&mut self, mut jobs: mpsc::Receiver<Job>) {
-        while let Some(job) = jobs.recv().await {
-            match job {
-                Job::Lines(lines) => lines.iter().for_each(|line| self.publish(line)),
-                Job::Vitals(statuses) => self.diagnose(&statuses),
+    /// Publishes lines, and diagnostics at intervals. Meanwhile the runtime reads positions.
+    async fn work(&mut self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>, hub: &Hub) {
+        let mut tick = tokio::time::interval(DIAGNOSTICS_EVERY);
+        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                lines = lines.recv() => match lines {
+                    Some(lines) => lines.iter().for_each(|line| self.publish(line)),
+                    None => return,
+                },
+                _ = tick.tick() => if let Ok(now) = hub.snapshot().await {
+                    let statuses = now.sensors.into_iter().map(|one| one.state.status);
+                    self.diagnose(&statuses.collect::<Vec<_>>());
+                },
             }
         }
     }
@@ -181,7 +170,7 @@ impl Ros2 {
 
     fn publish(&mut self, line: &Line) {
         let Some(event) = &line.event else {
-            warn!(gap = line.json.trim_end(), "ros2 is too slow");
+            warn!(gap = line.json().trim_end(), "ros2 is too slow");
             return;
         };
         let (topic, _, bytes) = ros::encode(event);
@@ -222,7 +211,11 @@ impl Ros2 {
 }
 
 /// Reads positions of the arm of `sensor`, forever.
-async fn take_positions(sensor: String, positions: Subscription<tools::PointStamped>, door: Door) {
+async fn take_positions(
+    sensor: String,
+    positions: Subscription<tools::PointStamped>,
+    queue: PositionQueue,
+) {
     loop {
         let taken = match positions.async_take().await {
             Ok((position, _)) => position.position(),
@@ -232,7 +225,7 @@ async fn take_positions(sensor: String, positions: Subscription<tools::PointStam
             }
         };
         match taken.and_then(|(at, mm)| ReportedPoint::at_time(at, mm)) {
-            Some(point) => door.put(Positions {
+            Some(point) => queue.put(Positions {
                 sensor: sensor.clone(),
                 points: vec![point],
             }),
@@ -249,7 +242,7 @@ fn publisher(
     space: &str,
     topic: Topic,
     qos: &QosProfile,
-) -> Result<Publisher<Message>, Error> {
+) -> Result<Publisher<Message>, Failure> {
     let (package, name) = topic.package_and_name();
     let made = node.create_topic(
         &Name::new(space, topic.name)?,
@@ -261,7 +254,10 @@ fn publisher(
 
 /// Subscribes to the positions of an arm. The subscription accepts reliable and best-effort
 /// publishers.
-fn subscription(node: &mut Node, topic: &str) -> Result<Subscription<tools::PointStamped>, Error> {
+fn subscription(
+    node: &mut Node,
+    topic: &str,
+) -> Result<Subscription<tools::PointStamped>, Failure> {
     let (space, base) = topic.rsplit_once('/').unwrap_or_default();
     let space = if space.is_empty() { "/" } else { space };
     let (package, name) = tools::POSITION.package_and_name();

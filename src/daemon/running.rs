@@ -1,5 +1,6 @@
 //! The running daemon: its main loop, reloads, and its end.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,12 +12,14 @@ use tracing::{error, info, warn};
 
 use super::clients::Clients;
 use super::config::Setup;
-use super::record::{Recorder, Target};
-use super::reload::{self, Readers, Refusal, Reload};
-use super::sensor::{Command, SensorHandle, Sensors};
-use super::{Error, about, alive, announce_sensor, hello, hub, short, start_sensor, systemd};
+use super::hub::Hub;
+use super::own::Store;
+use super::record::{Recorder, SensorRecorder, Target};
+use super::reload::{self, Refusal, Reload};
+use super::sensor::{Command, SensorCore, SensorHandle, Sensors};
+use super::serial::Sources;
+use super::{Error, about, announce_sensor, hello, now, pipeline_of, short, start_sensor, systemd};
 use crate::maybe;
-use hardnessd_core::event::Hello;
 
 /// How long subscribers may take to fetch their last lines. This is short, because the daemon must
 /// end within 1 s.
@@ -27,19 +30,22 @@ pub(super) struct Running {
     pub(super) setup: Setup,
     /// The token of this run.
     pub(super) run: String,
-    pub(super) hub: hub::Handle,
+    pub(super) hub: Hub,
     pub(super) sensors: Sensors,
     /// Sends the sensors after a reload that adds or removes some.
     pub(super) changed_sensors: watch::Sender<Arc<[SensorHandle]>>,
-    /// The tasks of the sensors. The result of a task is the name of its sensor.
-    pub(super) tasks: JoinSet<String>,
+    /// The tasks of the sensors.
+    pub(super) tasks: JoinSet<SensorCore>,
     /// The tasks of the publishers.
     pub(super) publishers: JoinSet<()>,
     /// The thread of those tasks.
     pub(super) clients: Clients,
+    pub(super) store: Store,
     pub(super) recorder: Option<Recorder>,
-    /// Sends orders to the listeners.
-    pub(super) orders: watch::Sender<()>,
+    /// The recorders before that one, which may still write.
+    pub(super) former: Vec<Recorder>,
+    /// The listeners stop when this is dropped.
+    pub(super) listening: watch::Sender<()>,
 }
 
 /// A configuration that is being read.
@@ -54,7 +60,6 @@ impl Running {
     ) -> Result<(), Error> {
         let mut heartbeat = tokio::time::interval(systemd::heartbeat());
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let readers = Readers::default();
         let mut loading: Option<Loading> = None;
         let mut shutdown = pin!(shutdown);
         loop {
@@ -64,21 +69,24 @@ impl Running {
                 Some(_) = self.publishers.join_next() => return Err(Error::Stopped("a listener")),
                 () = maybe::wait(self.recorder.as_mut().map(Recorder::stopped)) => return Ok(()),
                 _ = heartbeat.tick() => {
-                    if let Some(statuses) = alive(&self.hub, &self.sensors).await {
-                        systemd::alive(&statuses);
-                    }
+                    // This is the sensors' thread, so it works.
+                    systemd::alive(self.hub.live());
                 }
                 path = reload::requested(reload), if loading.is_none() => {
                     systemd::reloading();
-                    // Order the listeners to check that they can still be reached.
-                    let _ = self.orders.send(());
-                    loading = Some(Box::pin(readers.read(path)));
+                    loading = Some(Box::pin(reload::read(path)));
                 }
                 loaded = maybe::wait(loading.as_mut()) => {
                     loading = None;
                     let log = reload.as_ref().map(|reload| &reload.log);
-                    match loaded.and_then(|changed| reload::change(&self.setup, changed, log)) {
-                        Ok(changed) => self.adopt(changed).await?,
+                    let changed = loaded.and_then(|changed| {
+                        let changed = reload::change(&self.setup, changed)?;
+                        let recorder = self.record_anew(&changed)?;
+                        reload::change_log(&self.setup, &changed, log);
+                        Ok((changed, recorder))
+                    });
+                    match changed {
+                        Ok((changed, recorder)) => self.adopt(changed, recorder).await?,
                         Err(reason) => error!(%reason, "reload refused, all stays as it was"),
                     }
                     systemd::ready();
@@ -87,82 +95,111 @@ impl Running {
         }
     }
 
-    /// Uses `changed` from now on.
+    /// Uses `changed` from now on, and `recorder` if there is one. Nothing here can fail but a task that
+    /// ended by itself.
     ///
     /// # Errors
     ///
     /// Fails if the task of a sensor has ended by itself.
-    async fn adopt(&mut self, changed: Setup) -> Result<(), Error> {
-        self.setup = changed;
+    async fn adopt(&mut self, changed: Setup, recorder: Option<Recorder>) -> Result<(), Error> {
+        let former = std::mem::replace(&mut self.setup, changed);
         let running = self.sensors.current();
-        let sensors = &self.setup.sensors;
-        let (kept, removed): (Vec<&SensorHandle>, Vec<_>) = running
-            .iter()
-            .partition(|handle| sensors.iter().any(|sensor| sensor.name() == handle.name));
-        let are_others = !removed.is_empty() || kept.len() < sensors.len();
-        // The removed sensors end first, because an added one may have the port of one of them.
-        self.remove(&removed).await?;
-        let hello = hello(&self.setup, self.run.clone());
-        if are_others {
-            self.record_anew(&hello);
+        let runs_on = |handle: &&SensorHandle| self.setup.is_same(&former, &handle.name);
+        let (kept, stopped): (Vec<&SensorHandle>, Vec<_>) = running.iter().partition(runs_on);
+        // The others end first, because a sensor that starts may have the port of one of them.
+        let mut stopped = self.stop(&stopped).await?;
+        self.hub.describe(hello(&self.setup, self.run.clone()));
+        if let Some(recorder) = &recorder {
+            self.hub.record(recorder.of_hub());
         }
-        let recorder = self.recorder.as_ref().filter(|_| are_others);
-        let events = recorder.map(Recorder::of_hub);
-        self.hub.describe(hello, events).await;
         let mut sensors = Vec::with_capacity(self.setup.sensors.len());
+        let mut sources = Sources::default();
         for (index, sensor) in self.setup.sensors.iter().enumerate() {
-            let recorder = recorder.map(|recorder| recorder.of_sensor(index));
-            let handle = kept.iter().find(|handle| handle.name == sensor.name());
-            let Some(handle) = handle.copied() else {
-                let (setup, tasks) = (&self.setup, &mut self.tasks);
-                announce_sensor(&setup.config.sensors[index], sensor);
-                let recorder = recorder.unwrap_or_default();
-                sensors.push(start_sensor(setup, index, recorder, &self.hub, tasks));
+            let next = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
+            if let Some(&handle) = kept.iter().find(|handle| handle.name == sensor.name()) {
+                let hrn = self.setup.hrn_of(sensor.name()).clone();
+                let model = Command::Model(Box::new(sensor.clone()), hrn);
+                for command in [Some(model), next.map(Command::Recorder)]
+                    .into_iter()
+                    .flatten()
+                {
+                    // The main loop notices a sensor whose task has ended.
+                    let _ = handle.commands.send(command).await;
+                }
+                sensors.push(handle.clone());
                 continue;
+            }
+            announce_sensor(&self.setup, index);
+            let (before, recorder, unjudged) = match stopped.remove(sensor.name()) {
+                Some(core) => (Some(core.pipeline), core.recorder, core.unjudged),
+                None => (None, SensorRecorder::default(), 0),
             };
-            let hrn = self.setup.hrn_of(sensor.name()).clone();
-            let command = Command::Reload(Box::new(sensor.clone()), hrn, recorder);
-            // The main loop notices a sensor whose task has ended.
-            let _ = handle.commands.send(command).await;
-            sensors.push(handle.clone());
+            let mut core = SensorCore {
+                pipeline: pipeline_of(&self.setup, index, before, &self.store),
+                recorder,
+                unjudged,
+            };
+            if let Some(next) = next {
+                core.recorder.replace(next);
+            }
+            core.recorder.begin_anew(&core.pipeline, now());
+            let (setup, tasks) = (&self.setup, &mut self.tasks);
+            let beside = (&self.hub, &self.store);
+            let source = sources.take(&setup.sensors, index);
+            sensors.push(start_sensor(setup, index, (core, source), beside, tasks));
         }
         self.changed_sensors.send_replace(sensors.into());
+        if let Some(recorder) = recorder {
+            // The former recording ends when the sensors have let go of it.
+            self.former.extend(self.recorder.replace(recorder));
+        }
         info!(model = short(&self.setup), "reloaded");
         Ok(())
     }
 
-    /// Ends the tasks of sensors that the configuration no longer has.
-    async fn remove(&mut self, removed: &[&SensorHandle]) -> Result<(), Error> {
-        let is_removed = |name: &str| removed.iter().any(|sensor| sensor.name == name);
+    /// Ends the tasks of sensors that do not run on. Returns what is left of them, by name.
+    async fn stop(
+        &mut self,
+        stopped: &[&SensorHandle],
+    ) -> Result<BTreeMap<String, SensorCore>, Error> {
+        let is_stopped = |name: &str| stopped.iter().any(|sensor| sensor.name == name);
         let left = self.sensors.current();
-        let left = left.iter().filter(|sensor| !is_removed(&sensor.name));
+        let left = left.iter().filter(|sensor| !is_stopped(&sensor.name));
         self.changed_sensors.send_replace(left.cloned().collect());
-        for sensor in removed {
+        for sensor in stopped {
             // The task may have ended by itself.
             let _ = sensor.commands.send(Command::Finish).await;
         }
-        for _ in removed {
+        let mut ended = BTreeMap::new();
+        for _ in stopped {
             match self.tasks.join_next().await {
-                Some(Ok(name)) if is_removed(&name) => info!(sensor = name, "removed"),
+                Some(Ok(one)) if is_stopped(one.pipeline.sensor().name()) => {
+                    let name = one.pipeline.sensor().name().to_owned();
+                    info!(sensor = name, "stopped");
+                    ended.insert(name, one);
+                }
                 _ => return Err(Error::Stopped("a sensor")),
             }
         }
-        Ok(())
+        Ok(ended)
     }
 
-    /// Begins another recording, because a recording has the same sensors from its beginning to its end.
-    fn record_anew(&mut self, hello: &Hello) {
-        let Some(settings) = &self.setup.config.record else {
-            return;
+    /// Begins another recording if `changed` has other sensors, because a recording has the same sensors
+    /// from its beginning to its end.
+    fn record_anew(&self, changed: &Setup) -> Result<Option<Recorder>, Refusal> {
+        let names = |setup: &Setup| -> BTreeSet<String> {
+            let sensors = setup.sensors.iter();
+            sensors.map(|sensor| sensor.name().to_owned()).collect()
         };
+        let Some(settings) = &changed.config.record else {
+            return Ok(None);
+        };
+        if names(changed) == names(&self.setup) {
+            return Ok(None);
+        }
         let target = Target::Directory(settings.clone());
-        self.recorder = match Recorder::start(target, about(&self.setup, hello)) {
-            Ok(recorder) => Some(recorder),
-            Err(reason) => {
-                error!(%reason, "the recording ends");
-                None
-            }
-        };
+        let hello = hello(changed, self.run.clone());
+        Ok(Some(Recorder::start(target, about(changed, &hello))?))
     }
 
     /// Ends the daemon. Presses are aborted, and subscribers and the recording get their last
@@ -175,13 +212,22 @@ impl Running {
             let _ = sensor.commands.send(Command::Finish).await;
         }
         while self.tasks.join_next().await.is_some() {}
-        self.hub.close().await;
-        drop(self.orders);
+        self.hub.close();
+        drop(self.listening);
         let farewell = async { while self.publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
         drop(self.clients);
+        let former = async {
+            for recorder in self.former {
+                // A recording into a directory that fails has been logged.
+                let _ = recorder.finish().await;
+            }
+        };
+        if tokio::time::timeout(FAREWELL, former).await.is_err() {
+            warn!("the disk did not take the end of a former recording");
+        }
         let recorded = match self.recorder {
             // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,

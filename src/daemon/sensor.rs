@@ -8,34 +8,32 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use super::frame_rate::FrameRate;
-use super::hub;
+use super::hub::Hub;
 use super::log;
+use super::own::Store;
 use super::record::{NoBlackbox, SensorRecorder};
 use super::request::motion::{Calendar, Placed};
-use super::serial::{self, Link, Turn};
+use super::serial::{Source, Turn};
 use crate::maybe;
-use hardnessd_core::event::{Event, Kind, Status, Tared};
+use hardnessd_core::event::{Event, Phase, Status, Tared};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::StepBack;
-use hardnessd_core::pipeline::{Input, Pipeline};
+use hardnessd_core::pipeline::{Input, Pipeline, Refused};
+use hardnessd_core::port::Port;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Hrn;
-
-/// So many sensors are asked for their state at once: few switches between threads, and yet a frame
-/// that comes meanwhile does not wait for all sensors.
-const AT_ONCE: usize = 32;
+use hardnessd_core::wire::is_telnet;
 
 /// A command to a sensor's task.
 #[derive(Debug)]
 pub(crate) enum Command {
-    /// Report the current state of the sensor.
-    Status(oneshot::Sender<Vitals>),
     /// Take another tare. The answer comes when the tare is taken, refused or abandoned.
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
     /// Repeat the controller's context in events. The answer comes when the pipeline has the
@@ -45,19 +43,29 @@ pub(crate) enum Command {
     Motion(Placed, oneshot::Sender<Result<(), StepBack>>),
     /// Write the last minute to a file. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, NoBlackbox>>),
-    /// Use another description and model from now on. Values that only a restart can change must
-    /// not differ. If there is another recorder, use that one too.
-    Reload(Box<Sensor>, Arc<Hrn>, Option<SensorRecorder>),
+    /// Judge with another model from the next rest on. Of the sensor's tables, only `[model]` may differ.
+    Model(Box<Sensor>, Arc<Hrn>),
+    /// Record with another recorder.
+    Recorder(SensorRecorder),
     /// End the task. A press under way is aborted, and no further event follows.
     Finish,
 }
 
+/// A sensor without its port: what its task begins with, and what is left of it at the end.
+#[derive(Debug)]
+pub(crate) struct SensorCore {
+    pub(crate) pipeline: Pipeline,
+    pub(crate) recorder: SensorRecorder,
+    /// The number of verdicts since the start that are missing because the model failed.
+    pub(crate) unjudged: u64,
+}
+
 /// The current state of a sensor.
 #[derive(Debug, Clone)]
-pub(crate) struct Vitals {
+pub(crate) struct SensorState {
     pub(crate) status: Status,
-    /// The age of the sensor's last whole frame.
-    pub(crate) last_frame_age: Option<Duration>,
+    /// When the sensor's last whole frame came, by CLOCK_MONOTONIC.
+    pub(crate) last_frame: Option<Duration>,
     pub(crate) contact_threshold_n: f32,
     /// The number of verdicts since the start that are missing because the model failed.
     pub(crate) unjudged: u64,
@@ -89,74 +97,60 @@ impl Sensors {
     pub(crate) fn current(&self) -> Arc<[SensorHandle]> {
         Arc::clone(&self.0.borrow())
     }
-
-    /// The current state of every sensor, and whether every sensor answered. A sensor whose task has
-    /// ended is left out.
-    pub(crate) async fn vitals(&self) -> (Vec<Vitals>, bool) {
-        let sensors = self.current();
-        let mut all = Vec::with_capacity(sensors.len());
-        for some in sensors.chunks(AT_ONCE) {
-            let mut asked = Vec::with_capacity(AT_ONCE);
-            for sensor in some {
-                let (reply, vitals) = oneshot::channel();
-                if sensor.commands.send(Command::Status(reply)).await.is_ok() {
-                    asked.push(vitals);
-                }
-            }
-            for vitals in asked {
-                all.extend(vitals.await.ok());
-            }
-        }
-        let is_whole = all.len() == sensors.len();
-        (all, is_whole)
-    }
-
-    /// Every sensor's current status, and whether every sensor answered.
-    pub(crate) async fn statuses(&self) -> (Vec<Status>, bool) {
-        let (vitals, is_whole) = self.vitals().await;
-        let statuses = vitals.into_iter().map(|vitals| vitals.status);
-        (statuses.collect(), is_whole)
-    }
 }
 
-/// Serves one sensor until [`Command::Finish`].
+/// Serves one sensor until [`Command::Finish`]. Returns what is left of it, which is no longer in
+/// `link`.
 pub(crate) async fn serve(
-    mut pipeline: Pipeline,
-    mut link: Link,
-    mut recorder: SensorRecorder,
-    hub: hub::Handle,
+    core: SensorCore,
+    mut link: Source,
+    (hub, store): (Hub, Store),
     mut commands: mpsc::Receiver<Command>,
-) {
+) -> SensorCore {
     // The client that waits for the outcome of a tare.
     let mut taring = None;
-    let mut unjudged = 0;
+    let SensorCore {
+        mut pipeline,
+        mut recorder,
+        mut unjudged,
+    } = core;
     let mut calendar = Calendar::default();
     let mut frame_rate = FrameRate::default();
+    let mut frames = pipeline.frame_counts().0;
+    // The model that judges from the next rest on.
+    let mut next_model = None;
+    // Whether nothing came since the port was opened.
+    let mut is_new = false;
     loop {
+        if pipeline.is_at_rest()
+            && let Some((sensor, hrn)) = next_model.take()
+            && let Some(judging) = pipeline.with_model(sensor, hrn)
+        {
+            pipeline = judging;
+            recorder.begin_anew(&pipeline, super::now());
+        }
+        hub.report(state(&pipeline, unjudged));
+        // A sensor that never pauses leaves the others their turns.
+        tokio::task::yield_now().await;
         let deadline = pipeline.deadline();
         let events = tokio::select! {
             // The selection is not biased: the task must still obey `Finish` if the sensor never
             // pauses, and still read its port if commands never pause.
             command = commands.recv() => match command {
-                Some(Command::Status(reply)) => {
-                    // The client may have gone.
-                    let _ = reply.send(vitals(&pipeline, unjudged));
-                    continue;
-                }
                 Some(Command::Tare(reply)) => {
-                    recorder.note(&pipeline, &Input::Tare, super::now());
-                    match pipeline.retare() {
-                        Ok(()) => taring = Some(reply),
-                        Err(refusal) => {
+                    match take(&mut pipeline, &mut recorder, Input::Tare, super::now()) {
+                        Err(Refused::Tare(refusal)) => {
                             log::tare(pipeline.sensor().name(), &Err(refusal));
                             let _ = reply.send(Err(refusal));
                         }
+                        _ => taring = Some(reply),
                     }
                     continue;
                 }
                 Some(Command::Context(context, reply)) => {
                     log::context(pipeline.sensor().name(), context.as_ref());
-                    take(&mut pipeline, &mut recorder, Input::Context(context), super::now());
+                    let input = Input::Context(context);
+                    taken(&mut pipeline, &mut recorder, input, super::now());
                     let _ = reply.send(());
                     continue;
                 }
@@ -170,59 +164,74 @@ pub(crate) async fn serve(
                     recorder.blackbox(reply);
                     continue;
                 }
-                Some(Command::Reload(sensor, hrn, next)) => {
-                    recorder.reload(&pipeline, &sensor, &hrn, super::now());
-                    link.reload(serial::Settings::of(&sensor));
-                    let reloaded = pipeline.reload(*sensor, hrn);
-                    reloaded.expect("a configuration that differs in what is fixed was refused");
-                    recorder = next.unwrap_or(recorder);
-                    answer(&mut pipeline, &mut taring);
-                    frame_rate = FrameRate::default();
+                Some(Command::Model(sensor, hrn)) => {
+                    next_model = Some((*sensor, hrn));
+                    continue;
+                }
+                Some(Command::Recorder(next)) => {
+                    recorder.replace(next);
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    let events = take(&mut pipeline, &mut recorder, Input::Shutdown, super::now());
-                    return hub.publish(events).await;
+                    let events = taken(&mut pipeline, &mut recorder, Input::Shutdown, super::now());
+                    hub.publish(events);
+                    link.close().await;
+                    return SensorCore {
+                        pipeline,
+                        recorder,
+                        unjudged,
+                    };
                 }
             },
             turn = link.turn() => {
                 let at = super::now();
+                if let Turn::Bytes(bytes) = &turn
+                    && std::mem::take(&mut is_new)
+                    && is_telnet(bytes)
+                    && !matches!(pipeline.sensor().description().sensor.port, Port::Device(_))
+                {
+                    log::telnet(pipeline.sensor().name());
+                }
+                is_new |= matches!(turn, Turn::Opened);
                 let input = match turn {
                     Turn::Bytes(bytes) => Input::Bytes(bytes.into()),
+                    Turn::Skipped(bytes) => Input::Skipped(bytes),
                     Turn::Opened => Input::Opened,
                     Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
                     Turn::Lost(reason) => Input::Lost(reason.into()),
-                    Turn::Restored(changed) => {
-                        log::line_settings(pipeline.sensor().name(), &changed);
-                        continue;
-                    }
                     Turn::Stranger(address) => {
                         log::stranger(pipeline.sensor().name(), address);
                         continue;
                     }
                 };
-                take(&mut pipeline, &mut recorder, input, at)
+                taken(&mut pipeline, &mut recorder, input, at)
             }
-            () = maybe::until(deadline.map(moment)) => take(&mut pipeline, &mut recorder, Input::Tick, super::now()),
+            () = maybe::until(deadline.map(moment)) => {
+                taken(&mut pipeline, &mut recorder, Input::Tick, super::now())
+            }
         };
-        let kinds = events.iter().map(Event::kind);
-        let frames = kinds.filter(|&kind| kind == Kind::Frame).count();
-        if frames > 0 {
+        let before = std::mem::replace(&mut frames, pipeline.frame_counts().0);
+        if frames > before {
             link.proven();
-            let configured_hz = pipeline.sensor().description().frame_rate_hz;
-            let slow_hz = pipeline.slow_rate_hz();
+            let configured_hz = pipeline.sensor().frame_rate_hz();
             let now = super::now().mono;
-            let differs = frame_rate.differs(frames as u32, now, configured_hz, slow_hz);
+            let differs = frame_rate.differs((frames - before) as u32, now, configured_hz);
             if let Some(measured_hz) = differs {
                 log::frame_rate(pipeline.sensor().name(), configured_hz, measured_hz);
             }
         }
         answer(&mut pipeline, &mut taring);
         for failed in pipeline.unjudged() {
-            log::unjudged(&failed);
+            hub.unjudged(&failed);
             unjudged += 1;
         }
-        hub.publish(events).await;
+        let is_final =
+            |event: &Event| matches!(event, Event::Hardness(one) if one.phase == Phase::Final);
+        let is_judged = events.iter().any(is_final);
+        hub.publish(events);
+        if is_judged {
+            store.save(&pipeline);
+        }
     }
 }
 
@@ -232,9 +241,20 @@ fn take(
     recorder: &mut SensorRecorder,
     input: Input<'_>,
     at: Stamp,
-) -> Vec<Event> {
+) -> Result<Vec<Event>, Refused> {
     recorder.note(pipeline, &input, at);
     pipeline.take(input, at)
+}
+
+/// The same for an input that is never refused.
+fn taken(
+    pipeline: &mut Pipeline,
+    recorder: &mut SensorRecorder,
+    input: Input<'_>,
+    at: Stamp,
+) -> Vec<Event> {
+    let taken = take(pipeline, recorder, input, at);
+    taken.expect("only a tare and positions of the arm can be refused")
 }
 
 /// Records positions of the arm and passes them on to the pipeline. If this machine's calendar
@@ -247,16 +267,14 @@ fn take_positions(
 ) -> Result<(), StepBack> {
     if let Some(set) = placed.converted.and_then(|now| calendar.set(now)) {
         log::clock_set(pipeline.sensor().name(), set.by_ms);
-        take(
-            pipeline,
-            recorder,
-            Input::ClockSet(set.until_ns),
-            super::now(),
-        );
+        let input = Input::ClockSet(set.until_ns);
+        taken(pipeline, recorder, input, super::now());
     }
     let input = Input::Motion(placed.points.as_slice().into());
-    recorder.note(pipeline, &input, super::now());
-    pipeline.add_positions(&placed.points)
+    match take(pipeline, recorder, input, super::now()) {
+        Err(Refused::Motion(step_back)) => Err(step_back),
+        _ => Ok(()),
+    }
 }
 
 /// Answers the client that requested a tare, when the outcome is known.
@@ -273,13 +291,16 @@ fn answer(
     }
 }
 
-fn vitals(pipeline: &Pipeline, unjudged: u64) -> Vitals {
-    let now = super::now();
-    Vitals {
-        status: pipeline.status(now),
-        last_frame_age: pipeline
-            .last_frame()
-            .map(|frame| now.mono.saturating_sub(frame.mono)),
+/// The state of the sensor, which the hub has for everybody who asks.
+pub(super) fn state(pipeline: &Pipeline, unjudged: u64) -> SensorState {
+    // The hub sets the time of the status when somebody asks.
+    let at = Stamp {
+        mono: Duration::ZERO,
+        wall: Timestamp::UNIX_EPOCH,
+    };
+    SensorState {
+        status: pipeline.status(at),
+        last_frame: pipeline.last_frame().map(|frame| frame.mono),
         contact_threshold_n: pipeline.sensor().thresholds().contact_threshold_n,
         unjudged,
         motion: pipeline.motion_counts(),
@@ -293,7 +314,7 @@ fn moment(mono: Duration) -> Instant {
 
 #[cfg(test)]
 mod tests {
-    use jiff::{SignedDuration, Timestamp};
+    use jiff::SignedDuration;
     use serde_json::json;
 
     use super::*;
@@ -334,11 +355,11 @@ mod tests {
             }
             let mut raw = RawFrame::default();
             if pressed(ms) {
-                raw.counts[300..336].fill(60);
+                raw.counts[300..336].fill(60.0);
             }
             let mut bytes = Vec::new();
             pipeline.sensor().layout().encode(&raw, &mut bytes);
-            for event in pipeline.push(&bytes, now) {
+            for event in pipeline.take(Input::Bytes(bytes.into()), now).unwrap() {
                 if let Event::Frame(frame) = event
                     && pressed(ms)
                 {

@@ -6,10 +6,13 @@
 //! unplugged tty gives no bytes, and so does a read of a connection that the other end has closed.
 
 mod network;
+mod shared;
 pub(crate) mod tty;
 
+use std::collections::BTreeMap;
 use std::io;
 use std::net::SocketAddr;
+use std::ops::Range;
 use std::time::Duration;
 
 use rustix::io::Errno;
@@ -21,11 +24,14 @@ use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
 use self::network::{Datagram, Udp};
-use self::tty::{Changed, LineSettings};
-use super::busy;
-use super::port::Port;
-use crate::apart::{self, NoThread};
+use self::shared::Share;
+use self::tty::LineSettings;
+use super::baud::BITS_A_BYTE;
+use super::realtime;
 use crate::maybe;
+use crate::thread::{NoThread, spawn_thread};
+use hardnessd_core::allowance::Allowance;
+use hardnessd_core::port::Port;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::wording;
 
@@ -38,6 +44,20 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 const BUFFER_BYTES: usize = 16 * 1024;
 /// The longest datagram.
 const DATAGRAM_BYTES: usize = 64 * 1024;
+
+/// A link has held if frames come for this long. Only then is the port opened again at once after a loss.
+const HELD: Duration = LONGEST_PAUSE;
+
+/// The number of frames whose bytes are passed on at once. What they cost is then bounded, however small
+/// they are.
+const FRAMES_AT_ONCE: usize = 16;
+/// Bytes are passed on up to this many times the rate of a sensor's frames. Frames beyond twice their rate
+/// are dropped by the pipeline.
+const MOST_BYTES: f64 = 4.0;
+/// As many bytes may come at once as the highest rate has in this time.
+const BYTES_AT_ONCE: Duration = Duration::from_secs(5);
+/// The pause after each read of bytes that are not passed on.
+const OVERFLOW_PAUSE: Duration = Duration::from_millis(1);
 
 /// How often the settings of a serial line are compared while its sensor is stale.
 const COMPARE_EVERY: Duration = Duration::from_secs(1);
@@ -52,10 +72,11 @@ pub(crate) enum Turn<'a> {
     Unavailable(String),
     /// Bytes arrived.
     Bytes(&'a [u8]),
+    /// This many bytes arrived, which are more than the sensor's frames can have. The next bytes do not
+    /// continue the earlier ones.
+    Skipped(u64),
     /// The port was open and is lost, for this reason.
     Lost(String),
-    /// Another program had changed the settings of the line. They are set again.
-    Restored(Changed),
     /// Datagrams of this sender are ignored, because another one sends.
     Stranger(SocketAddr),
 }
@@ -69,18 +90,35 @@ pub(crate) struct Settings {
     pub(crate) start: Vec<u8>,
     /// Sent again and again, after this time.
     pub(crate) request: Option<(Vec<u8>, Duration)>,
+    /// How long a request and a frame take on the line.
+    pub(crate) on_the_line: Duration,
+    /// The most bytes that are passed on at once.
+    pub(crate) bytes_at_once: usize,
+    /// The bytes of the sensor's frames in a second, if all are as long as the longest.
+    pub(crate) bytes_per_s: f64,
 }
 
 impl Settings {
     /// The settings for `sensor`.
     pub(crate) fn of(sensor: &Sensor) -> Self {
-        let frame = &sensor.description().frame;
+        let frame = &sensor.description().sensor.frame;
         let every = frame.request_ms.map(|ms| Duration::from_millis(ms.into()));
         let request = frame.request.as_ref();
+        let asked = request.map_or(0, |bytes| bytes.0.len());
+        let frame_bytes = sensor.layout().max_frame_bytes();
+        let bytes = (asked + frame_bytes) as f64;
+        let baud = f64::from(sensor.description().sensor.baud);
+        let on_the_line = match sensor.description().sensor.port {
+            Port::Device(_) => Duration::from_secs_f64(bytes * BITS_A_BYTE / baud),
+            Port::Tcp(_) | Port::Udp(_) => Duration::ZERO,
+        };
         Self {
+            on_the_line,
             stale_after: sensor.stale_after(),
             start: frame.start.clone().unwrap_or_default().0,
             request: request.map(|bytes| (bytes.0.clone(), every.unwrap_or(sensor.period()))),
+            bytes_at_once: FRAMES_AT_ONCE * frame_bytes,
+            bytes_per_s: frame_bytes as f64 * sensor.frame_rate_hz(),
         }
     }
 
@@ -88,6 +126,90 @@ impl Settings {
     fn opening(&self) -> Vec<u8> {
         let request = self.request.iter().flat_map(|(bytes, _)| bytes);
         self.start.iter().chain(request).copied().collect()
+    }
+
+    /// The time that `bytes` take on the line at the highest rate. A line of `baud` carries that many bits
+    /// in any case.
+    fn time_of(&self, bytes: usize, baud: u32) -> Duration {
+        let most = MOST_BYTES * self.bytes_per_s;
+        let seconds = bytes as f64 / most.max(f64::from(baud) / 10.0);
+        Duration::try_from_secs_f64(seconds).unwrap_or(Duration::ZERO)
+    }
+}
+
+/// The port of a sensor: one of its own, or its share of one.
+#[derive(Debug)]
+pub(crate) enum Source {
+    Own(Box<Link>),
+    Shared(Share),
+}
+
+impl Source {
+    /// Waits for the next turn of the port. Cancelling the wait loses nothing.
+    pub(crate) async fn turn(&mut self) -> Turn<'_> {
+        match self {
+            Self::Own(link) => link.turn().await,
+            Self::Shared(share) => share.turn().await,
+        }
+    }
+
+    /// Records that the port works: frames come.
+    pub(crate) fn proven(&mut self) {
+        match self {
+            Self::Own(link) => link.proven(),
+            Self::Shared(share) => share.proven(),
+        }
+    }
+
+    /// Closes the port. One that is shared is closed when all its sensors have closed it.
+    pub(crate) async fn close(self) {
+        if let Self::Shared(share) = self {
+            share.close().await;
+        }
+    }
+}
+
+/// The ports of sensors that start together. Sensors with the same port share it.
+#[derive(Debug, Default)]
+pub(crate) struct Sources(BTreeMap<usize, Source>);
+
+impl Sources {
+    /// The port of the sensor at `index` of `sensors`.
+    pub(crate) fn take(&mut self, sensors: &[Sensor], index: usize) -> Source {
+        if let Some(source) = self.0.remove(&index) {
+            return source;
+        }
+        let table = |index: usize| &sensors[index].description().sensor;
+        let (port, baud) = (&table(index).port, table(index).baud);
+        let same = |&other: &usize| table(other).port == *port;
+        let sharing: Vec<usize> = (0..sensors.len()).filter(same).collect();
+        let settings = sharing.iter().map(|&one| Settings::of(&sensors[one]));
+        let settings: Vec<Settings> = settings.collect();
+        if let [settings] = &settings[..] {
+            return Source::Own(Box::new(Link::new(port, baud, settings.clone())));
+        }
+        let mut starts: Vec<&[u8]> = settings.iter().map(|one| one.start.as_slice()).collect();
+        starts.dedup();
+        let of_link = Settings {
+            stale_after: settings
+                .iter()
+                .map(|one| one.stale_after)
+                .max()
+                .unwrap_or_default(),
+            start: starts.concat(),
+            request: None,
+            on_the_line: Duration::ZERO,
+            bytes_at_once: settings
+                .iter()
+                .map(|one| one.bytes_at_once)
+                .min()
+                .unwrap_or_default(),
+            bytes_per_s: settings.iter().map(|one| one.bytes_per_s).sum(),
+        };
+        let shares = shared::share(Link::new(port, baud, of_link), &settings);
+        let shares = shares.into_iter().map(Source::Shared);
+        self.0.extend(sharing.into_iter().zip(shares));
+        self.0.remove(&index).expect("the sensor has its own port")
     }
 }
 
@@ -100,6 +222,9 @@ pub(crate) struct Link {
     state: State,
     pause: Duration,
     buffer: Box<[u8]>,
+    allowance: Allowance,
+    /// The number of bytes that were not passed on and not reported yet.
+    skipped: u64,
 }
 
 #[derive(Debug)]
@@ -126,8 +251,11 @@ struct Open {
     request_at: Option<Instant>,
     /// When the settings of a serial line are compared next.
     compare_at: Option<Instant>,
-    /// The number of bytes of a new sender that the next turn returns.
-    held: Option<usize>,
+    /// The bytes in the buffer that the next turns return.
+    held: Range<usize>,
+    /// When the next bytes are read, if the sensor sends too many.
+    read_at: Option<Instant>,
+    since: Instant,
 }
 
 #[derive(Debug)]
@@ -158,6 +286,8 @@ impl Link {
             state: State::Waiting(Instant::now()),
             pause: FIRST_PAUSE,
             buffer: vec![0; bytes].into(),
+            allowance: Allowance::default(),
+            skipped: 0,
         }
     }
 
@@ -195,28 +325,41 @@ impl Link {
                     }
                 }
                 State::Open(open) => {
-                    if let Some(read) = open.held.take() {
-                        return Turn::Bytes(&self.buffer[..read]);
+                    if !open.held.is_empty() {
+                        // Others get their turn between two pieces.
+                        let begin = open.held.start;
+                        let bytes = open.held.len().min(self.settings.bytes_at_once);
+                        open.held.start += bytes;
+                        return Turn::Bytes(&self.buffer[begin..][..bytes]);
                     }
                     // A sensor may send faster than the daemon reads.
-                    busy::rest();
+                    realtime::rest();
                     let happened = open.wait(&mut self.buffer, self.settings.stale_after).await;
                     let now = Instant::now();
                     let lost = match happened {
                         Happened::Read(Ok(Datagram::Bytes(0))) => open.line.end().to_owned(),
                         Happened::Read(Ok(Datagram::Bytes(read))) => {
-                            return Turn::Bytes(&self.buffer[..read]);
+                            let time = self.settings.time_of(read, self.baud);
+                            let at = super::now().mono;
+                            if !self.allowance.allows(at, time, BYTES_AT_ONCE) {
+                                self.skipped = (self.skipped + read as u64).min(u32::MAX.into());
+                                open.read_at = Some(now + OVERFLOW_PAUSE);
+                                continue;
+                            }
+                            open.held = 0..read;
+                            match std::mem::take(&mut self.skipped) {
+                                0 => continue,
+                                skipped => return Turn::Skipped(skipped),
+                            }
                         }
                         Happened::Read(Ok(Datagram::First(read))) => {
                             open.line.send(&self.settings.opening());
-                            if read == 0 {
-                                continue;
-                            }
-                            return Turn::Bytes(&self.buffer[..read]);
+                            open.held = 0..read;
+                            continue;
                         }
                         Happened::Read(Ok(Datagram::Next(read))) => {
                             open.line.send(&self.settings.opening());
-                            open.held = (read > 0).then_some(read);
+                            open.held = 0..read;
                             return Turn::Opened;
                         }
                         Happened::Read(Ok(Datagram::Stranger(address))) => {
@@ -226,7 +369,7 @@ impl Link {
                         Happened::Read(Err(error)) => error.to_string(),
                         Happened::RequestIsDue => {
                             if let Some((request, every)) = &self.settings.request {
-                                open.line.send(request);
+                                open.line.request(request, self.settings.stale_after);
                                 let next = open.request_at.map(|at| (at + *every).max(now));
                                 open.request_at = next;
                             }
@@ -234,10 +377,8 @@ impl Link {
                         }
                         Happened::CompareIsDue => {
                             open.compare_at = Some(now + COMPARE_EVERY);
-                            match open.line.restore() {
-                                Some(changed) => return Turn::Restored(changed),
-                                None => continue,
-                            }
+                            open.line.restore();
+                            continue;
                         }
                     };
                     self.wait();
@@ -247,22 +388,30 @@ impl Link {
         }
     }
 
-    /// Records that the port works: frames come. So it is opened again quickly after the next loss,
-    /// and its settings are right. A port that fails as soon as it is opened never gets so far.
-    pub(crate) fn proven(&mut self) {
-        self.pause = FIRST_PAUSE;
-        if let State::Open(Open {
-            compare_at: Some(at),
-            ..
-        }) = &mut self.state
-        {
-            *at = Instant::now() + self.settings.stale_after;
+    /// Sends a request, if the port is open and there is room for it.
+    fn request(&self, request: &[u8]) {
+        if let State::Open(open) = &self.state {
+            open.line.request(request, self.settings.stale_after);
         }
     }
 
-    /// Takes over the changed settings of the sensor.
-    pub(crate) fn reload(&mut self, settings: Settings) {
-        self.settings = settings;
+    /// Records that the port works: frames come. So its settings are right, and a sender of datagrams keeps
+    /// its place. A port that goes on so for a while is opened again quickly after the next loss. A port
+    /// that fails as soon as it is opened, or after a frame, never gets so far.
+    pub(crate) fn proven(&mut self) {
+        let State::Open(open) = &mut self.state else {
+            return;
+        };
+        let now = Instant::now();
+        if now.duration_since(open.since) >= HELD {
+            self.pause = FIRST_PAUSE;
+        }
+        if let Some(at) = &mut open.compare_at {
+            *at = now + self.settings.stale_after;
+        }
+        if let Line::Udp(udp) = &mut open.line {
+            udp.proven();
+        }
     }
 
     fn wait(&mut self) {
@@ -284,18 +433,30 @@ impl Open {
             line,
             request_at: settings.request.as_ref().map(|(_, every)| now + *every),
             compare_at: is_tty.then_some(now + COMPARE_EVERY),
-            held: None,
+            held: 0..0,
+            read_at: None,
+            since: now,
         })
     }
 
     async fn wait(&mut self, buffer: &mut [u8], stale_after: Duration) -> Happened {
         // A read that is cancelled has read nothing, because a read is one system call, made when
         // bytes are there.
-        tokio::select! {
-            read = self.line.read(buffer, stale_after) => Happened::Read(read),
+        let read = async {
+            if let Some(at) = self.read_at {
+                tokio::time::sleep_until(at).await;
+            }
+            self.line.read(buffer, stale_after).await
+        };
+        let happened = tokio::select! {
+            read = read => Happened::Read(read),
             () = maybe::until(self.request_at) => Happened::RequestIsDue,
             () = maybe::until(self.compare_at) => Happened::CompareIsDue,
+        };
+        if matches!(happened, Happened::Read(_)) {
+            self.read_at = None;
         }
+        happened
     }
 }
 
@@ -318,12 +479,19 @@ impl Line {
         }
     }
 
-    /// Sets the settings of a serial line again, if they differ.
-    fn restore(&self) -> Option<Changed> {
+    /// Sends a request, but to no sender of datagrams that sends no frames.
+    fn request(&self, request: &[u8], stale_after: Duration) {
         match self {
+            Self::Udp(udp) if !udp.may_be_a_sensor(stale_after) => {}
+            _ => self.send(request),
+        }
+    }
+
+    /// Sets the settings of a serial line again, if another program has changed them.
+    fn restore(&self) {
+        if let Self::Tty(_, settings) = self {
             // Where this fails, the next read finds out why.
-            Self::Tty(_, settings) => settings.restore().ok().flatten(),
-            Self::Tcp(_) | Self::Udp(_) => None,
+            let _ = settings.restore();
         }
     }
 
@@ -347,7 +515,7 @@ fn start_opening(
     first: Vec<u8>,
 ) -> Result<oneshot::Receiver<Result<Opened, String>>, NoThread> {
     let port = port.clone();
-    apart::start("port", move || {
+    spawn_thread("port", move || {
         open(&port, baud, &first).map_err(|error| reason(&port, &error))
     })
 }
@@ -377,20 +545,17 @@ fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
     }
 }
 
-/// Whether a port that is no device can be opened now.
-pub(crate) fn probe(port: &Port) -> io::Result<()> {
-    open(port, 0, &[]).map(drop)
+/// Opens a port that is no device for a moment. Returns whether a telnet server is at its other end.
+pub(crate) fn probe(port: &Port) -> io::Result<bool> {
+    match open(port, 0, &[])? {
+        Opened::Tcp(stream) => Ok(network::is_telnet(&stream)),
+        Opened::Tty(..) | Opened::Udp(_) => Ok(false),
+    }
 }
 
 /// Why `port` cannot be opened, in plain words.
 pub(crate) fn reason(port: &Port, error: &io::Error) -> String {
-    let Some(path) = port.device() else {
-        return wording::line(error);
-    };
-    match Errno::from_io_error(error) {
-        Some(Errno::BUSY | Errno::WOULDBLOCK) if tty::is_held_here(path) => {
-            "this daemon reads that port already, for another sensor".to_owned()
-        }
+    match Errno::from_io_error(error).filter(|_| port.device().is_some()) {
         Some(Errno::BUSY | Errno::WOULDBLOCK) => "port held by another process".to_owned(),
         Some(Errno::NOENT) => "no such device".to_owned(),
         Some(Errno::ACCESS) => "permission denied".to_owned(),

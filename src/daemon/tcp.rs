@@ -8,6 +8,7 @@ use rustix::net::sockopt;
 use tokio::net::{TcpListener, TcpStream};
 
 use super::accept::Listener;
+use super::publish::Error;
 
 /// The bytes that the system may hold for a subscriber that does not read, as many as for a Unix
 /// socket. The system doubles the number for its own use. The system's default would grow to
@@ -21,14 +22,10 @@ const KEEPALIVE_PAUSE: Duration = Duration::from_secs(10);
 /// The number of probes without an answer after which the connection is closed.
 const KEEPALIVE_TRIES: u32 = 3;
 
-/// The reason a listener could not be opened.
-#[derive(Debug, thiserror::Error)]
-#[error("{key}: cannot listen on {address}: {source}")]
-pub struct Error {
-    key: &'static str,
-    address: SocketAddr,
-    source: io::Error,
-}
+/// A connection whose other end takes nothing for this long is closed, even if it acknowledges that
+/// it takes nothing (`TCP_USER_TIMEOUT` of tcp(7)). Without this, such clients would occupy all
+/// connections for good.
+const UNREAD_PATIENCE: Duration = Duration::from_secs(60);
 
 /// A listening TCP socket.
 #[derive(Debug)]
@@ -49,11 +46,8 @@ impl Tcp {
             let listener = TcpListener::from_std(listener)?;
             Ok(Self { listener, address })
         };
-        bound().map_err(|source| Error {
-            key,
-            address,
-            source,
-        })
+        let failed = |error| format!("{key}: cannot listen on {address}: {error}");
+        bound().map_err(|error: io::Error| Error::io(failed(error)))
     }
 
     /// The listener's address. If the configured port was 0, the address has the port that the
@@ -77,6 +71,7 @@ impl Listener for Tcp {
 fn behave(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)?;
     sockopt::set_socket_send_buffer_size(stream, SEND_BUFFER_BYTES)?;
+    sockopt::set_tcp_user_timeout(stream, UNREAD_PATIENCE.as_millis() as u32)?;
     keep_alive(stream)
 }
 
@@ -86,4 +81,17 @@ pub(crate) fn keep_alive(stream: &TcpStream) -> io::Result<()> {
     sockopt::set_tcp_keepidle(stream, KEEPALIVE)?;
     sockopt::set_tcp_keepintvl(stream, KEEPALIVE_PAUSE)?;
     Ok(sockopt::set_tcp_keepcnt(stream, KEEPALIVE_TRIES)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_connection_ends_when_its_other_end_takes_nothing_for_long() {
+        let mut listener = Tcp::bind("key", "127.0.0.1:0".parse().unwrap()).unwrap();
+        let _client = std::net::TcpStream::connect(listener.address()).unwrap();
+        let stream = listener.accept().await.unwrap();
+        assert_eq!(sockopt::tcp_user_timeout(&stream).unwrap(), 60_000);
+    }
 }

@@ -1,6 +1,6 @@
 //! The answer of a verdict in words: its level, or the levels that it lies between.
 //!
-//! `demo`, `tail`, `replay`, `watch` and `fleet` show it. The page and the Python client repeat the
+//! `demo`, `tail`, `replay` and `watch` show it. The page and the Python client repeat the
 //! rule, and all of them agree on the cases of `fixtures/answers.json`.
 
 use serde_json::Value;
@@ -42,6 +42,19 @@ impl Answer {
     }
 }
 
+/// What a verdict says, with its Shore hardness first, such as `63 +- 6 OO, firm`. The interval of 90 % lies
+/// within these limits.
+pub(super) fn with_shore(answer: &str, verdict: &Value) -> String {
+    let shore = |key| verdict["shore"][key].as_f64();
+    match (shore("value"), shore("low"), shore("high")) {
+        (Some(value), Some(low), Some(high)) => {
+            let wide = (value - low).max(high - value);
+            format!("{value:.0} +- {wide:.0} OO, {answer}")
+        }
+        _ => answer.to_owned(),
+    }
+}
+
 /// The labels of the levels that a `hello` names.
 pub(super) fn labels(hello: &Value) -> Vec<String> {
     items(&hello["model"], "levels")
@@ -54,7 +67,8 @@ pub(super) fn items<'a>(event: &'a Value, key: &str) -> impl Iterator<Item = &'a
     event[key].as_array().into_iter().flatten()
 }
 
-fn named(level: u64, labels: &[String]) -> String {
+/// The label of a level, or its number.
+pub(super) fn named(level: u64, labels: &[String]) -> String {
     let place = usize::try_from(level).ok().and_then(|l| l.checked_sub(1));
     let label = place.and_then(|place| labels.get(place));
     label.map_or_else(|| format!("level {level}"), Clone::clone)

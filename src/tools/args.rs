@@ -3,8 +3,6 @@
 use clap::{Args as ClapArgs, Parser, Subcommand};
 
 use super::configuration::{Configuration, ModelFile};
-#[cfg(feature = "zenoh")]
-use super::fleet;
 #[cfg(feature = "watch")]
 use super::watch;
 use super::{
@@ -41,9 +39,6 @@ pub enum Command {
     /// Show the sensors of a running daemon on the terminal
     #[cfg(feature = "watch")]
     Watch(watch::Args),
-    /// Show the sensors of every robot behind a zenoh router
-    #[cfg(feature = "zenoh")]
-    Fleet(fleet::Args),
     /// `tare`, `context` and `blackbox`.
     #[command(flatten)]
     Control(control::Command),
@@ -73,5 +68,5 @@ pub struct Run {
 const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usage; 66 a file named \
     here is missing or unreadable; 69 device or daemon unavailable; 74 I/O error; 78 bad \
     configuration or model, or a file that the configuration names. SIGINT and SIGTERM end `run`, \
-    `demo`, `simulate`, `record`, `tail`, `watch` and `fleet` with 0, and any other command that had not \
+    `demo`, `simulate`, `record`, `tail` and `watch` with 0, and any other command that had not \
     finished with 130 and 143.";

@@ -17,10 +17,11 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::player::Played;
-use crate::apart::NoThread;
 use crate::daemon::accept::Listener;
 use crate::daemon::lines::{LineRead, Lines};
-use crate::daemon::socket::{self, Socket};
+use crate::daemon::publish;
+use crate::daemon::socket::Socket;
+use crate::thread::NoThread;
 use hardnessd_core::event::round_3;
 use hardnessd_simulator::{Rig, SequenceSettings, Touched};
 
@@ -114,7 +115,7 @@ impl Arm {
     /// # Errors
     ///
     /// Fails as [`Socket::bind`] does.
-    pub(crate) fn bind(path: &Path) -> Result<Self, socket::Error> {
+    pub(crate) fn bind(path: &Path) -> Result<Self, publish::Error> {
         let leg = Leg {
             from_mm: 0.0,
             start: Instant::now(),
@@ -128,7 +129,7 @@ impl Arm {
             touched: None,
         };
         Ok(Self {
-            socket: Socket::bind("--arm", path, 0o600)?,
+            socket: Socket::bind("--arm", path, 0o600, None)?,
             state: Arc::new(watch::Sender::new(state)),
         })
     }

@@ -11,21 +11,19 @@ mod gather;
 mod taxels;
 
 use std::future::Future;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::{Args as ClapArgs, ValueEnum};
 
 use self::gather::Press;
-use super::Unplayable;
 use super::configuration::Configuration;
-use super::exit::Failure;
+use super::exit::{Fail, Failure};
 use super::live;
-use super::simulate::{OutOfRange, within};
-use crate::apart;
+use super::simulate::within;
 use crate::daemon::config::Setup;
-use hardnessd_core::exit::{Coded, FAILED, IO, USAGE};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
@@ -80,52 +78,6 @@ pub enum What {
     Taxels,
 }
 
-/// The reason why presses have no values.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// Weights were given, but not for `calibrate force`.
-    #[error("--newtons is only for `calibrate force`: leave it out")]
-    Unasked,
-    /// A file was given, but not for `calibrate taxels`.
-    #[error("--out is only for `calibrate taxels`: leave it out")]
-    NoFile,
-    /// The presses do not determine the values of the arm.
-    #[error(transparent)]
-    Arm(arm::Unfit),
-    /// The weights do not determine the newtons per count.
-    #[error(transparent)]
-    Force(force::Unfit),
-    /// The presses do not determine the gains.
-    #[error(transparent)]
-    Taxels(taxels::Unfit),
-    /// The number of presses is not the number of weights.
-    #[error("found {found} presses, expected {expected}: put each weight on once")]
-    Count {
-        /// The number of recorded presses.
-        found: usize,
-        /// The number of weights.
-        expected: usize,
-    },
-    /// The gains cannot be written.
-    #[error("{path}: {source}")]
-    Out {
-        /// The path of the gains.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Unasked | Error::NoFile => USAGE,
-            Error::Arm(_) | Error::Force(_) | Error::Taxels(_) | Error::Count { .. } => FAILED,
-            Error::Out { .. } => IO,
-        }
-    }
-}
-
 /// Weights that disagree by more than this share get a warning.
 const DOUBTFUL_ERROR: f64 = 0.1;
 
@@ -161,10 +113,12 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
     if !matches!(args.what, What::Force) && !args.newtons.is_empty() {
-        return Err(Error::Unasked.into());
+        let unasked = "--newtons is only for `calibrate force`: leave it out";
+        return Err(Failure::new(USAGE, unasked));
     }
     if !matches!(args.what, What::Taxels) && args.out.is_some() {
-        return Err(Error::NoFile.into());
+        let unasked = "--out is only for `calibrate taxels`: leave it out";
+        return Err(Failure::new(USAGE, unasked));
     }
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // Test the output file now, before anybody presses two hundred times.
@@ -172,10 +126,8 @@ pub async fn run(
         What::Taxels => {
             let named = args.out.clone();
             let path = named.unwrap_or_else(|| config.with_file_name(GAINS));
-            match Part::new(&path) {
-                Ok(part) => Some((path, part)),
-                Err(source) => return Err(Error::Out { path, source }.into()),
-            }
+            let part = Part::new(&path).of_file(&path, IO)?;
+            Some((path, part))
         }
         What::Arm | What::Force => None,
     };
@@ -188,22 +140,24 @@ pub async fn run(
         let with_track = matches!(args.what, What::Arm);
         let (files, sensor, hrn) = (args.from.clone(), sensor.clone(), setup.hrn.clone());
         let work = move || recorded(&files, &sensor, &hrn, with_track);
-        let read = apart::start("calibrate", work)?;
+        let read = spawn_thread("calibrate", work)?;
         tokio::select! {
             read = read => read.expect("recordings are read without a panic")?,
             () = shutdown => return Ok(()),
         }
     };
     let text = match args.what {
-        What::Arm => of_arm(&arm::Fit::of(&presses).map_err(Error::Arm)?),
+        What::Arm => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
         What::Force => {
             let (found, expected) = (presses.len(), args.newtons.len());
             if found != expected {
-                return Err(Error::Count { found, expected }.into());
+                let count =
+                    format!("found {found} presses, expected {expected}: put each weight on once");
+                return Err(Failure::new(FAILED, count));
             }
             let weights = args.newtons.iter().copied().zip(&presses);
             let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor);
-            let fit = fit.map_err(Error::Force)?;
+            let fit = fit.exit(FAILED)?;
             let error = fit.error();
             if error > DOUBTFUL_ERROR {
                 hardnessd_core::stderr_line!(
@@ -226,13 +180,10 @@ pub async fn run(
             let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
             let dead = &dead_taxels(&sensor, &presses);
             let array = sensor.layout().array();
-            let fit = taxels::Fit::of(&plain, array, dead).map_err(Error::Taxels)?;
+            let fit = taxels::Fit::of(&plain, array, dead).exit(FAILED)?;
             let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
             let (path, part) = out.expect("the gains have a file");
-            part.write(&bytes).map_err(|source| Error::Out {
-                path: path.clone(),
-                source,
-            })?;
+            part.write(&bytes).of_file(&path, IO)?;
             of_taxels(&fit, array, dead, &super::as_in(config, &path))
         }
     };
@@ -253,8 +204,9 @@ async fn live(
     let Some(recorded) = recorded.await? else {
         return Ok(None);
     };
-    let read = gather::presses(recorded, sensor, hrn, matches!(args.what, What::Arm));
-    let mut presses = read.map_err(Unplayable::at(Path::new(live::RECORDED)))?;
+    let with_track = matches!(args.what, What::Arm);
+    let path = Path::new(live::RECORDED);
+    let mut presses = gather::presses(recorded, path, sensor, hrn, with_track)?;
     // Something else may have been pressed before the recording ended.
     presses.truncate(args.wanted() as usize);
     Ok(Some(presses))
@@ -270,8 +222,13 @@ fn recorded(
     let mut presses = Vec::new();
     for path in files {
         let file = super::open(path)?;
-        let read = gather::presses(file, sensor, hrn.clone(), with_track);
-        presses.extend(read.map_err(Unplayable::at(path))?);
+        presses.extend(gather::presses(
+            file,
+            path,
+            sensor,
+            hrn.clone(),
+            with_track,
+        )?);
     }
     Ok(presses)
 }
@@ -279,9 +236,9 @@ fn recorded(
 /// The dead taxels of the sensor, and those that were dead in a recording: what these show is no
 /// measurement.
 fn dead_taxels(sensor: &Sensor, presses: &[Press]) -> Vec<[usize; 2]> {
-    let mut dead = sensor.description().calibration.dead_taxels.clone();
+    let mut dead = sensor.calibration().dead_taxels.clone();
     let described = presses.iter().filter_map(|press| press.described.as_ref());
-    for taxel in described.flat_map(|described| &described.calibration.dead_taxels) {
+    for taxel in described.flat_map(|described| &described.sensor.calibration.dead_taxels) {
         if !dead.contains(taxel) {
             dead.push(*taxel);
         }
@@ -293,7 +250,7 @@ fn dead_taxels(sensor: &Sensor, presses: &[Press]) -> Vec<[usize; 2]> {
 fn plain(press: &Press) -> taxels::Plain {
     let mut frames = press.frames.clone();
     if let Some(described) = &press.described
-        && let Some(Gains::Taxels(rows)) = &described.calibration.gains
+        && let Some(Gains::Taxels(rows)) = &described.sensor.calibration.gains
     {
         let array = Array {
             rows: rows.len(),
@@ -335,7 +292,7 @@ fn print_next(args: &Args, seen: u64) {
 }
 
 /// A weight of the command line.
-fn newtons(text: &str) -> Result<f64, OutOfRange> {
+fn newtons(text: &str) -> Result<f64, String> {
     within(text, 0.001, 1e6)
 }
 

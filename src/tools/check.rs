@@ -1,28 +1,31 @@
 //! `hardnessd check`: prints what the daemon would run, without opening a device.
 
+use std::fmt::Display;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args as ClapArgs;
 use rustix::fs::Access;
 
 use super::configuration::Configuration;
-use super::exit::Failure;
-use crate::daemon;
-use crate::daemon::baud::{Excess, Load, Pace};
-use crate::daemon::config::{Endpoint, SensorTable, Setup};
-use hardnessd_core::exit::{CONFIG, Coded};
+use super::exit::{Coded, Failure};
+use crate::daemon::baud::{Load, Pace};
+use crate::daemon::config::{Endpoint, Setup};
+use crate::daemon::{self, record};
 use hardnessd_core::frame::Pitch;
-use hardnessd_core::tare::{self, Gains};
+use hardnessd_core::sensor::Settings;
+use hardnessd_core::tare;
 use hardnessd_core::verdict::Card;
 use hardnessd_core::wire::Layout;
+use hardnessd_core::wording::as_written;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
-    It refuses what `run` would refuse, as far as no port has to be opened for it: also a frame \
-    rate that the baud rate cannot carry, and a `dir` of [record] that cannot be written to. It \
-    warns of taxels of another pitch than the model's, and of keys that change no verdict of \
-    this model.";
+    It refuses what `run` would refuse, with the same exit code, as far as no port has to be opened \
+    for it. It warns of a `dir` of [record] that cannot be written to, of taxels of another pitch than \
+    the model's, of a full scale that no film has, and of keys that change no verdict of this model. \
+    Below what would run, it prints every key in force and where it comes from: written, a preset, or \
+    the default.";
 
 /// Arguments of `check`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -32,55 +35,30 @@ pub struct Args {
     config: Configuration,
 }
 
-/// An error of a configuration.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// A path that the configuration names cannot be written to.
-    #[error("{path}: {source}")]
-    Daemon {
-        /// Path of the configuration.
-        path: PathBuf,
-        /// The daemon's error, which names the path and the reason.
-        source: daemon::Error,
-    },
-    /// The line cannot carry that many frames.
-    #[error("{path}: sensor.frame_rate_hz of {sensor:?}: {excess}")]
-    FrameRate {
-        /// Path of the configuration.
-        path: PathBuf,
-        /// The sensor's name.
-        sensor: String,
-        /// What the line cannot carry.
-        excess: Excess,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Daemon { source, .. } => source.exit_code(),
-            Error::FrameRate { .. } => CONFIG,
-        }
-    }
-}
-
 /// Prints what the daemon would run. Warnings go to stderr.
 ///
 /// # Errors
 ///
-/// Returns a [`Failure`] if the configuration or its model cannot be used, a line cannot carry its
-/// frames, or a path for sockets, the log or recordings cannot be written to.
+/// Returns a [`Failure`] if the configuration or its model cannot be used, or a path for sockets cannot
+/// be written to.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let path = &args.config.path()?;
     let setup = Setup::load(path, None)?;
-    daemon::check(&setup.config).map_err(|source| Error::Daemon {
-        path: path.clone(),
-        source,
-    })?;
+    daemon::check(&setup.config)
+        .map_err(|error| Failure::of(error.exit_code(), path.display(), error))?;
     let mut lines = format!("robot {}\n", setup.config.robot);
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
-        lines += &line_of(sensor, checked.layout(), path)?;
+        lines += &line_of(sensor, checked.layout(), path);
         warn_of_pitch(sensor, setup.hrn.card(), path);
+        warn_of_scale(sensor, checked.layout(), path);
+        if setup.ignores_references_of(&sensor.name) {
+            hardnessd_core::stderr_line!(
+                "warning: {}: sensor.references of {:?}: not used, because its presses make verdicts on each other \
+                 worse: make others with `identify`",
+                path.display(),
+                sensor.name
+            );
+        }
     }
     lines += &model(&setup);
     for key in setup.without_effect() {
@@ -99,46 +77,34 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             warn_of_permissions(key, &socket, path);
         }
     }
-    lines += &if unix.enabled {
-        let (path, mode) = (unix.path(), String::from(unix.mode));
-        format!(
-            "socket {}, mode {mode}, {} subscribers\ncontrol {}\n",
-            path.display(),
-            unix.max_clients,
-            unix.control_path().display()
-        )
-    } else {
-        "no socket\n".to_owned()
-    };
-    if let Some(record) = &setup.config.record {
-        let what = if record.continuous {
-            "recordings and black boxes"
-        } else {
-            "black boxes"
-        };
-        lines += &format!("{what} in {}\n", record.dir().display());
+    if let Some(record) = &setup.config.record
+        && let Err(error) = record::check(record)
+    {
+        hardnessd_core::stderr_line!("warning: {}: {error}", path.display());
     }
     let tcp = setup.config.publish.tcp.as_ref().map(|tcp| tcp.listen);
     let http = setup.config.http.as_ref().map(|http| http.listen);
     let foxglove = setup.config.publish.foxglove.as_ref();
     let foxglove = foxglove.map(|foxglove| foxglove.listen);
-    for (key, way, listen) in [
-        ("publish.tcp.listen", "tcp ", tcp),
-        ("publish.foxglove.listen", "foxglove ws://", foxglove),
-        ("http.listen", "page http://", http),
+    for (key, listen) in [
+        ("publish.tcp.listen", tcp),
+        ("publish.foxglove.listen", foxglove),
+        ("http.listen", http),
     ] {
-        if let Some(listen) = listen {
-            lines += &format!("{way}{listen}\n");
-            if !listen.ip().is_loopback() {
-                hardnessd_core::stderr_line!(
-                    "warning: {}: {key}: {listen} is open to anyone who can reach this machine; \
-                     a loopback address, such as 127.0.0.1, is not",
-                    path.display()
-                );
-            }
+        if let Some(listen) = listen.filter(|listen| !listen.ip().is_loopback()) {
+            warn_of_strangers(key, &listen, path);
         }
     }
-    lines += &networks(&setup, path);
+    if let Some(zenoh) = &setup.config.publish.zenoh {
+        let open = |endpoint: &&Endpoint| {
+            let parsed = endpoint.address().parse::<SocketAddr>();
+            parsed.map_or(true, |address| !address.ip().is_loopback())
+        };
+        for endpoint in zenoh.listen.iter().filter(open) {
+            warn_of_strangers("publish.zenoh.listen", &endpoint.address(), path);
+        }
+    }
+    lines += &format!("\n{}", setup.in_force());
     super::print(lines.as_bytes())?;
     Ok(())
 }
@@ -167,7 +133,7 @@ fn warn_of_permissions(key: &str, socket: &Path, path: &Path) {
 }
 
 /// Warns if the taxels have another pitch than the model's.
-fn warn_of_pitch(sensor: &SensorTable, card: &Card, path: &Path) {
+fn warn_of_pitch(sensor: &Settings, card: &Card, path: &Path) {
     let Pitch { rows_mm, cols_mm } = sensor.calibration.pitch_mm;
     let is_models = |mm: f64| (mm - f64::from(card.pitch_mm)).abs() <= PITCH_TOLERANCE_MM;
     if is_models(rows_mm) && is_models(cols_mm) {
@@ -188,50 +154,48 @@ fn warn_of_pitch(sensor: &SensorTable, card: &Card, path: &Path) {
     );
 }
 
-/// Lines about zenoh and ROS 2.
-fn networks(setup: &Setup, path: &Path) -> String {
-    let publish = &setup.config.publish;
-    let mut lines = String::new();
-    if let Some(zenoh) = &publish.zenoh {
-        lines += &format!(
-            "zenoh tactile/{}/, listening on {:?}, connecting to {:?}\n",
-            zenoh.site(&setup.config.robot),
-            zenoh.listen,
-            zenoh.connect
-        );
-        if let Some(motion) = &zenoh.motion {
-            lines += &format!("zenoh positions of arms at {motion}\n");
-        }
-        let open = |endpoint: &&Endpoint| {
-            let parsed = endpoint.address().parse::<SocketAddr>();
-            parsed.map_or(true, |address| !address.ip().is_loopback())
-        };
-        for endpoint in zenoh.listen.iter().filter(open) {
-            hardnessd_core::stderr_line!(
-                "warning: {}: publish.zenoh.listen: {endpoint:?} is open to anyone who can reach it; \
-                 a loopback address, such as 127.0.0.1, is not",
-                path.display()
-            );
-        }
+/// The newtons that a taxel may read at full scale. A film taxel that saturates below or beyond them
+/// has a wrong scale.
+const FULL_SCALES_N: (f64, f64) = (0.5, 5000.0);
+
+/// Warns if a taxel at full scale reads what no film bears.
+fn warn_of_scale(sensor: &Settings, layout: &Layout, path: &Path) {
+    let Some(full_scale) = layout.full_scale() else {
+        return;
+    };
+    let tare::Settings {
+        newtons_per_count,
+        exponent,
+        ..
+    } = sensor.calibration;
+    let full_n = as_written(newtons_per_count) * f64::from(full_scale).powf(exponent.into());
+    let (least, most) = FULL_SCALES_N;
+    if (least..=most).contains(&full_n) {
+        return;
     }
-    if let Some(ros2) = &publish.ros2 {
-        let namespace = ros2.namespace.trim_end_matches('/');
-        lines += &format!(
-            "ros2 {namespace}/tactile/, domain {}, networks {:?}\n",
-            ros2.domain_id(),
-            ros2.networks
-        );
-        for (sensor, topic) in &ros2.motion {
-            lines += &format!("ros2 positions of the arm of {sensor} at {topic}\n");
-        }
-    }
-    lines
+    hardnessd_core::stderr_line!(
+        "warning: {}: sensor.calibration.newtons_per_count of {:?}: found {newtons_per_count}, with which \
+         {full_scale} counts are {:.3} N on a taxel, expected {least} to {most} N: measure it with \
+         `hardnessd calibrate force`",
+        path.display(),
+        sensor.name,
+        full_n
+    );
+}
+
+/// Warns of an address that others can reach.
+fn warn_of_strangers(key: &str, address: &dyn Display, path: &Path) {
+    hardnessd_core::stderr_line!(
+        "warning: {}: {key}: {address} is open to anyone who can reach this machine; a loopback address, \
+         such as 127.0.0.1, is not",
+        path.display()
+    );
 }
 
 /// Pitches closer than this count as equal, because datasheets give two digits.
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
-fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String, Error> {
+fn line_of(sensor: &Settings, layout: &Layout, path: &Path) -> String {
     let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
     let Load {
         pace,
@@ -240,17 +204,12 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
         excess,
     } = Load::of(sensor, layout);
     if let Some(excess) = excess {
-        let is_certain = excess.is_certain;
-        let error = Error::FrameRate {
-            path: path.to_owned(),
-            sensor: sensor.name.clone(),
-            excess,
-        };
-        if is_certain {
-            return Err(error);
-        }
         // Frames of some layouts vary in length, and a port that is not there may turn out to be USB CDC.
-        hardnessd_core::stderr_line!("warning: {error}");
+        hardnessd_core::stderr_line!(
+            "warning: {}: sensor.frame_rate_hz of {:?}: {excess}",
+            path.display(),
+            sensor.name
+        );
     }
     let array = layout.array();
     let frame_bytes = if shortest == longest {
@@ -270,7 +229,7 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
     let references = references.map_or(String::new(), |file| {
         format!(", references {}", file.display())
     });
-    Ok(format!(
+    format!(
         "sensor {}: {}, {}x{} taxels in {frame_bytes} bytes, {} frames/s: {load}{}{references}\n",
         sensor.name,
         sensor.port,
@@ -278,18 +237,15 @@ fn line_of(sensor: &SensorTable, layout: &Layout, path: &Path) -> Result<String,
         array.cols,
         sensor.frame_rate_hz,
         gains(&sensor.calibration)
-    ))
+    )
 }
 
 /// The spread of a sensor's gains, if it has any.
 fn gains(calibration: &tare::Settings) -> String {
-    let Some(Gains::Taxels(rows)) = &calibration.gains else {
-        return String::new();
-    };
-    let gains = rows.iter().flatten().copied();
-    let least = gains.clone().fold(f32::INFINITY, f32::min);
-    let most = gains.fold(0.0, f32::max);
-    format!(", gains {least:.2} to {most:.2}")
+    let extent = calibration.gains.as_ref().and_then(tare::Gains::extent);
+    extent.map_or(String::new(), |(least, most)| {
+        format!(", gains {least:.2} to {most:.2}")
+    })
 }
 
 fn model(setup: &Setup) -> String {

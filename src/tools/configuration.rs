@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
-use hardnessd_core::exit::{Coded, NO_INPUT};
+
+use super::exit::{Fail, Failure};
+use hardnessd_core::exit::NO_INPUT;
 
 /// The argument `--config`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -11,21 +13,6 @@ pub struct Configuration {
     /// Configuration [default: ./hardnessd.toml, else /etc/hardnessd.toml]
     #[arg(long, value_name = "F")]
     config: Option<PathBuf>,
-}
-
-/// No configuration was named, and none was found.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "no configuration: there is neither {} nor {}: name one with --config",
-    PLACES[0],
-    PLACES[1]
-)]
-pub struct Missing;
-
-impl Coded for Missing {
-    fn exit_code(&self) -> u8 {
-        NO_INPUT
-    }
 }
 
 /// The argument `--model`.
@@ -36,28 +23,18 @@ pub struct ModelFile {
     model: Option<PathBuf>,
 }
 
-/// The file of `--model` cannot be read.
-#[derive(Debug, thiserror::Error)]
-#[error("--model {0}")]
-pub struct NoModel(#[source] super::CannotRead);
-
-impl Coded for NoModel {
-    fn exit_code(&self) -> u8 {
-        NO_INPUT
-    }
-}
-
 impl ModelFile {
     /// The path of the model, if the command line names one.
     ///
     /// # Errors
     ///
-    /// Returns [`NoModel`] if the file cannot be opened.
-    pub fn path(&self) -> Result<Option<PathBuf>, NoModel> {
+    /// Fails if the file cannot be opened.
+    pub fn path(&self) -> Result<Option<PathBuf>, Failure> {
         let Some(path) = &self.model else {
             return Ok(None);
         };
-        super::open(path).map_err(NoModel)?;
+        let what = format!("--model {}: cannot read", path.display());
+        super::open_file(path).of(what, NO_INPUT)?;
         Ok(Some(path.clone()))
     }
 }
@@ -71,14 +48,22 @@ impl Configuration {
     ///
     /// # Errors
     ///
-    /// Returns [`Missing`] if the command line names no configuration and no default path exists.
-    pub fn path(&self) -> Result<PathBuf, Missing> {
+    /// Fails if the command line names no configuration and no default path exists.
+    pub fn path(&self) -> Result<PathBuf, Failure> {
         if let Some(config) = &self.config {
             return Ok(config.clone());
         }
         // If a file exists but cannot be read, that is an error, not a reason to try the next path.
         let there = |path: &&str| Path::new(path).symlink_metadata().is_ok();
-        let found = PLACES.into_iter().find(there).ok_or(Missing)?;
+        let Some(found) = PLACES.into_iter().find(there) else {
+            let [first, second] = PLACES;
+            return Err(Failure::new(
+                NO_INPUT,
+                format!(
+                    "no configuration: there is neither {first} nor {second}: name one with --config"
+                ),
+            ));
+        };
         hardnessd_core::stderr_line!("hardnessd: configuration {found}");
         Ok(PathBuf::from(found))
     }

@@ -12,14 +12,17 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
-use tokio::io::{AsyncRead, AsyncWriteExt};
-use tokio::net::{TcpStream, UnixStream, tcp, unix};
+#[cfg(feature = "watch")]
+use futures_util::FutureExt as _;
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpStream, UnixStream};
 
-use super::demo;
-use crate::apart;
+use super::exit::Failure;
+use super::{demo, doctor};
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{LineRead, Lines};
-use hardnessd_core::exit::{Coded, UNAVAILABLE};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::UNAVAILABLE;
 
 /// The reason why there is no daemon where a line begins with `HTTP/`.
 pub(super) const WEB_SERVER: &str = "a web server answers there, such as the live page's: name the address \
@@ -66,82 +69,15 @@ impl fmt::Display for Address {
     }
 }
 
-/// An error of a connection to a daemon.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// No daemon listens at the address.
-    #[error("{address}: no daemon answers: {source}")]
-    NoAnswer {
-        /// The address.
-        address: Address,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// No daemon listens at any of the usual places.
-    #[error(
-        "no daemon answers at {places}, and no demo runs: start one with `hardnessd run` or \
-         `hardnessd demo`, or name its socket with --socket"
-    )]
-    Nowhere {
-        /// The paths that were tried.
-        places: String,
-    },
-    /// This user may not connect to the socket.
-    #[error(
-        "{path}: permission denied: join the group {group} (`sudo usermod -aG {group} $USER`) and \
-         log in again"
-    )]
-    Denied {
-        /// Path of the socket.
-        path: PathBuf,
-        /// The group whose members may connect.
-        group: String,
-    },
-    /// The connection broke.
-    #[error("{address}: the connection broke: {source}")]
-    Broken {
-        /// The address.
-        address: Address,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// The daemon has ended.
-    #[error("{address}: the daemon closed the connection")]
-    Closed {
-        /// The address.
-        address: Address,
-    },
-    /// The other end sent a line that is too long for a daemon.
-    #[error(
-        "{address}: closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
-         daemon sends"
-    )]
-    TooLong {
-        /// The address.
-        address: Address,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        UNAVAILABLE
-    }
-}
-
 /// The longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame
 /// takes about 6 kB.
-const LONGEST_LINE_BYTES: usize = 1 << 20;
+pub(super) const LONGEST_LINE_BYTES: usize = 1 << 20;
 
 /// A connection to a daemon.
 pub(super) struct Connection {
     address: Address,
     lines: Lines<Box<dyn AsyncRead + Send + Unpin>>,
-    output: Output,
-}
-
-enum Output {
-    Unix(unix::OwnedWriteHalf),
-    Tcp(tcp::OwnedWriteHalf),
+    output: Box<dyn AsyncWrite + Send + Unpin>,
 }
 
 impl Source {
@@ -150,8 +86,8 @@ impl Source {
     ///
     /// # Errors
     ///
-    /// Returns [`Error`] if no daemon answers.
-    pub(super) async fn connect(&self) -> Result<Connection, Error> {
+    /// Fails if no daemon answers.
+    pub(super) async fn connect(&self) -> Result<Connection, Failure> {
         match self.given() {
             Some(address) => Connection::open(address).await,
             None => find("events.sock").await,
@@ -170,8 +106,8 @@ impl Source {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if no daemon answers.
-pub(super) async fn control(path: Option<PathBuf>) -> Result<Connection, Error> {
+/// Fails if no daemon answers.
+pub(super) async fn control(path: Option<PathBuf>) -> Result<Connection, Failure> {
     match path {
         Some(path) => Connection::open(Address::Unix(path)).await,
         None => find("control.sock").await,
@@ -179,56 +115,72 @@ pub(super) async fn control(path: Option<PathBuf>) -> Result<Connection, Error> 
 }
 
 /// The first daemon that answers at one of the usual places, at its socket of this name.
-async fn find(name: &str) -> Result<Connection, Error> {
+async fn find(name: &str) -> Result<Connection, Failure> {
     let place = |path: PathBuf| path.with_file_name(name);
     let places: Vec<PathBuf> = Unix::places().into_iter().map(place).collect();
     let demos = demo::sockets().into_iter().map(place);
     let mut denied = None;
     for path in places.iter().cloned().chain(demos) {
-        match Connection::open(Address::Unix(path)).await {
+        let address = Address::Unix(path);
+        match Connection::try_open(&address).await {
             Ok(connection) => return Ok(connection),
-            Err(error @ Error::Denied { .. }) => denied = denied.or(Some(error)),
+            Err(error) if error.kind() == ErrorKind::PermissionDenied => {
+                denied = denied.or(Some(refusal(&address, error)));
+            }
             Err(_) => {}
         }
     }
-    let tried = || {
+    let nowhere = || {
         let places: Vec<String> = places
             .iter()
             .map(|path| path.display().to_string())
             .collect();
-        places.join(" or ")
+        let places = places.join(" or ");
+        Failure::new(
+            UNAVAILABLE,
+            format!(
+                "no daemon answers at {places}, and no demo runs: start one with `hardnessd run` or \
+                 `hardnessd demo`, or name its socket with --socket"
+            ),
+        )
     };
-    Err(denied.unwrap_or_else(|| Error::Nowhere { places: tried() }))
+    Err(denied.unwrap_or_else(nowhere))
 }
 
 /// Connects to one of the addresses of a name. A lookup may take long.
 async fn connect(name: String) -> io::Result<TcpStream> {
-    let found = apart::start("lookup", move || name.to_socket_addrs())?;
+    let found = spawn_thread("lookup", move || name.to_socket_addrs())?;
     let addresses: Vec<SocketAddr> = found.await.map_err(io::Error::other)??.collect();
     TcpStream::connect(&addresses[..]).await
 }
 
 impl Connection {
-    async fn open(address: Address) -> Result<Self, Error> {
-        let opened: io::Result<(Box<dyn AsyncRead + Send + Unpin>, Output)> = match &address {
-            Address::Unix(path) => UnixStream::connect(path).await.map(|stream| {
-                let (input, output) = stream.into_split();
-                (Box::new(input) as Box<_>, Output::Unix(output))
-            }),
-            Address::Tcp(address) => connect(address.clone()).await.and_then(|stream| {
+    async fn open(address: Address) -> Result<Self, Failure> {
+        let opened = Self::try_open(&address).await;
+        opened.map_err(|error| refusal(&address, error))
+    }
+
+    async fn try_open(address: &Address) -> io::Result<Self> {
+        type Input = Box<dyn AsyncRead + Send + Unpin>;
+        let (input, output): (Input, Box<dyn AsyncWrite + Send + Unpin>) = match address {
+            Address::Unix(path) => {
+                let (input, output) = UnixStream::connect(path).await?.into_split();
+                (Box::new(input), Box::new(output))
+            }
+            Address::Tcp(address) => {
+                let stream = connect(address.clone()).await?;
                 crate::daemon::tcp::keep_alive(&stream)?;
                 let (input, output) = stream.into_split();
-                Ok((Box::new(input) as Box<_>, Output::Tcp(output)))
-            }),
+                (Box::new(input), Box::new(output))
+            }
         };
-        match opened {
-            Ok((input, output)) => Ok(Self {
-                address,
-                lines: Lines::new(input, LONGEST_LINE_BYTES),
-                output,
-            }),
-            Err(source) => Err(refusal(address, source)),
-        }
+        let address = address.clone();
+        let lines = Lines::new(input, LONGEST_LINE_BYTES);
+        Ok(Self {
+            address,
+            lines,
+            output,
+        })
     }
 
     /// The daemon's address.
@@ -240,72 +192,78 @@ impl Connection {
     ///
     /// # Errors
     ///
-    /// Returns [`Error`] if the connection has ended, or the line is longer than a daemon may send.
-    pub(super) async fn next(&mut self) -> Result<String, Error> {
-        let address = || self.address.clone();
-        match self.lines.next().await {
-            Ok(LineRead::Line(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
-            Ok(LineRead::End) => Err(Error::Closed { address: address() }),
-            Ok(LineRead::TooLong) => Err(Error::TooLong { address: address() }),
-            Err(source) => Err(Error::Broken {
-                address: address(),
-                source,
-            }),
+    /// Fails if the connection has ended, or the line is longer than a daemon may send.
+    pub(super) async fn next(&mut self) -> Result<String, Failure> {
+        match self.lines.next().await.map_err(|error| self.broke(error))? {
+            LineRead::Line(line) => Ok(String::from_utf8_lossy(&line).into_owned()),
+            LineRead::End => Err(self.failed("the daemon closed the connection")),
+            LineRead::TooLong => Err(self.failed(format_args!(
+                "closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
+                 daemon sends"
+            ))),
         }
+    }
+
+    /// The failure of this connection.
+    pub(super) fn failed(&self, why: impl fmt::Display) -> Failure {
+        Failure::new(UNAVAILABLE, format!("{}: {why}", self.address))
+    }
+
+    fn broke(&self, error: io::Error) -> Failure {
+        Failure::of(
+            UNAVAILABLE,
+            format!("{}: the connection broke", self.address),
+            error,
+        )
     }
 
     /// Sends a request.
     ///
     /// # Errors
     ///
-    /// Returns [`Error::Broken`] if the request cannot be sent.
-    pub(super) async fn send(&mut self, request: &str) -> Result<(), Error> {
+    /// Fails if the request cannot be sent.
+    pub(super) async fn send(&mut self, request: &str) -> Result<(), Failure> {
         let line = format!("{request}\n");
-        let sent = match &mut self.output {
-            Output::Unix(output) => output.write_all(line.as_bytes()).await,
-            Output::Tcp(output) => output.write_all(line.as_bytes()).await,
-        };
-        sent.map_err(|source| Error::Broken {
-            address: self.address.clone(),
-            source,
-        })
+        let sent = self.output.write_all(line.as_bytes()).await;
+        sent.map_err(|error| self.broke(error))
     }
 
     /// Sends a request if there is room for it now.
     #[cfg(feature = "watch")]
-    pub(super) fn try_send(&self, request: &str) {
+    pub(super) fn try_send(&mut self, request: &str) {
         let line = format!("{request}\n");
         // If the daemon does not receive the request, its missing answer shows that later.
-        let _ = match &self.output {
-            Output::Unix(output) => output.try_write(line.as_bytes()),
-            Output::Tcp(output) => output.try_write(line.as_bytes()),
-        };
+        let _ = self.output.write(line.as_bytes()).now_or_never();
     }
 }
 
-/// The error for a connection that was not accepted.
-fn refusal(address: Address, source: io::Error) -> Error {
+/// The failure of a connection that was not accepted.
+fn refusal(address: &Address, error: io::Error) -> Failure {
     match address {
-        Address::Unix(path) if source.kind() == ErrorKind::PermissionDenied => Error::Denied {
-            group: group(&path),
-            path,
-        },
-        address => Error::NoAnswer { address, source },
+        Address::Unix(path) if error.kind() == ErrorKind::PermissionDenied => {
+            let remedy = remedy(path);
+            Failure::new(
+                UNAVAILABLE,
+                format!("{address}: permission denied: {remedy}"),
+            )
+        }
+        _ => Failure::of(UNAVAILABLE, format!("{address}: no daemon answers"), error),
     }
 }
 
-/// The group of a socket. If it is unknown, the group of the packaged daemon.
-fn group(path: &Path) -> String {
-    let name = || {
-        let gid = fs::metadata(path).ok()?.gid().to_string();
-        let groups = fs::read_to_string("/etc/group").ok()?;
-        let mut lines = groups.lines().map(|line| line.split(':'));
-        lines.find_map(|mut fields| {
-            let name = fields.next()?;
-            (gid != "0" && fields.nth(1)? == gid).then(|| name.to_owned())
-        })
-    };
-    name().unwrap_or_else(|| "hardnessd".to_owned())
+/// What gives a user access to a socket: its group, if that may connect. If the group is unknown, it is that
+/// of the packaged daemon.
+fn remedy(path: &Path) -> String {
+    let file = fs::metadata(path).ok();
+    if file.as_ref().is_some_and(|file| file.mode() & 0o020 == 0) {
+        return "only the daemon's user may connect: use sudo, or set control_mode and control_group \
+                in [publish.unix]"
+            .to_owned();
+    }
+    let gid = file.map_or(0, |file| file.gid());
+    let group = doctor::group(gid).filter(|_| gid != 0);
+    let group = group.unwrap_or_else(|| "hardnessd".to_owned());
+    format!("join the group {group} (`sudo usermod -aG {group} $USER`) and log in again")
 }
 
 #[cfg(test)]
@@ -343,7 +301,7 @@ mod tests {
         };
         let mut connection = source.connect().await.unwrap();
         let error = connection.next().await.unwrap_err();
-        assert!(matches!(error, Error::TooLong { .. }), "{error}");
+        assert!(error.line().contains("which no daemon sends"), "{error:?}");
         drop(connection);
         // The sender wrote more than the reader took, because the system's buffers hold the rest.
         assert!(sender.await.unwrap() < 4 * LONGEST_LINE_BYTES);

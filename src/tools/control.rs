@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use super::connect::{self, Connection};
 use super::exit::Failure;
-use hardnessd_core::exit::{Coded, FAILED};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::wording;
 
 /// The sensor and the socket of a command.
@@ -57,23 +57,6 @@ fn pair(text: &str) -> Result<(String, Value), &'static str> {
     }
 }
 
-/// The reason why a command was not carried out.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The daemon refused the command.
-    #[error("{0}")]
-    Refused(String),
-    /// The daemon did not answer in time.
-    #[error("no answer within {} s", ANSWER.as_secs())]
-    Mute,
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        FAILED
-    }
-}
-
 /// The longest wait for an answer. The frames of a tare may take as long.
 const ANSWER: Duration = Duration::from_secs(60);
 
@@ -98,21 +81,32 @@ pub async fn run(command: Command) -> Result<(), Failure> {
             (target, json!({"context": context, "id": 1}))
         }
     };
-    let mut daemon = connect::control(target.socket).await?;
-    daemon.send(&request.to_string()).await?;
-    let answer = tokio::time::timeout(ANSWER, answer(&mut daemon)).await;
-    let answer = answer.map_err(|_| Error::Mute)??;
-    if answer["type"] == "error" {
-        let message = answer["message"].as_str().unwrap_or_default();
-        return Err(Error::Refused(wording::escaped(message)).into());
-    }
-    let line = in_words(&answer) + "\n";
+    let line = in_words(&ask(target.socket, &request).await?) + "\n";
     super::print(line.as_bytes())?;
     Ok(())
 }
 
+/// Sends a command with the `id` 1 to a control socket, by default to that of the first daemon that answers.
+/// Returns the answer.
+///
+/// # Errors
+///
+/// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
+pub(super) async fn ask(socket: Option<PathBuf>, request: &Value) -> Result<Value, Failure> {
+    let mut daemon = connect::control(socket).await?;
+    daemon.send(&request.to_string()).await?;
+    let answer = tokio::time::timeout(ANSWER, answer(&mut daemon)).await;
+    let mute = |_| Failure::new(FAILED, format!("no answer within {} s", ANSWER.as_secs()));
+    let answer = answer.map_err(mute)??;
+    if answer["type"] == "error" {
+        let message = answer["message"].as_str().unwrap_or_default();
+        return Err(Failure::new(FAILED, message.to_owned()));
+    }
+    Ok(answer)
+}
+
 /// The answer to the command. Other lines come before it.
-async fn answer(daemon: &mut Connection) -> Result<Value, connect::Error> {
+async fn answer(daemon: &mut Connection) -> Result<Value, Failure> {
     loop {
         let line = daemon.next().await?;
         let answer: Value = serde_json::from_str(&line).unwrap_or_default();

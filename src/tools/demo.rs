@@ -9,6 +9,7 @@
 mod account;
 mod place;
 
+use std::cell::Cell;
 use std::future::Future;
 use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
@@ -27,31 +28,32 @@ use self::place::Place;
 pub(super) use self::place::sockets;
 use super::Stdout;
 use super::configuration::ModelFile;
-use super::exit::Failure;
+use super::exit::{Fail, Failure};
 use super::faults::Faults;
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
-use super::simulate::{OutOfRange, within};
+use super::simulate::within;
 use crate::daemon::Daemon;
 use crate::daemon::baud::BITS_A_BYTE;
-use crate::daemon::config::{Config, Http, SensorTable, Setup};
-use crate::maybe;
-use hardnessd_core::exit::{Coded, FAILED, IO};
+use crate::daemon::config::{Config, Http, Setup};
+use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::motion;
+use hardnessd_core::sensor;
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
 /// What `--help` says below the options.
 const MORE: &str = "\
-    The presses are of four materials in turn, with 5 to 25 N. On a terminal, stdout has one \
-    line per press; elsewhere it has the events as JSON lines. stderr has the address of the \
-    live page and the socket, which `tail` and `watch` find by themselves.";
+    The presses are of four materials in turn, then of four random ones, and so on, with 5 to 25 N. On a \
+    terminal, stdout has one line per press: what was pressed, what a durometer reads on it, the verdict, \
+    whether its level is right, force and notes. Elsewhere it has the events as JSON lines. stderr has the \
+    address of the live page and the socket, which `tail` and `watch` find by themselves.";
 
 /// Arguments of `demo`.
 #[derive(Debug, Clone, ClapArgs)]
 #[command(after_help = MORE)]
 pub struct Args {
-    /// End after the final verdicts of N presses [default: no limit]
+    /// End after the final verdicts of N presses [default: go on until Ctrl-C]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
     /// Seed of everything random
@@ -70,39 +72,6 @@ pub struct Args {
     model: ModelFile,
 }
 
-/// The reason why the demonstration failed.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The pty or the socket failed.
-    #[error("{what}: {source}")]
-    Io {
-        /// The part that failed, such as the pty.
-        what: &'static str,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// Some presses got no verdict.
-    #[error("only {found} of {presses} presses got a verdict")]
-    Missed {
-        /// The number of verdicts.
-        found: u32,
-        /// The number of presses.
-        presses: u32,
-    },
-    /// The daemon closed the connection.
-    #[error("the daemon closed the connection")]
-    Closed,
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Missed { .. } | Error::Closed => FAILED,
-            Error::Io { .. } => IO,
-        }
-    }
-}
-
 /// The first four presses of this seed show each kind of answer, and none is near another.
 const SEED: u64 = 2;
 
@@ -116,15 +85,14 @@ const PATIENCE: Duration = Duration::from_secs(3);
 /// Returns a [`Failure`] if the daemon, the pty, the socket or stdout fails, or a press gets no
 /// verdict.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
-    let io = |what| move |source| Error::Io { what, source };
-    let place = Place::new().map_err(io("directory for socket and port"))?;
+    let place = Place::new().of("directory for socket and port", IO)?;
     let port = place.port();
-    let mut sensor = SensorTable {
+    let mut sensor = sensor::Settings {
         name: "demo".to_owned(),
-        ..SensorTable::new(port.clone())
+        ..sensor::Settings::new(port.clone())
     };
     let layout = Layout::new(&sensor.frame).expect("the default layout can be used");
-    let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud.get());
+    let line_s = layout.max_frame_bytes() as f64 * BITS_A_BYTE / f64::from(sensor.baud);
     sensor.arm = motion::Settings {
         stiffness_n_per_mm: Some(ARM_N_PER_MM),
         // A frame's stamp is the time of its last byte. The arm's stamp is the time of its
@@ -132,38 +100,45 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         delay_ms: (1e3 * line_s / args.speed).min(1e3),
         ..motion::Settings::default()
     };
-    let pace = Pace::new(sensor.frame_rate_hz, sensor.baud.get(), args.speed);
+    let pace = Pace::new(sensor.frame_rate_hz, sensor.baud, args.speed);
     let sequence = SequenceSettings {
         seed: args.seed,
         frame_rate_hz: sensor.frame_rate_hz,
         presses: args.presses,
+        has_random: true,
         ..SequenceSettings::default()
     };
     let shown = if args.json || !io::stdout().is_terminal() {
         Shown::Json
     } else {
-        Shown::Lines(Account::new(&sequence.materials))
+        Shown::Lines(Account::new(&sequence))
     };
-    let player = Player::new(Some(&port), layout, pace, Faults::none()).map_err(io("pty"))?;
+    let player = Player::new(Some(&port), layout, pace, Faults::none()).of("pty", IO)?;
 
     let socket = place.socket();
     let mut config = hastened(sensor, &socket, args.speed);
-    config.http = Some(Http { listen: args.http });
+    config.http = Some(Http {
+        listen: args.http,
+        set_context: true,
+    });
     let robot = Robot {
         socket: config.publish.unix.control_path(),
         sensor: None,
         position: Box::new(player.position()),
     };
-    let daemon = Daemon::bind(Setup::of(
+    let (config, path) = (
         config.with_model(args.model.path()?.as_deref()),
         Path::new("demo"),
-    )?)?;
+    );
+    let daemon = Daemon::bind(Setup::of(config, path)?.checked(path)?)?;
     if let Some(address) = daemon.http_address() {
-        hardnessd_core::stderr_line!("live page: http://{address}/");
+        hardnessd_core::stderr_line!(
+            "live page: http://{address}/ (Ctrl-C ends the demonstration)"
+        );
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
     hardnessd_core::stderr_line!("socket: {} ({listen})", socket.display());
-    let subscriber = UnixStream::connect(&socket).await.map_err(io("socket"))?;
+    let subscriber = UnixStream::connect(&socket).await.of("socket", IO)?;
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(
         async {
@@ -188,15 +163,15 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
 
 /// Parses `--speed`. Above 100, less than 2 ms would remain between frames, which a busy machine's
 /// timers cannot keep.
-fn speed(text: &str) -> Result<f64, OutOfRange> {
+fn speed(text: &str) -> Result<f64, String> {
     within(text, 0.01, 100.0)
 }
 
 /// The default configuration for a sensor that plays `speed` times as fast: the times of a press
 /// are divided by `speed`.
-fn hastened(sensor: SensorTable, socket: &Path, speed: f64) -> Config {
+fn hastened(sensor: sensor::Settings, socket: &Path, speed: f64) -> Config {
     let frame_rate_hz = sensor.frame_rate_hz * speed;
-    let mut config = Config::new(vec![SensorTable {
+    let mut config = Config::new(vec![sensor::Settings {
         frame_rate_hz,
         ..sensor
     }]);
@@ -238,7 +213,26 @@ async fn print(
     mut shown: Shown,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let printed = print_events(subscriber, presses, player, sequence, &mut shown, shutdown).await;
+    let (frames, progress) = (player::sequence(sequence)?, Progress::default());
+    let play = async {
+        let played = player.play(frames, Instant::now()).await;
+        played.of("pty", IO)?;
+        tokio::time::sleep(PATIENCE).await;
+        while progress.is_printing.get() {
+            tokio::time::sleep(PATIENCE).await;
+        }
+        if progress.missed.get() {
+            return Ok(());
+        }
+        let (finals, presses) = (progress.finals.get(), presses.unwrap_or(0));
+        let missed = format!("only {finals} of {presses} presses got a verdict");
+        Err(Failure::new(FAILED, missed))
+    };
+    let printed = tokio::select! {
+        () = shutdown => Ok(()),
+        printed = print_events(subscriber, presses, &mut shown, &progress) => printed,
+        played = play => played,
+    };
     if let Shown::Lines(account) = &shown {
         let last = super::print_apart((account.close() + "\n").into_bytes());
         // A blocked terminal does not hold the demonstration up.
@@ -247,63 +241,46 @@ async fn print(
     printed
 }
 
+/// What was printed so far.
+#[derive(Default)]
+struct Progress {
+    /// The final verdicts.
+    finals: Cell<u32>,
+    /// Whether a slow reader missed events. Verdicts may be among them.
+    missed: Cell<bool>,
+    /// Whether the reader of stdout lets it wait.
+    is_printing: Cell<bool>,
+}
+
 async fn print_events(
     subscriber: UnixStream,
     presses: Option<u32>,
-    player: Player,
-    sequence: SequenceSettings,
     shown: &mut Shown,
-    shutdown: impl Future<Output = ()>,
+    progress: &Progress,
 ) -> Result<(), Failure> {
-    let io = |what| move |source| Error::Io { what, source };
-    let mut lines = BufReader::new(subscriber);
-    let mut line = Vec::new();
-    let mut finals = 0;
-    // Whether a slow reader missed events. Verdicts may be among them.
-    let mut missed = false;
-    let frames = player::sequence(sequence)?;
-    let mut played = std::pin::pin!(player.play(frames, Instant::now()));
-    let mut shutdown = std::pin::pin!(shutdown);
-    let mut last_byte: Option<Instant> = None;
-    // The line that is being written. The sensor and the daemon do not wait for the reader of
-    // stdout.
-    let mut printing = std::pin::pin!(None);
+    let (mut lines, mut stdout) = (BufReader::new(subscriber), Stdout::open()?);
     loop {
-        let patience = last_byte.map(|at| at + PATIENCE);
-        tokio::select! {
-            // Read the lines that have arrived before checking for a timeout.
-            biased;
-            () = &mut shutdown => return Ok(()),
-            printed = maybe::wait(printing.as_mut().as_pin_mut()) => {
-                printing.set(None);
-                let printed: Result<bool, Stdout> = printed;
-                if !printed? || Some(finals) == presses {
-                    return Ok(());
-                }
+        let mut line = Vec::new();
+        let read = lines.read_until(b'\n', &mut line).await;
+        if read.of("socket", IO)? == 0 {
+            return Err(Failure::new(FAILED, "the daemon closed the connection"));
+        }
+        let event = serde_json::from_slice(&line).unwrap_or_default();
+        let finals = progress.finals.get() + u32::from(is_final(&event));
+        progress.finals.set(finals);
+        progress
+            .missed
+            .set(progress.missed.get() || event["type"] == "gap");
+        let text = shown.of(line, &event);
+        if !text.is_empty() {
+            progress.is_printing.set(true);
+            if !stdout.print(text).await? {
+                return Ok(());
             }
-            read = lines.read_until(b'\n', &mut line), if printing.is_none() => {
-                if read.map_err(io("socket"))? == 0 {
-                    return Err(Error::Closed.into());
-                }
-                let event = serde_json::from_slice(&line).unwrap_or_default();
-                finals += u32::from(is_final(&event));
-                missed |= event["type"] == "gap";
-                let text = shown.of(std::mem::take(&mut line), &event);
-                if !text.is_empty() {
-                    printing.set(Some(super::print_apart(text)));
-                }
-            }
-            ended = &mut played, if last_byte.is_none() => {
-                ended.map_err(io("pty"))?;
-                last_byte = Some(Instant::now());
-            }
-            () = maybe::until(patience), if printing.is_none() => {
-                if missed {
-                    return Ok(());
-                }
-                let presses = presses.unwrap_or(0);
-                return Err(Error::Missed { found: finals, presses }.into());
-            }
+            progress.is_printing.set(false);
+        }
+        if Some(finals) == presses {
+            return stdout.finish().await.map(drop);
         }
     }
 }

@@ -1,8 +1,7 @@
 //! `hardnessd doctor`: finds why a port does not work. It prints each fault on one line, with the
 //! remedy.
 //!
-//! It opens no device, because opening one resets boards like an Arduino. The exception is a port that the
-//! daemon has open already.
+//! It opens no device, because opening one resets boards like an Arduino.
 
 mod checks;
 #[cfg(test)]
@@ -12,20 +11,18 @@ use std::path::Path;
 
 use clap::Args as ClapArgs;
 
-use self::checks::{User, examine, in_the_way, network, ports, refused};
+use self::checks::{User, entry, examine, field, in_the_way, ports, refused, unreachable};
 use super::absolute;
 use super::exit::Failure;
-use crate::daemon::port::Port;
 use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
+use hardnessd_core::port::Port;
 use hardnessd_core::wording::escaped;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
-    It opens no device but one that the daemon has open already. It looks for a missing port, \
-    missing rights (of this user, and of the service), other processes that have the port open \
-    (all of them only as root), settings of the line that another program changed, addresses \
-    that do not answer, brltty, ModemManager and a slow FTDI timer. Exit code 1: it found a \
-    fault.";
+    It opens no device. It looks for a missing port, missing rights of this user, other processes \
+    that have the port open (all of them only as root), addresses that do not answer, brltty, \
+    ModemManager and a slow FTDI timer. Exit code 1: it found a fault.";
 
 /// Arguments of `doctor`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -36,20 +33,6 @@ pub struct Args {
     port: Option<Port>,
 }
 
-/// Faults were found, and stdout names them.
-#[derive(Debug, thiserror::Error)]
-#[error("{found} fault{} found", if *.found == 1 { "" } else { "s" })]
-pub struct Faults {
-    /// The number of faults.
-    found: usize,
-}
-
-impl Coded for Faults {
-    fn exit_code(&self) -> u8 {
-        FAILED
-    }
-}
-
 /// The fault that keeps this process from opening `port`, with the remedy. `None` if no fault is
 /// visible. For example, only root can see that a process of another user holds the port.
 pub(super) fn obstacle(port: &Port) -> Option<String> {
@@ -58,6 +41,12 @@ pub(super) fn obstacle(port: &Port) -> Option<String> {
     let user = User::of_this_process(root);
     let fault = refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next());
     fault.map(|fault| fault.to_string())
+}
+
+/// The name of a group.
+pub(super) fn group(gid: u32) -> Option<String> {
+    let line = entry(Path::new("/"), "etc/group", gid)?;
+    Some(field(&line, 0))
 }
 
 /// A sensor whose port does not open.
@@ -94,7 +83,7 @@ impl Unavailable {
 ///
 /// # Errors
 ///
-/// Returns [`Faults`] if there is a fault, and [`super::Stdout`] if stdout cannot be written to.
+/// Fails if there is a fault, or stdout cannot be written to.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let root = Path::new("/");
     let user = User::of_this_process(root);
@@ -119,8 +108,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                 (Port::Device(path), faults)
             }
             None => {
-                let faults = network::faults(root, &port);
-                (port, faults)
+                let fault = unreachable(&port);
+                (port, fault.into_iter().collect())
             }
         };
         found += faults.len();
@@ -135,6 +124,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     super::print(printed.as_bytes())?;
     match found {
         0 => Ok(()),
-        found => Err(Faults { found }.into()),
+        1 => Err(Failure::new(FAILED, "1 fault found")),
+        _ => Err(Failure::new(FAILED, format!("{found} faults found"))),
     }
 }

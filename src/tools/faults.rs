@@ -5,36 +5,44 @@
 //! them. Times are in seconds of the sensor since its start. The seed decides which bytes and bits
 //! are hit.
 
-mod bytes;
-mod cable;
 mod script;
-mod taxels;
-mod times;
 
 use std::path::Path;
 
-use self::bytes::OfBytes;
-use self::cable::Cable;
-pub(crate) use self::cable::Line;
-pub(crate) use self::script::{Error, FORMAT};
-use self::taxels::OfTaxels;
+pub(crate) use self::script::FORMAT;
+use self::script::{Fault, Kind};
+use super::exit::Failure;
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::random::Stream;
+use hardnessd_simulator::{FULL_SCALE_COUNTS, NEWTONS_PER_COUNT};
+
+/// The state of the line at a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Line {
+    /// Send the bytes, at the speed of the line.
+    Up,
+    /// Send the bytes all at once.
+    AtOnce,
+    /// Send nothing.
+    Silent,
+    /// Send nothing, and remove the port.
+    Unplugged,
+}
 
 /// A script that is being played.
 #[derive(Debug)]
 pub(crate) struct Faults {
-    taxels: Vec<OfTaxels>,
-    bytes: Vec<OfBytes>,
-    cable: Cable,
+    faults: Vec<Fault>,
+    /// The bytes that a stall holds back.
+    held: Vec<u8>,
     stream: Stream,
 }
 
 impl Faults {
     /// No faults.
     pub(crate) fn none() -> Self {
-        Self::of(script::Faults::default(), 0)
+        Self::of(Vec::new(), 0)
     }
 
     /// Reads a script.
@@ -42,15 +50,14 @@ impl Faults {
     /// # Errors
     ///
     /// Fails if the script cannot be read, or has a key or value that cannot be used.
-    pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Error> {
+    pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Failure> {
         Ok(Self::of(script::load(path)?, seed))
     }
 
-    fn of(faults: script::Faults, seed: u64) -> Self {
+    fn of(faults: Vec<Fault>, seed: u64) -> Self {
         Self {
-            taxels: faults.taxels,
-            bytes: faults.bytes,
-            cable: Cable::new(faults.cable),
+            faults,
+            held: Vec::new(),
             stream: Stream::new(seed, "faults"),
         }
     }
@@ -67,15 +74,96 @@ impl Faults {
         layout: &Layout,
         bytes: &mut Vec<u8>,
     ) -> Line {
-        for fault in &self.taxels {
-            fault.strike(time_s, &mut raw);
+        for fault in &mut self.faults {
+            strike_taxels(fault, time_s, &mut raw);
         }
         bytes.clear();
         layout.encode(&middle(&raw, layout.array()), bytes);
-        for fault in &mut self.bytes {
-            fault.strike(time_s, &mut self.stream, bytes);
+        for fault in &mut self.faults {
+            strike_bytes(fault, time_s, &mut self.stream, bytes);
         }
-        self.cable.strike(time_s, bytes)
+        self.strike_cable(time_s, bytes)
+    }
+
+    /// Makes of the frame that is due at `time_s` the bytes to send now, and returns how to send
+    /// them.
+    fn strike_cable(&mut self, time_s: f64, bytes: &mut Vec<u8>) -> Line {
+        let mut line = Line::Up;
+        for fault in &mut self.faults {
+            let kind = fault.kind;
+            match kind {
+                Kind::Unplug {} if fault.strikes(time_s) => line = Line::Unplugged,
+                Kind::Stall {} if line == Line::Up && fault.strikes(time_s) => {
+                    self.held.append(bytes);
+                    line = Line::Silent;
+                }
+                Kind::Silence {} if line == Line::Up && fault.strikes(time_s) => {
+                    line = Line::Silent;
+                }
+                _ => {}
+            }
+        }
+        // A cable that is pulled loses what it holds.
+        if line == Line::Unplugged {
+            self.held.clear();
+        }
+        if line == Line::Up && !self.held.is_empty() {
+            bytes.splice(0..0, self.held.drain(..));
+            return Line::AtOnce;
+        }
+        line
+    }
+}
+
+/// Changes what taxels of a frame read, if the fault is of taxels.
+fn strike_taxels(fault: &mut Fault, time_s: f64, raw: &mut RawFrame) {
+    let (stuck, newtons) = match fault.kind {
+        Kind::Stuck { counts } => (Some(counts), 0.0),
+        Kind::Contact { newtons } => (None, newtons),
+        Kind::Drift { newtons_per_hour } => {
+            let hours = (time_s - fault.at_s).min(fault.for_s) / 3600.0;
+            (None, newtons_per_hour * hours)
+        }
+        _ => return,
+    };
+    if !fault.strikes(time_s) {
+        return;
+    }
+    let Fault { rows, cols, .. } = *fault;
+    let more = newtons / f64::from(NEWTONS_PER_COUNT);
+    let most = f64::from(FULL_SCALE_COUNTS);
+    for row in rows[0]..=rows[1] {
+        let places = raw.array.place(row, cols[0])..=raw.array.place(row, cols[1]);
+        for count in &mut raw.counts[places] {
+            let changed = (f64::from(*count) + more).round().clamp(0.0, most) as f32;
+            *count = stuck.map_or(changed, f32::from);
+        }
+    }
+}
+
+/// Damages the bytes of a frame, if the fault is of bytes.
+fn strike_bytes(fault: &mut Fault, time_s: f64, stream: &mut Stream, frame: &mut Vec<u8>) {
+    let kind = fault.kind;
+    match kind {
+        Kind::Noise { bytes, .. } if fault.strikes(time_s) => {
+            let noise = (0..bytes).map(|_| (stream.next_u64() >> 56) as u8);
+            let noise: Vec<u8> = noise.collect();
+            frame.splice(0..0, noise);
+        }
+        Kind::DropBytes { bytes, .. } if fault.strikes(time_s) => {
+            for _ in 0..bytes.min(frame.len()) {
+                frame.remove(stream.below(frame.len()));
+            }
+        }
+        Kind::Flip { bits, .. } if fault.strikes(time_s) => {
+            // If all bytes were dropped, there is no bit to invert.
+            let bits = if frame.is_empty() { 0 } else { bits };
+            for _ in 0..bits {
+                let bit = stream.below(frame.len() * 8);
+                frame[bit / 8] ^= 1 << (bit % 8);
+            }
+        }
+        _ => {}
     }
 }
 
@@ -110,11 +198,11 @@ mod tests {
     struct Played {
         faults: Faults,
         layout: Layout,
-        rest: u16,
+        rest: f32,
     }
 
     impl Played {
-        fn new(script: &str, rest: u16) -> Self {
+        fn new(script: &str, rest: f32) -> Self {
             Self {
                 faults: Faults::of(script::parse(script).unwrap(), 1),
                 layout: Layout::new(&Settings::default()).unwrap(),
@@ -171,12 +259,8 @@ mod tests {
             [[fault]]
             at_s = 5.0
             kind = "flip"
-            [[fault]]
-            at_s = 6.0
-            kind = "repeat"
-            frames = 2
         "#;
-        let mut played = Played::new(script, 0);
+        let mut played = Played::new(script, 0.0);
         let whole = played.whole();
         let mut struck = |time_s| {
             let (line, bytes) = played.at(time_s);
@@ -195,23 +279,11 @@ mod tests {
         assert_eq!(struck(4.4), (Line::Up, 790, 0));
         assert_eq!(struck(5.0), (Line::Up, 790, 1));
         assert_eq!(struck(5.2), (Line::Up, 790, 0));
-        assert_eq!(struck(6.0), (Line::Up, 1580, 0));
-        assert_eq!(struck(6.2), (Line::Up, 1580, 0));
-        assert_eq!(struck(6.4), (Line::Up, 790, 0));
     }
 
     #[test]
-    fn half_a_frame_comes_with_or_without_its_other_half_and_a_stall_loses_nothing() {
+    fn a_stall_loses_nothing_but_with_the_cable() {
         let script = r#"
-            [[fault]]
-            at_s = 1.0
-            kind = "half"
-            for_s = 0.5
-            [[fault]]
-            at_s = 2.0
-            kind = "half"
-            for_s = 0.5
-            other_half = true
             [[fault]]
             at_s = 3.0
             kind = "stall"
@@ -225,40 +297,16 @@ mod tests {
             kind = "unplug"
             for_s = 0.1
         "#;
-        let mut played = Played::new(script, 9);
+        let mut played = Played::new(script, 9.0);
         let whole = played.whole();
-        let (head, tail) = whole.split_at(395);
-        assert_eq!(played.at(1.0), (Line::Up, head.to_vec()));
-        assert_eq!(played.at(1.2).0, Line::Silent);
-        assert_eq!(played.at(1.5), (Line::Up, whole.clone()));
-        assert_eq!(played.at(2.1), (Line::Up, head.to_vec()));
-        assert_eq!(played.at(2.2).0, Line::Silent);
-        assert_eq!(played.at(2.6), (Line::AtOnce, [tail, &whole].concat()));
-        assert_eq!(played.at(2.8), (Line::Up, whole.clone()));
         assert_eq!(played.at(3.0).0, Line::Silent);
         assert_eq!(played.at(3.4).0, Line::Silent);
         assert_eq!(played.at(3.5), (Line::AtOnce, whole.repeat(3)));
         assert_eq!(played.at(3.6), (Line::Up, whole.clone()));
-        // What was held back is lost with the cable.
         assert_eq!(played.at(4.0).0, Line::Silent);
         assert_eq!(played.at(4.2).0, Line::Unplugged);
         assert_eq!(played.at(4.4).0, Line::Silent);
         assert_eq!(played.at(4.5), (Line::AtOnce, whole.repeat(2)));
-    }
-
-    #[test]
-    fn at_a_wrong_baud_rate_no_frame_is_read() {
-        let script = "[[fault]]\nat_s = 1.0\nkind = \"wrong-baud\"\nratio = 0.5\nfor_s = 1.0\n";
-        let mut played = Played::new(script, 9);
-        let whole = played.whole();
-        assert_eq!(played.at(0.5), (Line::Up, whole.clone()));
-        let (line, bytes) = played.at(1.5);
-        assert_eq!(line, Line::AtOnce);
-        assert!(bytes.len() < whole.len(), "{}", bytes.len());
-        let mut decoder = Decoder::new(played.layout.clone());
-        decoder.push(&bytes);
-        assert!(!matches!(decoder.next_frame(), Some(Ok(_))));
-        assert_eq!(played.at(2.0), (Line::Up, whole));
     }
 
     #[test]
@@ -272,7 +320,8 @@ mod tests {
             for_s = 0.5
             [[fault]]
             at_s = 2.0
-            kind = "dead"
+            kind = "stuck"
+            counts = 0
             rows = [27, 27]
             for_s = 0.5
             [[fault]]
@@ -292,11 +341,11 @@ mod tests {
             rows = [0, 0]
             newtons_per_hour = -100.0
         "#;
-        let mut played = Played::new(script, 7);
+        let mut played = Played::new(script, 7.0);
         // The taxels that read another number than at rest, and that number.
         let mut other = |time_s| {
             let raw = played.frame(time_s);
-            let places = (0..784).filter(|&place| raw.counts[place] != 7);
+            let places = (0..784).filter(|&place| raw.counts[place] != 7.0);
             let places: Vec<usize> = places.collect();
             (
                 places.len(),
@@ -304,35 +353,20 @@ mod tests {
             )
         };
         assert_eq!(other(0.9), (0, None));
-        assert_eq!(other(1.0), (2, Some((2 * 28 + 3, 255))));
+        assert_eq!(other(1.0), (2, Some((2 * 28 + 3, 255.0))));
         assert_eq!(other(1.5), (0, None));
-        assert_eq!(other(2.0), (28, Some((27 * 28, 0))));
+        assert_eq!(other(2.0), (28, Some((27 * 28, 0.0))));
         assert_eq!(other(2.5), (0, None));
-        assert_eq!(other(3.4), (56, Some((5, 17))));
+        assert_eq!(other(3.4), (56, Some((5, 17.0))));
         assert_eq!(other(4.0), (0, None));
         // A count is 0.04 N, which 0.5 N an hour reach in 288 s.
         assert_eq!(other(10.0 + 140.0), (0, None));
-        assert_eq!(other(10.0 + 150.0), (784, Some((0, 8))));
-        assert_eq!(other(10.0 + 3500.0), (784, Some((0, 19))));
+        assert_eq!(other(10.0 + 150.0), (784, Some((0, 8.0))));
+        assert_eq!(other(10.0 + 3500.0), (784, Some((0, 19.0))));
         // After its hour it stays.
-        assert_eq!(other(4999.0), (784, Some((0, 20))));
+        assert_eq!(other(4999.0), (784, Some((0, 20.0))));
         // No taxel reads less than nothing.
-        assert_eq!(other(9000.0), (784, Some((0, 0))));
-        assert_eq!(played.frame(9000.0).counts[28], 20);
-    }
-
-    #[test]
-    fn a_frame_of_which_nothing_is_left_has_no_bits_to_flip() {
-        let script = r#"
-            [[fault]]
-            at_s = 1.0
-            kind = "drop-bytes"
-            bytes = 1000
-            [[fault]]
-            at_s = 1.0
-            kind = "flip"
-            bits = 3
-        "#;
-        assert_eq!(Played::new(script, 0).at(1.0), (Line::Up, Vec::new()));
+        assert_eq!(other(9000.0), (784, Some((0, 0.0))));
+        assert_eq!(played.frame(9000.0).counts[28], 20.0);
     }
 }

@@ -14,20 +14,20 @@ use std::sync::Arc;
 use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
-use super::exit::Failure;
+use super::exit::{Fail, Failure};
 use super::replay::{self, feed, no_frame};
-use super::{CannotRead, Unplayable, Unreadable, live, open, print_apart};
-use crate::apart;
+use super::{cannot_read, live, open, print_apart, unplayable};
 use crate::daemon::config::{self, Config, Setup};
-use hardnessd_core::exit::{Coded, FAILED, IO, USAGE};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::motion::Point;
-use hardnessd_core::part::{Part, directory_of};
+use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{FileKind, Labels, Playback, Reader};
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{
-    Borders, BordersError, Course, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress,
+    Borders, Course, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress, Tried,
 };
 
 /// Arguments of `identify`.
@@ -43,7 +43,7 @@ pub struct Args {
     #[arg(long)]
     append: bool,
     /// What is pressed: flat:MM (a rigid flat piece, its width), ball:MM (a rigid ball, its radius),
-    /// shore:OO or level:N [default: the recording's labels `reference`, `shore` or `level`]
+    /// shore:OO, level:N or unknown (any everyday objects) [default: the recording's labels `reference`, `shore` or `level`]
     #[arg(long = "as", value_name = "WHAT")]
     what: Option<What>,
     /// Positions of the arm for raw bytes: CSV with the columns time_s, counted from the first whole
@@ -69,24 +69,27 @@ enum What {
     Level(u8),
 }
 
-/// A text that names no piece.
-#[derive(Debug, PartialEq, thiserror::Error)]
-#[error("expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, or level:N")]
-pub struct NoPiece;
-
 impl FromStr for What {
-    type Err = NoPiece;
+    type Err = &'static str;
 
-    fn from_str(text: &str) -> Result<Self, NoPiece> {
-        let (kind, value) = text.split_once(':').ok_or(NoPiece)?;
+    fn from_str(text: &str) -> Result<Self, &'static str> {
+        What::named(text).ok_or(
+            "expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, level:N, or unknown",
+        )
+    }
+}
+
+impl What {
+    fn named(text: &str) -> Option<Self> {
+        if text.trim() == "unknown" {
+            return Some(Self::Piece(Piece::UNKNOWN));
+        }
+        let (kind, value) = text.split_once(':')?;
         let within = |least: f32, most: f32| {
-            let number: f32 = value.trim().parse().map_err(|_| NoPiece)?;
-            (least..=most)
-                .contains(&number)
-                .then_some(number)
-                .ok_or(NoPiece)
+            let number = value.trim().parse().ok();
+            number.filter(|number| (least..=most).contains(number))
         };
-        Ok(match kind.trim() {
+        Some(match kind.trim() {
             "flat" => Self::Piece(Piece::Flat {
                 width_mm: within(0.1, 1000.0)?,
             }),
@@ -96,94 +99,9 @@ impl FromStr for What {
             "shore" => Self::Piece(Piece::Shore {
                 range: [within(0.0, 100.0)?; 2],
             }),
-            "level" => Self::Level(value.trim().parse().map_err(|_| NoPiece)?),
-            _ => return Err(NoPiece),
+            "level" => Self::Level(value.trim().parse().ok()?),
+            _ => return None,
         })
-    }
-}
-
-/// The reason why there are no references.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// Nothing says what is pressed now.
-    #[error("--as: found nothing, expected what will be pressed, such as flat:20 or ball:10")]
-    Unnamed,
-    /// Nothing says what was pressed in a recording.
-    #[error(
-        "{path}: found no label `reference`, `shore` or `level`: say what was pressed with --as"
-    )]
-    Unlabelled {
-        /// The path of the recording.
-        path: PathBuf,
-    },
-    /// A label says nothing of a piece.
-    #[error("{path}: label {key}: found {found:?}, {source}")]
-    Label {
-        /// The path of the recording.
-        path: PathBuf,
-        /// The label.
-        key: &'static str,
-        /// Its text.
-        found: String,
-        /// What was expected.
-        source: NoPiece,
-    },
-    /// The model has no such level.
-    #[error("level: found {found}, expected 1 to {most}, those of the model")]
-    Level {
-        /// The level.
-        found: u8,
-        /// The model's last level.
-        most: usize,
-    },
-    /// The model's levels are no parts of the scale.
-    #[error("the model's levels: found {0}")]
-    Borders(#[from] BordersError),
-    /// There are no presses.
-    #[error("{path}: found no press of sensor {sensor:?}, expected at least one")]
-    NoPress {
-        /// The path of the recording, or words for the recording that was made just now.
-        path: PathBuf,
-        /// The sensor.
-        sensor: String,
-    },
-    /// There are more presses than a file may have.
-    #[error("found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out")]
-    Many {
-        /// The number of presses, with those of the file.
-        found: usize,
-    },
-    /// The file to add to is none of references.
-    #[error("{path}: {source}")]
-    References {
-        /// The path of the file.
-        path: PathBuf,
-        /// The reason.
-        source: references::Error,
-    },
-    /// The file exists.
-    #[error("{path} exists already: add to it with --append, or name another file")]
-    Taken {
-        /// The path of the file.
-        path: PathBuf,
-    },
-    /// The file cannot be written.
-    #[error("{path}: {source}")]
-    Out {
-        /// The path of the file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Self::Unnamed => USAGE,
-            Self::Taken { .. } | Self::Out { .. } => IO,
-            _ => FAILED,
-        }
     }
 }
 
@@ -217,9 +135,13 @@ pub async fn run(
     // A file that cannot be made or added to shows before anything is pressed.
     begin(&args)?;
     let levels = setup.hrn.card().levels.clone();
+    let hrn = setup.hrn.clone();
     let file = if args.files.is_empty() {
         let Some(what) = args.what else {
-            return Err(Error::Unnamed.into());
+            return Err(Failure::new(
+                USAGE,
+                "--as: found nothing, expected what will be pressed, such as flat:20 or ball:10",
+            ));
         };
         let wanted = args.presses;
         let print_next = |seen: u64| match seen {
@@ -239,14 +161,22 @@ pub async fn run(
     } else {
         let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());
         let work = move || of_files(&args, &sensor, &hrn, &levels);
-        let read = apart::start("identify", work)?;
+        let read = spawn_thread("identify", work)?;
         tokio::select! {
             read = read => read.expect("recordings are read without a panic")?,
             () = shutdown => return Ok(()),
         }
     };
     let all = write(&args, file)?;
-    let text = account(&super::as_in(config, &args.out), &all);
+    let tried = match all.len() <= hrn.most_references() {
+        true => {
+            hrn.identified_by(&all)
+                .of(args.out.display().to_string(), FAILED)?
+                .1
+        }
+        false => Tried::default(),
+    };
+    let text = account(&super::as_in(config, &args.out), &all, tried);
     print_apart(text.into_bytes()).await?;
     Ok(())
 }
@@ -254,55 +184,47 @@ pub async fn run(
 /// Begins the file, and reads the presses that it has already. Fails if there is a file that nothing is to
 /// be added to.
 fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
-    let path = || args.out.clone();
-    let failed = |source| Error::Out {
-        path: path(),
-        source,
-    };
+    let out = &args.out;
     if !args.append {
-        return match Part::new(&args.out) {
-            Ok(part) => Ok((Vec::new(), part)),
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-                Err(Error::Taken { path: path() }.into())
-            }
-            Err(error) => Err(failed(error).into()),
+        return match Part::new(out) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Err(Failure::new(
+                IO,
+                format!(
+                    "{} exists already: add to it with --append, or name another file",
+                    out.display()
+                ),
+            )),
+            part => Ok((Vec::new(), part.of_file(out, IO)?)),
         };
     }
     // It refuses a pipe, whose reading might never end.
-    let part = Part::over(&args.out).map_err(failed)?;
+    let part = Part::over(out).of_file(out, IO)?;
     let mut bytes = Vec::new();
-    let read = File::open(&args.out).and_then(|file| {
+    let read = File::open(out).and_then(|file| {
         file.take(references::MAX_FILE_BYTES as u64 + 1)
             .read_to_end(&mut bytes)
     });
     match read {
         Ok(_) => {}
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Vec::new(), part)),
-        Err(error) => return Err(CannotRead::at(&args.out)(error).into()),
+        Err(error) => return Err(cannot_read(out)(error)),
     }
-    match references::read(&bytes) {
-        Ok(known) => Ok((known, part)),
-        Err(source) => Err(Error::References {
-            path: path(),
-            source,
-        }
-        .into()),
-    }
+    Ok((references::read(&bytes).of_file(out, FAILED)?, part))
 }
 
 /// What is known of a piece, with the model's levels.
-fn piece(what: What, levels: &[Level]) -> Result<Piece, Error> {
+fn piece(what: What, levels: &[Level]) -> Result<Piece, Failure> {
     let level = match what {
         What::Piece(piece) => return Ok(piece),
         What::Level(level) => level,
     };
     if !(1..=levels.len()).contains(&usize::from(level)) {
-        return Err(Error::Level {
-            found: level,
-            most: levels.len(),
-        });
+        let most = levels.len();
+        let unknown = format!("level: found {level}, expected 1 to {most}, those of the model");
+        return Err(Failure::new(FAILED, unknown));
     }
-    let range = Borders::of(levels)?.part(usize::from(level) - 1);
+    let borders = Borders::of(levels).of("the model's levels", FAILED)?;
+    let range = borders.part(usize::from(level) - 1);
     Ok(Piece::Shore { range })
 }
 
@@ -319,10 +241,10 @@ fn of_files(
     };
     let mut all = Vec::new();
     for path in &args.files {
-        let (kind, file) = FileKind::read(open(path)?).map_err(CannotRead::at(path))?;
+        let (kind, file) = FileKind::read(open(path)?).map_err(cannot_read(path))?;
         let (courses, labels) = match kind {
             FileKind::Recording if motion.is_some() => {
-                return Err(replay::Error::OwnMotion { path: path.clone() }.into());
+                return Err(replay::own_motion(path));
             }
             FileKind::Recording => {
                 of_recording(BufReader::new(file), path, sensor.name(), hrn.clone())?
@@ -357,22 +279,26 @@ fn spread(mut courses: Vec<Course>, most: usize) -> Vec<Course> {
 }
 
 /// What the labels of a recording say was pressed.
-fn labelled(labels: &Labels, path: &Path) -> Result<What, Error> {
+fn labelled(labels: &Labels, path: &Path) -> Result<What, Failure> {
     let kinds = [("reference", ""), ("shore", "shore:"), ("level", "level:")];
     let known = kinds
         .into_iter()
         .find_map(|(key, kind)| Some((key, kind, labels.get(key)?)));
     let Some((key, kind, found)) = known else {
-        return Err(Error::Unlabelled {
-            path: path.to_owned(),
-        });
+        let unlabelled =
+            "found no label `reference`, `shore` or `level`: say what was pressed with --as";
+        return Err(Failure::new(
+            FAILED,
+            format!("{}: {unlabelled}", path.display()),
+        ));
     };
     let what = format!("{kind}{found}").parse();
-    what.map_err(|source| Error::Label {
-        path: path.to_owned(),
-        key,
-        found: found.clone(),
-        source,
+    what.map_err(|expected| {
+        let path = path.display();
+        Failure::new(
+            FAILED,
+            format!("{path}: label {key}: found {found:?}, {expected}"),
+        )
     })
 }
 
@@ -381,12 +307,11 @@ fn made_of(
     piece: Piece,
     path: &Path,
     sensor: &Sensor,
-) -> Result<Vec<ReferencePress>, Error> {
+) -> Result<Vec<ReferencePress>, Failure> {
     if courses.is_empty() {
-        return Err(Error::NoPress {
-            path: path.to_owned(),
-            sensor: sensor.name().to_owned(),
-        });
+        let (path, sensor) = (path.display(), sensor.name());
+        let none = format!("{path}: found no press of sensor {sensor:?}, expected at least one");
+        return Err(Failure::new(FAILED, none));
     }
     let press = |course| ReferencePress { course, piece };
     Ok(courses.into_iter().map(press).collect())
@@ -398,8 +323,8 @@ fn of_recording(
     path: &Path,
     sensor: &str,
     hrn: Arc<Hrn>,
-) -> Result<(Vec<Course>, Labels), Unplayable> {
-    let read = || -> Result<_, Unreadable> {
+) -> Result<(Vec<Course>, Labels), Failure> {
+    let read = || -> anyhow::Result<_> {
         let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
         playback.keep_courses();
         for found in Reader::new(file) {
@@ -408,9 +333,12 @@ fn of_recording(
         }
         playback.end();
         courses.extend(playback.courses(sensor));
+        for note in playback.left_out() {
+            hardnessd_core::stderr_line!("warning: {}: {note}", path.display());
+        }
         Ok((courses, playback.labels()))
     };
-    read().map_err(Unplayable::at(path))
+    read().map_err(unplayable(path))
 }
 
 /// The courses of the presses in raw bytes.
@@ -425,40 +353,39 @@ fn of_bytes(
     pipeline.keep_courses();
     let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
     match end.as_deref().and_then(|end| no_frame(path, end)) {
-        Some(error) => Err(error.into()),
+        Some(error) => Err(error),
         None => Ok(pipeline.courses()),
     }
 }
 
 /// Writes the file, and returns all its presses.
 fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, Failure> {
-    let failed = |source| Error::Out {
-        path: args.out.clone(),
-        source,
-    };
-    // Two calls may add to the file at once. The later one reads what the earlier one wrote.
-    let directory = File::open(directory_of(&args.out)).map_err(failed)?;
-    // Some file systems have no locks. There, one call at a time may add.
-    let _ = directory.lock();
+    let out = &args.out;
+    // Another call may have added to the file meanwhile.
     let (mut all, part) = begin(args)?;
     all.extend(made);
     if all.len() > MOST_REFERENCES {
-        return Err(Error::Many { found: all.len() }.into());
+        let found = all.len();
+        let many = format!(
+            "found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out"
+        );
+        return Err(Failure::new(FAILED, many));
     }
-    let bytes = references::write(&all).map_err(failed)?;
-    part.write(&bytes).map_err(failed)?;
+    let bytes = references::write(&all).of_file(out, IO)?;
+    part.write(&bytes).of_file(out, IO)?;
     Ok(all)
 }
 
 /// What the file holds, what is missing, and the lines of the configuration. `out` is the file's path as
 /// the configuration may name it.
-fn account(out: &str, references: &[ReferencePress]) -> String {
+fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
     let count = |is: fn(&Piece) -> bool| references.iter().filter(|p| is(&p.piece)).count();
     let flat = count(|piece| matches!(piece, Piece::Flat { .. }));
     let ball = count(|piece| matches!(piece, Piece::Ball { .. }));
+    let unknown = count(|piece| piece.is_unknown());
     let mut text = format!(
-        "presses on  rigid flat piece {flat}, rigid ball {ball}, known hardness {}\n",
-        references.len() - flat - ball
+        "presses on  rigid flat piece {flat}, rigid ball {ball}, known hardness {}, unknown {unknown}\n",
+        references.len() - flat - ball - unknown
     );
     let forces = references.iter().map(|press| greatest_n(&press.course));
     let (least, most) = forces.fold((f64::INFINITY, 0.0), |(least, most), force_n| {
@@ -477,7 +404,19 @@ fn account(out: &str, references: &[ReferencePress]) -> String {
             );
         }
     }
-    if flat < 2 || ball < 2 {
+    let Tried {
+        presses,
+        right: [with, without],
+        ..
+    } = tried;
+    if presses > 0 {
+        text +=
+            &format!("judged rightly  {with} of {presses} with the others, {without} with none\n");
+    }
+    if tried.are_worse() {
+        text += "these references make verdicts worse, so the daemon will not use them: check newtons with \
+                 `calibrate force`, press from 5 N on, or leave `references` out\n";
+    } else if flat + ball > 0 && (flat < 2 || ball < 2) {
         text += "a light and a hard press on a rigid flat piece and on a rigid ball tell most\n";
     }
     text + &format!("\n[[sensor]]\nreferences = {out:?}\n")
@@ -486,11 +425,11 @@ fn account(out: &str, references: &[ReferencePress]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::verdict::{CourseMoment, ModelFrame, TAXELS};
+    use hardnessd_core::verdict::{ModelFrame, Sample, TAXELS};
 
     fn press(newtons: f32) -> Course {
         Course {
-            moments: vec![CourseMoment {
+            moments: vec![Sample {
                 time_s: 0.0,
                 approach_mm: None,
                 frame: ModelFrame {
@@ -523,7 +462,7 @@ mod tests {
             piece: Piece::Ball { radius_mm: 10.0 },
             course: press(newtons),
         });
-        let text = account("r.npz", &presses);
+        let text = account("r.npz", &presses, Tried::default());
         assert!(text.contains("press  7.8 to 23.5 N\n"), "{text}");
     }
 
@@ -537,6 +476,7 @@ mod tests {
         let shore = Piece::Shore { range: [63.0; 2] };
         assert_eq!(parse("shore:63"), Ok(What::Piece(shore)));
         assert_eq!(parse("level:2"), Ok(What::Level(2)));
+        assert_eq!(parse("unknown"), Ok(What::Piece(Piece::UNKNOWN)));
         for text in [
             "flat",
             "flat:",
@@ -546,7 +486,7 @@ mod tests {
             "level:x",
             "egg:3",
         ] {
-            assert_eq!(parse(text), Err(NoPiece), "{text}");
+            assert!(parse(text).is_err(), "{text}");
         }
     }
 }

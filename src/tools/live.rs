@@ -5,34 +5,19 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, Seek, SeekFrom};
-use std::path::PathBuf;
+use std::io::{Seek, SeekFrom};
 use std::pin::pin;
 use std::time::Duration;
 
 use tokio::sync::watch;
 
-use super::exit::Failure;
+use super::exit::{Fail, Failure};
 use super::record;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
-use hardnessd_core::exit::{Coded, IO};
+use hardnessd_core::exit::IO;
 use hardnessd_core::recording::Labels;
-
-/// The temporary file for the recording cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{directory}: {source}")]
-struct Temporary {
-    directory: PathBuf,
-    source: io::Error,
-}
-
-impl Coded for Temporary {
-    fn exit_code(&self) -> u8 {
-        IO
-    }
-}
 
 /// What an error calls the recording in place of its path.
 pub(super) const RECORDED: &str = "what was recorded";
@@ -54,13 +39,9 @@ pub(super) async fn record(
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
     let path = std::env::temp_dir();
-    let temporary = |source| Temporary {
-        directory: path.clone(),
-        source,
-    };
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
-    let file = tempfile::tempfile().map_err(temporary)?;
-    let mut recorded = file.try_clone().map_err(temporary)?;
+    let file = tempfile::tempfile().of_file(&path, IO)?;
+    let mut recorded = file.try_clone().of_file(&path, IO)?;
 
     let (progress, mut counted) = watch::channel(Progress::default());
     let enough = async {
@@ -89,6 +70,6 @@ pub(super) async fn record(
     if stopped {
         return Ok(None);
     }
-    recorded.seek(SeekFrom::Start(0)).map_err(temporary)?;
+    recorded.seek(SeekFrom::Start(0)).of_file(&path, IO)?;
     Ok(Some(recorded))
 }

@@ -13,8 +13,8 @@ use tokio::time::Instant;
 
 use super::faults::{Faults, Line};
 use super::pty::Pty;
-use crate::apart::NoThread;
 use crate::daemon::baud::BITS_A_BYTE;
+use crate::thread::NoThread;
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{Approach, Sequence, SequenceSettings};

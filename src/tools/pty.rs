@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::io::Errno;
-use rustix::termios::{OptionalActions, QueueSelector, Winsize};
+use rustix::termios::{QueueSelector, Winsize};
 use tokio::time::Instant;
 
 use self::pair::Pair;
@@ -51,12 +51,8 @@ impl Pty {
             master,
             device,
             path,
-        } = Pair::open()?;
+        } = Pair::raw()?;
         rustix::io::ioctl_fionbio(&master, true)?;
-        // A new tty echoes and edits lines. A sensor does neither.
-        let mut settings = rustix::termios::tcgetattr(&device)?;
-        settings.make_raw();
-        rustix::termios::tcsetattr(&device, OptionalActions::Now, &settings)?;
         let (ws_xpixel, ws_ypixel) = SIMULATED;
         let mark = Winsize {
             ws_row: 0,
@@ -121,7 +117,7 @@ impl Pty {
         // Written bytes reach the device a moment later, so one look at an empty device is not
         // enough.
         let mut empty = 0;
-        while empty < 3 && Instant::now() < end {
+        while empty < 10 && Instant::now() < end {
             tokio::time::sleep(Duration::from_millis(5)).await;
             let is_empty = rustix::io::ioctl_fionread(&self.device)? == 0;
             empty = if is_empty { empty + 1 } else { 0 };

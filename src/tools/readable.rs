@@ -8,7 +8,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::answer::Answer;
+use super::answer::{Answer, with_shore};
 use hardnessd_core::wording;
 
 /// How events are printed on stdout.
@@ -119,11 +119,19 @@ fn status(line: &mut String, event: &Value) {
         line,
         format_args!("{state:<10}  {frames} frames, {damaged} damaged"),
     );
+    match number(event, "frames_dropped") {
+        0 => {}
+        dropped => write(line, format_args!(", {dropped} dropped")),
+    }
     if let Some(hz) = event["frame_rate_hz"].as_f64() {
         write(line, format_args!(", {hz:.1} frames/s"));
     }
     if let Some(reason) = event["reason"].as_str() {
-        write(line, format_args!("  ({reason})"));
+        let detail = event["detail"].as_str().map(|detail| format!(": {detail}"));
+        write(
+            line,
+            format_args!("  ({reason}{})", detail.unwrap_or_default()),
+        );
     }
 }
 
@@ -145,7 +153,7 @@ fn press(line: &mut String, event: &Value) {
 
 fn hardness(line: &mut String, event: &Value, labels: &[String]) {
     let (press, phase) = (number(event, "press"), event["phase"].as_str());
-    let answer = Answer::of(event, labels).text;
+    let answer = with_shore(&Answer::of(event, labels).text, event);
     let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
     let probabilities: Vec<String> = event["probabilities"]
         .as_array()
@@ -156,7 +164,7 @@ fn hardness(line: &mut String, event: &Value, labels: &[String]) {
     write(
         line,
         format_args!(
-            "#{press:<4} {:<8}  {answer:<20} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
+            "#{press:<4} {:<8}  {answer:<32} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
             phase.unwrap_or_default(),
             percent(&event["confidence"]),
             probabilities.join(" "),
@@ -164,12 +172,8 @@ fn hardness(line: &mut String, event: &Value, labels: &[String]) {
             event["force_n"].as_f64().unwrap_or_default(),
         ),
     );
-    let shore = |key: &str| event["shore"][key].as_f64();
-    if let (Some(value), Some(low), Some(high)) = (shore("value"), shore("low"), shore("high")) {
-        write(
-            line,
-            format_args!("  Shore {value:.0} ({low:.0} to {high:.0})"),
-        );
+    if let Some(advice) = event["advice"].as_str() {
+        write(line, format_args!("  {}", advice.replace('_', " ")));
     }
     let object = &event["object"];
     if let (Some(name), Some(presses @ 2..)) = (object["name"].as_str(), object["presses"].as_u64())
@@ -203,22 +207,16 @@ fn hardness(line: &mut String, event: &Value, labels: &[String]) {
 }
 
 fn frame(line: &mut String, event: &Value) {
-    let newtons = || {
-        event["newtons"]
-            .as_array()
-            .into_iter()
-            .flatten()
-            .filter_map(Value::as_f64)
-    };
-    write(
-        line,
-        format_args!(
-            "#{:<13}  {:>6.2} N, highest taxel {:.2} N",
-            number(event, "frame"),
-            newtons().sum::<f64>(),
-            newtons().fold(0.0, f64::max)
+    let newtons = event["newtons"].as_array().into_iter().flatten();
+    let highest_n = newtons.filter_map(Value::as_f64).fold(0.0, f64::max);
+    let number = number(event, "frame");
+    match event["force_n"].as_f64() {
+        Some(force_n) => write(
+            line,
+            format_args!("#{number:<13}  {force_n:>6.2} N, highest taxel {highest_n:.2} N"),
         ),
-    );
+        None => write(line, format_args!("#{number:<13}  no zero yet")),
+    }
 }
 
 fn context(line: &mut String, event: &Value) {
@@ -249,9 +247,16 @@ mod tests {
         check(
             json!({"type": "status", "sensor": "forearm", "time": time, "state": "lost",
                    "reason": "end\u{1b} of\u{202e} file", "frames": 120, "frames_damaged": 2,
-                   "frame_rate_hz": 4.96}),
-            "10:00:00.123  forearm       status    lost        120 frames, 2 damaged, \
+                   "frames_dropped": 7, "frame_rate_hz": 4.96}),
+            "10:00:00.123  forearm       status    lost        120 frames, 2 damaged, 7 dropped, \
              5.0 frames/s  (end of file)",
+        );
+        check(
+            json!({"type": "status", "sensor": "forearm", "time": time, "state": "live",
+                   "reason": "tare: contact", "detail": "3 taxels varied", "frames": 5,
+                   "frames_damaged": 0, "frame_rate_hz": null}),
+            "10:00:00.123  forearm       status    live        5 frames, 0 damaged  \
+             (tare: contact: 3 taxels varied)",
         );
         check(
             json!({"type": "press", "sensor": "forearm", "time": time, "press": 3,
@@ -264,7 +269,7 @@ mod tests {
                    "notes": ["at_edge"], "probabilities": [0.01, 0.93, 0.05, 0.01],
                    "confidence": 0.93, "contact_area_taxels": 52, "force_n": 12.345,
                    "frame": 41, "age_at_publish_ms": 1400.5, "context": {"tag": "pick-17"}}),
-            "10:00:01.523  wrist         hardness  #3    final     firm                  \
+            "10:00:01.523  wrist         hardness  #3    final     firm                              \
              93 % [1 93 5 1]   52 taxels   12.35 N  frame 41 at 10:00:00.123  (at_edge)  \
              {\"tag\":\"pick-17\"}",
         );
@@ -273,22 +278,20 @@ mod tests {
                    "phase": "final", "level": 2, "label": "firm", "rejected": null,
                    "notes": [], "probabilities": [0.1, 0.9], "confidence": 0.9,
                    "contact_area_taxels": 52, "force_n": 12.345, "context": null,
+                   "advice": "press_again",
                    "shore": {"value": 63.6, "low": 58.2, "high": 70.0}}),
-            "10:00:00.123  wrist         hardness  #3    final     firm                  \
-             90 % [10 90]   52 taxels   12.35 N  Shore 64 (58 to 70)",
-        );
-        check(
-            json!({"type": "hardness", "sensor": "wrist", "time": time, "press": 3,
-                   "phase": "early", "level": null, "rejected": "low_force", "notes": [],
-                   "probabilities": [1.0], "confidence": 1.0, "contact_area_taxels": 5,
-                   "force_n": 0.5, "context": null}),
-            "10:00:00.123  wrist         hardness  #3    early     low force            \
-             100 % [100]    5 taxels    0.50 N",
+            "10:00:00.123  wrist         hardness  #3    final     64 +- 6 OO, firm                  \
+             90 % [10 90]   52 taxels   12.35 N  press again",
         );
         check(
             json!({"type": "frame", "sensor": "wrist", "time": time, "frame": 7,
-                   "newtons": [0.5, 0.25]}),
-            "10:00:00.123  wrist         frame     #7                0.75 N, highest taxel 0.50 N",
+                   "newtons": [0.5, 0.25, -0.01], "force_n": 0.74}),
+            "10:00:00.123  wrist         frame     #7                0.74 N, highest taxel 0.50 N",
+        );
+        check(
+            json!({"type": "frame", "sensor": "wrist", "time": time, "frame": 7,
+                   "newtons": [300.5, 308.25], "force_n": null}),
+            "10:00:00.123  wrist         frame     #7              no zero yet",
         );
         check(
             json!({"type": "gap", "lost": 4}),

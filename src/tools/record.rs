@@ -21,25 +21,26 @@ use tokio::time::Instant;
 
 use super::configuration::Configuration;
 use super::doctor;
+use super::exit::Failure;
 use super::simulate::positive;
-use crate::apart::NoThread;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::port::Port;
 use crate::daemon::record::{Error as RecordError, Progress};
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
+use hardnessd_core::port::Port;
 use hardnessd_core::recording::{LabelError, Labels, check_label};
+use hardnessd_core::sensor;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
-    --session asks for the name of each object, and for its level or the reading of a durometer, \
-    then counts its presses. Meanwhile Enter starts the next object, r records this one again, q \
-    or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap and a line of session.csv. A \
+    --session asks for the name of each object, and for the reading of a durometer or its level, \
+    then counts its presses. Meanwhile Enter starts the next object, r and Enter records this one \
+    again, q and Enter or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap and a line of session.csv. A \
     second session in the same directory continues the numbers.";
 
 /// Arguments of `record`.
@@ -53,7 +54,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", required_unless_present = "session")]
     out: Option<PathBuf>,
     /// Ask on the terminal for one object after another, and write a recording of each into this directory,
-    /// labelled for `hrn-train collect`
+    /// labelled for `hrn-train fit`
     #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "seconds"])]
     session: Option<PathBuf>,
     /// Label to store in the recording, such as level=2, object=7 or shore=64; may be repeated
@@ -69,56 +70,10 @@ pub struct Args {
 
 /// The reason why there is no recording, or why it ended early.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The label `level` is not a level of the model.
-    #[error(
-        "--label level: found {found:?}, expected 0 (unlabelled) or one of the model's: {levels}"
-    )]
-    Level {
-        /// The value of the label.
-        found: String,
-        /// The levels of the model.
-        levels: String,
-    },
-    /// Two labels have the same key.
-    #[error("--label {key}: given twice: give it once")]
-    Twice {
-        /// The key.
-        key: String,
-    },
-    /// A label was given that a session asks for.
-    #[error("--label {key}: --session asks for it: leave it out")]
-    Asked {
-        /// The key.
-        key: String,
-    },
-    /// A session needs a terminal to ask on.
-    #[error(
-        "`record --session` needs a terminal on stdin and stderr: use --out and --label instead"
-    )]
-    NoTerminal,
-    /// The directory of a session, or the list in it, cannot be used.
-    #[error("--session: {}: {source}", path.display())]
-    Session {
-        /// The path of the directory or of the list.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// The file cannot be made.
-    #[error("{path}: {source}: name a new file")]
-    Create {
-        /// The path of the file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+pub(super) enum Error {
     /// A sensor is missing at the start.
     #[error(transparent)]
     Unavailable(#[from] doctor::Unavailable),
-    /// The system has no thread for it.
-    #[error(transparent)]
-    Thread(#[from] NoThread),
     /// Recording failed, or all sensors were lost.
     #[error(transparent)]
     Daemon(#[from] daemon::Error),
@@ -127,10 +82,6 @@ pub enum Error {
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            Error::Level { .. } | Error::Twice { .. } | Error::Asked { .. } | Error::NoTerminal => {
-                USAGE
-            }
-            Error::Session { .. } | Error::Create { .. } | Error::Thread(_) => IO,
             Error::Unavailable(_) => UNAVAILABLE,
             Error::Daemon(error) => error.exit_code(),
         }
@@ -141,19 +92,20 @@ impl Coded for Error {
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if a label names a level that the model does not have or is given twice, the
+/// Fails if a label names a level that the model does not have or is given twice, the
 /// file cannot be made or written, a sensor is missing at the start, or the last sensor is lost.
 pub async fn run(
     args: Args,
     setup: Setup,
     log: &Log,
     shutdown: impl Future<Output = ()>,
-) -> Result<(), Error> {
+) -> Result<(), Failure> {
     check_level(&args.labels, &setup.hrn.card().levels)?;
     let mut labels = BTreeMap::new();
     for (key, value) in args.labels {
         if labels.insert(key.clone(), value).is_some() {
-            return Err(Error::Twice { key });
+            let twice = format!("--label {key}: given twice: give it once");
+            return Err(Failure::new(USAGE, twice));
         }
     }
     let sockets = if args.sockets {
@@ -164,8 +116,8 @@ pub async fn run(
     if let Some(directory) = &args.session {
         let asked = ["level", "object", "name", "shore"];
         if let Some(key) = asked.into_iter().find(|&key| labels.contains_key(key)) {
-            let key = key.to_owned();
-            return Err(Error::Asked { key });
+            let asked = format!("--label {key}: --session asks for it: leave it out");
+            return Err(Failure::new(USAGE, asked));
         }
         return session::run(directory, &labels, setup, sockets, log, pin!(shutdown)).await;
     }
@@ -197,11 +149,12 @@ pub async fn run(
         frames,
         tared,
         presses,
+        ..
     } = *counted.borrow();
     if holds_nothing(&recorded, frames) {
         // The path must be free for the next try.
         part::remove(&path, &own);
-        return recorded;
+        return Ok(recorded?);
     }
     let seen = frames_in_words(frames);
     if io::stderr().is_terminal() {
@@ -225,16 +178,16 @@ pub async fn run(
             );
         }
     }
-    recorded
+    Ok(recorded?)
 }
 
 /// Makes the file of a recording, twice open: to record into, and to know it again. A file that exists is
 /// left alone.
-fn create(path: &Path) -> Result<(File, File), Error> {
+fn create(path: &Path) -> Result<(File, File), Failure> {
     let created = File::create_new(path).and_then(|file| Ok((file.try_clone()?, file)));
-    created.map_err(|source| Error::Create {
-        path: path.to_owned(),
-        source,
+    created.map_err(|error| {
+        let problem = format!("{}: {error}: name a new file", path.display());
+        Failure::new(IO, problem)
     })
 }
 
@@ -269,7 +222,7 @@ pub(super) async fn record(
     }
 }
 
-fn port_of(sensor: &crate::daemon::config::SensorTable) -> (String, Port) {
+fn port_of(sensor: &sensor::Settings) -> (String, Port) {
     (sensor.name.clone(), sensor.port.clone())
 }
 
@@ -321,21 +274,28 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
     std::future::pending::<()>().await;
 }
 
+/// The most levels of a model of `hrn-train fit`.
+const MOST_LEVELS: u64 = 16;
+
 /// Checks the label `level`, which a data set is made from. A wrong level must be found before
 /// anything is pressed.
-fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Error> {
-    let is_level = |found: &str| {
-        found
-            .parse()
-            .is_ok_and(|found: u8| found == 0 || levels.iter().any(|level| level.level == found))
+fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Failure> {
+    // Levels of the user's own have names, or numbers up to 16. `hrn-train fit` takes both.
+    let is_level = |found: &str| match found.parse::<u64>() {
+        Ok(number) => number <= MOST_LEVELS,
+        Err(_) => found.starts_with(char::is_alphabetic),
     };
     let mut labelled = labels.iter().filter(|(key, _)| key == "level");
     match labelled.find(|(_, found)| !is_level(found)) {
         None => Ok(()),
-        Some((_, found)) => Err(Error::Level {
-            found: found.clone(),
-            levels: self::levels(levels),
-        }),
+        Some((_, found)) => {
+            let levels = self::levels(levels);
+            let problem = format!(
+                "--label level: found {found:?}, expected a name, or a number from 0 (unlabelled) to {MOST_LEVELS}; \
+                 the model's are {levels}"
+            );
+            Err(Failure::new(USAGE, problem))
+        }
     }
 }
 

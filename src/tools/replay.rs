@@ -18,15 +18,17 @@ use super::configuration::ModelFile;
 use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
-use super::{Stdout, Unplayable};
-use crate::apart;
-use crate::daemon::config::{Config, SensorTable, Setup};
+use super::unplayable;
+use crate::daemon::config::{Config, Setup};
 use crate::daemon::now;
+use crate::thread::spawn_thread;
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::exit::{Coded, FAILED, NO_INPUT, USAGE};
+use hardnessd_core::exit::{FAILED, NO_INPUT, USAGE};
+use hardnessd_core::judge::Unjudged;
 use hardnessd_core::motion::Point;
-use hardnessd_core::pipeline::{Clock, Pipeline, Unjudged};
+use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::recording::{self, FileKind, Playback, Reader};
+use hardnessd_core::sensor;
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -51,48 +53,6 @@ pub struct Args {
     json: bool,
 }
 
-/// The reason why a recording cannot be played.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The arm's positions cannot be used.
-    #[error("--motion {path}:{source}")]
-    Motion {
-        /// The path of the file of positions.
-        path: PathBuf,
-        /// The error of that file.
-        source: motion::Error,
-    },
-    /// Positions were given for a recording, which has its own.
-    #[error("--motion: found {path}, a recording with times of its own, expected raw bytes")]
-    OwnMotion {
-        /// The path of the recording.
-        path: PathBuf,
-    },
-    /// The file has no whole frame of the configured layout.
-    #[error(
-        "{path}: no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged): the layout is not \
-         that of [sensor.frame]: `hardnessd sniff {path}` looks for another"
-    )]
-    NoFrame {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The number of bytes in the file.
-        bytes_skipped: u64,
-        /// The number of damaged candidates for a frame.
-        frames_damaged: u64,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Motion { source, .. } if source.is_unreadable() => NO_INPUT,
-            Error::Motion { .. } | Error::NoFrame { .. } => FAILED,
-            Error::OwnMotion { .. } => USAGE,
-        }
-    }
-}
-
 /// The number of bytes that are read at once if neither a speed nor positions pace them.
 const CHUNK_BYTES: usize = 64 * 1024;
 
@@ -106,7 +66,7 @@ pub async fn run(args: Args) -> Result<(), Failure> {
     let (_stop, stopped) = mpsc::channel();
     // The replay runs on a thread of its own, so that a signal waits neither for a recording that
     // is a pipe nor for the reader of stdout.
-    let played = apart::start("replay", move || play(&args, &stopped))?;
+    let played = spawn_thread("replay", move || play(&args, &stopped))?;
     played.await.expect("a replay does not panic")
 }
 
@@ -116,7 +76,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
     let setup = match &args.config {
         Some(config) => Setup::load(config, model.as_deref())?,
         None => {
-            let config = Config::new(vec![SensorTable::new(args.file.clone())]);
+            let config = Config::new(vec![sensor::Settings::new(args.file.clone())]);
             Setup::of(config.with_model(model.as_deref()), Path::new("defaults"))?
         }
     };
@@ -131,25 +91,29 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
         stopped,
         printer: &printer,
     };
-    let (kind, recording) = FileKind::read(recording).map_err(Unplayable::at(path))?;
+    let (kind, recording) = FileKind::read(recording).map_err(unplayable(path))?;
     let motion = match &args.motion {
         Some(_) if kind == FileKind::Recording => {
-            return Err(Error::OwnMotion { path: path.clone() }.into());
+            return Err(own_motion(path));
         }
         Some(path) => Some(positions(path)?),
         None => None,
     };
     match kind {
         FileKind::Recording => play_recording(path, BufReader::new(recording), &setup, pace),
-        FileKind::Raw => play_bytes(path, recording, motion, &setup, pace),
+        FileKind::Raw => play_bytes(path, recording, motion, &setup.checked(path)?, pace),
     }
 }
 
 /// The arm's positions in a CSV file.
-pub(super) fn positions(path: &Path) -> Result<Vec<Point>, Error> {
-    motion::load(path).map_err(|source| Error::Motion {
-        path: path.to_owned(),
-        source,
+pub(super) fn positions(path: &Path) -> Result<Vec<Point>, Failure> {
+    motion::load(path).map_err(|error| {
+        let code = if error.is_unreadable() {
+            NO_INPUT
+        } else {
+            FAILED
+        };
+        Failure::new(code, format!("--motion {}:{error}", path.display()))
     })
 }
 
@@ -190,6 +154,9 @@ fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Re
     if let Ok(false) = played {
         return Ok(());
     }
+    for note in playback.left_out() {
+        hardnessd_core::stderr_line!("warning: {}: {note}", path.display());
+    }
     if let Some(model) = playback.other_model() {
         hardnessd_core::stderr_line!(
             "warning: {}: recorded with model {}, played with another",
@@ -215,23 +182,31 @@ fn play_entries(
     // The moment of the first entry.
     let mut first: Option<Duration> = None;
     for found in Reader::new(file) {
-        let found = found.map_err(Unplayable::at(path))?;
+        let found = found.map_err(unplayable(path))?;
         let first = *first.get_or_insert(found.at.mono);
         if !pace.wait(found.at.mono.saturating_sub(first)) {
             return Ok(false);
         }
-        let events = playback.feed(found).map_err(Unplayable::at(path))?;
+        let events = playback.feed(found).map_err(unplayable(path))?;
         warn(playback.unjudged());
         if !print(events, seq, pace.printer)? {
             return Ok(false);
         }
     }
     if playback.sensors() == 0 {
-        return Err(Unplayable::at(path)(recording::Error::Foreign {
-            found: "no state of a sensor".to_owned(),
-            expected: "a recording of hardnessd",
-        })
-        .into());
+        // A clip of a recording may lie inside one press.
+        let (found, expected) = match playback.left_out().is_empty() {
+            true => ("no state of a sensor", "a recording of hardnessd"),
+            false => (
+                "no sensor at rest",
+                "a recording with a moment between presses",
+            ),
+        };
+        let found = found.to_owned();
+        return Err(unplayable(path)(recording::Error::Foreign {
+            found,
+            expected,
+        }));
     }
     Ok(true)
 }
@@ -266,7 +241,7 @@ fn play_bytes(
     };
     let none = no_frame(path, &end);
     print(end, &mut seq, printer)?;
-    none.map_or(Ok(()), |none| Err(none.into()))
+    none.map_or(Ok(()), Err)
 }
 
 /// Sends raw bytes through a pipeline, with the arm's positions. `each` takes the events of a part
@@ -280,7 +255,7 @@ pub(super) fn feed(
     pipeline: &mut Pipeline,
     mut each: impl FnMut(Vec<Event>, Duration) -> Result<bool, Failure>,
 ) -> Result<Option<Vec<Event>>, Failure> {
-    let frame_rate_hz = pipeline.sensor().description().frame_rate_hz;
+    let frame_rate_hz = pipeline.sensor().frame_rate_hz();
     // No two frames end within this many bytes, so each frame comes at its own moment, between its
     // positions.
     let chunk_bytes = if is_paced || motion.is_some() {
@@ -294,7 +269,7 @@ pub(super) fn feed(
         let read = match file.read(&mut chunk) {
             Ok(read) => read,
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(error) => return Err(Unplayable::at(path)(error).into()),
+            Err(error) => return Err(unplayable(path)(error)),
         };
         if read == 0 {
             let end = pipeline.end_of_recording(None);
@@ -310,10 +285,10 @@ pub(super) fn feed(
             .position(|point| i128::from(point.at_ns) > until_ns as i128);
         let points: Vec<Point> = motion.drain(..count.unwrap_or(motion.len())).collect();
         // An error means that the time of a point went back. The approach of its press is then
-        // unknown.
-        let _ = pipeline.add_positions(&points);
-        // The pipeline takes its times from the recording and does not use this one.
-        let events = pipeline.push(&chunk[..read], now());
+        // unknown. The pipeline takes its times from the recording and does not use this one.
+        let _ = pipeline.take(Input::Motion(points.into()), now());
+        let bytes = Input::Bytes((&chunk[..read]).into());
+        let events = pipeline.take(bytes, now()).unwrap_or_default();
         warn(pipeline.unjudged());
         let (frames, _) = pipeline.frame_counts();
         let since = time_of(frames.saturating_sub(1), frame_rate_hz);
@@ -323,14 +298,26 @@ pub(super) fn feed(
     }
 }
 
-/// The error of raw bytes that had no whole frame, from the events of their end.
-pub(super) fn no_frame(path: &Path, end: &[Event]) -> Option<Error> {
+/// The failure of positions beside a recording.
+pub(super) fn own_motion(path: &Path) -> Failure {
+    let path = path.display();
+    let problem =
+        format!("--motion: found {path}, a recording with times of its own, expected raw bytes");
+    Failure::new(USAGE, problem)
+}
+
+/// The failure of raw bytes that had no whole frame, from the events of their end.
+pub(super) fn no_frame(path: &Path, end: &[Event]) -> Option<Failure> {
+    let path = path.display();
     end.iter().find_map(|event| match event {
-        Event::Status(status) if status.frames == 0 => Some(Error::NoFrame {
-            path: path.to_owned(),
-            bytes_skipped: status.bytes_skipped,
-            frames_damaged: status.frames_damaged,
-        }),
+        Event::Status(status) if status.frames == 0 => {
+            let (bytes, damaged) = (status.bytes_skipped, status.frames_damaged);
+            let problem = format!(
+                "{path}: no whole frame in {bytes} bytes ({damaged} damaged): the layout is not that of \
+                 [sensor.frame]: `hardnessd sniff {path}` looks for another"
+            );
+            Some(Failure::new(FAILED, problem))
+        }
         _ => None,
     })
 }
@@ -358,7 +345,7 @@ fn warn(unjudged: Vec<Unjudged>) {
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
 /// reads stdout.
-fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Stdout> {
+fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Failure> {
     let mut lines = String::new();
     for mut event in events {
         if event.kind() != Kind::Frame {

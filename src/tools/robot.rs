@@ -4,15 +4,19 @@
 //! daemon may start later, end, and start again: the robot waits for it and never delays the
 //! sensor.
 
+use std::convert::Infallible;
 use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::io::AsyncWriteExt;
 use tokio::net::UnixStream;
+use tokio::net::unix::OwnedReadHalf;
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::connect::LONGEST_LINE_BYTES;
+use crate::daemon::lines::{LineRead, Lines};
 use crate::daemon::now;
 use hardnessd_core::wording;
 
@@ -39,14 +43,7 @@ impl Robot {
     pub(crate) async fn run(self) {
         let mut complained = false;
         loop {
-            let complaint = match self.send().await {
-                Err(Ended::Refused(message)) => Some(message),
-                Err(Ended::Absent(error)) => Some(format!(
-                    "{}: no daemon takes positions there yet, and they are sent as soon as one does",
-                    wording::line(&error)
-                )),
-                Ok(()) | Err(Ended::Gone) => None,
-            };
+            let Err(complaint) = self.send().await;
             if let Some(complaint) = complaint.filter(|_| !complained) {
                 hardnessd_core::stderr_line!("warning: {}: {complaint}", self.socket.display());
                 complained = true;
@@ -55,33 +52,37 @@ impl Robot {
         }
     }
 
-    /// Sends positions to one daemon until the daemon ends or refuses them.
-    async fn send(&self) -> Result<(), Ended> {
+    /// Sends positions to one daemon until the daemon ends, or there is something to complain of.
+    async fn send(&self) -> Result<Infallible, Option<String>> {
+        let gone = |_| None;
+        let absent = |error: io::Error| {
+            let yet = "no daemon takes positions there yet, and they are sent as soon as one does";
+            Some(format!("{}: {yet}", wording::line(&error)))
+        };
         let daemon = UnixStream::connect(&self.socket).await;
-        let (input, mut output) = daemon.map_err(Ended::Absent)?.into_split();
-        let mut lines = BufReader::new(input).lines();
-        let hello = lines.next_line().await?.ok_or(Ended::Gone)?;
-        let hello: Value = serde_json::from_str(&hello).unwrap_or_default();
+        let (input, mut output) = daemon.map_err(absent)?.into_split();
+        let mut lines = Lines::new(input, LONGEST_LINE_BYTES);
+        let hello = next(&mut lines).await?;
         if hello["type"] != "hello" {
             let foreign = "what answers there is no hardnessd: name the control socket of a daemon";
-            return Err(Ended::Refused(foreign.to_owned()));
+            return Err(Some(foreign.to_owned()));
         }
         let first = hello["sensors"][0]["name"].as_str().map(str::to_owned);
-        let sensor = self.sensor.clone().or(first).ok_or(Ended::Gone)?;
+        let sensor = self.sensor.clone().or(first).ok_or(None)?;
         // The robot needs no events.
-        output.write_all(b"{\"subscribe\":[]}\n").await?;
+        let sent = output.write_all(b"{\"subscribe\":[]}\n").await;
+        sent.map_err(gone)?;
         let mut tick = tokio::time::interval(STEP);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut points: Vec<(u64, f64)> = Vec::with_capacity(POINTS);
         loop {
             tokio::select! {
-                line = lines.next_line() => {
-                    let line = line?.ok_or(Ended::Gone)?;
-                    let answer: Value = serde_json::from_str(&line).unwrap_or_default();
+                line = next(&mut lines) => {
+                    let answer = line?;
                     if let ("error", Some(message)) =
                         (answer["type"].as_str().unwrap_or_default(), answer["message"].as_str())
                     {
-                        return Err(Ended::Refused(message.to_owned()));
+                        return Err(Some(message.to_owned()));
                     }
                 }
                 _ = tick.tick() => {
@@ -92,7 +93,7 @@ impl Robot {
                     points.push((mono_ns, mm));
                     if points.len() == POINTS {
                         let motion = json!({"motion": {"sensor": sensor, "at": points}});
-                        output.write_all(format!("{motion}\n").as_bytes()).await?;
+                        output.write_all(format!("{motion}\n").as_bytes()).await.map_err(gone)?;
                         points.clear();
                     }
                 }
@@ -101,18 +102,10 @@ impl Robot {
     }
 }
 
-/// The reason why no more positions are sent to a daemon.
-enum Ended {
-    /// Nothing answers at the socket.
-    Absent(io::Error),
-    /// The daemon has ended.
-    Gone,
-    /// The daemon refused the positions with this message.
-    Refused(String),
-}
-
-impl From<io::Error> for Ended {
-    fn from(_: io::Error) -> Self {
-        Self::Gone
+/// The next line of a daemon. Whoever sends a line without end is none.
+async fn next(lines: &mut Lines<OwnedReadHalf>) -> Result<Value, Option<String>> {
+    match lines.next().await {
+        Ok(LineRead::Line(line)) => Ok(serde_json::from_slice(&line).unwrap_or_default()),
+        Ok(LineRead::TooLong | LineRead::End) | Err(_) => Err(None),
     }
 }

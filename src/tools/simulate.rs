@@ -11,20 +11,18 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
 
-use super::Stdout;
 use super::arm::{self, Arm};
-use super::exit::Failure;
+use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
-use crate::apart;
 use crate::daemon::baud::BITS_A_BYTE;
-use crate::daemon::socket;
 use crate::maybe;
-use hardnessd_core::exit::{Coded, IO, USAGE};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
-use hardnessd_core::wire::{Layout, LayoutError, Preset, Settings as Frame};
+use hardnessd_core::wire::{Layout, Preset, Settings as Frame};
 use hardnessd_core::wording::named;
 use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings};
 
@@ -88,56 +86,6 @@ pub struct Args {
     faults: Option<PathBuf>,
 }
 
-/// The reason why the sensor cannot be simulated.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The layout needs more than a preset.
-    #[error("--preset: {0}")]
-    Layout(#[source] LayoutError),
-    /// The frames have more bytes than the line carries.
-    #[error(
-        "--baud: found {baud}, expected at least {needed} to carry {fps} frames/s of {bytes} bytes"
-    )]
-    Baud {
-        /// The baud rate of the line.
-        baud: u32,
-        /// The lowest baud rate that carries the frames.
-        needed: u32,
-        /// The frame rate in frames/s.
-        fps: f64,
-        /// The number of bytes in a frame.
-        bytes: usize,
-    },
-    /// The recording cannot be written.
-    #[error("{path}: {source}")]
-    Recording {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
-    /// The arm's socket cannot be made.
-    #[error(transparent)]
-    Arm(socket::Error),
-    /// The pty or its link failed.
-    #[error("{what}: {source}")]
-    Pty {
-        /// The path of the link, or `pty` if there is no link.
-        what: String,
-        /// The system's error.
-        source: std::io::Error,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Layout(_) | Error::Baud { .. } => USAGE,
-            Error::Recording { .. } | Error::Pty { .. } | Error::Arm(_) => IO,
-        }
-    }
-}
-
 /// Plays until the presses are over or `shutdown` comes.
 ///
 /// # Errors
@@ -145,16 +93,16 @@ impl Coded for Error {
 /// Returns a [`Failure`] if the arguments do not fit together, or the pty or a file fails.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     let layout = Layout::new(&Frame {
-        preset: args.preset,
+        preset: Some(args.preset),
         ..Frame::default()
     })
-    .map_err(Error::Layout)?;
+    .of("--preset", USAGE)?;
     let mut shutdown = pin!(shutdown);
     let faults = match args.faults.clone() {
         Some(path) => {
             // The script may be a pipe without a writer.
             let seed = args.seed;
-            let loaded = apart::start("faults", move || Faults::load(&path, seed))?;
+            let loaded = spawn_thread("faults", move || Faults::load(&path, seed))?;
             tokio::select! {
                 loaded = loaded => loaded.expect("a script is read without a panic")?,
                 () = &mut shutdown => return Ok(()),
@@ -169,7 +117,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         let to = path.clone();
         let (stop, stopped) = mpsc::channel();
         let work = move || record(&to, &layout, settings, faults, &stopped);
-        let mut recorded = apart::start("record", work)?;
+        let mut recorded = spawn_thread("record", work)?;
         let finished = tokio::select! {
             finished = &mut recorded => Some(finished),
             () = shutdown => {
@@ -178,29 +126,19 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
             }
         };
         let written = finished.map(|finished| finished.expect("the simulation does not panic"));
-        written
-            .unwrap_or(Ok(()))
-            .map_err(|source| Error::Recording { path, source })?;
-        return Ok(());
+        return written.unwrap_or(Ok(())).of_file(&path, IO);
     }
-    let (baud, warning) = baud(&args, &layout)?;
-    if let Some(warning) = warning {
-        hardnessd_core::stderr_line!("{warning}");
-    }
+    let baud = baud(&args, &layout)?;
     let what = args
         .link
         .as_ref()
         .map_or("pty".to_owned(), |link| link.display().to_string());
-    let failed = |source| Error::Pty {
-        what: what.clone(),
-        source,
-    };
     let pace = Pace::new(args.fps, baud, args.speed);
-    let player = Player::new(args.link.as_deref(), layout, pace, faults).map_err(failed)?;
+    let player = Player::new(args.link.as_deref(), layout, pace, faults).of(&what, IO)?;
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
     let arm = args.arm.as_deref().map(Arm::bind).transpose();
-    let arm = arm.map_err(Error::Arm)?;
+    let arm = arm.exit(IO)?;
     let position: Box<dyn Fn(Instant) -> Option<f64>> = match &arm {
         Some(arm) => Box::new(arm.position()),
         None => Box::new(player.position()),
@@ -220,11 +158,11 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let printed = super::print_apart(line.into_bytes());
-        let printed = async { printed.await.map_err(|Stdout(error)| error) };
-        tokio::try_join!(printed, player.play(frames, start)).map(|_| ())
+        let played = async { player.play(frames, start).await.of(&what, IO) };
+        tokio::try_join!(printed, played).map(|_| ())
     };
     tokio::select! {
-        played = play => Ok(played.map_err(failed)?),
+        played = play => played,
         () = robot => Ok(()),
         () = serving => Ok(()),
         () = shutdown => Ok(()),
@@ -312,77 +250,55 @@ fn write(
     file.sync_all()
 }
 
-/// The baud rate of the line. A given rate must carry the shortest frames. Without one, it is the
-/// first usual rate from 115,200 on that carries them. The text says that this rate is not 115,200,
-/// or warns that longer frames may come late.
-fn baud(args: &Args, layout: &Layout) -> Result<(u32, Option<String>), Error> {
+/// The baud rate of the line: the given one, or the first usual one from 115,200 on that carries the
+/// longest frames.
+fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
     const USUAL: [u32; 7] = [
         115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
     ];
     let needed = |bytes: usize| (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
-    let short = |baud, bytes| Error::Baud {
-        baud,
-        needed: needed(bytes),
-        fps: args.fps,
-        bytes,
-    };
-    let (shortest, longest) = (layout.min_frame_bytes(), layout.max_frame_bytes());
-    let least = needed(shortest);
-    let baud = match args.baud {
-        Some(baud) if baud < least => return Err(short(baud, shortest)),
-        Some(baud) => baud,
-        None => {
-            let usual = USUAL.into_iter().find(|&usual| usual >= least);
-            usual.unwrap_or(least)
-        }
-    };
-    let warning = if baud < needed(longest) {
-        Some(format!("warning: {}", short(baud, longest)))
-    } else if args.baud.is_none() && baud != USUAL[0] {
-        let (usual, fps) = (USUAL[0], args.fps);
-        Some(format!(
-            "{usual} baud cannot carry {fps} frames/s of {shortest} bytes: played at {baud}"
-        ))
-    } else {
-        None
-    };
-    Ok((baud, warning))
+    let (shortest, most) = (layout.min_frame_bytes(), needed(layout.max_frame_bytes()));
+    let usual = USUAL.into_iter().find(|&usual| usual >= most);
+    let (baud, needed, fps) = (
+        args.baud.or(usual).unwrap_or(most),
+        needed(shortest),
+        args.fps,
+    );
+    if baud >= needed {
+        return Ok(baud);
+    }
+    let carries = format!("expected at least {needed} to carry {fps} frames/s of {shortest} bytes");
+    Err(Failure::new(
+        USAGE,
+        format!("--baud: found {baud}, {carries}"),
+    ))
 }
 
 /// Parses `--fps`. A press is computed as a whole, with as many frames as it takes to reach its
 /// force. At a rate beyond any sensor's, they would fill the memory.
-fn frame_rate_hz(text: &str) -> Result<f64, OutOfRange> {
+fn frame_rate_hz(text: &str) -> Result<f64, String> {
     within(text, 0.1, 1000.0)
 }
 
 /// Parses `--force`, which is limited for the same reason as [`frame_rate_hz`]: the softest
 /// material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N a taxel.
-fn force_n(text: &str) -> Result<f64, OutOfRange> {
+fn force_n(text: &str) -> Result<f64, String> {
     within(text, 0.01, 200.0)
 }
 
 /// Parses `--rest`.
-fn rest_s(text: &str) -> Result<f64, OutOfRange> {
+fn rest_s(text: &str) -> Result<f64, String> {
     within(text, REST_S, 3600.0)
 }
 
-/// The option's value is not a number, or is out of range.
-#[derive(Debug, thiserror::Error)]
-#[error("expected a number from {least} to {most}")]
-pub(super) struct OutOfRange {
-    least: f64,
-    most: f64,
-}
-
-pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, OutOfRange> {
-    match text.parse::<f64>() {
-        Ok(number) if (least..=most).contains(&number) => Ok(number),
-        _ => Err(OutOfRange { least, most }),
-    }
+pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok();
+    let number = number.filter(|number| (least..=most).contains(number));
+    number.ok_or_else(|| format!("expected a number from {least} to {most}"))
 }
 
 /// Parses a number above 0 that is so near to 1 that a clock can count seconds made of it.
-pub(super) fn positive(text: &str) -> Result<f64, OutOfRange> {
+pub(super) fn positive(text: &str) -> Result<f64, String> {
     within(text, 1e-6, 1e9)
 }
 
@@ -399,33 +315,24 @@ mod tests {
     }
 
     #[test]
-    fn the_shortest_frame_chooses_the_rate_and_the_longest_one_warns() {
-        // Texts of 784 values are 1,569 to 5,546 bytes, packed zeros 9 to 1,569.
-        for (arguments, expected, message) in [
-            ("", Some(115_200), ""),
-            ("--fps 20", Some(230_400), "played at 230400"),
-            ("--preset ascii", Some(115_200), "warning"),
-            ("--preset ascii --fps 2", Some(115_200), ""),
-            ("--preset ascii --baud 115200", Some(115_200), "of 5546"),
-            ("--preset ascii --baud 78450", Some(78_450), "warning"),
-            ("--preset ascii --baud 78449", None, "of 1569"),
-            ("--preset ascii --fps 10", Some(230_400), "warning"),
-            ("--preset zero-run --baud 9600", Some(9_600), "of 1569"),
-            ("--baud 39499", None, "at least 39500"),
+    fn the_longest_frame_chooses_the_rate_and_the_shortest_one_bounds_it() {
+        // Texts of 784 values are 1,568 to 5,610 bytes.
+        for (arguments, expected) in [
+            ("", Some(115_200)),
+            ("--fps 20", Some(230_400)),
+            ("--preset csv", Some(460_800)),
+            ("--preset csv --baud 78400", Some(78_400)),
+            ("--preset csv --baud 78399", None),
+            ("--baud 39499", None),
         ] {
             let words = ["simulate"].into_iter().chain(arguments.split_whitespace());
             let args = Line::try_parse_from(words).unwrap().args;
             let layout = Layout::new(&Frame {
-                preset: args.preset,
+                preset: Some(args.preset),
                 ..Frame::default()
             });
-            let (found, warning) = match baud(&args, &layout.unwrap()) {
-                Ok((found, warning)) => (Some(found), warning.unwrap_or_default()),
-                Err(error) => (None, error.to_string()),
-            };
+            let found = baud(&args, &layout.unwrap()).ok();
             assert_eq!(found, expected, "{arguments}");
-            assert_eq!(warning.is_empty(), message.is_empty(), "{warning}");
-            assert!(warning.contains(message), "{message:?} not in {warning:?}");
         }
     }
 }

@@ -1,64 +1,41 @@
 //! `hardnessd sniff`: raw bytes in, a proposed `[sensor.frame]` out.
 //!
 //! It prints TOML on stdout, to be appended below a `[[sensor]]`. The comments in the TOML say how
-//! sure the proposal is. With `--out`, it writes a whole configuration to a file instead. If two
-//! arrays are likely, it shows both as pictures on stderr, and the user chooses.
-//!
-//! The files below are in reading order: the length of a frame, what each byte is, how good a picture
-//! of a press is, which checksums hold, where the cells may be, and how an array is written as
-//! settings. Each uses only those above it.
-
-mod period;
-mod columns;
-mod marking;
-mod picture;
-mod checks;
-mod places;
-mod proposal;
-mod found;
-mod noise;
-mod text;
-mod find;
-#[cfg(test)]
-mod generator;
-#[cfg(test)]
-mod tests;
+//! sure the proposal is. With `--out`, it writes a whole configuration to a file instead. If it is not
+//! sure, it shows the likeliest arrays as pictures on stderr, and the user chooses. The crate
+//! `hardnessd-sniff` finds the layouts.
 
 use std::fmt::Write;
-use std::io::{self, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::{ArgGroup, Args as ClapArgs};
+use hardnessd_sniff::{Arrival, Capture, Found, Known, Proposal, Ranked, Scale, sniff};
 
-use self::find::find;
-pub use self::found::Failure;
-use self::found::{Found, Known, Shown};
-use self::noise::noise_counts;
-use self::picture::draw;
+use super::exit::{Fail, Failure};
 use super::simulate::positive;
-use super::{CannotRead, absolute, doctor, exit};
-use crate::apart;
-use crate::daemon::port::Port;
+use super::{absolute, cannot_read, doctor};
 use crate::daemon::serial::{self, Link, Turn};
-use hardnessd_core::exit::{Coded, FAILED, IO, UNAVAILABLE};
-use hardnessd_core::frame::{MOST_SIDE, Pitch};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::{FAILED, IO, UNAVAILABLE};
+use hardnessd_core::frame::MOST_SIDE;
 use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;
-use hardnessd_core::recording::{self, Entry, FileKind, Reader};
+use hardnessd_core::port::Port;
+use hardnessd_core::recording::{Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
-use hardnessd_core::tare::NEWTONS_PER_COUNT;
 use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::escaped;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
     Press the sensor meanwhile, with one finger at several places and at the edges: only presses \
-    show the shape of the array. It finds frames of one length with a constant mark, and \
-    ff-tail, zero-run, ascii, csv and jq-glove, of up to 64x64 taxels. If two arrays are likely, \
-    it shows a picture of each with the options that choose it. `order`, `mask` and `invert` \
-    leave no trace in the bytes, and without a checksum a header and a tail look the same. Exit \
-    code 1: no layout was found, or it is not sure.";
+    show the shape of the array. It finds frames of one length with a constant mark, \
+    lines of numbers, SLIP and COBS, and jq-glove, of up to 64x64 taxels. If two arrays are likely, it \
+    shows a picture of each with the options that choose it. `order`, `mask` and `invert` leave \
+    no trace in the bytes, and without a checksum a header and a tail look the same. Exit code 1: \
+    no layout was found, it is not sure, or the daemon cannot read what it found.";
 
 /// Arguments of `sniff`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -84,7 +61,7 @@ pub struct Args {
     /// Columns of the array, if you know them
     #[arg(long, value_name = "C", value_parser = side)]
     cols: Option<usize>,
-    /// Type of a cell, if you know it: `u8`, `u16le` or `u16be`
+    /// Type of a cell, if you know it, as in `[sensor.frame]`
     #[arg(long, value_name = "T", value_parser = cell)]
     cell: Option<Cell>,
     /// Write a whole configuration to this new file, instead of a [sensor.frame] on stdout
@@ -92,82 +69,54 @@ pub struct Args {
     out: Option<PathBuf>,
 }
 
-/// The reason why `sniff` proposes nothing.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The recording is damaged, or of another program.
-    #[error("{path}: {source}")]
-    Recording {
-        /// Path of the recording.
-        path: PathBuf,
-        /// The error of the recording.
-        source: recording::Error,
-    },
-    /// The port does not open, or it was lost before the first byte.
-    #[error("{path}: {reason}")]
-    Unavailable {
-        /// Path of the port.
-        path: PathBuf,
-        /// The fault that was found, or the system's reason.
-        reason: String,
-    },
-    /// There is no layout for the bytes.
-    #[error("{path}: {failure}")]
-    Unexplained {
-        /// Path of the recording or the port.
-        path: PathBuf,
-        /// What the bytes are instead.
-        failure: Failure,
-    },
-    /// Two arrays are likely.
-    #[error(
-        "{path}: not sure: choose with `{options}` or as the pictures say, or press with one finger at several \
-         places and at the edges"
-    )]
-    Unsure {
-        /// Path of the recording or the port.
-        path: PathBuf,
-        /// The options for the likelier array.
-        options: String,
-    },
-    /// The configuration cannot be written.
-    #[error("--out {path}: {source}")]
-    Write {
-        /// The path of the configuration.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+/// The most bytes that are examined, from the beginning: 20,000 frames of the JX255N.
+const MOST_BYTES: usize = 16 << 20;
+
+/// Bytes with the times of their arrival, if these are known.
+#[derive(Debug, Default)]
+struct Captured {
+    bytes: Vec<u8>,
+    arrivals: Vec<Arrival>,
 }
 
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Recording { .. } | Error::Unexplained { .. } | Error::Unsure { .. } => FAILED,
-            Error::Unavailable { .. } => UNAVAILABLE,
-            Error::Write { .. } => IO,
-        }
+impl Captured {
+    fn take(&mut self, bytes: &[u8], time: Duration) {
+        let arrival = Arrival {
+            at: self.bytes.len(),
+            time_s: time.as_secs_f64(),
+        };
+        self.arrivals.push(arrival);
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    /// The frames in a second. `None` if the times are unknown, or too short to tell.
+    fn frame_rate_hz(&self, frames: u64) -> Option<f64> {
+        let (first, last) = (self.arrivals.first()?, self.arrivals.last()?);
+        let seconds = last.time_s - first.time_s;
+        // The duration is not exact enough for more digits.
+        let hz = (frames.saturating_sub(1) as f64 / seconds * 10.0).round() / 10.0;
+        (seconds >= LEAST_SECONDS).then_some(hz.max(0.1))
     }
 }
 
-/// The most bytes that are examined, from the beginning: 20,000 frames of the JX255N.
-const MOST_BYTES: usize = 16 << 20;
+/// The shortest time that a frame rate is counted in.
+const LEAST_SECONDS: f64 = 1.0;
 
 /// Prints a proposal, or writes it to a file.
 ///
 /// # Errors
 ///
-/// Returns an [`exit::Failure`] if the bytes cannot be read, there is no layout or more than one for
-/// them, or the output fails.
-pub async fn run(args: Args) -> Result<(), exit::Failure> {
+/// Fails if the bytes cannot be read, there is no layout or more than one for them, or the output
+/// fails.
+pub async fn run(args: Args) -> Result<(), Failure> {
     let listened = match &args.port {
         Some(port) => Some(listen(port, args.baud, args.seconds).await?),
         None => None,
     };
     // This runs on another thread, because the file may be a pipe and many bytes take long.
-    let proposed = apart::start("sniff", move || match listened {
-        Some(bytes) => propose(&args, &bytes),
-        None => read(&args.source()).and_then(|bytes| propose(&args, &bytes)),
+    let proposed = spawn_thread("sniff", move || match listened {
+        Some(captured) => propose(&args, &captured),
+        None => read(&args.source()).and_then(|captured| propose(&args, &captured)),
     })?;
     proposed.await.expect("a proposal is made without a panic")
 }
@@ -181,45 +130,36 @@ impl Args {
     }
 }
 
-/// Prints or writes the layout that explains `bytes`.
-fn propose(args: &Args, bytes: &[u8]) -> Result<(), exit::Failure> {
+/// Prints or writes the layout that explains the bytes.
+fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
     let path = &args.source();
     let Args {
         rows, cols, cell, ..
     } = *args;
-    let found = find(bytes, Known { rows, cols, cell }).map_err(|failure| Error::Unexplained {
-        path: path.to_owned(),
-        failure,
-    })?;
-    if !found.is_sure() {
-        for shown in [&found.best].into_iter().chain(&found.next) {
-            show(shown);
+    let Captured { bytes, arrivals } = captured;
+    let found = sniff(&Capture { bytes, arrivals }, Known { rows, cols, cell });
+    let found = found.of_file(path, FAILED)?;
+    let proposal = match (&found.doubt, &found.best.proposal) {
+        (None, Some(proposal)) => proposal,
+        (doubt, _) => {
+            for ranked in [&found.best].into_iter().chain(&found.next) {
+                show(ranked);
+            }
+            let doubt = doubt.as_ref().map_or(String::new(), ToString::to_string);
+            let message = format!("{}: not sure: {doubt}", path.display());
+            return Err(Failure::new(FAILED, message));
         }
-        return Err(Error::Unsure {
-            path: path.to_owned(),
-            options: options(&found.best),
-        }
-        .into());
-    }
-    let frame = toml(path, bytes.len(), &found);
+    };
+    let frame = toml(path, bytes.len(), &found, proposal);
     let Some(out) = &args.out else {
         super::print(frame.as_bytes())?;
         return Ok(());
     };
-    let proposal = &found.best.proposal;
-    let listened_s = args.port.as_ref().map(|_| args.seconds);
-    let text = configuration(args, listened_s.map(|s| proposal.frames as f64 / s))
-        + &frame
-        + &thresholds(
-            proposal.most_counts,
-            noise_counts(&proposal.settings, bytes),
-        )
-        + PAGE;
+    let rate = captured.frame_rate_hz(proposal.frames);
+    let scale = Scale::of(&proposal.settings, bytes);
+    let text = configuration(args, rate) + &frame + &newtons(&scale) + PAGE;
     let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
-    written.map_err(|source| Error::Write {
-        path: out.clone(),
-        source,
-    })?;
+    written.of(format!("--out {}", out.display()), IO)?;
     let out = escaped(&out.display().to_string());
     let next = if args.port.is_some() {
         format!("`hardnessd check --config {out}` says what would run")
@@ -240,96 +180,108 @@ fn configuration(args: &Args, frame_rate_hz: Option<f64>) -> String {
     };
     let port = toml::Value::String(port.to_string());
     let baud = args.baud;
-    let mut text = format!("[[sensor]]\nname = \"sensor\"\nport = {port}\nbaud = {baud}\n");
-    match frame_rate_hz {
-        // The duration is not exact enough for more digits.
-        Some(hz) => {
-            text += &format!(
-                "frame_rate_hz = {:?}  # as counted\n",
-                (hz * 10.0).round().max(1.0) / 10.0
-            );
-        }
-        None => text += &format!("# frame_rate_hz = {DEFAULT_FRAME_RATE_HZ:?}\n"),
-    }
-    text
+    let rate = match frame_rate_hz {
+        Some(hz) => format!("frame_rate_hz = {:?}  # counted: {hz:?}", usual(hz)),
+        None => format!("# frame_rate_hz = {DEFAULT_FRAME_RATE_HZ:?}"),
+    };
+    format!("[[sensor]]\nname = \"sensor\"\nport = {port}\nbaud = {baud}\n{rate}\n")
+}
+
+/// The usual frame rate that was counted, or what was counted where none is within 3 %.
+fn usual(hz: f64) -> f64 {
+    const USUAL_HZ: [f64; 18] = [
+        5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0, 75.0, 80.0, 100.0, 120.0, 125.0,
+        150.0, 200.0, 250.0, 500.0,
+    ];
+    let is_near = |usual: &&f64| (*usual - hz).abs() <= 0.03 * *usual;
+    let near = USUAL_HZ.iter().filter(is_near);
+    near.min_by(|a, b| (*a - hz).abs().total_cmp(&(*b - hz).abs()))
+        .copied()
+        .unwrap_or(hz)
 }
 
 /// The end of a configuration.
 const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for your browser\n";
 
-/// The part below `[sensor.frame]`, where the noise at rest would pass for a touch by default. Counts
-/// that are finer than a byte get fewer newtons: full scale is as many newtons as that of a byte.
-fn thresholds(most_counts: u16, noise_counts: u16) -> String {
+/// The part below `[sensor.frame]`, where the defaults would take the sensor at rest for a touch.
+fn newtons(scale: &Scale) -> String {
     let mut text = String::new();
-    let mut newtons = NEWTONS_PER_COUNT;
-    let full_scale = (u32::from(most_counts) + 1).next_power_of_two() - 1;
-    if full_scale > u32::from(u8::MAX) {
-        newtons *= f32::from(u8::MAX) / full_scale as f32;
+    let Scale {
+        newtons_per_count,
+        tare_max_n,
+        contact_threshold_n,
+        most_counts,
+        noise_counts,
+    } = *scale;
+    if newtons_per_count.is_some() || tare_max_n.is_some() {
+        text += "\n[sensor.calibration]\n";
+    }
+    if let Some(newtons) = newtons_per_count {
         text += &format!(
-            "\n[sensor.calibration]\nnewtons_per_count = {newtons:.5}  # a guess from counts up to {most_counts}: \
-             measure it with weights\n"
+            "newtons_per_count = {newtons:.6}  # a guess from counts up to {most_counts}: measure it with weights\n"
         );
     }
-    // What is as large as this may be a touch.
-    let is_noise = 10 * u32::from(noise_counts) < u32::from(most_counts);
-    // The zero may be taken where the noise goes the other way.
-    if is_noise && 2.0 * f32::from(noise_counts) * newtons >= Pitch::JX255N.contact_threshold_n() {
-        let threshold_n = (f32::from(noise_counts) + 1.5) * newtons;
-        let plural = if noise_counts == 1 { "" } else { "s" };
+    if let Some(most) = tare_max_n {
+        text += &format!("tare_max_n = {most:.3}  # taxels at rest differ\n");
+    }
+    if let Some(threshold) = contact_threshold_n {
+        let plural = if noise_counts == 1.0 { "" } else { "s" };
         text += &format!(
-            "\n[press]\ncontact_threshold_n = {threshold_n:.3}  # noise of {noise_counts} count{plural} at rest is \
-             no touch\n"
+            "\n[press]\ncontact_threshold_n = {threshold:.3}  # noise of {noise_counts} count{plural} at rest is no touch\n"
         );
     }
     text
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, exit::Failure> {
-    let unreadable = CannotRead::at(path);
+fn read(path: &Path) -> Result<Captured, Failure> {
+    let unreadable = cannot_read(path);
     let (kind, file) = FileKind::read(super::open(path)?).map_err(&unreadable)?;
-    let mut bytes = Vec::new();
+    let mut captured = Captured::default();
     if kind == FileKind::Recording {
         // If there are several sensors, take the bytes of the first.
         let mut sensor = None;
         for found in Reader::new(BufReader::new(file)) {
-            let found = found.map_err(|source| Error::Recording {
-                path: path.to_owned(),
-                source,
-            })?;
+            let found = found.of_file(path, FAILED)?;
             if let Entry::Input(Input::Bytes(more)) = found.entry
                 && *sensor.get_or_insert(found.sensor.clone()) == found.sensor
             {
-                bytes.extend_from_slice(&more);
+                captured.take(&more, found.at.mono);
             }
-            if bytes.len() >= MOST_BYTES {
+            if captured.bytes.len() >= MOST_BYTES {
                 break;
             }
         }
-        return Ok(bytes);
+        return Ok(captured);
     }
-    let read = file.take(MOST_BYTES as u64).read_to_end(&mut bytes);
+    let read = file
+        .take(MOST_BYTES as u64)
+        .read_to_end(&mut captured.bytes);
     read.map_err(unreadable)?;
-    Ok(bytes)
+    Ok(captured)
 }
 
 /// After this silence another sender of datagrams is taken.
 const STALE_AFTER: Duration = Duration::from_secs(1);
 
 /// The bytes that come from the port in `seconds`. Fewer if the port is lost.
-async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> {
+async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failure> {
     let settings = serial::Settings {
         stale_after: STALE_AFTER,
         start: Vec::new(),
         request: None,
+        on_the_line: Duration::ZERO,
+        bytes_at_once: usize::MAX,
+        bytes_per_s: f64::INFINITY,
     };
     let mut link = Link::new(port, baud, settings);
-    let mut bytes = Vec::new();
+    let mut captured = Captured::default();
     let mut lost = None;
+    let begin = Instant::now();
     // If the duration is too long to count, listening ends when the port is lost or enough bytes
     // have come.
     let listened = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let _ = tokio::time::timeout(listened, async {
-        while bytes.len() < MOST_BYTES {
+        while captured.bytes.len() < MOST_BYTES {
             match link.turn().await {
                 Turn::Opened => {
                     let port = escaped(&port.to_string());
@@ -337,8 +289,8 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
                         "listening at {port} for {seconds} s: press the sensor"
                     );
                 }
-                Turn::Bytes(read) => bytes.extend_from_slice(read),
-                Turn::Restored(_) | Turn::Stranger(_) => {}
+                Turn::Bytes(read) => captured.take(read, begin.elapsed()),
+                Turn::Stranger(_) | Turn::Skipped(_) => {}
                 Turn::Unavailable(reason) | Turn::Lost(reason) => {
                     lost = Some(reason);
                     return;
@@ -348,37 +300,53 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Vec<u8>, Error> 
     })
     .await;
     match lost {
-        Some(reason) if bytes.is_empty() => Err(Error::Unavailable {
-            path: port.to_string().into(),
-            reason: doctor::obstacle(port).unwrap_or(reason),
-        }),
-        _ => Ok(bytes),
-    }
-}
-
-/// The options that choose an array.
-fn options(shown: &Shown) -> String {
-    let array = format!("--rows {} --cols {}", shown.array.rows, shown.array.cols);
-    match shown.cell {
-        Some(cell) => format!("{array} --cell {}", name(cell)),
-        None => array,
+        Some(reason) if captured.bytes.is_empty() => {
+            let reason = doctor::obstacle(port).unwrap_or(reason);
+            Err(Failure::new(UNAVAILABLE, format!("{port}: {reason}")))
+        }
+        _ => Ok(captured),
     }
 }
 
 /// Shows the strongest press as an array would have it.
-fn show(shown: &Shown) {
-    hardnessd_core::stderr_line!("{}:", options(shown));
-    for line in draw(&shown.picture, shown.array.cols) {
+fn show(ranked: &Ranked) {
+    let title = match &ranked.proposal {
+        Some(_) => ranked.options(),
+        None => format!("{} {}", ranked.array, ranked.words),
+    };
+    hardnessd_core::stderr_line!("{title}:");
+    for line in draw(&ranked.picture, ranked.array.cols) {
         hardnessd_core::stderr_line!("    |{line}|");
     }
 }
 
-fn toml(path: &Path, bytes: usize, found: &Found) -> String {
+/// The most characters of a drawing, down and across.
+const DRAWN: (usize, usize) = (16, 32);
+
+/// A small picture for a terminal, a line for each row. Large arrays are drawn coarser.
+fn draw(cells: &[f32], cols: usize) -> Vec<String> {
+    let rows = cells.len() / cols;
+    let step = rows.div_ceil(DRAWN.0).max(cols.div_ceil(DRAWN.1)).max(1);
+    let highest = |most: f32, value: &f32| most.max(value.abs());
+    let most = cells.iter().fold(f32::MIN_POSITIVE, highest);
+    let shade = |row: usize, col: usize| {
+        let near = (row..rows.min(row + step))
+            .flat_map(|row| (col..cols.min(col + step)).map(move |col| &cells[row * cols + col]));
+        let shades = b" .:-=+*#%@";
+        let value = near.fold(0.0, highest);
+        char::from(shades[((value / most * 9.0).round() as usize).min(9)])
+    };
+    (0..rows)
+        .step_by(step)
+        .map(|row| (0..cols).step_by(step).map(|col| shade(row, col)).collect())
+        .collect()
+}
+
+fn toml(path: &Path, bytes: usize, found: &Found, proposal: &Proposal) -> String {
     let mut toml = String::new();
     let mut remark =
         |words: &str| writeln!(toml, "# {}", escaped(words)).expect("a string takes it all");
     let Found { best, next, .. } = found;
-    let proposal = &best.proposal;
     remark(&format!("{}: {bytes} bytes", path.display()));
     remark(&format!(
         "explained: {:.1} % of the bytes, {} whole frames, {} damaged",
@@ -386,43 +354,32 @@ fn toml(path: &Path, bytes: usize, found: &Found) -> String {
         proposal.frames,
         proposal.frames_damaged
     ));
-    remark(&match (next, found.lead()) {
+    remark(&match (next, found.lead_bits()) {
         (Some(next), Some(lead)) => format!(
             "{}: its picture is {} times as likely as the next, {}",
             array_in_words(best),
-            lead.min(1e6).round(),
+            lead.exp2().min(1e6).round(),
             array_in_words(next)
         ),
         _ => format!("{}: no other array makes a picture", array_in_words(best)),
     });
-    for words in proposal.remarks.iter().chain(&proposal.doubt) {
+    for words in &proposal.remarks {
         remark(words);
     }
     remark("bytes do not show order, mask and invert, nor which side of the sensor is up");
-    toml + "[sensor.frame]\n"
-        + &toml::to_string(&proposal.settings).expect("settings are keys and plain values")
+    toml + "[sensor.frame]\n" + &proposal.toml()
 }
 
-fn array_in_words(shown: &Shown) -> String {
-    match shown.cell {
-        Some(cell) => format!("{} {}", shown.array, name(cell)),
-        None => shown.array.to_string(),
-    }
-}
-
-/// The name of a type of cells in a configuration.
-fn name(cell: Cell) -> &'static str {
-    match cell {
-        Cell::U8 => "u8",
-        Cell::U16le => "u16le",
-        Cell::U16be => "u16be",
+fn array_in_words(ranked: &Ranked) -> String {
+    match ranked.cell {
+        Some(cell) => format!("{} {}", ranked.array, hardnessd_sniff::cell_name(cell)),
+        None => format!("{} {}", ranked.array, ranked.words),
     }
 }
 
 fn cell(text: &str) -> Result<Cell, String> {
-    let cells = [Cell::U8, Cell::U16le, Cell::U16be];
-    let found = cells.into_iter().find(|&cell| name(cell) == text);
-    found.ok_or_else(|| "expected u8, u16le or u16be".to_owned())
+    let known = toml::Value::String(text.to_owned()).try_into();
+    known.map_err(|_| "expected a name such as u8, i16le or f32be".to_owned())
 }
 
 fn side(text: &str) -> Result<usize, String> {
@@ -431,4 +388,22 @@ fn side(text: &str) -> Result<usize, String> {
         .ok()
         .filter(|side| (1..=MOST_SIDE).contains(side));
     found.ok_or_else(|| format!("expected 1 to {MOST_SIDE}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::usual;
+
+    #[test]
+    fn a_rate_within_three_per_cent_of_a_usual_one_is_that_one() {
+        for (counted, expected) in [
+            (49.0, 50.0),
+            (5.1, 5.0),
+            (123.0, 125.0),
+            (46.0, 46.0),
+            (97.0, 100.0),
+        ] {
+            assert_eq!(usual(counted), expected);
+        }
+    }
 }

@@ -10,14 +10,14 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
-use super::answer;
-use super::connect::{Address, Connection, Source, WEB_SERVER};
+use super::connect::{Connection, Source, WEB_SERVER};
 use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
+use super::{Stdout, answer};
 use crate::maybe;
 use hardnessd_core::event::{Kind, PROTOCOL};
-use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::wording;
 
 /// What `--help` says below the options.
@@ -52,64 +52,6 @@ pub struct Args {
     types: Vec<Kind>,
 }
 
-/// The reason why `tail` ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The time limit has passed.
-    #[error("timed out after {seconds} s ({})", events(*.found, *.count))]
-    Timeout {
-        /// The number of printed events.
-        found: u64,
-        /// The time limit in seconds.
-        seconds: f64,
-        /// The number of events after which to end, if it was given.
-        count: Option<u64>,
-    },
-    /// The other end accepts the connection and sends nothing.
-    #[error(
-        "{address}: no answer for {} s: what listens there is no hardnessd, or it hangs",
-        HELLO.as_secs()
-    )]
-    Mute {
-        /// The address.
-        address: Address,
-    },
-    /// The other end is not a daemon of this protocol.
-    #[error("{address}: found {found}, expected the hello of a daemon of protocol {PROTOCOL}")]
-    Foreign {
-        /// The address.
-        address: Address,
-        /// A description of the line that came instead.
-        found: String,
-    },
-    /// The other end is a web server.
-    #[error("{address}: {WEB_SERVER}")]
-    Web {
-        /// The address.
-        address: Address,
-    },
-    /// The daemon refused the connection: it has too many subscribers.
-    #[error("{address}: the daemon says: {message}")]
-    Refused {
-        /// The address.
-        address: Address,
-        /// The daemon's message.
-        message: String,
-    },
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Mute { .. }
-            | Error::Foreign { .. }
-            | Error::Web { .. }
-            | Error::Refused { .. } => UNAVAILABLE,
-            Error::Timeout { .. } => FAILED,
-        }
-    }
-}
-
 /// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes
 /// at most, because a service manager may have to start it first.
 const HELLO: Duration = Duration::from_secs(5);
@@ -136,36 +78,41 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         () = shutdown => return Ok(()),
         () = maybe::until(maybe::after(args.timeout)) => {}
     }
-    Err(Error::Timeout {
-        found,
-        seconds: args.timeout.unwrap_or_default(),
-        count: args.count,
-    }
-    .into())
+    let seconds = args.timeout.unwrap_or_default();
+    let events = events(found, args.count);
+    Err(Failure::new(
+        FAILED,
+        format!("timed out after {seconds} s ({events})"),
+    ))
 }
 
 async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
     let mut daemon = args.source.connect().await?;
-    let address = daemon.address().clone();
     let request = json!({"subscribe": args.types}).to_string();
     daemon.send(&request).await?;
     let labels = match tokio::time::timeout(HELLO, next(&mut daemon)).await {
         Ok(hello) => {
             let (_, hello) = hello?;
-            meet(&hello, address.clone())?;
+            meet(&hello).map_err(|why| daemon.failed(why))?;
             answer::labels(&hello)
         }
-        Err(_) => return Err(Error::Mute { address }.into()),
+        Err(_) => {
+            return Err(daemon.failed(format_args!(
+                "no answer for {} s: what listens there is no hardnessd, or it hangs",
+                HELLO.as_secs()
+            )));
+        }
     };
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
         hardnessd_core::stderr_line!(
             "hardnessd: events of {}",
-            wording::escaped(&address.to_string())
+            wording::escaped(&daemon.address().to_string())
         );
     }
     let printer = Printer::new(args.json, labels);
+    let mut stdout = Stdout::open()?;
     loop {
         let (line, event) = next(&mut daemon).await?;
         let kind = event["type"].as_str().unwrap_or_default();
@@ -175,29 +122,36 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
             continue;
         }
         let line = printer.line(line, || event);
-        if !super::print_apart(line.into_bytes()).await? {
+        if !stdout.print(line.into_bytes()).await? {
             return Ok(());
         }
         *found += u64::from(counts);
         if args.count == Some(*found) {
-            return Ok(());
+            return stdout.finish().await.map(drop);
         }
     }
 }
 
 /// Fails unless this is a daemon's first line.
-fn meet(hello: &Value, address: Address) -> Result<(), Error> {
-    let kind = hello["type"].as_str().unwrap_or_default();
-    let found = match (kind, &hello["protocol"]) {
+fn meet(hello: &Value) -> Result<(), String> {
+    let found = match (
+        hello["type"].as_str().unwrap_or_default(),
+        &hello["protocol"],
+    ) {
         ("hello", protocol) if *protocol == PROTOCOL => return Ok(()),
         ("hello", protocol) => format!("protocol {protocol}"),
+        // It has too many subscribers.
         ("error", _) => {
-            let message = hello["message"].as_str().unwrap_or_default().to_owned();
-            return Err(Error::Refused { address, message });
+            let message = hello["message"].as_str().unwrap_or_default();
+            return Err(format!("the daemon says: {message}"));
         }
         (kind, _) => format!("{kind:?}"),
     };
-    Err(Error::Foreign { address, found })
+    Err(foreign(&found))
+}
+
+fn foreign(found: &str) -> String {
+    format!("found {found}, expected the hello of a daemon of protocol {PROTOCOL}")
 }
 
 /// The daemon's next line, as text and as JSON.
@@ -205,14 +159,7 @@ async fn next(daemon: &mut Connection) -> Result<(String, Value), Failure> {
     let line = daemon.next().await?;
     match serde_json::from_str(&line) {
         Ok(event) => Ok((line, event)),
-        Err(_) if line.starts_with("HTTP/") => {
-            let address = daemon.address().clone();
-            Err(Error::Web { address }.into())
-        }
-        Err(_) => Err(Error::Foreign {
-            address: daemon.address().clone(),
-            found: "a line that is no JSON".to_owned(),
-        }
-        .into()),
+        Err(_) if line.starts_with("HTTP/") => Err(daemon.failed(WEB_SERVER)),
+        Err(_) => Err(daemon.failed(foreign("a line that is no JSON"))),
     }
 }

@@ -13,52 +13,35 @@ mod view;
 
 use std::future::Future;
 use std::io::{self, IsTerminal};
-use std::pin::Pin;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
-use tokio::time::{Instant, MissedTickBehavior};
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+use tokio::time::MissedTickBehavior;
 
 use self::draw::draw;
 use self::look::Look;
 use self::screen::{Screen, keys};
-use self::view::{Clock, Key, Loss, QUESTION, View};
-use super::connect::{self, Address, Connection, Source};
+use self::view::{Clock, Loss, Order, QUESTION, View};
+use super::connect::{Address, Source};
+use super::control;
+use super::exit::{Fail, Failure};
 use crate::daemon::now;
-use hardnessd_core::exit::{Coded, IO, USAGE};
+use hardnessd_core::exit::{IO, USAGE};
 
 /// Arguments of `watch`.
 #[derive(Debug, Clone, ClapArgs)]
 #[command(
     after_help = "Keys: q or Ctrl-C quits; Tab, arrows or 1 to 9 choose a sensor; Ctrl-L draws \
-                        again. DAEMON SILENT: no answer for 3 s. NO DAEMON: nobody answers, or the \
+                        again; p asks what you press (`firm`, `2`, `cup` or `cup firm`), tells it to the daemon as \
+                        the context `object` and `level`, and counts right and wrong verdicts. DAEMON SILENT: no answer for 3 s. NO DAEMON: nobody answers, or the \
                         protocol is another one; `watch` connects again. A map that is not live is \
-                        grey. Without colours where NO_COLOR is set or TERM has none, and in ASCII \
-                        unless LC_ALL, LC_CTYPE or LANG says UTF-8."
+                        grey. Without colours where NO_COLOR is set or TERM has none."
 )]
 pub struct Args {
     #[command(flatten)]
     source: Source,
-}
-
-/// An error of `watch`.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// Stdin or stdout is not a terminal.
-    #[error("`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead")]
-    NoTerminal,
-    /// The terminal cannot be read from or written to.
-    #[error("terminal: {0}")]
-    Terminal(#[source] io::Error),
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::NoTerminal => USAGE,
-            Error::Terminal(_) => IO,
-        }
-    }
 }
 
 /// Time between two pictures: as fast as eyes can follow.
@@ -71,10 +54,11 @@ const PAUSE: Duration = Duration::from_millis(500);
 ///
 /// # Errors
 ///
-/// Returns [`Error`] if there is no terminal or the terminal fails.
-pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+/// Fails if there is no terminal or the terminal fails.
+pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
     if !(io::stdin().is_terminal() && io::stdout().is_terminal()) {
-        return Err(Error::NoTerminal);
+        let needs = "`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead";
+        return Err(Failure::new(USAGE, needs));
     }
     let look = look();
     let mut view = View::new();
@@ -88,33 +72,41 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
             hardnessd_core::wording::escaped(&address)
         );
     }
-    let mut screen = Screen::open().map_err(Error::Terminal)?;
-    let mut keys = keys().map_err(Error::Terminal)?;
+    let mut screen = Screen::open().of("terminal", IO)?;
+    let mut keys = keys().of("terminal", IO)?;
     let mut pictures = tokio::time::interval(PICTURE);
     pictures.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let mut questions = tokio::time::interval(QUESTION);
     questions.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let mut shutdown = std::pin::pin!(shutdown);
+    // The address of the last connection.
+    let mut daemon_at = None;
+    let (told, mut outcomes) = mpsc::channel(4);
     loop {
         tokio::select! {
             // Many lines from the daemon must not delay a key or a picture.
             biased;
             () = &mut shutdown => return Ok(()),
             () = screen.gone() => return Ok(()),
-            key = keys.recv() => match key {
-                None | Some(Key::Quit) => return Ok(()),
-                Some(Key::Redraw) => screen.forget().map_err(Error::Terminal)?,
-                Some(key) => view.press(key),
+            key = keys.recv() => match key.map_or(Some(Order::Quit), |key| view.press(key)) {
+                Some(Order::Quit) => return Ok(()),
+                Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
+                Some(Order::Context(context)) => {
+                    tokio::spawn(tell(daemon_at.clone(), context, told.clone()));
+                }
+                None => {}
             },
+            Some(outcome) = outcomes.recv() => view.said = Some(outcome),
             _ = pictures.tick() => {
                 let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
-                drawn.map_err(Error::Terminal)?;
+                drawn.of("terminal", IO)?;
             }
             _ = questions.tick() => daemon.send(r#"{"get":"status"}"#),
             received = daemon.next() => match received {
                 Ok(FromDaemon::Connection(address)) => {
                     let clock = Clock::of(&address);
                     view.wait(address.to_string(), clock, now().mono);
+                    daemon_at = Some(address);
                 }
                 Ok(FromDaemon::Line(line)) => {
                     if let Some(request) = view.take_line(&line, now()) {
@@ -127,32 +119,27 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), E
     }
 }
 
+/// Sets a context at the control socket beside the daemon's other one, and sends the outcome in words.
+async fn tell(daemon_at: Option<Address>, context: Value, told: mpsc::Sender<String>) {
+    let outcome = match daemon_at {
+        Some(Address::Unix(path)) => {
+            let socket = path.with_file_name("control.sock");
+            let request = json!({"context": context, "id": 1});
+            match control::ask(Some(socket), &request).await {
+                Ok(_) => "the daemon repeats it in every verdict from now on".to_owned(),
+                Err(error) => format!("counted here only: {}", error.line()),
+            }
+        }
+        _ => "counted here only: over TCP nothing can be set, use `hardnessd context`".to_owned(),
+    };
+    // If `watch` has ended, nobody reads it.
+    let _ = told.send(outcome).await;
+}
+
 fn look() -> Look {
     let variable = |name| std::env::var(name).unwrap_or_default();
-    let locale = ["LC_ALL", "LC_CTYPE", "LANG"].map(variable);
-    let locale = locale.into_iter().find(|value| !value.is_empty());
-    Look::new(
-        &variable("TERM"),
-        &variable("COLORTERM"),
-        &variable("NO_COLOR"),
-        &locale.unwrap_or_default(),
-    )
+    Look::new(&variable("TERM"), &variable("NO_COLOR"))
 }
-
-/// The connection to the daemon. When it breaks, it is made again.
-struct Daemon {
-    source: Source,
-    state: State,
-}
-
-enum State {
-    /// There is no daemon. The next try is at this time.
-    Waiting(Instant),
-    Connecting(Connecting),
-    Connected(Connection),
-}
-
-type Connecting = Pin<Box<dyn Future<Output = Result<Connection, connect::Error>> + Send>>;
 
 /// A connection to the daemon, or a line from it.
 enum FromDaemon {
@@ -161,59 +148,70 @@ enum FromDaemon {
     Line(String),
 }
 
+/// The connection to the daemon. When it breaks, it is made again.
+struct Daemon {
+    received: mpsc::Receiver<Result<FromDaemon, Loss>>,
+    requests: mpsc::Sender<String>,
+}
+
 impl Daemon {
     fn new(source: Source) -> Self {
-        Self {
-            source,
-            state: State::Waiting(Instant::now()),
-        }
+        let (sender, received) = mpsc::channel(64);
+        let (requests, asked) = mpsc::channel(16);
+        tokio::spawn(follow(source, sender, asked));
+        Self { received, requests }
     }
 
     /// The next connection or line, or the reason why there is no daemon. Cancelling the call loses
     /// nothing.
     async fn next(&mut self) -> Result<FromDaemon, Loss> {
-        loop {
-            match &mut self.state {
-                State::Waiting(until) => {
-                    tokio::time::sleep_until(*until).await;
-                    let source = self.source.clone();
-                    let connecting = async move { source.connect().await };
-                    self.state = State::Connecting(Box::pin(connecting));
-                }
-                State::Connecting(connecting) => match connecting.await {
-                    Ok(connection) => {
-                        let address = connection.address().clone();
-                        self.state = State::Connected(connection);
-                        return Ok(FromDaemon::Connection(address));
-                    }
-                    Err(error) => {
-                        self.pause();
-                        return Err(Loss::Unreachable(error.to_string()));
-                    }
-                },
-                State::Connected(connection) => match connection.next().await {
-                    Ok(line) => return Ok(FromDaemon::Line(line)),
-                    Err(error) => {
-                        self.pause();
-                        return Err(match error {
-                            connect::Error::TooLong { .. } => Loss::Unreachable(error.to_string()),
-                            _ => Loss::Closed,
-                        });
-                    }
-                },
-            }
-        }
+        let next = self.received.recv().await;
+        next.expect("the task goes on as long as there is a receiver")
     }
 
-    fn pause(&mut self) {
-        self.state = State::Waiting(Instant::now() + PAUSE);
-    }
-
-    /// Sends a request.
+    /// Sends a request, if there is a daemon.
     fn send(&self, request: &str) {
-        if let State::Connected(connection) = &self.state {
-            connection.try_send(request);
-        }
+        // If the daemon does not receive the request, its missing answer shows that later.
+        let _ = self.requests.try_send(request.to_owned());
+    }
+}
+
+/// Connects again and again, until nobody receives any more.
+async fn follow(
+    source: Source,
+    sender: mpsc::Sender<Result<FromDaemon, Loss>>,
+    mut requests: mpsc::Receiver<String>,
+) {
+    while !sender.is_closed() {
+        let loss = match source.connect().await {
+            Ok(mut connection) => {
+                while requests.try_recv().is_ok() {}
+                let address = connection.address().clone();
+                if sender
+                    .send(Ok(FromDaemon::Connection(address)))
+                    .await
+                    .is_err()
+                {
+                    return;
+                }
+                loop {
+                    tokio::select! {
+                        line = connection.next() => match line {
+                            Ok(line) => {
+                                if sender.send(Ok(FromDaemon::Line(line))).await.is_err() {
+                                    return;
+                                }
+                            }
+                            Err(error) => break Loss::Broken(error.line()),
+                        },
+                        Some(request) = requests.recv() => connection.try_send(&request),
+                    }
+                }
+            }
+            Err(error) => Loss::Unreachable(error.line()),
+        };
+        let _ = sender.send(Err(loss)).await;
+        tokio::time::sleep(PAUSE).await;
     }
 }
 

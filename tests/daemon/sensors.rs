@@ -1,12 +1,22 @@
 //! A reload that adds and removes sensors.
 
-use std::fs;
-use std::path::PathBuf;
+use std::fs::{self, File, Permissions};
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+use std::time::Duration;
 
-use rustix::process::Signal;
+use rustix::process::{Resource, Signal, geteuid, getrlimit};
 use serde_json::json;
 
-use crate::bench::{Bench, Daemon, events, get, hardnessd, recordings_in, wait_for};
+use crate::bench::{
+    BINARY, Bench, Daemon, Process, events, get, hardnessd, recordings_in, wait_for,
+};
 
 /// A configuration with these sensors, each at the port of its name.
 fn configure(bench: &Bench, names: &[&str], more: &str) -> PathBuf {
@@ -93,41 +103,276 @@ fn a_reload_adds_and_removes_sensors_and_the_others_run_on() {
     subscriber.until(&json!({"type": "press", "sensor": "elbow", "press": 1, "state": "begin"}));
     drop(plays);
 
-    // A recording has the sensors that there were, and can be replayed.
-    daemon.process.signal(Signal::TERM);
-    assert_eq!(daemon.process.exit_code(), Some(0));
-    let files = || recordings_in(&bench.path("records"), "hardnessd-");
-    wait_for("three recordings", || files().len() == 3);
-    for (file, expected) in files().iter().zip([
-        ["elbow", "wrist"].as_slice(),
-        &["palm", "wrist"],
-        &["elbow", "palm", "wrist"],
-    ]) {
-        let replayed = hardnessd(&["replay", file.to_str().unwrap()]);
-        assert!(replayed.status.success(), "{replayed:?}");
-        let replayed = events(&String::from_utf8(replayed.stdout).unwrap());
-        let mut found: Vec<&str> = replayed
-            .iter()
-            .map(|event| event["sensor"].as_str().unwrap())
-            .collect();
-        found.sort_unstable();
-        found.dedup();
-        assert_eq!(found, expected, "{}", file.display());
-    }
+    // Each set of sensors has a recording of its own.
+    daemon.end();
+    wait_for("three recordings", || {
+        recordings_in(&bench.path("records"), "hardnessd-").len() == 3
+    });
 }
 
 #[test]
-fn a_changed_key_of_a_sensor_is_refused_beside_an_added_one() {
+fn a_sensor_whose_table_changed_begins_anew_and_its_numbers_go_on() {
     let bench = Bench::new();
-    let mut daemon = Daemon::start(&configure(&bench, &["wrist"], ""));
+    let _plays = ["wrist", "palm"].map(|name| bench.sensor_at(name, 20, &[]));
+    let mut daemon = Daemon::start(&configure(&bench, &["wrist", "palm"], ""));
+    let mut subscriber = bench.subscriber();
+    let begun = subscriber.until(&json!({"type": "press", "sensor": "wrist", "state": "begin"}));
+    let before = [frames(&bench, "wrist"), frames(&bench, "palm")];
     let path = configure(&bench, &["wrist", "palm"], "");
     let text = fs::read_to_string(&path).unwrap();
-    fs::write(
-        &path,
-        text.replacen("frame_rate_hz = 20.0", "frame_rate_hz = 30.0", 1),
-    )
-    .unwrap();
-    let line = reload(&mut daemon, "refused");
-    assert!(line.contains("sensor.frame_rate_hz of \"wrist\""), "{line}");
+    let (was, is) = ("frame_rate_hz = 20.0", "frame_rate_hz = 19.0");
+    fs::write(&path, text.replacen(was, is, 1)).unwrap();
+    reload(&mut daemon, "reloaded");
+    let stops = daemon
+        .log
+        .seen
+        .iter()
+        .filter(|line| line.contains("stopped"));
+    let stops: Vec<_> = stops.collect();
+    assert!(stops.len() == 1 && stops[0].contains("wrist"), "{stops:?}");
+    let end = subscriber.until(&json!({"type": "press", "sensor": "wrist"}));
+    assert_eq!(end["press"], begun["press"]);
+    assert_eq!(end["reason"], "shutdown");
+    // The changed sensor takes a tare again, and counts on.
+    let live = subscriber.until(&json!({"type": "status", "sensor": "wrist", "state": "live"}));
+    assert!(live["seq"].as_u64() > end["seq"].as_u64(), "{live}");
+    let next = subscriber.until(&json!({"type": "press", "sensor": "wrist", "state": "begin"}));
+    assert_eq!(
+        next["press"].as_u64(),
+        begun["press"].as_u64().map(|press| press + 1)
+    );
+    assert!(next["frame"].as_u64() > begun["frame"].as_u64(), "{next}");
+    assert!(frames(&bench, "wrist") > before[0] && frames(&bench, "palm") > before[1]);
+
+    // One recording has it all, and a replay gives the same presses.
+    subscriber.until(&json!({"type": "hardness", "sensor": "wrist", "press": next["press"]}));
+    daemon.end();
+    let files = recordings_in(&bench.path("records"), "hardnessd-");
+    let [file] = &files[..] else {
+        panic!("{files:?}");
+    };
+    let replayed = hardnessd(&["replay", file.to_str().unwrap()]);
+    assert!(replayed.status.success(), "{replayed:?}");
+    let replayed = events(&String::from_utf8(replayed.stdout).unwrap());
+    for live in [&begun, &end, &next] {
+        let same = |event: &serde_json::Value| {
+            ["type", "sensor", "press", "state", "frame", "time"]
+                .iter()
+                .all(|key| event[*key] == live[*key])
+        };
+        assert!(replayed.iter().any(same), "{live} in the replay");
+    }
+}
+
+/// Runs a program as a user without processes, because no limit of processes holds for root. If the test
+/// does not run as root, this is the user who runs it.
+fn by_a_user(program: &Path) -> Command {
+    if !geteuid().is_root() {
+        return Command::new(program);
+    }
+    let user = 20_000 + std::process::id() % 40_000;
+    let mut command = Command::new("setpriv");
+    command.args([format!("--reuid={user}"), format!("--regid={user}")]);
+    command.args(["--clear-groups", "--bounding-set=-all", "--inh-caps=-all"]);
+    command.arg("--").arg(program);
+    command
+}
+
+/// Limits how many threads the user may have when `process` makes another one.
+fn limit(process: &Process, threads: Option<u64>) {
+    let most = threads.or(getrlimit(Resource::Nproc).maximum);
+    let most = most.map_or("unlimited".to_owned(), |most| most.to_string());
+    let mut command = by_a_user(Path::new("prlimit"));
+    command.arg(format!("--pid={}", process.0.id()));
+    command.arg(format!("--nproc={most}:"));
+    assert!(command.status().unwrap().success());
+}
+
+#[test]
+fn a_reload_that_cannot_record_is_refused_and_the_former_recording_goes_on() {
+    let bench = Bench::new();
+    let config = configure(&bench, &["wrist"], "");
+    let program = bench.path("hardnessd");
+    fs::copy(BINARY, &program).unwrap();
+    fs::set_permissions(bench.path(""), Permissions::from_mode(0o777)).unwrap();
+    let mut command = by_a_user(&program);
+    let mut daemon = Daemon::start_by(&mut command, &config);
+    // Now and then there is a thread more, which tries to open the port.
+    let tasks = format!("/proc/{}/task", daemon.process.0.id());
+    let threads = (0..40).map(|_| {
+        thread::sleep(Duration::from_millis(20));
+        fs::read_dir(&tasks).unwrap().count()
+    });
+    let threads = threads.min().unwrap();
+
+    // The configuration is a pipe, so the thread that reads it is there before the limit. When it has
+    // ended, there is none for another recording.
+    configure(&bench, &["palm", "wrist"], "");
+    let text = fs::read_to_string(&config).unwrap();
+    fs::remove_file(&config).unwrap();
+    let pipe = bench.fifo("hardnessd.toml");
+    fs::set_permissions(&pipe, Permissions::from_mode(0o666)).unwrap();
+    daemon.process.signal(Signal::HUP);
+    let mut pipe = File::options().write(true).open(pipe).unwrap();
+    limit(&daemon.process, Some(threads as u64));
+    pipe.write_all(text.as_bytes()).unwrap();
+    drop(pipe);
+    let line = daemon.logged("refused");
+    assert!(line.contains("no thread for the recording"), "{line}");
     assert_eq!(names(&bench.subscriber().next().unwrap()), ["wrist"]);
+    assert_eq!(recordings_in(&bench.path("records"), "hardnessd-").len(), 1);
+
+    limit(&daemon.process, None);
+    fs::remove_file(&config).unwrap();
+    fs::write(&config, text).unwrap();
+    reload(&mut daemon, "reloaded");
+    assert_eq!(
+        names(&bench.subscriber().next().unwrap()),
+        ["palm", "wrist"]
+    );
+    // Both recordings are whole when the daemon has ended.
+    daemon.end();
+    let files = recordings_in(&bench.path("records"), "hardnessd-");
+    assert_eq!(files.len(), 2, "{files:?}");
+    for file in files {
+        let replayed = hardnessd(&["replay", file.to_str().unwrap()]);
+        assert!(replayed.status.success(), "{replayed:?}");
+    }
+}
+
+/// The areas of a hand: the register at which each begins, and its rows and columns.
+fn areas() -> Vec<(u16, usize, usize)> {
+    let fingers = (0..5).flat_map(|finger| {
+        let first = 3000 + 370 * finger;
+        [(first, 3, 3), (first + 18, 12, 8), (first + 210, 10, 8)]
+    });
+    fingers.chain([(4880, 4, 4), (4900, 14, 8)]).collect()
+}
+
+/// A hand on a network that answers Modbus TCP. The area at the register `mute` is silent. All taxels of
+/// an area read the number of its register, modulo 97.
+fn hand(mute: Arc<AtomicUsize>) -> u16 {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.unwrap();
+            let mut request = [0; 12];
+            while stream.read_exact(&mut request).is_ok() {
+                let first = u16::from_be_bytes([request[8], request[9]]);
+                let cells = usize::from(u16::from_be_bytes([request[10], request[11]]));
+                if usize::from(first) == mute.load(Ordering::Relaxed) {
+                    continue;
+                }
+                let length = (3 + 2 * cells) as u16;
+                // The number of the transaction is repeated.
+                let mut answer = vec![request[0], request[1], 0, 0];
+                answer.extend(length.to_be_bytes());
+                answer.extend([1, 3, (2 * cells) as u8]);
+                answer.extend((first % 97).to_be_bytes().repeat(cells));
+                stream.write_all(&answer).unwrap();
+            }
+        }
+    });
+    port
+}
+
+#[test]
+fn seventeen_areas_of_a_hand_share_a_port_and_a_silent_one_makes_no_other_stale() {
+    let bench = Bench::new();
+    let mute = Arc::new(AtomicUsize::new(0));
+    let port = hand(mute.clone());
+    let hex = |bytes: &[u8]| {
+        bytes
+            .iter()
+            .map(|byte| format!("{byte:02X}"))
+            .collect::<String>()
+    };
+    let mut text =
+        "[publish.unix]\npath = \"events.sock\"\n[http]\nlisten = \"127.0.0.1:0\"\n".to_owned();
+    for (first, rows, cols) in areas() {
+        let bytes = 2 * rows * cols;
+        // The register serves as the number of the transaction.
+        let [high, low] = first.to_be_bytes();
+        let sync = [
+            &[high, low, 0, 0][..],
+            &((3 + bytes) as u16).to_be_bytes(),
+            &[1, 3, bytes as u8],
+        ]
+        .concat();
+        let request = [
+            high,
+            low,
+            0,
+            0,
+            0,
+            6,
+            1,
+            3,
+            high,
+            low,
+            0,
+            (rows * cols) as u8,
+        ];
+        text += &format!(
+            "[[sensor]]\nname = \"a{first}\"\nport = \"tcp://127.0.0.1:{port}\"\nframe_rate_hz = 50.0\n\
+             stale_after_ms = 1000\n[sensor.frame]\nsync = \"{}\"\ncell = \"u16be\"\nrows = {rows}\n\
+             cols = {cols}\nrequest = \"{}\"\n[sensor.calibration]\ntare_frames = 0\n\
+             newtons_per_count = 1.0\n",
+            hex(&sync),
+            hex(&request)
+        );
+    }
+    let path = bench.path("hardnessd.toml");
+    fs::write(&path, text).unwrap();
+    let mut daemon = Daemon::start(&path);
+    let http = daemon.address("http").to_string();
+    let statuses = || -> Vec<serde_json::Value> {
+        let answer = get(&http, "/api/status");
+        let (_, body) = answer.split_once("\r\n\r\n").unwrap();
+        let status: serde_json::Value = serde_json::from_str(body).unwrap();
+        let sensors = status["sensors"].as_array().unwrap().iter();
+        sensors.map(|sensor| sensor["status"].clone()).collect()
+    };
+    let rate = |status: &serde_json::Value| status["frame_rate_hz"].as_f64().unwrap_or(0.0);
+    // A busy machine may miss some.
+    wait_for("17 areas at 50 frames/s", || {
+        statuses().iter().all(|status| rate(status) > 40.0)
+    });
+    assert_eq!(statuses().len(), 17);
+
+    // Each sensor has the frames of its own area.
+    let mut subscriber = bench.subscriber();
+    subscriber.send_line("{\"subscribe\":[\"frame\",\"status\"]}");
+    for (first, rows, cols) in areas() {
+        let frame = subscriber.until(&json!({"type": "frame", "sensor": format!("a{first}")}));
+        let newtons = frame["newtons"].as_array().unwrap();
+        let expected = f64::from(first % 97);
+        assert_eq!(newtons.len(), rows * cols);
+        assert!(
+            newtons.iter().all(|n| n.as_f64() == Some(expected)),
+            "{first}: {frame}"
+        );
+    }
+
+    let mut others = bench.subscriber();
+    mute.store(3018, Ordering::Relaxed);
+    others.until(&json!({"type": "status", "sensor": "a3018", "state": "stale"}));
+    thread::sleep(Duration::from_secs(2));
+    let live = statuses()
+        .iter()
+        .filter(|status| status["state"] == "live")
+        .count();
+    assert_eq!(live, 16, "{:?}", statuses());
+    mute.store(0, Ordering::Relaxed);
+    // Nothing else was stale in between.
+    loop {
+        let line = others.next().unwrap();
+        if line["type"] == "status" {
+            assert_eq!(line["sensor"], "a3018", "{line}");
+            if line["state"] == "live" {
+                break;
+            }
+        }
+    }
 }

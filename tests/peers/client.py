@@ -6,8 +6,7 @@
 
 Claims, for Client and AsyncClient alike: over connections that break at random, each numbered event
 is given once and in order; a daemon that ends and comes back is noticed, and its events follow; a
-slow reader learns how many events it lost; a client that is closed at any moment ends. A wait that is
-cancelled loses nothing. The control socket's answers arrive. The program ends with the exit codes of
+slow reader learns how many events it lost. A wait that is cancelled loses nothing. The control socket's answers arrive. The program ends with the exit codes of
 its help, and the README's programs run.
 """
 
@@ -120,35 +119,6 @@ def resumes(bench, address, kind):
     continued.end()
     assert continued.numbers()[:3] == [last - 2, last - 1, last], continued.numbers()
     print(f"{kind.__name__} at {address}: {len(numbers)} events over {breaks} breaks, each once")
-
-
-def ends_when_closed(bench):
-    client = hardnessd.Client(bench.path("events.sock"))
-
-    def connect(address, timeout_s):
-        connection = connected(address, timeout_s)
-        # Another thread closes the client before it can know of the connection.
-        client.close()
-        return connection
-
-    connected, hardnessd.Connection = hardnessd.Connection, connect
-    try:
-        events = Events(client)
-        events.thread.join(PATIENCE_S)
-    finally:
-        hardnessd.Connection = connected
-    assert not events.thread.is_alive() and not events, events
-    # Closed while it connects, while it pauses, while it reads.
-    for address in ("events.sock", "nobody.sock"):
-        for _ in range(20):
-            for kind in (hardnessd.Client, hardnessd.AsyncClient):
-                events = Events(kind(bench.path(address)))
-                wait_for("its thread", lambda e=events: hasattr(e, "loop") or kind is hardnessd.Client)
-                time.sleep(random.uniform(0, 0.02))
-                start = time.monotonic()
-                events.end()
-                assert time.monotonic() - start < 2, address
-    print("a client that is closed at any moment is at its end")
 
 
 def notices_a_restart(bench, daemon):
@@ -376,7 +346,6 @@ def main(binary):
             resumes(bench, (host, int(port)), hardnessd.AsyncClient)
             resumes(bench, tcp, hardnessd.Client)
             resumes(bench, pathlib.Path(bench.path("events.sock")), hardnessd.AsyncClient)
-            ends_when_closed(bench)
             notices_a_restart(bench, daemon)
             commands(bench)
             a_verdict_in_words()

@@ -10,7 +10,6 @@ import shutil
 import socket
 import subprocess
 import tempfile
-import termios
 import threading
 import time
 import tty
@@ -187,7 +186,6 @@ class Machine:
             "-append", f"root=/dev/vda rw console={console} quiet",
             "-drive", f"file={disk},format=qcow2,if=virtio,cache=unsafe",
             "-drive", f"file={load},format=raw,if=virtio,readonly=on",
-            # A reboot is a new qemu: `reboot`.
             "-no-reboot", "-serial", f"file:{self.path('console')}",
             "-qmp", f"unix:{self.path('qmp.sock')},server=on,wait=off",
             "-device", "virtio-serial",
@@ -228,18 +226,6 @@ class Machine:
             raise AssertionError(f"it does not boot: {self.read('qemu')}{self.read('console')}")
         self.boot_s = time.monotonic() - start
         self.events = self._connect("events", PATIENCE_S)
-
-    def reboot(self):
-        """Once more, with the cable of the adapter pulled."""
-        self.ask("systemd-run --quiet --on-active=1 systemctl reboot")
-        self.qemu.wait(PATIENCE_S)
-        for left in glob.glob(self.path("*.sock")):
-            os.unlink(left)
-        start = time.monotonic()
-        assert self._started(PATIENCE_S), self.read("console")
-        self.boot_s = time.monotonic() - start
-        for cable in self.cables.values():
-            cable.connect()
 
     def _started(self, patience_s, *more):
         with open(self.path("qemu"), "wb") as log:

@@ -32,8 +32,7 @@ os.environ.setdefault("HF_HOME", tempfile.mkdtemp())
 import hardnessd
 import lerobot
 import numpy as np
-from bench import Bench
-from export_peer import take
+from bench import Bench, taken
 from lerobot.cameras import CameraConfig
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.datasets import LeRobotDataset
@@ -192,7 +191,7 @@ def a_recorded_episode(bench, directory, pictures):
     data = LeRobotDataset("hardnessd/recorded", root=out)
     names = data.features["observation.state"]["names"]
     assert names == ["joint.pos", "force_n", "level"] and data.num_frames > 0.8 * 8 * FPS, (names, data.num_frames)
-    forces = [round(sum(event["newtons"]), 2) for event in live if event["type"] == "frame"]
+    forces = [round(event["force_n"], 2) for event in live if event["type"] == "frame" and event["tared"]]
     levels = {event["level"] or 0 for event in live if event["type"] == "hardness"}
     pressed = 0
     for item in data:
@@ -241,7 +240,7 @@ def the_array(bench, directory, video):
         newtons = item[ARRAY].numpy()
         event = frames[newtons.tobytes()]
         state = dict(zip(names, item[STATE].tolist(), strict=True))
-        assert np.isclose(state["force_n"], sum(event["newtons"]), atol=1e-3), state
+        assert np.isclose(state["force_n"], event["force_n"], atol=1e-3), state
         # Frames without a force are alike, so that this event need not be the very frame.
         if state["force_n"] > 1:
             assert state["contact_area_taxels"] == event["contact_area_taxels"], (state, event)
@@ -348,7 +347,8 @@ def main():
     print("LeRobot", lerobot.__version__)
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
-        path, _ = take(binary, directory)
+        path = directory / "take.mcap"
+        taken(binary, path, "--motion", "{control}")
         for episodes in ("recordings", "presses"):
             print("an export of %d episodes and %d frames" % an_export(path, directory, episodes))
         with Bench(binary, frame_rate_hz=FPS) as bench:

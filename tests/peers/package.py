@@ -71,7 +71,7 @@ def listing(package):
         assert mode == ("-rwxr-xr-x" if is_program else "-rw-r--r--"), line
         files[name[1:]] = mode
     for path in [
-        "/usr/lib/systemd/system/hardnessd.service", "/usr/lib/systemd/system/hardnessd.socket",
+        "/usr/lib/systemd/system/hardnessd.service",
         "/usr/lib/sysusers.d/hardnessd.conf", "/usr/lib/tmpfiles.d/hardnessd.conf",
         "/usr/lib/udev/rules.d/99-hardnessd.rules", "/etc/hardnessd.toml",
         "/usr/share/doc/hardnessd/copyright", "/usr/share/doc/hardnessd/LICENSE-MIT",
@@ -155,8 +155,7 @@ def units(root, files):
     unit = open(f"{root}/usr/lib/systemd/system/hardnessd.service").read()
     program, config = re.search(r"ExecStart=(\S+) run --config (\S+)", unit).groups()
     assert program in files and config in files, unit
-    socket = open(f"{root}/usr/lib/systemd/system/hardnessd.socket").read()
-    assert "ListenStream=/run/hardnessd/events.sock" in socket and "RuntimeDirectory=hardnessd" in unit
+    assert "RuntimeDirectory=hardnessd" in unit
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ curve, press or verdict; what comes late,
 after a connection broke, is shown as old as it is, whatever the browser's clock says; force against
 approach is drawn where an arm's positions come, and hidden elsewhere; sensors can be chosen; a phone of
 360 px is wide enough, and presses are numbered on it; no console error and no breach of the page's
-policy; a daemon that goes is said, and the page finds it again by itself. With --pictures it leaves
+policy; what a person says that they press is told to the daemon and counted; words are explained; a daemon that goes is said, and the page finds it again by itself. With --pictures it leaves
 one of each state, light, dark and narrow.
 """
 
@@ -22,11 +22,10 @@ import os
 import re
 import shutil
 import signal
-import socket
 import time
 import urllib.request
 
-from bench import Bench, wait_for
+from bench import Bench, free_port, wait_for
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 
@@ -164,7 +163,7 @@ def events_arrive(page, bench, sensors):
     assert (page.tab("forearm"), page.tab("wrist")) == ("live", "live")
     wait_for("a verdict", lambda: page.text("label") not in ("", "none yet"))
     wait_for("a verdict that is sure", lambda: page.colour("label") != page.colour("facts"))
-    assert re.match(r"Shore \d+ \(\d+ to \d+\), \d+ taxels", page.text("facts")), page.text("facts")
+    assert re.match(r"Shore \d+ to \d+, \d+ taxels", page.text("facts")), page.text("facts")
     wait_for("several verdicts", lambda: len(page.driver.find_elements(By.CSS_SELECTOR, "#rows tr")) > 1)
     before = int(page.text("frames").replace("\u202f", ""))
     wait_for("more frames", lambda: int(page.text("frames").replace("\u202f", "")) > before)
@@ -184,6 +183,29 @@ def a_verdict_in_words(page):
         finally { hello = before; }"""
     said = page.driver.execute_script(script, table)
     assert said == [[case["text"], case["is_weak"]] for case in table["cases"]], said
+
+
+def what_is_pressed_is_counted(page, bench):
+    """Each press is of another material, so a level is right now and then."""
+    page.driver.find_element(By.XPATH, "//*[@id='truth']/button[text()='hard']").click()
+    wait_for("no verdict yet, or some", lambda: page.text("tally"))
+    name = page.driver.find_element(By.ID, "object")
+    name.send_keys("cup\n")
+    tally = wait_for("counted", lambda: re.match(r"(\d+) of (\d+) right, (\d+) wrong", page.text("tally")))
+    assert int(tally[1]) + int(tally[3]) <= int(tally[2]), tally[0]
+    assert not page.text("told"), page.text("told")
+    with urllib.request.urlopen(f"http://{bench.address('http')}/api/status") as answer:
+        context = json.load(answer)["sensors"][0]["last"]["context"]
+    assert context == {"sensor": "forearm", "level": 1, "object": "cup"}, context
+    page.picture("score-dark")
+
+
+def words_are_explained(page):
+    page.driver.find_element(By.CSS_SELECTOR, "[data-word=damaged]").click()
+    assert "checksum" in page.text("meaning"), page.text("meaning")
+    page.picture("word-dark")
+    page.driver.find_element(By.ID, "h-link").click()
+    assert not page.shown("meaning")
 
 
 def force_against_approach_is_drawn(page):
@@ -319,17 +341,11 @@ def the_daemon_may_go_and_come(page, bench, daemon):
     wait_for("the wrist", lambda: page.text("state") == "live" and "wrist" in page.text("name"))
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def main(binary, pictures):
     if pictures:
         os.makedirs(pictures, exist_ok=True)
     # The same port after a restart, as in a configuration.
-    http = f'[http]\nlisten = "127.0.0.1:{free_port()}"\n'
+    http = f'[http]\nlisten = "127.0.0.1:{free_port()}"\nset_context = true\n'
     page = Page(pictures)
     try:
         with Bench(binary, ("forearm", "wrist"), more=http) as bench:
@@ -340,6 +356,8 @@ def main(binary, pictures):
             page.driver.get(f"http://{bench.address('http')}/")
             events_arrive(page, bench, sensors)
             a_verdict_in_words(page)
+            what_is_pressed_is_counted(page, bench)
+            words_are_explained(page)
             force_against_approach_is_drawn(page)
             fits_a_phone(page)
             a_reload_loses_nothing(page)

@@ -167,45 +167,7 @@ def killed(binary):
         return counts
 
 
-def full(binary):
-    """On a disk that fills up the recording stops, the sensor does not; with room it goes on."""
-    more = '[record]\ndir = "rec"\nkeep_free_mb = 8\n'
-    with Bench(binary, more=more) as bench:
-        bench.sensor("forearm", "--force", "15")
-        os.mkdir(bench.path("rec"))
-        config, log = bench.path("hardnessd.toml"), bench.path("log")
-        # A disk of its own, which only that process and its /proc see.
-        script = f"mount -t tmpfs -o size=16m none {bench.path('rec')} && exec {binary} run --config {config}"
-        with open(log, "wb") as output:
-            running = subprocess.Popen(
-                ["unshare", "--mount", "--map-root-user", "bash", "-c", script], stderr=output
-            )
-        bench.processes.append(running)
-        disk = pathlib.Path(f"/proc/{running.pid}/root{bench.path('rec')}")
-        wait_for("a recording", lambda: disk.exists() and list(disk.glob("*.mcap")))
-        (disk / "filler").write_bytes(bytes(10_000_000))
-        said = lambda: pathlib.Path(log).read_text()  # noqa: E731
-        wait_for("the stop", lambda: "recording stopped" in said())
-        first = list(disk.glob("hardnessd-*.mcap"))
-        size = first[0].stat().st_size
-        ask = ["tail", "--json", "--socket", bench.path("events.sock"), "--types", "press"]
-        subprocess.run([binary, *ask, "--count", "2", "--timeout", "30"], check=True, capture_output=True)
-        assert [first[0].stat().st_size, len(first)] == [size, 1]
-        (disk / "filler").unlink()
-        wait_for("a second recording", lambda: len(list(disk.glob("hardnessd-*.mcap"))) == 2)
-        assert said().count("recording stopped") == 1, said()
-        # The first was ended as it should be.
-        with open(first[0], "rb") as file:
-            assert make_reader(file).get_summary().statistics.message_count > 0
-
-
 if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
     print("recorded:", daemon(binary))
     print("recovered:", killed(binary))
-    may = subprocess.run(["unshare", "--mount", "--map-root-user", "true"], capture_output=True)
-    if may.returncode == 0:
-        full(binary)
-        print("a full disk: the recording stops and goes on")
-    else:
-        print("skipped: a full disk: no mount namespaces here")

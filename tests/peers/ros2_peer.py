@@ -11,13 +11,11 @@ and the recording; the node and its topics are in ROS's own discovery; a frozen 
 event, nor the stop its second.
 """
 
-import json
 import math
 import os
 import pathlib
 import re
 import struct
-import subprocess
 import sys
 import time
 
@@ -290,8 +288,7 @@ def discovered(participant):
 
 
 FROZEN = """
-import sys, time
-sys.path.insert(0, sys.argv[1])
+import time
 from ros2_peer import DOMAIN, readers
 from cyclonedds.domain import DomainParticipant
 topics = readers(DomainParticipant(DOMAIN), "/tactile/forearm")
@@ -306,11 +303,7 @@ def a_frozen_reader(binary):
     with Bench(binary, frame_rate_hz=100, more=table()) as bench:
         daemon = bench.daemon()
         bench.sensor("forearm", "--force", "15", "--baud", "921600")
-        here = os.path.dirname(os.path.abspath(__file__))
-        peer = subprocess.Popen([sys.executable, "-c", FROZEN, here], stdout=subprocess.PIPE, text=True)
-        bench.processes.append(peer)
-        assert peer.stdout.readline() == "there\n"
-        return bench.freeze(peer, daemon)
+        return bench.freeze(daemon, FROZEN)
 
 
 if __name__ == "__main__":

@@ -15,19 +15,16 @@ import json
 import os
 import queue
 import socket
-import subprocess
 import sys
 import time
 
 import zenoh
-from bench import Arm, Bench, arm_reached_the_press, wait_for
+from bench import Arm, Bench, an_address_in_use, arm_reached_the_press, free_port, wait_for
 from mcap_ros2.reader import read_ros2_messages
 
 
 def free():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def session(connect=(), listen=()):
@@ -171,7 +168,6 @@ def an_arm(binary):
 
 FROZEN = """
 import sys, time
-sys.path.insert(0, sys.argv[2])
 from zenoh_peer import session
 peer = session(connect=[sys.argv[1]])
 subscriber = peer.declare_subscriber("tactile/**", lambda sample: None)
@@ -185,12 +181,6 @@ def a_frozen_peer(binary):
     more = f'[publish.zenoh]\nlisten = ["{endpoint}"]\n'
     with Bench(binary, frame_rate_hz=100, more=more) as bench:
         daemon = bench.daemon()
-        here = os.path.dirname(os.path.abspath(__file__))
-        peer = subprocess.Popen(
-            [sys.executable, "-c", FROZEN, endpoint, here], stdout=subprocess.PIPE, text=True
-        )
-        bench.processes.append(peer)
-        assert peer.stdout.readline() == "there\n"
         bench.sensor("forearm", "--force", "15", "--baud", "921600")
         first = bench.tail("--types", "frame", "--count", "100", "--timeout", "60").communicate()[0]
         assert len(first.splitlines()) == 100
@@ -199,20 +189,7 @@ def a_frozen_peer(binary):
                 key = "tactile/arm-7/forearm/status"
                 answers = [json.loads(reply.ok.payload.to_string()) for reply in asker.get(key)]
                 assert [answer["state"] for answer in answers] == ["live"], answers
-        return bench.freeze(peer, daemon)
-
-
-def an_address_in_use(binary):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        with Bench(binary, more=f'[publish.zenoh]\nlisten = ["{endpoint}"]\n') as bench:
-            config = bench.path("hardnessd.toml")
-            run = subprocess.run([binary, "run", "--config", config], capture_output=True, text=True, timeout=30)
-    assert run.returncode == 74 and "publish.zenoh" in run.stderr, run
-    assert len(run.stderr.splitlines()) == 1, run.stderr
-    return run.stderr.strip()
+        return bench.freeze(daemon, FROZEN, endpoint)
 
 
 if __name__ == "__main__":
@@ -222,4 +199,4 @@ if __name__ == "__main__":
     a_router_that_comes_later(binary)
     print("a router that comes later is found")
     print("a frozen peer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_peer(binary))
-    print("an address in use:", an_address_in_use(binary))
+    print("an address in use:", an_address_in_use(binary, "publish.zenoh", '["tcp/127.0.0.1:{port}"]'))

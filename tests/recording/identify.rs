@@ -1,34 +1,28 @@
 //! References: made of recordings and of presses that are made now, judged with, and recorded.
 
-use std::fs::{self, Permissions};
-use std::io::{Read, Write};
-use std::net::TcpListener;
-use std::os::unix::fs::{PermissionsExt, symlink};
-use std::process::{Command, Output, Stdio};
+use std::fs;
+use std::process::{Command, Stdio};
 
-use crate::bench::{BINARY, Bench, Process, by_terminal, events, wait_for};
+use crate::bench::{BINARY, Bench, Process, by_terminal, events, ran, wait_for};
 use serde_json::{Value, json};
 
-/// Runs a command in the directory of the bench.
-fn run(bench: &Bench, arguments: &str) -> Output {
-    Command::new(BINARY)
+/// Runs a command in the directory of the bench. Returns exit code, stdout and stderr.
+fn run(bench: &Bench, arguments: &str) -> (i32, String, String) {
+    ran(Command::new(BINARY)
         .args(arguments.split_whitespace())
-        .current_dir(bench.path("."))
-        .output()
-        .unwrap()
+        .current_dir(bench.path(".")))
 }
 
 fn succeed(bench: &Bench, arguments: &str) -> String {
-    let output = run(bench, arguments);
-    assert!(output.status.success(), "{arguments}: {output:?}");
-    String::from_utf8(output.stdout).unwrap()
+    let (code, printed, message) = run(bench, arguments);
+    assert_eq!(code, 0, "{arguments}: {message}");
+    printed
 }
 
 /// What a refused command says, and its exit code.
 fn refused(bench: &Bench, arguments: &str) -> (String, i32) {
-    let output = run(bench, arguments);
-    let message = String::from_utf8(output.stderr).unwrap();
-    (message, output.status.code().unwrap())
+    let (code, _, message) = run(bench, arguments);
+    (message, code)
 }
 
 /// The final verdicts of a replay.
@@ -98,7 +92,7 @@ fn references_of_raw_bytes_are_judged_with_and_change_verdicts() {
     );
     assert!(text.contains("without the arm's approach 2:"), "{text}");
     let with = finals(&bench, "wood.bin --config hardnessd.toml");
-    assert_eq!(with[0]["references"], "both");
+    assert_eq!(with[0]["references"], "rigid+labelled");
 }
 
 #[test]
@@ -112,6 +106,7 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
     let before = fs::read(bench.path("r.npz")).unwrap();
     fs::write(bench.path("text.npz"), "no references").unwrap();
     fs::write(bench.path("still.bin"), vec![0; 10]).unwrap();
+    let here = "no/where.npz: the directory no does not exist";
     for (arguments, expected, code) in [
         (
             "--out r.npz --as ball:10 wood.bin",
@@ -145,7 +140,7 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         ),
         (
             "--out n.npz --as flat:20 still.bin",
-            "still.bin: no whole frame in 10 bytes",
+            "still.bin: no whole frame",
             1,
         ),
         (
@@ -154,17 +149,8 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
             2,
         ),
         ("--out n.npz", "--as: found nothing", 2),
-        (
-            "--out no/where.npz --as flat:20 wood.bin",
-            "no/where.npz: the directory no does not exist",
-            74,
-        ),
         // It says so before anything is pressed, and here before it finds that there is no sensor.
-        (
-            "--out no/where.npz --as flat:20",
-            "no/where.npz: the directory no does not exist",
-            74,
-        ),
+        ("--out no/where.npz --as flat:20", here, 74),
     ] {
         let (message, found) = refused(&bench, &format!("{identify} {arguments}"));
         assert!(message.contains(expected), "{arguments}: {message}");
@@ -185,89 +171,6 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
         "{message}"
     );
     assert_eq!(code, 78);
-}
-
-#[test]
-fn presses_after_those_that_were_asked_for_do_not_count() {
-    let bench = bench();
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = format!("tcp://{}", listener.local_addr().unwrap());
-    let config = SENSOR.replace("port = \"port\"", &format!("port = \"{port}\""));
-    assert!(config.contains(&port), "{config}");
-    let sockets = "[publish.unix]\npath = \"events.sock\"\n";
-    fs::write(bench.path("tcp.toml"), config + sockets).unwrap();
-    // The arm goes on at once, and presses twenty times in all.
-    let bytes = fs::read(bench.path("wood.bin")).unwrap().repeat(10);
-    let pressing = std::thread::spawn(move || {
-        let (mut peer, _) = listener.accept().unwrap();
-        // The connection stays open until the command has ended.
-        (peer.write_all(&bytes).is_ok(), peer)
-    });
-    let identify = "identify --config tcp.toml --out r.npz --as flat:20 --presses 3";
-    let text = succeed(&bench, identify);
-    assert!(text.contains("rigid flat piece 3,"), "{text}");
-    assert!(pressing.join().unwrap().0);
-}
-
-/// A pipe is there, and nobody writes to it.
-#[test]
-fn a_pipe_is_no_file_of_references() {
-    let bench = bench();
-    bench.fifo("pipe.npz");
-    for (append, expected) in [
-        (None, "pipe.npz exists already"),
-        (Some("--append"), "pipe.npz: found no file"),
-    ] {
-        let identify = "identify --config plain.toml --out pipe.npz --as ball:10 wood.bin";
-        let child = Command::new(BINARY)
-            .args(identify.split_whitespace().chain(append))
-            .current_dir(bench.path("."))
-            .stderr(Stdio::piped())
-            .spawn();
-        let mut identify = Process(child.unwrap());
-        assert_eq!(identify.exit_code(), Some(74));
-        let mut message = String::new();
-        let mut stderr = identify.0.stderr.take().unwrap();
-        stderr.read_to_string(&mut message).unwrap();
-        assert!(message.contains(expected), "{message}");
-    }
-}
-
-#[test]
-fn calls_that_add_at_once_take_nothing_from_each_other() {
-    let bench = bench();
-    let (link, file) = (bench.path("r.npz"), bench.path("own.npz"));
-    let pipe = bench.fifo("pipe");
-    let append = "identify --config plain.toml --append --out r.npz";
-    for expected in [2, 4] {
-        let mut slow = Command::new(BINARY);
-        slow.args(append.split_whitespace())
-            .args(["--as", "flat:20", "pipe"])
-            .current_dir(bench.path("."))
-            .stdout(Stdio::piped());
-        let slow = slow.spawn().unwrap();
-        // This waits until the first call reads. By then it has looked at the file.
-        let mut bytes = fs::File::options().write(true).open(&pipe).unwrap();
-        succeed(&bench, &format!("{append} --as level:1 wood.bin"));
-        if !file.exists() {
-            // From now on the file lies elsewhere, and only its owner may read it.
-            fs::rename(&link, &file).unwrap();
-            symlink(&file, &link).unwrap();
-            let only_own = Permissions::from_mode(0o600);
-            fs::set_permissions(&file, only_own).unwrap();
-        }
-        bytes
-            .write_all(&fs::read(bench.path("wood.bin")).unwrap())
-            .unwrap();
-        drop(bytes);
-        let output = slow.wait_with_output().unwrap();
-        let text = String::from_utf8(output.stdout).unwrap();
-        let all = format!("rigid flat piece {expected}, rigid ball 0, known hardness {expected}");
-        assert!(output.status.success() && text.contains(&all), "{text}");
-        assert_eq!(fs::read_link(&link).unwrap(), file);
-        let mode = fs::metadata(&file).unwrap().permissions().mode();
-        assert_eq!(mode & 0o777, 0o600);
-    }
 }
 
 #[test]
@@ -343,4 +246,35 @@ fn a_recording_keeps_the_references_that_presses_of_now_gave() {
     let hrn = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
     let other = finals(&bench, &format!("take.mcap --model {hrn}"));
     assert_eq!(other[0]["references"], "none");
+}
+
+#[test]
+fn references_that_make_verdicts_worse_are_not_used_and_everybody_says_so() {
+    let bench = bench();
+    let simulate = |seed: u32, presses: u32, to: &str| {
+        let piece = format!("--piece flat:20 --seed {seed} --presses {presses} --to {to}");
+        succeed(&bench, &format!("simulate --fps 20 {piece}"));
+    };
+    simulate(6, 8, "flat.bin");
+    simulate(5, 20, "again.bin");
+    let identify = "identify --config hardnessd.toml --out r.npz --as flat:20 flat.bin";
+    let text = succeed(&bench, identify);
+    assert!(text.contains("the daemon will not use them"), "{text}");
+    let (code, _, warnings) = run(&bench, "check --config hardnessd.toml");
+    assert!(code == 0 && warnings.contains("sensor.references of \"forearm\": not used"));
+
+    // The piece is pressed again: verdicts are those without the file, and none is wrong.
+    let without = finals(&bench, "again.bin --config plain.toml");
+    let with = finals(&bench, "again.bin --config hardnessd.toml");
+    assert_eq!(with.len(), 20);
+    let ignored = json!("references_ignored");
+    let notes = |event: &Value| event["notes"].as_array().unwrap().clone();
+    for (without, with) in without.iter().zip(&with) {
+        assert_eq!(with["probabilities"], without["probabilities"]);
+        assert_ne!(
+            notes(with).contains(&ignored),
+            notes(without).contains(&ignored)
+        );
+        assert!(with["level"].is_null() || with["level"] == 1, "{with}");
+    }
 }

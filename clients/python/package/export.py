@@ -1,6 +1,7 @@
 """Recordings as tables (Parquet), or as a data set of LeRobot (v3.0).
 
     python3 -m hardnessd.export take.mcap --to parquet --out tables
+    python3 -m hardnessd.export takes/*.mcap --to parquet --partition --append --skip-damaged --out tables
     python3 -m hardnessd.export takes/*.mcap --to lerobot --episodes presses --out presses
 
 It reads one recording after another, and holds a bounded part of one in memory.
@@ -12,11 +13,13 @@ from __future__ import annotations
 
 import argparse
 import collections
+import datetime
 import json
 import os
 import pathlib
 import signal
 import sys
+import urllib.parse
 from typing import Any, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Sequence, Tuple
 
 import numpy as np
@@ -115,6 +118,7 @@ TABLES: Dict[str, pa.Schema] = {
             ("course", pa.string()),
             ("stiffness_n_per_mm", pa.float64()),
             ("references", pa.string()),
+            ("advice", pa.string()),
             (
                 "object",
                 pa.struct(
@@ -142,12 +146,12 @@ class Problem(Exception):
 
 
 class Output:
-    """A new folder, and what was made in it: on an error exactly that is removed again."""
+    """A folder, and what was made in it: on an error exactly that is removed again."""
 
-    def __init__(self, folder: pathlib.Path) -> None:
+    def __init__(self, folder: pathlib.Path, append: bool = False) -> None:
         self.folder = folder
         self._made: List[pathlib.Path] = []
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not append)):
             raise Problem(f"{folder}: it exists and is not an empty folder: name a new one", 74)
         self._make(folder)
 
@@ -174,38 +178,57 @@ class Output:
 
 
 class Tables:
-    """The tables of TABLES, a file each."""
+    """The tables of TABLES: a file each, or with `--partition` a file of each recording."""
 
-    def __init__(self, output: Output) -> None:
+    def __init__(self, output: Output, options: argparse.Namespace) -> None:
+        self._output = output
+        self._is_parted: bool = options.partition
         self._rows: Dict[str, List[Dict[str, Any]]] = {name: [] for name in TABLES}
         self._counts = dict.fromkeys(TABLES, 0)
-        self._writers = {
-            name: pq.ParquetWriter(output.path(f"{name}.parquet"), schema, compression="zstd")
-            for name, schema in TABLES.items()
-        }
+        self._writers: Dict[str, pq.ParquetWriter] = {}
+        # The folder of a partition says the robot.
+        self._schemas = dict(TABLES)
+        if self._is_parted:
+            columns = TABLES["recording"]
+            self._schemas["recording"] = columns.remove(columns.get_field_index("robot"))
+
+    def _begin(self, name: str, take: recording.Recording) -> bool:
+        """Opens the files of a recording. Returns whether they are new."""
+        folder, file = "", ""
+        if self._is_parted:
+            first = next(take._messages(["input", "frame", "contact", "press", "hardness", "status"]), None)
+            day = datetime.datetime.fromtimestamp(first[2] / 1e9 if first else 0, datetime.timezone.utc)
+            robot = urllib.parse.quote(take.about.get("robot", "unknown"), safe=" ")
+            folder = f"robot={robot}/date={day:%Y-%m-%d}/"
+            file = pathlib.PurePath(name).as_posix().replace("/", "_").removesuffix(".mcap")
+        elif self._writers:
+            return True
+        for table, schema in self._schemas.items():
+            path = f"{table}/{folder}{file}.parquet" if self._is_parted else f"{table}.parquet"
+            if (self._output.folder / path).exists():
+                return False
+            self._writers[table] = pq.ParquetWriter(self._output.path(path), schema, compression="zstd")
+        return True
 
     def add(self, name: str, take: recording.Recording) -> None:
-        self._row(
-            "recording",
-            recording=name,
-            labels=list(take.labels.items()),
-            sensors=json.dumps(take.sensors),
-            **{key: take.about.get(key) for key in ("robot", "run", "version")},
-        )
-        # A frame is followed by its contact, which has its number.
-        frames: Dict[str, Any] = {}
-        for sensor, topic, time_ns, message in take._messages(["frame", "contact", "motion", "press", "hardness"]):
+        if not self._begin(name, take):
+            print(f"{take.path}: it is there already", file=sys.stderr)
+            return
+        about = {key: take.about.get(key) for key in ("robot", "run", "version")}
+        settings = json.dumps(take.sensors)
+        self._row("recording", recording=name, labels=list(take.labels.items()), sensors=settings, **about)
+        for sensor, topic, time_ns, message in take.joined(["motion", "press", "hardness"]):
             time_us = time_ns // 1000
             place = {"recording": name, "sensor": sensor, "time": time_us}
-            if topic == "frame":
-                frames[sensor] = message
-            elif topic == "contact":
-                frame, number = frames[sensor], message.frame
-                approach = {"approach_mm": recording._value("approach_mm", message)}
-                fields = ("frame", "force_n", "contact_area_taxels", "tared")
-                self._row("contact", **place, **approach, **{key: getattr(message, key) for key in fields})
-                grid = {"rows": frame.height, "cols": frame.width}
-                self._row("frames", **place, **grid, frame=number, newtons=_newtons(frame).ravel())
+            if topic == "touch":
+                frame, contact = message
+                number = None if contact is None else contact.frame
+                if contact is not None:
+                    fields = ("frame", "force_n", "contact_area_taxels", "approach_mm", "tared")
+                    self._row("contact", **place, **{key: recording._value(key, contact) for key in fields})
+                if frame is not None:
+                    grid = {"rows": frame.height, "cols": frame.width}
+                    self._row("frames", **place, **grid, frame=number, newtons=_newtons(frame).ravel())
             elif topic == "motion":
                 for at_ns, mm in zip(message.at_ns, message.approach_mm):
                     then = {**place, "time": time_us + (at_ns - message.mono_ns) // 1000}
@@ -215,6 +238,8 @@ class Tables:
                 if event["context"] is not None:
                     event["context"] = json.dumps(event["context"])
                 self._row(topic, **{**event, **place})
+        if self._is_parted:
+            self.close()
 
     def _row(self, name: str, **row: Any) -> None:
         self._rows[name].append(row)
@@ -222,7 +247,7 @@ class Tables:
             self._write(name)
 
     def _write(self, name: str) -> None:
-        self._writers[name].write_table(pa.Table.from_pylist(self._rows[name], schema=TABLES[name]))
+        self._writers[name].write_table(pa.Table.from_pylist(self._rows[name], schema=self._schemas[name]))
         self._counts[name] += len(self._rows[name])
         self._rows[name].clear()
 
@@ -231,6 +256,7 @@ class Tables:
             if self._rows[name]:
                 self._write(name)
             writer.close()
+        self._writers.clear()
 
     def summary(self) -> str:
         return "rows: " + ", ".join(f"{name} {count}" for name, count in self._counts.items())
@@ -333,7 +359,10 @@ class LeRobot:
             raise Problem(f"{take.path}: it has no sensor {wanted!r}, only {', '.join(take.sensors)}")
         for frame in take.frames():
             if frame.sensor == wanted:
-                return Sensor(wanted, frame.rows, frame.cols, take.sensors[wanted]["frame_rate_hz"])
+                rate = take.sensors[wanted].get("frame_rate_hz")
+                if rate is None:
+                    raise Problem(f"{take.path}: it lacks the settings of {wanted}, and so its frame rate")
+                return Sensor(wanted, frame.rows, frame.cols, rate)
         return None
 
     def _begin(self, name: str, sensor: Sensor) -> None:
@@ -482,16 +511,13 @@ def _rows(
 ) -> Iterator[Tuple[str, Any]]:
     """In the order of time: ("row", Row) of each frame after a tare, ("press", message), ("final", event), and
     ("gone", None) where the sensor was stale or lost."""
-    frame: Any = None
     # A verdict is in the recording at the time of its frame, and is known only later.
     coming: List[Tuple[int, Dict[str, Any]]] = []
     last: Optional[Tuple[int, Dict[str, Any]]] = None
-    for name, topic, time_ns, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
+    for name, topic, time_ns, message in take.joined(["press", "hardness", "status"]):
         if name != sensor.name:
             continue
-        if topic == "frame":
-            frame = message
-        elif topic == "press":
+        if topic == "press":
             yield "press", message
         elif topic == "status":
             if message.state != "live":
@@ -502,7 +528,8 @@ def _rows(
             coming.append((time_ns + int(age_ms * 1e6), event))
             if event["phase"] == "final":
                 yield "final", event
-        elif message.tared:
+        elif None not in message and message.contact.tared:
+            frame, contact = message
             if (frame.height, frame.width) != (sensor.rows, sensor.cols):
                 raise Problem(f"{take.path}: found a frame of {frame.height}x{frame.width} taxels, expected {sensor}")
             known = [verdict for verdict in coming if verdict[0] <= time_ns]
@@ -511,9 +538,10 @@ def _rows(
             verdict = last and observation.Verdict(
                 last[1]["level"], last[1]["confidence"], (time_ns - last[0]) / 1e9
             )
-            approach = recording._value("approach_mm", message)
-            area = message.contact_area_taxels
-            yield "row", Row(message.frame, time_ns, observation.values(keys, _newtons(frame), area, approach, verdict))
+            approach = recording._value("approach_mm", contact)
+            touched = (contact.force_n, contact.contact_area_taxels)
+            values = observation.values(keys, _newtons(frame), *touched, approach, verdict)
+            yield "row", Row(contact.frame, time_ns, values)
 
 
 def _whole(found: Iterator[Tuple[str, Any]]) -> Iterator[Episode]:
@@ -589,22 +617,43 @@ def _column(values: Array) -> pa.Array:
     return pa.ListArray.from_arrays(np.arange(0, count * rows + 1, rows, dtype=np.int32), inner)
 
 
+LEFT_OUT = "left-out.tsv"
+"""The file that names the recordings that `--skip-damaged` left out, and why."""
+
+
 def export(paths: Sequence[str], options: argparse.Namespace) -> str:
-    """Writes the recordings into the new folder `options.out`. Returns what is in it, in words."""
-    for path in paths:
+    """Writes the recordings into the folder `options.out`. Returns what is in it, in words."""
+    # Two folders may have a recording of the same name.
+    names = [os.path.basename(path) for path in paths]
+    names = names if len(set(names)) == len(names) else list(paths)
+    taken, left_out = [], []
+    for path, name in zip(paths, names):
         # A bad file among many is named at once, not after an hour.
-        recording.open(path).close()
-    output = Output(pathlib.Path(options.out))
+        try:
+            with recording.open(path) as take:
+                if options.skip_damaged:
+                    take.check()
+                for lack in take.lacks:
+                    print(f"{path}: another program has changed this recording. It lacks {lack}", file=sys.stderr)
+            taken.append((path, name))
+        except recording.Damaged as error:
+            if not options.skip_damaged:
+                raise
+            print(error, file=sys.stderr)
+            left_out.append((path, str(error)))
+    output = Output(pathlib.Path(options.out), options.append)
     try:
-        writer = LeRobot(output, options) if options.to == "lerobot" else Tables(output)
-        # Two folders may have a recording of the same name.
-        names = [os.path.basename(path) for path in paths]
-        names = names if len(set(names)) == len(names) else list(paths)
-        for path, name in zip(paths, names):
+        writer = LeRobot(output, options) if options.to == "lerobot" else Tables(output, options)
+        for path, name in taken:
             with recording.open(path) as take:
                 writer.add(name, take)
         writer.close()
-        return writer.summary()
+        if left_out:
+            lines = "".join(f"{path}\t{why}\n" for path, why in left_out)
+            with open(output.path(LEFT_OUT), "a") as file:
+                file.write(lines)
+        counted = f"; {len(left_out)} recordings left out, see {LEFT_OUT}" if left_out else ""
+        return writer.summary() + counted
     except BaseException:
         output.remove()
         raise
@@ -627,6 +676,18 @@ def _arguments() -> argparse.ArgumentParser:
     parser.add_argument("file", nargs="+", help="recording (.mcap)")
     parser.add_argument("--to", choices=("parquet", "lerobot"), required=True)
     parser.add_argument("--out", required=True, metavar="DIR", help="new or empty folder")
+    parser.add_argument(
+        "--skip-damaged", action="store_true", help=f"go on past a damaged recording, and list it in {LEFT_OUT}"
+    )
+    parquet = parser.add_argument_group("for --to parquet")
+    parquet.add_argument(
+        "--partition",
+        action="store_true",
+        help="a file of each recording, in folders robot=NAME/date=YYYY-MM-DD of each table",
+    )
+    parquet.add_argument(
+        "--append", action="store_true", help="with --partition: add to the folder the recordings that it lacks"
+    )
     lerobot = parser.add_argument_group("for --to lerobot")
     lerobot.add_argument(
         "--episodes",
@@ -656,6 +717,10 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     parser = _arguments()
     options = parser.parse_args(arguments)
     options.key = dict(options.key)
+    if options.partition and options.to != "parquet":
+        parser.error("--partition: tables have partitions, and --to lerobot has none")
+    if options.append and not options.partition:
+        parser.error("--append: it needs --partition")
     try:
         observation.keys_of("sensor", options.key)
     except ValueError as error:

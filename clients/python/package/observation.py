@@ -70,6 +70,7 @@ def features(keys: Mapping[str, str], rows: int, cols: int) -> Dict[str, Dict[st
 def values(
     keys: Mapping[str, str],
     newtons: Array,
+    force_n: float,
     contact_area_taxels: int,
     approach_mm: Optional[float],
     verdict: Optional[Verdict],
@@ -84,7 +85,7 @@ def values(
     if verdict is None or verdict.age_s >= LONGEST_VERDICT_AGE_S:
         verdict = Verdict(None, 0.0, LONGEST_VERDICT_AGE_S)
     numbers: Dict[str, float] = {
-        "force_n": float(newtons.sum(dtype=np.float64)),
+        "force_n": force_n,
         "contact_area_taxels": contact_area_taxels,
         "approach_mm": approach_mm if known and approach_mm is not None else 0.0,
         "approach_known": float(known),

@@ -20,11 +20,12 @@ from __future__ import annotations
 import array
 import builtins
 import contextlib
+import itertools
 import json
 import math
 import os
 import sys
-from typing import Any, Dict, Iterator, List, NamedTuple, Sequence, Tuple, Union, cast
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union, cast
 
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -40,10 +41,12 @@ _NULL: Dict[str, Union[int, str, bytes]] = {
     "label": "",
     "rejected": "",
     "reason": "",
+    "detail": "",
     "context": "",
     "mono_ns": 0,
     "levels": b"",
     "course": "",
+    "advice": "",
     "object": "",
 }
 
@@ -51,8 +54,9 @@ _NULL: Dict[str, Union[int, str, bytes]] = {
 # The first bytes of an MCAP file.
 _MAGIC = b"\x89MCAP0\r\n"
 
-# The constant BYTES of tactile_interfaces/msg/Input.
+# Constants of tactile_interfaces/msg/Input.
 _BYTES = 0
+_STATE = 9
 
 
 class Frame(NamedTuple):
@@ -65,6 +69,8 @@ class Frame(NamedTuple):
     """rows x cols newtons, row by row. numpy.asarray(newtons).reshape(rows, cols) makes an image of it."""
     rows: int
     cols: int
+    number: Optional[int]
+    """The frame's number, as in events. None if the recording lacks its contact."""
 
 
 class Chunk(NamedTuple):
@@ -76,6 +82,23 @@ class Chunk(NamedTuple):
     mono_ns: int
     """The same by CLOCK_MONOTONIC."""
     data: bytes
+
+
+class _Found(NamedTuple):
+    """A message."""
+
+    sensor: str
+    topic: str
+    time_ns: int
+    sequence: int
+    message: Any
+
+
+class Touch(NamedTuple):
+    """A frame and its contact, joined by sensor and time. One of them may be missing, but not both."""
+
+    frame: Any
+    contact: Any
 
 
 class Damaged(ValueError):
@@ -96,21 +119,46 @@ class Recording:
                 self._reader = make_reader(
                     self._file, validate_crcs=True, decoder_factories=[DecoderFactory()]
                 )
-                records = [(found.name, dict(found.metadata)) for found in self._reader.iter_metadata()]
-                sensors = [found for name, found in records if name == "hardnessd.sensor"]
-                settings = {found["name"]: json.loads(found["settings"]) for found in sensors}
-            named = dict(records)
-            if "hardnessd.recording" not in named:
+                metadata = [(found.name, dict(found.metadata)) for found in self._reader.iter_metadata()]
+                summary = self._reader.get_summary()
+                topics = [channel.topic.split("/") for channel in summary.channels.values()] if summary else []
+            named = dict(metadata)
+            names = {topic[2]: None for topic in topics if len(topic) == 4 and topic[1] == "tactile"}
+            if "hardnessd.recording" not in named and not names:
                 raise ValueError(f"{self.path}: a recording, but none of hardnessd")
+            sensors = [found for name, found in metadata if name == "hardnessd.sensor"]
+            settings = {found["name"]: json.loads(found["settings"]) for found in sensors}
+            self.sensors: Dict[str, Dict[str, Any]] = settings
+            """Settings of each sensor. Empty for a sensor whose settings the recording lacks."""
+            self.about: Dict[str, str] = named.get("hardnessd.recording", {})
+            """robot, run, boot_id, version. Empty if the recording lacks them."""
+            self.labels: Dict[str, str] = named.get("hardnessd.labels", {})
+            """What was given with `record --label`."""
+            self.lacks: List[str] = []
+            """What another program has taken from the recording, in words."""
+            if not self.about:
+                self._restore([*names, *(name for name in settings if name not in names)])
+            written = {topic[3] for topic in topics if len(topic) == 4}
+            if ("frame" in written) != ("contact" in written):
+                self.lacks.append("contacts, so its frames have no numbers" if "frame" in written else "frames")
         except BaseException:
             self._file.close()
             raise
-        self.about: Dict[str, str] = named["hardnessd.recording"]
-        """robot, run, boot_id, version."""
-        self.labels: Dict[str, str] = named.get("hardnessd.labels", {})
-        """What was given with `record --label`."""
-        self.sensors: Dict[str, Dict[str, Any]] = settings
-        """Settings of each sensor."""
+
+    def _restore(self, names: List[str]) -> None:
+        """What the metadata said, as far as the states of the sensors say it too."""
+        self.lacks.append("metadata: robot, run and version")
+        for name in names:
+            with self._reading():
+                inputs = self._reader.iter_decoded_messages([f"/tactile/{name}/input"])
+                state = next((bytes(found[3].data) for found in inputs if found[3].kind == _STATE), None)
+            if state is None:
+                self.sensors.setdefault(name, {})
+                self.lacks.append(f"the settings and labels of {name}")
+            else:
+                known = json.loads(state)
+                self.sensors[name] = known["sensor"]
+                self.labels = self.labels or known["labels"]
 
     def __enter__(self) -> Recording:
         return self
@@ -133,11 +181,36 @@ class Recording:
 
     def frames(self) -> Iterator[Frame]:
         """Frames after tare, in the order of time."""
-        for sensor, _, time_ns, message in self._messages(["frame"]):
-            newtons = array.array("f", bytes(message.data))
-            if sys.byteorder == "big":
-                newtons.byteswap()
-            yield Frame(sensor, time_ns, newtons, message.height, message.width)
+        for sensor, _, time_ns, (frame, contact) in self.joined([]):
+            if frame is not None:
+                newtons = array.array("f", bytes(frame.data))
+                if sys.byteorder == "big":
+                    newtons.byteswap()
+                number = None if contact is None else contact.frame
+                yield Frame(sensor, time_ns, newtons, frame.height, frame.width, number)
+
+    def joined(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, int, Any]]:
+        """Sensor, topic, nanoseconds since 1970, and message, in the order of time. A frame and its contact come as
+        one Touch, with the topic `touch`, before the other topics of their moment.
+
+        A frame has no number of its own, and its contact has one. Both have the same time, and where frames of one
+        moment are several, their order in the recording is that of their numbers.
+        """
+        found = self._records(["frame", "contact", *topics])
+        for time_ns, same in itertools.groupby(found, key=lambda one: one.time_ns):
+            moment = list(same)
+            for sensor in dict.fromkeys(one.sensor for one in moment):
+                of = {topic: [one for one in moment if (one.sensor, one.topic) == (sensor, topic)] for topic in ("frame", "contact")}
+                frames = sorted(of["frame"], key=lambda one: one.sequence)
+                contacts = sorted(of["contact"], key=lambda one: one.message.frame)
+                if frames and contacts and len(frames) != len(contacts):
+                    counts = f"{len(frames)} frames and {len(contacts)} contacts of {sensor} at one moment"
+                    raise Damaged(f"{self.path}: {counts}: another program has changed this recording")
+                for frame, contact in itertools.zip_longest(frames, contacts):
+                    yield sensor, "touch", time_ns, Touch(frame and frame.message, contact and contact.message)
+            for one in moment:
+                if one.topic not in ("frame", "contact"):
+                    yield one.sensor, one.topic, time_ns, one.message
 
     def chunks(self) -> Iterator[Chunk]:
         """The bytes that came from the sensors, as they were read, in the order of time."""
@@ -145,8 +218,20 @@ class Recording:
             if message.kind == _BYTES:
                 yield Chunk(sensor, time_ns, message.mono_ns, bytes(message.data))
 
+    def check(self) -> None:
+        """Reads the whole recording. Raises Damaged if it is not whole."""
+        with self._reading():
+            for _ in self._reader.iter_messages():
+                pass
+        for _ in self._records(["status"]):
+            pass
+
     def _messages(self, topics: Sequence[str]) -> Iterator[Tuple[str, str, int, Any]]:
         """Sensor, topic, nanoseconds since 1970, and message."""
+        for found in self._records(topics):
+            yield found.sensor, found.topic, found.time_ns, found.message
+
+    def _records(self, topics: Sequence[str]) -> Iterator[_Found]:
         names = [f"/tactile/{sensor}/{topic}" for sensor in self.sensors for topic in topics]
         count = 0
         with self._reading():
@@ -154,7 +239,7 @@ class Recording:
                 _, _, sensor, topic = channel.topic.split("/")
                 count += 1
                 # MCAP's own time goes on after 2038, where a ROS header ends, but does not know the time before 1970.
-                yield sensor, topic, record.log_time or _time_ns(message), message
+                yield _Found(sensor, topic, record.log_time or _time_ns(message), record.sequence, message)
             # The library takes a chunk of zeros, as a power failure leaves it, for an empty one.
             summary = self._reader.get_summary()
             if summary is not None and summary.statistics is not None:

@@ -90,7 +90,8 @@ class Log:
         if event["type"] == "frame":
             newtons = np.array(event["newtons"], np.float32).reshape(event["rows"], event["cols"])
             time_ns = _time_ns(event["time"])
-            self.frame(event["sensor"], time_ns, newtons, event["contact_area_taxels"], event["approach_mm"])
+            touched = (event["force_n"], event["contact_area_taxels"], event["approach_mm"])
+            self.frame(event["sensor"], time_ns, newtons, *touched)
         elif event["type"] == "hardness":
             age_ms = event["age_at_publish_ms"] or 0.0
             self._at(_time_ns(event["time"]) + int(age_ms * 1e6))
@@ -115,13 +116,20 @@ class Log:
             self._text("daemon", "connection", event)
 
     def frame(
-        self, sensor: str, time_ns: int, newtons: Any, contact_area_taxels: int, approach_mm: Optional[float]
+        self,
+        sensor: str,
+        time_ns: int,
+        newtons: Any,
+        force_n: Optional[float],
+        contact_area_taxels: int,
+        approach_mm: Optional[float],
     ) -> None:
-        """One frame, with shape [rows, cols]."""
+        """One frame, with shape [rows, cols]. Before the first tare it has no force."""
         self._at(time_ns)
         picture = rr.DepthImage(newtons, meter=1.0, colormap="inferno", depth_range=[0, BRIGHTEST_N])
         self._stream.log(f"{sensor}/frame", picture)
-        self._stream.log(f"{sensor}/force_n", rr.Scalars(float(newtons.sum(dtype=np.float64))))
+        if force_n is not None:
+            self._stream.log(f"{sensor}/force_n", rr.Scalars(force_n))
         self._stream.log(f"{sensor}/contact_area_taxels", rr.Scalars(contact_area_taxels))
         if approach_mm is not None:
             self._stream.log(f"{sensor}/approach_mm", rr.Scalars(approach_mm))
@@ -150,15 +158,15 @@ def log_recording(take: recording.Recording, log: Log) -> None:
     known = range(1, max((level or 0 for level in labels), default=0) + 1)
     levels = [{"level": level, "label": labels.get(level) or f"level {level}"} for level in known]
     log.begin(list(take.sensors), levels, live=False)
-    frames: Dict[str, Any] = {}
-    for sensor, topic, time_ns, message in take._messages(["frame", "contact", "press", "hardness", "status"]):
-        if topic == "frame":
-            frames[sensor] = message
-        elif topic == "contact":
-            frame = frames[sensor]
-            newtons = np.frombuffer(bytes(frame.data), "<f4").reshape(frame.height, frame.width)
-            approach_mm = recording._value("approach_mm", message)
-            log.frame(sensor, time_ns, newtons, message.contact_area_taxels, approach_mm)
+    for lack in take.lacks:
+        print(f"{take.path}: another program has changed this recording. It lacks {lack}", file=sys.stderr)
+    for sensor, topic, time_ns, message in take.joined(["press", "hardness", "status"]):
+        if topic == "touch":
+            if None not in message:
+                frame, contact = message
+                newtons = np.frombuffer(bytes(frame.data), "<f4").reshape(frame.height, frame.width)
+                force_n, approach_mm = (recording._value(key, contact) for key in ("force_n", "approach_mm"))
+                log.frame(sensor, time_ns, newtons, force_n, contact.contact_area_taxels, approach_mm)
         else:
             fields = {key: recording._value(key, message) for key in recording._fields(topic)}
             log.event(cast(hardnessd.Event, {"type": topic, **fields}))

@@ -30,21 +30,3 @@ pub fn viridis(share: f32) -> [u8; 3] {
         (a + rest * (b - a)).round() as u8
     })
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_share_between_two_colours_is_between_them() {
-        for (share, expected) in [
-            (-1.0, VIRIDIS[0]),
-            (0.0, VIRIDIS[0]),
-            (1.0 / 18.0, [70, 21, 102]),
-            (1.0, VIRIDIS[9]),
-            (2.0, VIRIDIS[9]),
-        ] {
-            assert_eq!(viridis(share), expected, "{share}");
-        }
-    }
-}

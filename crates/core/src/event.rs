@@ -4,6 +4,7 @@
 //! ever changes its meaning. The order of fields is part of the golden bytes. Nothing here decides
 //! anything: the pipeline fills events in, and the hub numbers and publishes them.
 
+mod number;
 mod reply;
 
 use std::time::Duration;
@@ -83,8 +84,10 @@ fn levels(value: &Value) -> usize {
 ///     time: jiff::Timestamp::UNIX_EPOCH,
 ///     state: LinkState::Live,
 ///     reason: None,
+///     detail: None,
 ///     frames: 41,
 ///     frames_damaged: 0,
+///     frames_dropped: 0,
 ///     bytes_skipped: 0,
 ///     frame_rate_hz: Some(5.0),
 /// });
@@ -228,11 +231,16 @@ pub struct Status {
     pub frames: u64,
     /// The number of damaged frames since the start.
     pub frames_damaged: u64,
+    /// The number of whole frames since the start that were dropped because the sensor sent more than
+    /// twice its rate. `frames` leaves them out.
+    pub frames_dropped: u64,
     /// The number of bytes since the start that belonged to no whole frame.
     pub bytes_skipped: u64,
     /// The frame rate over the last frames. Null before there are two.
     #[serde(serialize_with = "rounded_or_null")]
     pub frame_rate_hz: Option<f64>,
+    /// What was found and what to do, where the daemon knows more than the reason says.
+    pub detail: Option<String>,
 }
 
 /// The state of a press.
@@ -294,6 +302,16 @@ pub enum Rejection {
     Ambiguous,
 }
 
+/// What the robot may do to know more of an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Advice {
+    /// Nothing is known of the sensor, and the force was too small for a verdict. No level is named.
+    PressHarder,
+    /// The verdict is not sure, and another press of the object makes it surer.
+    PressAgain,
+}
+
 /// The source of the arm's approach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -323,6 +341,8 @@ pub enum Note {
     /// The model takes references, and the sensor has none: what the sensor reads of a known piece is
     /// unknown.
     NotIdentified,
+    /// The sensor has references, and they are not used: they make verdicts on themselves worse.
+    ReferencesIgnored,
 }
 
 /// A verdict.
@@ -337,7 +357,7 @@ pub enum Note {
 ///
 /// use hardnessd_core::event::{Event, Phase};
 /// use hardnessd_core::frame::Stamp;
-/// use hardnessd_core::pipeline::{Clock, Pipeline};
+/// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 /// use hardnessd_core::sensor::{Description, Sensor};
 /// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 ///
@@ -347,7 +367,8 @@ pub enum Note {
 ///     mono: Duration::ZERO,
 ///     wall: jiff::Timestamp::UNIX_EPOCH,
 /// };
-/// let events = pipeline.push(&std::fs::read("../../fixtures/foam.5hz.bin")?, at);
+/// let bytes = std::fs::read("../../fixtures/foam.5hz.bin")?;
+/// let events = pipeline.take(Input::Bytes(bytes.into()), at)?;
 /// let labels = events.iter().filter_map(|event| match event {
 ///     Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.label.as_deref(),
 ///     _ => None,
@@ -390,7 +411,7 @@ pub struct Hardness {
     /// The contact area of the chosen frame in mm2.
     #[serde(serialize_with = "rounded_3")]
     pub contact_area_mm2: f64,
-    /// The total force of the chosen frame in newtons.
+    /// The force of the contact in the chosen frame, in newtons.
     #[serde(serialize_with = "rounded_3")]
     pub force_n: f64,
     /// The first 12 hex digits of the model file's SHA-256.
@@ -417,6 +438,8 @@ pub struct Hardness {
     pub stiffness_n_per_mm: Option<f64>,
     /// The references of the sensor that the model was given.
     pub references: ReferenceKinds,
+    /// What the robot may do to know more; null if nothing.
+    pub advice: Option<Advice>,
     /// The verdict on the object that the context names, over all its presses so far; null if it
     /// names none.
     pub object: Option<ObjectVerdict>,
@@ -456,11 +479,14 @@ pub struct FrameEvent {
     pub rows: usize,
     /// The columns of the sensor's array.
     pub cols: usize,
-    /// `[rows, cols]` flattened, row-major, rounded to 0.001 N.
+    /// `[rows, cols]` flattened, row-major, rounded to 0.001 N. Noise makes some of them negative.
     #[serde(serialize_with = "millinewtons")]
     pub newtons: Vec<f32>,
     /// The number of taxels at or above the contact threshold.
     pub contact_area_taxels: u32,
+    /// The force of the contact in newtons; null until the first tare is taken.
+    #[serde(serialize_with = "rounded_or_null")]
+    pub force_n: Option<f64>,
     /// False until the first tare is taken: until then, `newtons` contain those of the unloaded
     /// sensor.
     pub tared: bool,
@@ -471,8 +497,7 @@ pub struct FrameEvent {
 }
 
 fn line<T: Serialize>(value: &T) -> String {
-    let mut text = serde_json::to_string(value)
-        .expect("plain structs of numbers and strings always serialise");
+    let mut text = number::json(value);
     text.push('\n');
     text
 }
@@ -486,11 +511,7 @@ pub fn name(state: &impl Serialize) -> String {
     }
 }
 
-/// The time by RFC 3339 in UTC with microseconds, so that every time has the same width.
-pub fn time_text(time: Timestamp) -> String {
-    format!("{time:.6}")
-}
-
+/// RFC 3339 in UTC with microseconds, so that every time has the same width.
 fn rfc3339<S: Serializer>(time: &Timestamp, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{time:.6}"))
 }
@@ -529,9 +550,9 @@ fn millionths<S: Serializer>(values: &[f32], serializer: S) -> Result<S::Ok, S::
     serializer.collect_seq(values.iter().map(|&value| round_6(value)))
 }
 
-/// Rounds to three digits.
+/// Rounds to three digits. There is no negative zero.
 pub fn round_3(value: f64) -> f64 {
-    (value * 1e3).round() / 1e3
+    (value * 1e3).round() / 1e3 + 0.0
 }
 
 /// Rounds to six digits. More would mean nothing: an f32 has seven, and a calibrated probability is

@@ -4,12 +4,14 @@
 //! with dead taxels replaced. Only `tare` makes a [`Frame`] from a [`RawFrame`], so raw counts
 //! cannot reach the press tracker.
 
+mod felt;
 pub mod sparse;
 
 use std::time::Duration;
 
-use serde::de::{SeqAccess, Visitor};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
+
+pub use self::felt::MARGIN_TAXELS;
 
 /// The most rows, and the most columns, of an array.
 pub const MOST_SIDE: usize = 64;
@@ -68,7 +70,8 @@ impl Array {
 /// assert_eq!(serde_json::to_string(&Pitch::square(3.5))?, "3.5");
 /// # Ok::<(), serde_json::Error>(())
 /// ```
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(into = "Written", from = "Written")]
 pub struct Pitch {
     /// The distance from row to row.
     pub rows_mm: f64,
@@ -76,53 +79,29 @@ pub struct Pitch {
     pub cols_mm: f64,
 }
 
-impl Serialize for Pitch {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Self { rows_mm, cols_mm } = self;
+/// A pitch as it is written.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected a number, or [rows, columns]")]
+enum Written {
+    Square(f64),
+    Both([f64; 2]),
+}
+
+impl From<Pitch> for Written {
+    fn from(Pitch { rows_mm, cols_mm }: Pitch) -> Self {
         if rows_mm == cols_mm {
-            rows_mm.serialize(serializer)
+            Self::Square(rows_mm)
         } else {
-            [rows_mm, cols_mm].serialize(serializer)
+            Self::Both([rows_mm, cols_mm])
         }
     }
 }
 
-impl<'de> Deserialize<'de> for Pitch {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(PitchVisitor)
-    }
-}
-
-/// Reads a number or a list of two. A derived reader of either would not say what it found.
-struct PitchVisitor;
-
-impl<'de> Visitor<'de> for PitchVisitor {
-    type Value = Pitch;
-
-    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("a number, or [rows, columns]")
-    }
-
-    fn visit_f64<E: serde::de::Error>(self, mm: f64) -> Result<Pitch, E> {
-        Ok(Pitch::square(mm))
-    }
-
-    fn visit_i64<E: serde::de::Error>(self, mm: i64) -> Result<Pitch, E> {
-        Ok(Pitch::square(mm as f64))
-    }
-
-    fn visit_u64<E: serde::de::Error>(self, mm: u64) -> Result<Pitch, E> {
-        Ok(Pitch::square(mm as f64))
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Pitch, A::Error> {
-        let mut mm = Vec::new();
-        while let Some(next) = list.next_element()? {
-            mm.push(next);
-        }
-        match mm[..] {
-            [rows_mm, cols_mm] => Ok(Pitch { rows_mm, cols_mm }),
-            _ => Err(serde::de::Error::invalid_length(mm.len(), &self)),
+impl From<Written> for Pitch {
+    fn from(written: Written) -> Self {
+        match written {
+            Written::Square(mm) => Self::square(mm),
+            Written::Both([rows_mm, cols_mm]) => Self { rows_mm, cols_mm },
         }
     }
 }
@@ -177,15 +156,16 @@ impl Default for Pitch {
 ///
 /// let array = Array { rows: 10, cols: 12 };
 /// let mut raw = RawFrame::zero(array);
-/// raw.counts[array.place(0, 0)] = 200;
-/// assert_eq!(format!("{raw:?}"), "RawFrame { array: 10x12, sum: 200, peak: Some(200) }");
+/// raw.counts[array.place(0, 0)] = 200.0;
+/// assert_eq!(format!("{raw:?}"), "RawFrame { array: 10x12, sum: 200.0, peak: 200.0 }");
 /// ```
-#[derive(Clone, PartialEq, Eq)]
+#[derive(Clone, PartialEq)]
 pub struct RawFrame {
     /// The size of the array.
     pub array: Array,
-    /// A count for each taxel, row-major.
-    pub counts: Box<[u16]>,
+    /// A count for each taxel, row-major: a finite number, which a sensor may write as a whole number,
+    /// with a sign, or as a float.
+    pub counts: Box<[f32]>,
 }
 
 impl RawFrame {
@@ -193,7 +173,7 @@ impl RawFrame {
     pub fn zero(array: Array) -> Self {
         Self {
             array,
-            counts: vec![0; array.taxels()].into(),
+            counts: vec![0.0; array.taxels()].into(),
         }
     }
 }
@@ -209,8 +189,8 @@ impl Default for RawFrame {
 /// assertion.
 impl std::fmt::Debug for RawFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let sum: u32 = self.counts.iter().map(|&count| u32::from(count)).sum();
-        let peak = self.counts.iter().max();
+        let sum: f32 = self.counts.iter().sum();
+        let peak = self.counts.iter().copied().fold(f32::MIN, f32::max);
         f.debug_struct("RawFrame")
             .field("array", &format_args!("{}", self.array))
             .field("sum", &sum)
@@ -241,7 +221,8 @@ impl std::fmt::Display for Array {
 pub struct Frame {
     /// The size of the array.
     pub array: Array,
-    /// The force on each taxel, row-major, in newtons; finite and not negative.
+    /// The force on each taxel, row-major, in newtons; finite. Noise makes some of an unloaded
+    /// sensor's taxels negative.
     pub newtons: Box<[f32]>,
 }
 
@@ -277,9 +258,29 @@ impl Frame {
         contact_area_taxels(&self.newtons, threshold_n)
     }
 
-    /// The total force in newtons. It is summed in f64, so the order of taxels makes no difference.
+    /// The sum of all taxels in newtons. It is summed in f64, so the order of taxels makes no
+    /// difference. The force of a contact is that of [`Frame::felt`].
     pub fn force_n(&self) -> f64 {
         force_n(&self.newtons)
+    }
+
+    /// The centre of the force, as a row and a column. The middle of the array if there is no force.
+    pub(crate) fn centre(&self) -> (f64, f64) {
+        let force_n = self.force_n();
+        let Array { rows, cols } = self.array;
+        let last = [(rows - 1) as f64, (cols - 1) as f64];
+        if force_n <= 0.0 {
+            return (last[0] / 2.0, last[1] / 2.0);
+        }
+        let (mut row_sum, mut col_sum) = (0.0, 0.0);
+        for (place, &newtons) in self.newtons.iter().enumerate() {
+            let (row, col) = self.array.position(place);
+            row_sum += f64::from(newtons) * row as f64;
+            col_sum += f64::from(newtons) * col as f64;
+        }
+        // Negative forces may pull the sums beyond the array.
+        let within = |sum: f64, last: f64| (sum / force_n).clamp(0.0, last);
+        (within(row_sum, last[0]), within(col_sum, last[1]))
     }
 }
 

@@ -10,6 +10,8 @@ pub mod colour;
 pub mod wording;
 pub mod exit;
 pub mod range;
+pub mod allowance;
+pub mod line;
 pub mod part;
 pub mod npy;
 pub mod npz;
@@ -17,13 +19,17 @@ pub mod wire;
 pub mod tare;
 pub mod press;
 pub mod motion;
-pub mod sensor;
 pub mod verdict;
+pub mod port;
+pub mod sensor;
 pub mod references;
 pub mod event;
 pub mod ros;
+pub mod judge;
 pub mod pipeline;
 pub mod recording;
 pub mod trial;
 #[cfg(any(test, feature = "test-support"))]
 pub mod test_support;
+#[cfg(test)]
+mod tests;

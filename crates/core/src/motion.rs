@@ -49,9 +49,6 @@ pub const LONGEST_JUMP_MM: f64 = 20.0;
 pub const FURTHEST_MM: f64 = 1e6;
 /// The most points that are held: a little over a minute at 1000 points a second.
 const MOST_POINTS: usize = 1 << 16;
-/// The most unusable stretches that are remembered. When there are more, the two oldest stretches
-/// become one.
-const MOST_DOUBTS: usize = 16;
 
 const HELD_NS: i64 = HELD.as_nanos() as i64;
 const LONGEST_GAP_NS: i64 = LONGEST_GAP.as_nanos() as i64;
@@ -67,6 +64,32 @@ pub struct StepBack {
     pub index: usize,
     /// How far the point goes back in time.
     pub back_ms: f64,
+}
+
+/// The positions that presses from some moment on need. A recording holds no more.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AtRest {
+    points: Vec<Point>,
+    uncertain_ns: Option<i64>,
+}
+
+impl AtRest {
+    /// Whether a track can be made of it. A recording may hold anything.
+    pub(crate) fn is_usable(&self) -> bool {
+        self.points.iter().all(Point::is_usable)
+    }
+}
+
+impl From<AtRest> for Track {
+    fn from(state: AtRest) -> Self {
+        let mut track = Self {
+            uncertain_ns: state.uncertain_ns,
+            ..Self::default()
+        };
+        // Of points that step back, the earlier ones are forgotten.
+        let _ = track.push(&state.points);
+        track
+    }
 }
 
 /// The positions of one sensor's arm in the last minute.
@@ -94,13 +117,13 @@ pub struct StepBack {
 /// assert_eq!(track.approach(begin, &frames, no_delay), None);
 /// # Ok::<(), hardnessd_core::motion::StepBack>(())
 /// ```
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Track {
     /// The points, ascending in time.
     points: VecDeque<Point>,
-    /// The first and the last moment of each stretch in which moments are uncertain: time stepped
-    /// back, or this machine's calendar clock was set.
-    doubts: VecDeque<(i64, i64)>,
+    /// The last moment that is uncertain, because this machine's calendar clock was set. All points are
+    /// later.
+    uncertain_ns: Option<i64>,
     /// The number of points since the start.
     received: u64,
     /// The number of points that came after the verdict that they belong to.
@@ -115,7 +138,8 @@ impl Track {
     /// # Errors
     ///
     /// Returns a [`StepBack`] for the first point that is not later than the point before it. All
-    /// points are taken in nevertheless: after a clock was set back, points continue from there.
+    /// points are taken in nevertheless: after a clock was set back, points continue from there, and
+    /// the earlier ones are forgotten.
     pub fn push(&mut self, points: &[Point]) -> Result<(), StepBack> {
         let mut first_back = None;
         for (index, &point) in points.iter().enumerate() {
@@ -124,49 +148,31 @@ impl Track {
             if let Some(latest) = self.points.back().map(|point| point.at_ns)
                 && point.at_ns <= latest
             {
-                self.doubt(point.at_ns, latest);
-                let kept = self.points.partition_point(|p| p.at_ns < point.at_ns);
-                self.points.truncate(kept);
+                // Nobody knows which of both moments is right.
+                self.points.clear();
                 first_back.get_or_insert(StepBack {
                     index,
                     back_ms: (latest.saturating_sub(point.at_ns)) as f64 / 1e6,
                 });
             }
-            self.points.push_back(point);
-            if self.points.len() > MOST_POINTS {
+            if self.uncertain_ns.is_none_or(|until| point.at_ns > until) {
+                self.points.push_back(point);
+            }
+            let oldest = point.at_ns.saturating_sub(HELD_NS);
+            let is_old = |first: &Point| first.at_ns < oldest;
+            while self.points.len() > MOST_POINTS || self.points.front().is_some_and(is_old) {
                 self.points.pop_front();
             }
-            self.forget(point.at_ns);
         }
         first_back.map_or(Ok(()), Err)
     }
 
     /// Takes in that this machine's calendar clock was set since the latest point. Moments from
-    /// calendar times are uncertain from the latest point to `until_ns`, because nobody knows by
-    /// which setting the robot or this machine took them.
+    /// calendar times are uncertain up to `until_ns`, because nobody knows by which setting the robot or
+    /// this machine took them.
     pub fn clock_set(&mut self, until_ns: i64) {
-        let latest = self.points.back().map(|point| point.at_ns);
-        let from = latest.unwrap_or(-FURTHEST_NS);
-        self.doubt(from, until_ns.max(from));
-    }
-
-    fn doubt(&mut self, from: i64, to: i64) {
-        self.doubts.push_back((from, to));
-        if self.doubts.len() > MOST_DOUBTS
-            && let (Some(one), Some(other)) = (self.doubts.pop_front(), self.doubts.pop_front())
-        {
-            let both = (one.0.min(other.0), one.1.max(other.1));
-            self.doubts.push_front(both);
-        }
-    }
-
-    /// Drops everything that is older than [`HELD`] at `latest`.
-    fn forget(&mut self, latest: i64) {
-        let oldest = latest.saturating_sub(HELD_NS);
-        while self.points.front().is_some_and(|p| p.at_ns < oldest) {
-            self.points.pop_front();
-        }
-        self.doubts.retain(|&(_, to)| to >= oldest);
+        self.points.clear();
+        self.uncertain_ns = Some(until_ns);
     }
 
     /// The number of points since the start, and the number of points that came too late.
@@ -206,15 +212,10 @@ impl Track {
         let end = self.points.partition_point(|p| p.at_ns < last);
         let used = self.points.range(first..self.points.len().min(end + 1));
         let latest = used.clone().next_back()?.at_ns;
-        let is_doubtful = |&(from, to): &(i64, i64)| from <= last && to >= begin;
         let is_broken = used.clone().zip(used.clone().skip(1)).any(|(one, next)| {
             next.at_ns - one.at_ns > LONGEST_GAP_NS || (next.mm - one.mm).abs() > LONGEST_JUMP_MM
         });
-        if latest < begin
-            || last.saturating_sub(latest) > LONGEST_GAP_NS
-            || self.doubts.iter().any(is_doubtful)
-            || is_broken
-        {
+        if latest < begin || last.saturating_sub(latest) > LONGEST_GAP_NS || is_broken {
             return None;
         }
         let zero = self.at(begin)?;
@@ -240,40 +241,19 @@ impl Track {
         Some(before.mm + part * (next.1.mm - before.mm))
     }
 
-    /// The points that presses from `since` on need. A recording holds no more.
+    /// The points that presses from `since` on need.
     #[must_use]
-    pub fn since(&self, since: Duration) -> Self {
+    pub fn since(&self, since: Duration) -> AtRest {
         let since = of_arm(since, settings::DELAYS_MS.1);
         let first = self.points.partition_point(|p| p.at_ns <= since);
         // Keep the newest point, however old it is: it shows that the robot sends positions.
         let first = first
             .saturating_sub(1)
             .min(self.points.len().saturating_sub(1));
-        Self {
+        AtRest {
             points: self.points.range(first..).copied().collect(),
-            doubts: self
-                .doubts
-                .iter()
-                .copied()
-                .filter(|&(_, to)| to >= since)
-                .collect(),
-            ..*self
+            uncertain_ns: self.uncertain_ns,
         }
-    }
-
-    /// Whether points can have made this track. A damaged recording may hold an impossible one.
-    pub(crate) fn is_possible(&self) -> bool {
-        let ascends = |(one, next): (&Point, &Point)| one.at_ns < next.at_ns;
-        let span = self.points.front().zip(self.points.back());
-        self.points
-            .iter()
-            .zip(self.points.iter().skip(1))
-            .all(ascends)
-            && self.points.iter().all(Point::is_usable)
-            && span.is_none_or(|(first, last)| last.at_ns - first.at_ns <= HELD_NS)
-            && self.points.len() <= MOST_POINTS
-            && self.doubts.len() <= MOST_DOUBTS
-            && self.late <= self.received
     }
 }
 

@@ -4,7 +4,7 @@
 //! [`to_bytes`] is the way back. The length of a header is bounded, and no more bytes are unpacked
 //! than the header asks for.
 
-use std::io::{self, Read};
+use std::io::{self, ErrorKind, Read};
 
 use serde::Deserialize;
 
@@ -26,61 +26,18 @@ pub struct Header {
     pub shape: Vec<usize>,
 }
 
-/// The reason why bytes are not a usable array. Each message follows the word "found".
-#[derive(Debug, thiserror::Error)]
-pub enum NpyError {
-    /// The magic bytes are missing.
-    #[error("no .npy array")]
-    Magic,
-    /// The format is newer than this reader.
-    #[error("an .npy array of version {0}")]
-    Version(u8),
-    /// The header is too long.
-    #[error("a header of {0} bytes, of which at most {LONGEST_HEADER} are read")]
-    LongHeader(usize),
-    /// The header is not as numpy writes it.
-    #[error("a header that cannot be read: {0}")]
-    Header(String),
-    /// There are fewer elements than the header says.
-    #[error("{found} elements of {expected}")]
-    Few {
-        /// The number of elements in the file.
-        found: usize,
-        /// The number of elements by the header.
-        expected: usize,
-    },
-    /// There are more elements than the header says.
-    #[error("more than {0} elements")]
-    Many(usize),
-    /// The elements are no numbers, or of a size or a byte order that is not read.
-    #[error("dtype '{}'", short(.0))]
-    Type(String),
-    /// A number does not fit into the type that is needed.
-    #[error("{value:?} at {place}")]
-    Value {
-        /// The number.
-        value: f64,
-        /// Its place among the elements.
-        place: usize,
-    },
-    /// The shape is not the expected one.
-    #[error("an array of shape {0:?}")]
-    Shape(Vec<usize>),
-    /// The file ends too early.
-    #[error("an array that is cut off")]
-    CutOff,
-    /// The bytes cannot be read or unpacked.
-    #[error(transparent)]
-    Io(io::Error),
+/// The error of bytes that are not a usable array. Each message follows the word "found".
+fn unusable(found: String) -> io::Error {
+    io::Error::new(ErrorKind::InvalidData, found)
 }
 
-impl From<io::Error> for NpyError {
-    fn from(error: io::Error) -> Self {
-        match error.kind() {
-            io::ErrorKind::UnexpectedEof => Self::CutOff,
-            _ => Self::Io(error),
-        }
-    }
+/// Fills `bytes` from a reader that should not end before.
+fn fill(reader: &mut impl Read, bytes: &mut [u8]) -> io::Result<()> {
+    let filled = reader.read_exact(bytes);
+    filled.map_err(|error| match error.kind() {
+        ErrorKind::UnexpectedEof => unusable("an array that is cut off".to_owned()),
+        _ => error,
+    })
 }
 
 impl Header {
@@ -88,28 +45,33 @@ impl Header {
     ///
     /// # Errors
     ///
-    /// Returns an [`NpyError`] if there is no header or an unreadable one.
-    pub fn read(reader: &mut impl Read) -> Result<Self, NpyError> {
+    /// Returns an error if there is no header or an unreadable one.
+    pub fn read(reader: &mut impl Read) -> io::Result<Self> {
         let mut start = [0; 8];
-        reader.read_exact(&mut start)?;
+        fill(reader, &mut start)?;
         let [magic @ .., major, _minor] = start;
         if &magic != b"\x93NUMPY" {
-            return Err(NpyError::Magic);
+            return Err(unusable("no .npy array".to_owned()));
         }
         let mut length = [0; 4];
         match major {
-            1 => reader.read_exact(&mut length[..2])?,
-            2 | 3 => reader.read_exact(&mut length)?,
-            other => return Err(NpyError::Version(other)),
+            1 => fill(reader, &mut length[..2])?,
+            2 | 3 => fill(reader, &mut length)?,
+            other => return Err(unusable(format!("an .npy array of version {other}"))),
         }
         let length = u32::from_le_bytes(length) as usize;
         if length > LONGEST_HEADER {
-            return Err(NpyError::LongHeader(length));
+            return Err(unusable(format!(
+                "a header of {length} bytes, of which at most {LONGEST_HEADER} are read"
+            )));
         }
         let mut text = vec![0; length];
-        reader.read_exact(&mut text)?;
+        fill(reader, &mut text)?;
         let header = serde_json::from_str(&as_json(&text));
-        header.map_err(|error| NpyError::Header(short(&error.to_string())))
+        header.map_err(|error| {
+            let problem = short(&error.to_string());
+            unusable(format!("a header that cannot be read: {problem}"))
+        })
     }
 
     /// The bytes before the elements of an array, whose length is a multiple of 64.
@@ -132,7 +94,7 @@ impl Header {
         bytes
     }
 
-    /// The number of elements. `None` if no machine can hold so many.
+    /// The number of elements. `None` if it is larger than any memory.
     pub fn count(&self) -> Option<usize> {
         let mut lengths = self.shape.iter();
         lengths.try_fold(1_usize, |count, &length| count.checked_mul(length))
@@ -143,17 +105,18 @@ impl Header {
     ///
     /// # Errors
     ///
-    /// Returns an [`NpyError`] if the elements are no numbers or one does not fit, if there are fewer
-    /// or more elements, or they cannot be unpacked.
+    /// Returns an error if the elements are no numbers or one does not fit, if there are fewer or more
+    /// elements, or they cannot be unpacked.
     pub fn elements<T>(
         &self,
         reader: &mut impl Read,
         convert: impl Fn(f64) -> Option<T>,
-    ) -> Result<Vec<T>, NpyError> {
+    ) -> io::Result<Vec<T>> {
         let count = self.count();
-        let count = count.ok_or_else(|| NpyError::Shape(self.shape.clone()))?;
+        let count = count.ok_or_else(|| self.unexpected_shape())?;
         let number = number(&self.descr);
-        let (size, number) = number.ok_or_else(|| NpyError::Type(self.descr.clone()))?;
+        let (size, number) =
+            number.ok_or_else(|| unusable(format!("dtype '{}'", short(&self.descr))))?;
         let mut values = Vec::new();
         let mut block = Vec::with_capacity(BLOCK_BYTES);
         while values.len() < count {
@@ -164,22 +127,27 @@ impl Header {
                 .take(wanted as u64)
                 .read_to_end(&mut block)?;
             for bytes in block.chunks_exact(size) {
-                let (value, place) = (number(bytes), values.len());
-                values.push(convert(value).ok_or(NpyError::Value { value, place })?);
+                let value = number(bytes);
+                let place = values.len();
+                let converted = convert(value);
+                values.push(converted.ok_or_else(|| unusable(format!("{value:?} at {place}")))?);
             }
             if block.len() < wanted {
-                return Err(NpyError::Few {
-                    found: values.len(),
-                    expected: count,
-                });
+                let found = values.len();
+                return Err(unusable(format!("{found} elements of {count}")));
             }
         }
         match reader.read(&mut [0]) {
             Ok(0) => Ok(values),
-            Ok(_) => Err(NpyError::Many(count)),
+            Ok(_) => Err(unusable(format!("more than {count} elements"))),
             // The unpacker compares the checksum at the end, and reports a difference here.
-            Err(error) => Err(error.into()),
+            Err(error) => Err(error),
         }
+    }
+
+    /// The error of an array whose shape is not the expected one.
+    pub fn unexpected_shape(&self) -> io::Error {
+        unusable(format!("an array of shape {:?}", self.shape))
     }
 }
 
@@ -220,38 +188,63 @@ type Decode = fn(&[u8]) -> f64;
     reason = "the same line reads the wide integers, which have no `From`"
 )]
 fn number(descr: &str) -> Option<(usize, Decode)> {
-    macro_rules! little_endian {
-        ($type:ty) => {
+    macro_rules! of {
+        ($type:ty, $from:ident) => {
             Some((size_of::<$type>(), |bytes| {
                 let bytes = bytes.try_into().expect("a chunk of this size");
-                <$type>::from_le_bytes(bytes) as f64
+                <$type>::$from(bytes) as f64
             }))
         };
     }
     match descr {
-        "|u1" | "<u1" | ">u1" => little_endian!(u8),
-        "|i1" | "<i1" | ">i1" => little_endian!(i8),
-        "<u2" => little_endian!(u16),
-        "<i2" => little_endian!(i16),
-        "<u4" => little_endian!(u32),
-        "<i4" => little_endian!(i32),
-        "<u8" => little_endian!(u64),
-        "<i8" => little_endian!(i64),
-        "<f4" => little_endian!(f32),
-        "<f8" => little_endian!(f64),
+        "|u1" | "<u1" | ">u1" => of!(u8, from_le_bytes),
+        "|i1" | "<i1" | ">i1" => of!(i8, from_le_bytes),
+        "<u2" => of!(u16, from_le_bytes),
+        "<i2" => of!(i16, from_le_bytes),
+        "<u4" => of!(u32, from_le_bytes),
+        "<i4" => of!(i32, from_le_bytes),
+        "<u8" => of!(u64, from_le_bytes),
+        "<i8" => of!(i64, from_le_bytes),
+        "<f4" => of!(f32, from_le_bytes),
+        "<f8" => of!(f64, from_le_bytes),
+        ">u2" => of!(u16, from_be_bytes),
+        ">i2" => of!(i16, from_be_bytes),
+        ">u4" => of!(u32, from_be_bytes),
+        ">i4" => of!(i32, from_be_bytes),
+        ">u8" => of!(u64, from_be_bytes),
+        ">i8" => of!(i64, from_be_bytes),
+        ">f4" => of!(f32, from_be_bytes),
+        ">f8" => of!(f64, from_be_bytes),
+        "<f2" => Some((2, |bytes| half([bytes[1], bytes[0]]))),
+        ">f2" => Some((2, |bytes| half([bytes[0], bytes[1]]))),
         _ => None,
     }
+}
+
+/// The number that a float16 of IEEE 754 is.
+fn half([high, low]: [u8; 2]) -> f64 {
+    let (exponent, fraction) = (
+        high >> 2 & 31,
+        f64::from(u16::from(high & 3) << 8 | u16::from(low)),
+    );
+    let size = match exponent {
+        0 => fraction * 2_f64.powi(-24),
+        31 if fraction == 0.0 => f64::INFINITY,
+        31 => f64::NAN,
+        _ => (1.0 + fraction / 1024.0) * 2_f64.powi(i32::from(exponent) - 15),
+    };
+    if high & 0x80 == 0 { size } else { -size }
 }
 
 /// Reads a table of numbers, row by row.
 ///
 /// # Errors
 ///
-/// Returns an [`NpyError`] if the bytes are not an array, or not a table of numbers.
-pub fn table(reader: &mut impl Read) -> Result<Vec<Vec<f32>>, NpyError> {
+/// Returns an error if the bytes are not an array, or not a table of numbers.
+pub fn table(reader: &mut impl Read) -> io::Result<Vec<Vec<f32>>> {
     let header = Header::read(reader)?;
     let (&[rows, cols], Some(1..)) = (header.shape.as_slice(), header.count()) else {
-        return Err(NpyError::Shape(header.shape));
+        return Err(header.unexpected_shape());
     };
     let values = header.elements(reader, |value| Some(value as f32))?;
     let place = |row: usize, col: usize| match header.fortran_order {
@@ -400,6 +393,11 @@ mod tests {
             ("<u2", &[1, 0, 0, 1], [1.0, 256.0]),
             ("<i2", &[1, 0, 255, 255], [1.0, -1.0]),
             ("<i4", &[1, 0, 0, 0, 255, 255, 255, 255], [1.0, -1.0]),
+            (">i2", &[0, 1, 255, 255], [1.0, -1.0]),
+            (">f4", &[0x3F, 0x80, 0, 0, 0xC0, 0, 0, 0], [1.0, -2.0]),
+            // 1, and the least number.
+            ("<f2", &[0, 0x3C, 1, 0], [1.0, 2_f64.powi(-24)]),
+            (">f2", &[0xC0, 0, 0x35, 0x55], [-2.0, 0.333_251_953_125]),
         ] {
             assert_eq!(read(descr, bytes).unwrap(), expected, "{descr}");
         }
@@ -412,7 +410,8 @@ mod tests {
         assert_eq!(read("<u8", &7_u64.to_le_bytes()).unwrap(), [7.0]);
         for (descr, bytes, expected) in [
             ("<u2", &[1, 0, 255, 255][..], "65535.0 at 1"),
-            (">f4", &[0; 4], "dtype '>f4'"),
+            (">c8", &[0; 8], "dtype '>c8'"),
+            ("<f2", &[0, 0x7C], "inf at 0"),
             ("|O", &[0; 4], "dtype '|O'"),
         ] {
             let error = read(descr, bytes).unwrap_err().to_string();

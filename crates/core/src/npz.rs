@@ -42,7 +42,9 @@ macro_rules! element {
 }
 element!(f32, "<f4", |rounded, _| Some(rounded));
 element!(u32, "<u4", exactly);
+element!(i32, "<i4", exactly);
 element!(u16, "<u2", exactly);
+element!(i16, "<i2", exactly);
 element!(u8, "|u1", exactly);
 
 /// A whole number, if it equals `number`.

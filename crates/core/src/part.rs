@@ -1,21 +1,25 @@
 //! Files that are whole or not there.
 //!
-//! In: a path, and bytes. The bytes go into a file with another name in the same directory, which gets its
-//! own name once it is whole and on the disk. Nothing is removed but what this process has made: what else
-//! is in the directory, whatever its name, stays as it is.
+//! In: a path, and bytes. The bytes go into a file without a name in the same directory, which gets its name once
+//! it is whole and on the disk. If the process is killed before, nothing is left. Nothing is removed but what this
+//! process has made: what else is in the directory, whatever its name, stays as it is.
 
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, Permissions};
 use std::io::{self, ErrorKind, Write as _};
+use std::os::fd::AsRawFd as _;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
 
-use tempfile::NamedTempFile;
+use rustix::fs::{AtFlags, CWD, Mode, OFlags, linkat};
+use tempfile::{Builder, TempPath};
 
-/// A file that is being written. Unless the process is killed, it is removed if it is dropped before
-/// [`Part::finish`].
+/// A file that is being written. It is gone if it is dropped before [`Part::finish`].
 #[derive(Debug)]
 pub struct Part {
-    file: NamedTempFile,
+    file: File,
+    /// The name of the file until it is whole, on a file system where it needs one.
+    named: Option<TempPath>,
     path: PathBuf,
     /// Whether an earlier file at the path is replaced.
     replaces: bool,
@@ -32,8 +36,10 @@ impl Part {
         if path.symlink_metadata().is_ok() {
             return Err(taken());
         }
+        let (file, named) = beside(path)?;
         Ok(Self {
-            file: beside(path)?,
+            file,
+            named,
             path: path.to_owned(),
             replaces: false,
         })
@@ -59,14 +65,15 @@ impl Part {
         while let Ok(next) = fs::read_link(&target) {
             target = directory_of(&target).join(next);
         }
-        let file = beside(&target)?;
+        let (file, named) = beside(&target)?;
         if let Some(before) = before {
             // Only root may give a file away.
-            let _ = fchown(file.as_file(), Some(before.uid()), Some(before.gid()));
-            file.as_file().set_permissions(before.permissions())?;
+            let _ = fchown(&file, Some(before.uid()), Some(before.gid()));
+            file.set_permissions(before.permissions())?;
         }
         Ok(Self {
             file,
+            named,
             path: target,
             replaces: true,
         })
@@ -74,7 +81,7 @@ impl Part {
 
     /// The file to write to.
     pub fn as_file(&self) -> &File {
-        self.file.as_file()
+        &self.file
     }
 
     /// Writes the bytes of the whole file, and gives it its name.
@@ -94,14 +101,23 @@ impl Part {
     /// Fails if a new file's path has been taken meanwhile, or if the file cannot be written to the disk or
     /// renamed.
     pub fn finish(self) -> io::Result<()> {
-        self.as_file().sync_all()?;
-        let named = match self.replaces {
-            true => self.file.persist(&self.path),
-            false => self.file.persist_noclobber(&self.path),
+        self.file.sync_all()?;
+        let named = match (self.named, self.replaces) {
+            (Some(part), true) => part.persist(&self.path).map_err(|failed| failed.error),
+            (Some(part), false) => {
+                let named = part.persist_noclobber(&self.path);
+                named.map_err(|failed| failed.error)
+            }
+            (None, false) => link(&self.file, &self.path),
+            // A link replaces nothing, but a renamed one does.
+            (None, true) => name(&prefix(&self.path))
+                .make_in(directory_of(&self.path), |part| link(&self.file, part))
+                .and_then(|part| part.persist(&self.path).map_err(|failed| failed.error))
+                .map(drop),
         };
-        named.map_err(|failed| match failed.error.kind() {
+        named.map_err(|error| match error.kind() {
             ErrorKind::AlreadyExists => taken(),
-            _ => failed.error,
+            _ => error,
         })?;
         // The name is on the disk only after the directory is flushed.
         File::open(directory_of(&self.path))?.sync_all()
@@ -136,20 +152,47 @@ pub fn directory_of(file: &Path) -> &Path {
     directory.unwrap_or(Path::new("."))
 }
 
-fn beside(path: &Path) -> io::Result<NamedTempFile> {
+/// The descriptors of this process, by which a file without a name gets one.
+const DESCRIPTORS: &str = "/proc/self/fd";
+
+/// A file in the directory of `path`, without a name where the file system can do that.
+fn beside(path: &Path) -> io::Result<(File, Option<TempPath>)> {
     let directory = directory_of(path);
     if !directory.exists() {
         let text = format!("the directory {} does not exist", directory.display());
         return Err(io::Error::new(ErrorKind::NotFound, text));
     }
-    // What a killed process leaves shows what it was going to be.
+    let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
+    if Path::new(DESCRIPTORS).exists()
+        && let Ok(file) = rustix::fs::open(directory, flags, Mode::from_raw_mode(0o666))
+    {
+        return Ok((file.into(), None));
+    }
+    let file = name(&prefix(path))
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(directory)?;
+    let (file, part) = file.into_parts();
+    Ok((file, Some(part)))
+}
+
+/// The begin of the name of a file until it is whole. What a killed process leaves shows what it was
+/// going to be.
+fn prefix(path: &Path) -> OsString {
     let mut prefix = path.file_name().unwrap_or_default().to_owned();
     prefix.push(".");
-    tempfile::Builder::new()
-        .prefix(&prefix)
-        .suffix(".part")
-        .permissions(Permissions::from_mode(0o666))
-        .tempfile_in(directory)
+    prefix
+}
+
+fn name(prefix: &OsStr) -> Builder<'_, 'static> {
+    let mut name = Builder::new();
+    name.prefix(prefix).suffix(".part");
+    name
+}
+
+/// Gives a name to a file without one.
+fn link(file: &File, path: &Path) -> io::Result<()> {
+    let file = format!("{DESCRIPTORS}/{}", file.as_raw_fd());
+    Ok(linkat(CWD, file, CWD, path, AtFlags::SYMLINK_FOLLOW)?)
 }
 
 fn taken() -> io::Error {
@@ -193,20 +236,6 @@ mod tests {
         assert_eq!(fs::read(path("late")).unwrap(), b"theirs");
         drop(Part::new(&path("given up")).unwrap());
         assert_eq!(names(directory.path()), ["late", "link", "new"]);
-    }
-
-    #[test]
-    fn only_an_own_file_is_removed() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("file");
-        let file = File::create_new(&path).unwrap();
-        fs::rename(&path, directory.path().join("moved")).unwrap();
-        remove(&path, &file);
-        fs::write(&path, "theirs").unwrap();
-        remove(&path, &file);
-        assert_eq!(names(directory.path()), ["file", "moved"]);
-        remove(&directory.path().join("moved"), &file);
-        assert_eq!(names(directory.path()), ["file"]);
     }
 
     #[test]

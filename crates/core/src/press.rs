@@ -4,7 +4,7 @@
 //! no clock: the times of the frames decide how long a press lasts.
 
 mod held;
-mod packed;
+mod phases;
 mod settings;
 mod settling;
 mod thin;
@@ -13,17 +13,15 @@ use std::cmp::Ordering;
 use std::sync::Arc;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use self::held::HeldFrames;
+pub use self::phases::Phases;
 pub use self::settings::{Settings, Thresholds};
-pub use self::settling::first_settled;
 use self::settling::{Load, Settling};
 pub use self::thin::thinned;
-use crate::frame::{Array, Frame, Stamp};
+use crate::frame::{Frame, Stamp};
 
 /// The number of a frame in a press, and when its last byte came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameAt {
     /// The number of the frame, per sensor.
     pub frame: u64,
@@ -33,7 +31,7 @@ pub struct FrameAt {
 
 /// Marks of a frame. They are decided by the settings at the frame's arrival, because the settings
 /// may have changed when the press is judged.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Marks {
     /// Whether the contact touches the border of the array.
     pub at_edge: bool,
@@ -43,18 +41,17 @@ pub struct Marks {
 
 /// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
 /// greater force wins, then the earlier frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(into = "packed::Packed", try_from = "packed::Packed")]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ContactFrame {
     /// The frame's number and arrival.
     pub moment: FrameAt,
-    /// The frame itself.
+    /// The frame as [`Frame::felt`] gives it.
     pub frame: Arc<Frame>,
     /// The frame's marks.
     pub marks: Marks,
     /// The contact area of the frame.
     pub contact_area_taxels: u32,
-    /// The total force of the frame.
+    /// The force of the contact.
     pub force_n: f64,
 }
 
@@ -130,10 +127,8 @@ pub enum Change {
     },
     /// The contact has settled.
     Settled {
-        /// The press's number.
-        press: u64,
-        /// The best frame so far.
-        peak: Box<ContactFrame>,
+        /// The press so far.
+        press: Box<SoFar>,
     },
     /// The press ended and is to be judged.
     End {
@@ -160,7 +155,7 @@ pub enum Change {
 }
 
 /// The frames in contact of a press up to now.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SoFar {
     press: u64,
     peak: ContactFrame,
@@ -211,48 +206,17 @@ impl SoFar {
 ///     changes.extend(tracker.push(frame, Marks::default(), at));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
-/// assert!(matches!(changes[1], Change::Settled { press: 1, .. }));
+/// assert!(matches!(changes[1], Change::Settled { .. }));
 /// assert!(matches!(changes[2], Change::End { frames: 3, .. }));
 /// ```
 #[derive(Debug)]
 pub struct PressTracker {
     thresholds: Thresholds,
-    memory: Memory,
-}
-
-/// The state of a [`PressTracker`], without its thresholds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Memory {
     state: State,
     presses: u64,
 }
 
-impl Memory {
-    /// Whether a tracker of `array` can have this state after this many frames.
-    pub(crate) fn is_possible(&self, frames: u64, array: Array) -> bool {
-        let is_press = |pressed: &Pressed| {
-            let SoFar {
-                press,
-                peak,
-                course,
-            } = &pressed.so_far;
-            *press == self.presses
-                && pressed.frames <= frames
-                && peak.moment.frame < frames
-                && peak.frame.array == array
-                && peak.contact_area_taxels as usize <= array.taxels()
-                && course.is_possible(frames, array)
-                && pressed.settling.as_ref().is_none_or(Settling::is_possible)
-        };
-        self.presses <= frames
-            && match &self.state {
-                State::Pressed(pressed) => is_press(pressed),
-                State::Idle | State::AwaitingRelease { .. } => true,
-            }
-    }
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug)]
 enum State {
     Idle,
     Pressed(Box<Pressed>),
@@ -262,9 +226,8 @@ enum State {
     },
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug)]
 struct Pressed {
-    #[serde(flatten)]
     so_far: SoFar,
     began: Duration,
     last: FrameAt,
@@ -279,26 +242,19 @@ impl PressTracker {
     pub fn new(thresholds: Thresholds) -> Self {
         Self {
             thresholds,
-            memory: Memory {
-                state: State::Idle,
-                presses: 0,
-            },
+            state: State::Idle,
+            presses: 0,
         }
     }
 
-    /// Takes over changed thresholds. They also apply to a press under way.
-    pub fn reload(&mut self, thresholds: Thresholds) {
-        self.thresholds = thresholds;
+    /// The number of presses so far.
+    pub fn presses(&self) -> u64 {
+        self.presses
     }
 
-    /// The tracker's state.
-    pub fn memory(&self) -> Memory {
-        self.memory.clone()
-    }
-
-    /// Continues from the state of another tracker.
-    pub fn recall(&mut self, memory: Memory) {
-        self.memory = memory;
+    /// Continues after this number of presses.
+    pub fn resume(&mut self, presses: u64) {
+        self.presses = presses;
     }
 
     /// Whether a press is under way.
@@ -308,12 +264,7 @@ impl PressTracker {
 
     /// Whether there is no press under way, and no press that timed out and is not yet released.
     pub fn is_idle(&self) -> bool {
-        matches!(self.memory.state, State::Idle)
-    }
-
-    /// The number of frames in contact of the press under way.
-    pub fn frames(&self) -> Option<u64> {
-        self.pressed().map(|pressed| pressed.frames)
+        matches!(self.state, State::Idle)
     }
 
     /// The start time of the press under way.
@@ -321,13 +272,14 @@ impl PressTracker {
         self.pressed().map(|pressed| pressed.began)
     }
 
-    /// The frames of the press under way.
-    pub fn so_far(&self) -> Option<SoFar> {
-        self.pressed().map(|pressed| pressed.so_far.clone())
+    /// The press under way, and the number of its frames in contact.
+    pub fn so_far(&self) -> Option<(&SoFar, u64)> {
+        let pressed = self.pressed()?;
+        Some((&pressed.so_far, pressed.frames))
     }
 
     fn pressed(&self) -> Option<&Pressed> {
-        match &self.memory.state {
+        match &self.state {
             State::Pressed(pressed) => Some(pressed),
             State::Idle | State::AwaitingRelease { .. } => None,
         }
@@ -335,26 +287,31 @@ impl PressTracker {
 
     /// Takes the next frame in. Returns its changes, in order.
     pub fn push(&mut self, frame: &Frame, marks: Marks, at: FrameAt) -> Vec<Change> {
-        let area = frame.contact_area_taxels(self.thresholds.contact_threshold_n);
+        let threshold_n = self.thresholds.contact_threshold_n;
+        let area = frame.contact_area_taxels(threshold_n);
         let touched = area >= self.thresholds.end_area_taxels;
+        let mut changes = Vec::new();
+        if self.is_idle() && area < self.thresholds.begin_area_taxels {
+            return changes;
+        }
+        let felt = frame.felt(threshold_n);
+        let force_n = felt.force_n();
         let contact = || ContactFrame {
             moment: at,
-            frame: Arc::new(frame.clone()),
+            frame: Arc::new(felt),
             marks,
             contact_area_taxels: area,
-            force_n: frame.force_n(),
+            force_n,
         };
-        let mut changes = Vec::new();
-        match &mut self.memory.state {
-            State::Idle if area < self.thresholds.begin_area_taxels => return changes,
+        match &mut self.state {
             State::Idle => {
-                self.memory.presses += 1;
-                let press = self.memory.presses;
+                self.presses += 1;
+                let press = self.presses;
                 let peak = contact();
                 changes.push(Change::Begin { press, at });
                 let mut course = HeldFrames::default();
                 course.push(peak.clone());
-                self.memory.state = State::Pressed(Box::new(Pressed {
+                self.state = State::Pressed(Box::new(Pressed {
                     so_far: SoFar {
                         press,
                         peak,
@@ -372,42 +329,41 @@ impl PressTracker {
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if touched { 0 } else { *released_frames + 1 };
                 if *released_frames >= self.thresholds.end_frames {
-                    self.memory.state = State::Idle;
+                    self.state = State::Idle;
                 }
                 return changes;
             }
         }
-        self.conclude(frame, at, area, &mut changes);
+        let load = Load {
+            at: at.stamp.mono,
+            contact_area_taxels: area,
+            force_n,
+        };
+        self.conclude(load, &mut changes);
         changes
     }
 
     /// Ends a press under way without a verdict.
     pub fn abort(&mut self, reason: Abort) -> Option<Change> {
         let aborted = self.pressed()?.aborted(reason);
-        self.memory.state = State::Idle;
+        self.state = State::Idle;
         Some(aborted)
     }
 
-    /// Adds the changes of this frame to the press: settled, released or timed out.
-    fn conclude(&mut self, frame: &Frame, at: FrameAt, area: u32, changes: &mut Vec<Change>) {
-        let State::Pressed(pressed) = &mut self.memory.state else {
+    /// Adds the changes of a frame with this load to the press: settled, released or timed out.
+    fn conclude(&mut self, load: Load, changes: &mut Vec<Change>) {
+        let State::Pressed(pressed) = &mut self.state else {
             return;
         };
-        if let Some(settling) = &mut pressed.settling {
-            let load = Load {
-                at: at.stamp.mono,
-                contact_area_taxels: area,
-                force_n: frame.force_n(),
-            };
-            if settling.push(load, &self.thresholds) {
-                pressed.settling = None;
-                changes.push(Change::Settled {
-                    press: pressed.so_far.press,
-                    peak: Box::new(pressed.so_far.peak.clone()),
-                });
-            }
+        if let Some(settling) = &mut pressed.settling
+            && settling.push(load, &self.thresholds)
+        {
+            pressed.settling = None;
+            changes.push(Change::Settled {
+                press: Box::new(pressed.so_far.clone()),
+            });
         }
-        let held = at.stamp.mono.saturating_sub(pressed.began).as_secs_f64();
+        let held = load.at.saturating_sub(pressed.began).as_secs_f64();
         let end = if pressed.released_frames >= self.thresholds.end_frames {
             End::Release
         } else if held >= self.thresholds.max_seconds {
@@ -421,7 +377,7 @@ impl PressTracker {
                 released_frames: pressed.released_frames,
             },
         };
-        if let State::Pressed(pressed) = std::mem::replace(&mut self.memory.state, next) {
+        if let State::Pressed(pressed) = std::mem::replace(&mut self.state, next) {
             changes.push(pressed.finish(end, self.thresholds.min_frames));
         }
     }

@@ -1,24 +1,43 @@
-//! The check of a configured value. In: its key, the value, and what it may be. Out: an error that
-//! says all three.
+//! Tables of settings: a key, its default and its range stand in one place.
+//!
+//! In: the table, as [`settings!`](crate::settings) declares it. Out: a struct that reads and writes the
+//! table in TOML, and the check of its values. An error names the key, the value, and what it may be.
 
 use std::fmt::{Debug, Display};
 
-/// A value that is not in its range.
+use crate::frame::Pitch;
+use crate::wording::as_written;
+
+/// A value that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key}: {problem}")]
 pub struct OutOfRange {
-    /// The key of the value in its table.
-    pub key: &'static str,
-    /// What was found, and what was expected.
-    problem: Box<str>,
+    /// The key of the value, after those of its tables, such as `sensor.frame.rows`.
+    pub key: String,
+    /// What was found, and what was expected; or the problem and its remedy.
+    pub problem: Box<str>,
 }
 
 impl OutOfRange {
     /// The error of a value `found` that does not fit.
-    pub fn new(key: &'static str, found: impl Debug, expected: impl Display) -> Self {
+    pub fn new(key: &str, found: impl Debug, expected: impl Display) -> Self {
+        Self::because(key, format_args!("found {found:?}, expected {expected}"))
+    }
+
+    /// The error of a value with this problem.
+    pub fn because(key: &str, problem: impl Display) -> Self {
         Self {
-            key,
-            problem: format!("found {found:?}, expected {expected}").into(),
+            key: key.to_owned(),
+            problem: problem.to_string().into(),
+        }
+    }
+
+    /// The error of a value in the table `table`.
+    #[must_use]
+    pub fn within(self, table: &str) -> Self {
+        Self {
+            key: format!("{table}.{}", self.key),
+            ..self
         }
     }
 }
@@ -29,7 +48,7 @@ impl OutOfRange {
 ///
 /// Returns [`OutOfRange`] if `fits` is false.
 pub fn check(
-    key: &'static str,
+    key: &str,
     found: impl Debug,
     fits: bool,
     expected: impl Display,
@@ -46,7 +65,7 @@ pub fn check(
 ///
 /// Returns [`OutOfRange`] if the number is less or more, or no number.
 pub fn within<T: PartialOrd + Debug + Display>(
-    key: &'static str,
+    key: &str,
     found: T,
     (least, most): (T, T),
     unit: &str,
@@ -61,8 +80,185 @@ pub fn within<T: PartialOrd + Debug + Display>(
 /// # Errors
 ///
 /// Returns [`OutOfRange`] if the number is less or more, or no number.
-pub fn positive(key: &'static str, found: f64, most: f64) -> Result<(), OutOfRange> {
-    let fits = found > 0.0 && found <= most;
-    let expected = format_args!("a number above 0 and at most {most}");
-    check(key, found, fits, expected)
+pub fn positive(key: &str, found: f64, most: f64) -> Result<(), OutOfRange> {
+    above_0(most).check(key, &found)
+}
+
+/// The range of a number in a table of settings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Range {
+    least: f64,
+    most: f64,
+    /// Whether `least` itself is no value.
+    is_open: bool,
+    unit: &'static str,
+}
+
+/// The numbers from `least` to `most`. `unit` follows them in messages.
+pub const fn from_to((least, most): (f64, f64), unit: &'static str) -> Range {
+    Range {
+        least,
+        most,
+        is_open: false,
+        unit,
+    }
+}
+
+/// The numbers above 0 and up to `most`.
+pub const fn above_0(most: f64) -> Range {
+    Range {
+        least: 0.0,
+        most,
+        is_open: true,
+        unit: "",
+    }
+}
+
+impl Range {
+    /// Checks the value of a key.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`OutOfRange`] if one of its numbers is outside the range.
+    pub fn check(self, key: &str, value: &impl Ranged) -> Result<(), OutOfRange> {
+        let Self {
+            least,
+            most,
+            is_open,
+            unit,
+        } = self;
+        let fits = |number: f64| number <= most && (number > least || !is_open && number == least);
+        let Some(found) = value.numbers().into_iter().find(|&number| !fits(number)) else {
+            return Ok(());
+        };
+        let expected = match is_open {
+            true => format!("a number above {least} and at most {most}"),
+            false => format!("{least} to {most} {unit}"),
+        };
+        Err(OutOfRange::because(
+            key,
+            format_args!(
+                "found {}, expected {}",
+                value.shown(found),
+                expected.trim_end()
+            ),
+        ))
+    }
+}
+
+/// A value whose numbers have a range.
+pub trait Ranged {
+    /// The numbers of the value. Without a value, there are none.
+    fn numbers(&self) -> Vec<f64>;
+    /// One of these numbers, as a message shows it.
+    fn shown(&self, number: f64) -> String;
+}
+
+macro_rules! ranged {
+    ($($kind:ty, $number:expr, $shown:literal;)*) => {
+        $(impl Ranged for $kind {
+            fn numbers(&self) -> Vec<f64> {
+                vec![$number(*self)]
+            }
+
+            fn shown(&self, number: f64) -> String {
+                format!($shown, number)
+            }
+        })*
+    };
+}
+
+ranged! {
+    f64, f64::from, "{:?}";
+    f32, as_written, "{:?}";
+    u16, f64::from, "{}";
+    u32, f64::from, "{}";
+    u64, |number| number as f64, "{}";
+    usize, |number| number as f64, "{}";
+}
+
+impl Ranged for Pitch {
+    fn numbers(&self) -> Vec<f64> {
+        vec![self.rows_mm, self.cols_mm]
+    }
+
+    fn shown(&self, number: f64) -> String {
+        number.shown(number)
+    }
+}
+
+impl<T: Ranged + Default> Ranged for Option<T> {
+    fn numbers(&self) -> Vec<f64> {
+        self.as_ref().map_or_else(Vec::new, T::numbers)
+    }
+
+    fn shown(&self, number: f64) -> String {
+        T::default().shown(number)
+    }
+}
+
+/// Declares a table of settings. Each key has its default after `=`, and its [`Range`] after `in` if it
+/// has one. A key without a default is `None` by default, and TOML does not show it then.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::range::from_to;
+/// use hardnessd_core::settings;
+///
+/// settings! {
+///     /// The `[motor]` table.
+///     pub struct Motor {
+///         /// The speed.
+///         pub speed_mm_s: f64 = 5.0, in from_to((0.1, 90.0), "mm/s");
+///         /// The name.
+///         pub name: Option<String>;
+///     }
+/// }
+///
+/// assert_eq!(Motor::default().speed_mm_s, 5.0);
+/// let motor: Motor = toml::from_str("speed_mm_s = 0.0")?;
+/// let error = motor.check_ranges().unwrap_err();
+/// assert_eq!(error.to_string(), "speed_mm_s: found 0.0, expected 0.1 to 90 mm/s");
+/// assert!(toml::from_str::<Motor>("speed = 1.0").is_err());
+/// # Ok::<(), toml::de::Error>(())
+/// ```
+#[macro_export]
+macro_rules! settings {
+    (@default) => { None };
+    (@default $default:expr) => { $default };
+    (
+        $(#[$about_table:meta])*
+        pub struct $table:ident {
+            $(
+                $(#[$about:meta])*
+                $vis:vis $key:ident: $kind:ty $(= $default:expr)? $(, in $range:expr)?;
+            )*
+        }
+    ) => {
+        $(#[$about_table])*
+        #[derive(Debug, Clone, PartialEq, ::serde::Serialize, ::serde::Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct $table {
+            $($(#[$about])* $vis $key: $kind,)*
+        }
+
+        impl Default for $table {
+            fn default() -> Self {
+                Self { $($key: $crate::settings!(@default $($default)?),)* }
+            }
+        }
+
+        impl $table {
+            /// Checks that each value is in its range.
+            ///
+            /// # Errors
+            ///
+            /// Returns an error for the first value that is not.
+            pub fn check_ranges(&self) -> Result<(), $crate::range::OutOfRange> {
+                $($($range.check(stringify!($key), &self.$key)?;)?)*
+                Ok(())
+            }
+        }
+    };
 }

@@ -1,8 +1,8 @@
 //! Recordings: the bytes of sensors and when they came, as MCAP files that ROS tools open.
 //!
-//! In: what happens to a sensor's pipeline ([`pipeline::Input`]), and the events that follow. Out: the bytes
+//! In: what happens to a sensor's pipeline ([`Input`]), and the events that follow. Out: the bytes
 //! of a file. A [`Reader`] returns the inputs, and a [`Playback`] turns them into the same events.
-//! A file can be played from the first [`State`] of a sensor on. It has one every few seconds, so
+//! A file can be played from the first [`State`] of a sensor on. It has one before each press, so
 //! damage costs only the damaged stretch. Nothing here opens a file or asks the time. No other
 //! module uses the MCAP library.
 
@@ -17,7 +17,6 @@ mod writer;
 use std::io::{self, Read};
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 pub use self::labels::{LabelError, Labels, check_label};
 pub use self::message::MOTION;
@@ -29,41 +28,46 @@ pub use self::writer::{About, Writer};
 use crate::event::ContextError;
 use crate::frame::Stamp;
 use crate::motion::Point;
-use crate::pipeline::{self, Input, Pipeline};
-use crate::sensor::{Description, Sensor, SensorError};
+use crate::pipeline::{AtRest, Input, Pipeline};
+use crate::range::OutOfRange;
+use crate::sensor::{Description, Sensor};
 use crate::verdict::{Hrn, References};
 
 /// An entry of a recording for one sensor. Entries are in order of time.
 ///
 /// # Example
 ///
-/// This counts the bytes of a sensor in a recording, and how often the configuration was read again.
+/// This counts the bytes of a sensor in a recording, and the moments at rest from which it can be played.
 ///
 /// ```no_run
 /// use hardnessd_core::pipeline::Input;
 /// use hardnessd_core::recording::{Entry, Reader};
 ///
 /// let file = std::fs::File::open("press.mcap")?;
-/// let (mut bytes, mut reloads) = (0, 0);
+/// let (mut bytes, mut rests) = (0, 0);
 /// for found in Reader::new(file) {
 ///     match found?.entry {
 ///         Entry::Input(Input::Bytes(chunk)) => bytes += chunk.len(),
-///         Entry::Settings(_) => reloads += 1,
-///         Entry::Input(_) | Entry::State(_) => {}
+///         Entry::State(_) => rests += 1,
+///         Entry::Input(_) => {}
 ///     }
 /// }
-/// println!("{bytes} bytes, {reloads} reloads");
+/// println!("{bytes} bytes, {rests} rests");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub enum Entry {
     /// Something happened to the sensor.
     Input(Input<'static>),
-    /// The configuration was read again. This sensor and model hold from then on.
-    Settings(Box<RecordedSensor>),
-    /// The whole state of the pipeline.
+    /// The state of the pipeline, which is at rest. Its sensor holds from then on.
     State(Box<State>),
 }
+
+/// The most memory of a state, in bytes, unless positions came in a long silence: the gains and the
+/// baseline of 4,096 taxels, the references, and what came since the last frame.
+const STATE_BYTES: usize = 128 << 10;
+/// The most memory of a context for each byte of its text: a list of objects with one number each.
+const CONTEXT_BYTES_A_BYTE: usize = 96;
 
 impl Entry {
     /// The approximate memory of the entry in bytes, including its time.
@@ -71,38 +75,15 @@ impl Entry {
         let beside = match self {
             Entry::Input(Input::Bytes(bytes)) => bytes.len(),
             Entry::Input(Input::Unavailable(reason) | Input::Lost(reason)) => reason.len(),
-            Entry::Input(Input::Context(context)) => context.as_ref().map_or(0, heap_bytes),
+            Entry::Input(Input::Context(context)) => {
+                let text = context.as_ref().map(ToString::to_string);
+                CONTEXT_BYTES_A_BYTE * text.map_or(0, |text| text.len())
+            }
             Entry::Input(Input::Motion(points)) => size_of_val::<[Point]>(points),
             Entry::Input(_) => 0,
-            Entry::Settings(sensor) => text_bytes(sensor),
-            Entry::State(state) => text_bytes(state) + state.memory.context().map_or(0, heap_bytes),
+            Entry::State(_) => STATE_BYTES,
         };
         size_of::<(Stamp, Self)>() + beside
-    }
-}
-
-/// The length as JSON. A state is mostly lists of numbers, and their JSON is about as long as their
-/// memory.
-fn text_bytes(value: &impl Serialize) -> usize {
-    serde_json::to_vec(value).map_or(0, |text| text.len())
-}
-
-/// The memory that a value points to. A small object takes many times the length of its text.
-fn heap_bytes(value: &Value) -> usize {
-    match value {
-        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
-        Value::String(text) => text.len(),
-        Value::Array(items) => {
-            size_of_val(items.as_slice()) + items.iter().map(heap_bytes).sum::<usize>()
-        }
-        Value::Object(fields) => {
-            // A B-tree's nodes have 11 places, of which 5 may be taken.
-            let places = 11 * fields.len().div_ceil(5);
-            let held = fields
-                .iter()
-                .map(|(key, value)| key.len() + heap_bytes(value));
-            places * size_of::<(String, Value)>() + held.sum::<usize>()
-        }
     }
 }
 
@@ -113,9 +94,13 @@ pub struct RecordedSensor {
     #[serde(flatten)]
     pub description: Description,
     /// The SHA-256 of the model.
-    pub model: String,
+    pub model_sha256: String,
     /// The references of the sensor, as the model takes them.
-    #[serde(default, skip_serializing_if = "References::is_none")]
+    #[serde(
+        default,
+        rename = "known_presses",
+        skip_serializing_if = "References::is_none"
+    )]
     pub references: References,
 }
 
@@ -124,14 +109,14 @@ impl RecordedSensor {
     pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
         Self {
             description: sensor.for_recording(),
-            model: hrn.sha256().to_owned(),
+            model_sha256: hrn.sha256().to_owned(),
             references: hrn.known_references().clone(),
         }
     }
 
     /// The sensor's name.
     pub fn name(&self) -> &str {
-        &self.description.name
+        &self.description.sensor.name
     }
 
     /// Checks the description and returns the sensor.
@@ -139,30 +124,36 @@ impl RecordedSensor {
     /// # Errors
     ///
     /// Returns the errors of [`Sensor::new`], because a recording may hold anything.
-    pub fn check(&self) -> Result<Sensor, SensorError> {
+    pub fn check(&self) -> Result<Sensor, OutOfRange> {
         Sensor::new(self.description.clone())
     }
 }
 
-/// A sensor and the whole state of its pipeline. Another pipeline can continue from it.
+/// The version of the format. It rises when an older version cannot be played any more.
+pub const FORMAT: u32 = 3;
+
+/// A sensor and the state of its pipeline at rest. Another pipeline can continue from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct State {
+    /// The version of the format.
+    pub format: u32,
     /// The sensor.
     pub sensor: RecordedSensor,
     /// The state of the pipeline.
-    pub memory: pipeline::Memory,
+    pub at_rest: AtRest,
     /// The recording's labels. They are repeated here because a checksum covers them here.
     pub labels: Labels,
 }
 
 impl State {
-    /// The current state of `pipeline`.
-    pub fn of(pipeline: &Pipeline, labels: Labels) -> Self {
-        Self {
+    /// The current state of `pipeline`. `None` while a press or a tare is under way.
+    pub fn of(pipeline: &Pipeline, labels: &Labels) -> Option<Self> {
+        Some(Self {
+            format: FORMAT,
+            at_rest: pipeline.at_rest()?,
             sensor: RecordedSensor::new(pipeline.sensor(), pipeline.hrn()),
-            memory: pipeline.memory(),
-            labels,
-        }
+            labels: labels.clone(),
+        })
     }
 }
 

@@ -10,15 +10,15 @@ use std::ops::RangeInclusive;
 
 use zip::ZipArchive;
 
-use crate::npy::{Header, NpyError};
+use crate::npy::Header;
 use crate::npz::Writer;
 use crate::verdict::{
-    COLS, COURSE_FRAMES, Course, CourseMoment, MOST_REFERENCES, ModelFrame, Piece, ROWS,
-    ReferencePress, TAXELS,
+    COLS, COURSE_FRAMES, Course, MOST_REFERENCES, ModelFrame, Piece, ROWS, ReferencePress, Sample,
+    TAXELS,
 };
 
-/// Newtons per unit of `frames_mn`.
-const NEWTONS: f32 = 1e-3;
+/// The newtons on a taxel, without the sign.
+const MOST_N: f64 = 1e6;
 /// The lengths of pieces, in mm.
 const MOST_MM: f64 = 1000.0;
 /// The largest file that is read, in bytes.
@@ -44,7 +44,7 @@ pub enum Error {
         /// The name of the array.
         array: &'static str,
         /// What was found in its place.
-        source: NpyError,
+        source: std::io::Error,
     },
     /// An array has an unusable content.
     #[error("{array}: found {found}, expected {expected}")]
@@ -85,7 +85,7 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
     let time_s = arrays.read("time_s", &[], frames..=frames, 0.0..=1e5)?;
     let approach_mm = arrays.read("approach_mm", &[], frames..=frames, -1e6..=1e6)?;
     let known = arrays.read("known", &[], frames..=frames, 0.0..=1.0)?;
-    let frames_mn = arrays.read("frames_mn", &[ROWS, COLS], frames..=frames, 0.0..=65535.0)?;
+    let newtons = arrays.read("frames", &[ROWS, COLS], frames..=frames, -MOST_N..=MOST_N)?;
 
     let (mut references, mut first) = (Vec::with_capacity(count), 0);
     for number in 0..count {
@@ -98,11 +98,11 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
             let found = format!("{length} frames of press {number}");
             return Err(content("press", found, &expected));
         }
-        let moment = |row: usize| CourseMoment {
+        let moment = |row: usize| Sample {
             time_s: time_s[row] as f32,
             approach_mm: (known[row] == 1.0).then_some(approach_mm[row] as f32),
             frame: ModelFrame {
-                newtons: std::array::from_fn(|k| frames_mn[row * TAXELS + k] as f32 * NEWTONS),
+                newtons: std::array::from_fn(|k| newtons[row * TAXELS + k] as f32),
             },
         };
         let mm = piece_mm[number] as f32;
@@ -163,7 +163,7 @@ impl Arrays<'_> {
         let header = Header::read(&mut entry).map_err(failed)?;
         let found = match header.shape.split_first() {
             Some((&found, rest)) if !header.fortran_order && rest == row => found,
-            _ => return Err(failed(NpyError::Shape(header.shape))),
+            _ => return Err(failed(header.unexpected_shape())),
         };
         if !rows.contains(&found) {
             return Err(content(format!("{found} rows"), within(&rows)));
@@ -234,10 +234,9 @@ pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
     npz.add_list("approach_mm", &approach_mm.collect::<Vec<f32>>())?;
     let known = moments().map(|(_, m)| u8::from(m.approach_mm.is_some()));
     npz.add_list("known", &known.collect::<Vec<u8>>())?;
-    // A u16 holds up to 65 N on a taxel, which is beyond the range of any film.
     let newtons = moments().flat_map(|(_, m)| m.frame.newtons);
-    let millinewtons: Vec<u16> = newtons.map(|n| (n / NEWTONS).round() as u16).collect();
-    npz.add("frames_mn", &[numbers.len(), ROWS, COLS], &millinewtons)?;
+    let newtons: Vec<f32> = newtons.collect();
+    npz.add("frames", &[numbers.len(), ROWS, COLS], &newtons)?;
     Ok(npz.finish()?.into_inner())
 }
 
@@ -253,8 +252,9 @@ mod tests {
     fn press(frames: usize, piece: Piece) -> ReferencePress {
         let moment = |place: usize| {
             let mut frame = ModelFrame::default();
-            frame.newtons[400..403].fill((250 * (place + 1)) as f32 * NEWTONS);
-            CourseMoment {
+            frame.newtons[400..403].fill(0.25 * (place + 1) as f32);
+            frame.newtons[403] = -0.0125;
+            Sample {
                 time_s: 0.05 * place as f32,
                 approach_mm: (place != 2).then_some(0.5 * place as f32),
                 frame,

@@ -9,13 +9,13 @@ pub mod tools;
 
 use byteorder::LittleEndian;
 use jiff::Timestamp;
-use serde::de::Visitor;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::ser::SerializeTuple as _;
+use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value;
 
 pub use self::frame::contact;
 pub use self::frame::{CONTACT, FRAME, GRID};
-use crate::event::{self, Event, name};
+use crate::event::Event;
 use crate::frame::Pitch;
 
 /// The bytes before every message: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
@@ -121,100 +121,7 @@ impl Header {
 }
 
 /// Bytes that are written in one piece, because writing one element at a time is slow.
-#[derive(Debug)]
-pub struct Blob(pub Vec<u8>);
-
-impl Serialize for Blob {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_bytes(&self.0)
-    }
-}
-
-impl<'de> Deserialize<'de> for Blob {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct Bytes;
-        impl Visitor<'_> for Bytes {
-            type Value = Blob;
-
-            fn expecting(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                out.write_str("bytes")
-            }
-
-            fn visit_byte_buf<E>(self, bytes: Vec<u8>) -> Result<Blob, E> {
-                Ok(Blob(bytes))
-            }
-        }
-        deserializer.deserialize_byte_buf(Bytes)
-    }
-}
-
-#[derive(Debug, Serialize)]
-struct HardnessMessage<'a> {
-    header: Header,
-    seq: u64,
-    sensor: &'a str,
-    time: String,
-    press: u64,
-    phase: String,
-    level: u8,
-    label: &'a str,
-    rejected: String,
-    notes: Vec<String>,
-    probabilities: &'a [f32],
-    confidence: f32,
-    frame: u64,
-    contact_area_taxels: u32,
-    contact_area_mm2: f64,
-    force_n: f64,
-    model: &'a str,
-    state: String,
-    context: String,
-    mono_ns: u64,
-    age_at_publish_ms: f64,
-    latency_us: u64,
-    shore: f64,
-    shore_low: f64,
-    shore_high: f64,
-    levels: Blob,
-    course: String,
-    stiffness_n_per_mm: f64,
-    references: String,
-    object: &'a str,
-    object_presses: u64,
-    object_level: u8,
-    object_probabilities: &'a [f32],
-    object_shore: f64,
-    object_shore_low: f64,
-    object_shore_high: f64,
-}
-
-#[derive(Debug, Serialize)]
-struct PressMessage<'a> {
-    header: Header,
-    seq: u64,
-    sensor: &'a str,
-    time: String,
-    press: u64,
-    state: String,
-    frame: u64,
-    reason: &'a str,
-    frames: u64,
-    context: String,
-}
-
-#[derive(Debug, Serialize)]
-struct StatusMessage<'a> {
-    header: Header,
-    seq: u64,
-    sensor: &'a str,
-    time: String,
-    state: String,
-    reason: &'a str,
-    frames: u64,
-    frames_damaged: u64,
-    bytes_skipped: u64,
-    frame_rate_hz: f64,
-}
+pub type Blob = serde_bytes::ByteBuf;
 
 /// The bytes of a message: [`ENCAPSULATION`], then CDR.
 pub fn to_cdr(message: &impl Serialize) -> Vec<u8> {
@@ -224,8 +131,90 @@ pub fn to_cdr(message: &impl Serialize) -> Vec<u8> {
     bytes
 }
 
-fn context(context: Option<&Value>) -> String {
-    context.map_or_else(String::new, Value::to_string)
+/// A message whose fields have the names of an event's: a header, then the values of the event. A field
+/// such as `shore_low` is the field `low` of the event's `shore`.
+struct Named<'a> {
+    topic: Topic,
+    header: Header,
+    event: &'a Value,
+}
+
+impl Serialize for Named<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let definition = self.topic.definition.lines();
+        let fields = definition.filter(|line| !line.starts_with('#'));
+        let mut message = serializer.serialize_tuple(fields.clone().count())?;
+        for field in fields {
+            let (kind, name) = field
+                .split_once(' ')
+                .expect("a field has a type and a name");
+            let value = value_of(self.event, name);
+            let list = || value.as_array().into_iter().flatten();
+            let float = |value: &Value| value.as_f64().unwrap_or(f64::NAN);
+            match kind {
+                "std_msgs/Header" => message.serialize_element(&self.header)?,
+                "bool" => message.serialize_element(&value.as_bool().unwrap_or(false))?,
+                "uint8" => message.serialize_element(&(whole(value) as u8))?,
+                "uint32" => message.serialize_element(&(whole(value) as u32))?,
+                "uint64" => message.serialize_element(&whole(value))?,
+                "float32" => message.serialize_element(&(float(value) as f32))?,
+                "float64" => message.serialize_element(&float(value))?,
+                "string" => message.serialize_element(&text(value))?,
+                "string[]" => {
+                    message.serialize_element(&list().map(text).collect::<Vec<_>>())?;
+                }
+                "uint8[]" => {
+                    let bytes = list().map(|value| whole(value) as u8);
+                    message.serialize_element(&bytes.collect::<Vec<_>>())?;
+                }
+                "float32[]" => {
+                    let numbers = list().map(|value| float(value) as f32);
+                    message.serialize_element(&numbers.collect::<Vec<_>>())?;
+                }
+                other => unreachable!("no message of an event has a field of the type {other}"),
+            }
+        }
+        message.end()
+    }
+}
+
+/// The value of a field. Of an object it is the name or the value.
+fn value_of<'a>(event: &'a Value, name: &str) -> &'a Value {
+    if let Some(value) = event.get(name) {
+        let own = value.get("name").or_else(|| value.get("value"));
+        return own.filter(|_| name != "context").unwrap_or(value);
+    }
+    let mut borders = name.match_indices('_');
+    borders
+        .find_map(|(at, _)| Some(value_of(event.get(&name[..at])?, &name[at + 1..])))
+        .unwrap_or(&Value::Null)
+}
+
+fn whole(value: &Value) -> u64 {
+    value.as_u64().unwrap_or(0)
+}
+
+fn text(value: &Value) -> String {
+    match value {
+        Value::Null => String::new(),
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    }
+}
+
+fn named(
+    topic: Topic,
+    time: Timestamp,
+    sensor: &str,
+    event: &impl Serialize,
+) -> (Topic, Timestamp, Vec<u8>) {
+    let event = serde_json::to_value(event).expect("an event is JSON");
+    let message = Named {
+        topic,
+        header: Header::new(time, sensor),
+        event: &event,
+    };
+    (topic, time, to_cdr(&message))
 }
 
 /// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has three
@@ -242,79 +231,49 @@ pub fn encode_all(event: &Event, pitch: Pitch) -> Vec<(Topic, Timestamp, Vec<u8>
 pub fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
     match event {
         Event::Frame(frame) => frame::image(frame),
-        Event::Hardness(verdict) => {
-            let shore = verdict.shore;
-            let object = verdict.object.as_ref();
-            let of_object = object.and_then(|object| object.shore);
-            let message = HardnessMessage {
-                header: Header::new(verdict.time, &verdict.sensor),
-                seq: verdict.seq.unwrap_or(0),
-                sensor: &verdict.sensor,
-                time: event::time_text(verdict.time),
-                press: verdict.press,
-                phase: name(&verdict.phase),
-                level: verdict.level.unwrap_or(0),
-                label: verdict.label.as_deref().unwrap_or_default(),
-                rejected: verdict.rejected.as_ref().map_or_else(String::new, name),
-                notes: verdict.notes.iter().map(name).collect(),
-                probabilities: &verdict.probabilities,
-                confidence: verdict.confidence,
-                frame: verdict.frame,
-                contact_area_taxels: verdict.contact_area_taxels,
-                contact_area_mm2: verdict.contact_area_mm2,
-                force_n: verdict.force_n,
-                model: &verdict.model,
-                state: name(&verdict.state),
-                context: context(verdict.context.as_ref()),
-                mono_ns: verdict.mono_ns.unwrap_or(0),
-                age_at_publish_ms: verdict.age_at_publish_ms.unwrap_or(f64::NAN),
-                latency_us: verdict.latency_us.unwrap_or(0),
-                shore: shore.map_or(f64::NAN, |shore| shore.value.into()),
-                shore_low: shore.map_or(f64::NAN, |shore| shore.low.into()),
-                shore_high: shore.map_or(f64::NAN, |shore| shore.high.into()),
-                levels: Blob(verdict.levels.clone().unwrap_or_default()),
-                course: verdict.course.as_ref().map_or_else(String::new, name),
-                stiffness_n_per_mm: verdict.stiffness_n_per_mm.unwrap_or(f64::NAN),
-                references: name(&verdict.references),
-                object: object.map_or("", |object| &object.name),
-                object_presses: object.map_or(0, |object| object.presses),
-                object_level: object.map_or(0, |object| object.level),
-                object_probabilities: object.map_or(&[], |object| &object.probabilities),
-                object_shore: of_object.map_or(f64::NAN, |shore| shore.value.into()),
-                object_shore_low: of_object.map_or(f64::NAN, |shore| shore.low.into()),
-                object_shore_high: of_object.map_or(f64::NAN, |shore| shore.high.into()),
-            };
-            (HARDNESS, verdict.time, to_cdr(&message))
-        }
-        Event::Press(press) => {
-            let message = PressMessage {
-                header: Header::new(press.time, &press.sensor),
-                seq: press.seq.unwrap_or(0),
-                sensor: &press.sensor,
-                time: event::time_text(press.time),
-                press: press.press,
-                state: name(&press.state),
-                frame: press.frame,
-                reason: press.reason.unwrap_or_default(),
-                frames: press.frames,
-                context: context(press.context.as_ref()),
-            };
-            (PRESS, press.time, to_cdr(&message))
-        }
-        Event::Status(status) => {
-            let message = StatusMessage {
-                header: Header::new(status.time, &status.sensor),
-                seq: status.seq.unwrap_or(0),
-                sensor: &status.sensor,
-                time: event::time_text(status.time),
-                state: name(&status.state),
-                reason: status.reason.as_deref().unwrap_or_default(),
-                frames: status.frames,
-                frames_damaged: status.frames_damaged,
-                bytes_skipped: status.bytes_skipped,
-                frame_rate_hz: status.frame_rate_hz.unwrap_or(f64::NAN),
-            };
-            (STATUS, status.time, to_cdr(&message))
-        }
+        Event::Hardness(verdict) => named(HARDNESS, verdict.time, &verdict.sensor, verdict),
+        Event::Press(press) => named(PRESS, press.time, &press.sensor, press),
+        Event::Status(status) => named(STATUS, status.time, &status.sensor, status),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_message_has_the_values_of_an_event_in_the_order_of_its_definition() {
+        let topic = Topic {
+            definition: "# Words\nstd_msgs/Header header\nuint64 seq\nstring[] notes\nuint8[] levels\n\
+                         float64 shore\nfloat64 shore_low\nstring object\nfloat64 object_shore_low\n\
+                         string context\nfloat32 confidence\nstring reason\n",
+            ..HARDNESS
+        };
+        let event = json!({
+            "notes": ["at_edge"],
+            "levels": [2, 3],
+            "shore": {"value": 61.5, "low": 55.0},
+            "object": {"name": "cup", "shore": null},
+            "context": {"name": "x"},
+            "confidence": 0.5,
+            "reason": null,
+        });
+        let (_, _, bytes) = named(topic, Timestamp::UNIX_EPOCH, "forearm", &event);
+        type Numbers = (u64, Vec<String>, Vec<u8>, f64, f64);
+        type Texts = (String, f64, String, f32, String);
+        let read = cdr_encoding::from_bytes::<_, LittleEndian>(&bytes[4..]);
+        let (header, numbers, texts): (Header, Numbers, Texts) = read.unwrap().0;
+        assert_eq!(header.frame_id, "forearm");
+        let notes = vec!["at_edge".to_owned()];
+        assert_eq!(numbers, (0, notes, vec![2, 3], 61.5, 55.0));
+        let (object, low, context, confidence, reason) = texts;
+        assert!(low.is_nan());
+        let texts = [object, context, reason];
+        assert_eq!(
+            (texts, confidence),
+            (["cup", r#"{"name":"x"}"#, ""].map(str::to_owned), 0.5)
+        );
     }
 }

@@ -1,101 +1,67 @@
-//! The description of a sensor: how it writes frames, how counts become newtons, when a press
-//! begins and ends, and when a verdict is rejected.
+//! A sensor: the tables of a configuration that describe it.
 //!
 //! In: a [`Description`] from a configuration or a recording. Out: a [`Sensor`]. Every value of a
 //! [`Sensor`] is in its range, and the values fit each other, so no other module checks them again.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::port::Port;
 use crate::press::Thresholds;
-use crate::range::{self, OutOfRange, within};
+use crate::range::{OutOfRange, check, from_to};
 use crate::wire::{self, Layout};
-use crate::{motion, press, tare};
+use crate::{motion, press, tare, verdict};
 
-/// The description of a sensor. Its values are unchecked.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Description {
-    /// The sensor's name: `[a-z][a-z0-9_]*`.
-    pub name: String,
-    /// The number of frames that the sensor is expected to send in a second.
-    pub frame_rate_hz: f64,
-    /// The silence after which a live sensor is stale. `None` means the larger of 2.5 periods and
-    /// 50 ms.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub stale_after_ms: Option<f64>,
-    /// How the sensor writes a frame.
-    pub frame: wire::Settings,
-    /// How counts become newtons.
-    pub calibration: tare::Settings,
-    /// The thresholds that begin and end a press.
-    pub press: press::Settings,
-    /// The arm that presses with this sensor.
-    pub arm: motion::Settings,
-    /// A verdict below this confidence is rejected.
-    pub min_confidence: f32,
-    /// A verdict on a frame with less total force is rejected.
-    pub min_force_n: f64,
-    /// A model of the course gives an early verdict when its confidence reaches this value.
-    pub early_confidence: f32,
+crate::settings! {
+    /// The `[[sensor]]` table. By default, it is a JX255N (paper, "Tactile sensor").
+    pub struct Settings {
+        /// The sensor's name: `[a-z][a-z0-9_]*`.
+        pub name: String = "sensor".to_owned();
+        /// The sensor's port, which a configuration must name.
+        pub port: Port = Port::default();
+        /// The baud rate of the serial line, in bits per second. A pty and USB CDC ignore it.
+        pub baud: u32 = 115_200, in from_to((50.0, 20_000_000.0), "bits/s");
+        /// The number of frames that the sensor is expected to send in a second.
+        pub frame_rate_hz: f64 = DEFAULT_FRAME_RATE_HZ, in from_to(FRAME_RATES_HZ, "frames a second");
+        /// The silence after which a live sensor is stale. `None` means the larger of three periods and
+        /// 150 ms. Nobody waits longer than an hour for a frame.
+        pub stale_after_ms: Option<f64>, in from_to((0.1, 3_600_000.0), "milliseconds");
+        /// The file with presses of known pieces on this sensor, as `identify` makes it.
+        pub references: Option<PathBuf>;
+        /// The number of the sensor's last presses that serve as its references. 0 keeps none.
+        pub own_presses: u32 = 16, in from_to((0.0, 32.0), "presses");
+        /// How the sensor writes a frame.
+        pub frame: wire::Settings = wire::Settings::default();
+        /// How counts become newtons.
+        pub calibration: tare::Settings = tare::Settings::default();
+        /// The arm that presses with this sensor.
+        pub arm: motion::Settings = motion::Settings::default();
+    }
 }
 
-impl Default for Description {
-    /// A JX255N (paper, "Tactile sensor") named `sensor`; nothing is rejected.
-    fn default() -> Self {
+impl Settings {
+    /// A sensor at `port`, with the defaults of all other keys.
+    pub fn new(port: impl Into<Port>) -> Self {
         Self {
-            name: "sensor".to_owned(),
-            frame_rate_hz: DEFAULT_FRAME_RATE_HZ,
-            stale_after_ms: None,
-            frame: wire::Settings::default(),
-            calibration: tare::Settings::default(),
-            press: press::Settings::default(),
-            arm: motion::Settings::default(),
-            min_confidence: 0.0,
-            min_force_n: 0.0,
-            early_confidence: 0.95,
+            port: port.into(),
+            ..Self::default()
         }
     }
 }
 
-impl Description {
-    /// The first key that differs and that a running pipeline cannot change.
-    pub fn fixed_difference(&self, other: &Self) -> Option<&'static str> {
-        let differs = [
-            ("name", self.name != other.name),
-            ("frame_rate_hz", self.frame_rate_hz != other.frame_rate_hz),
-            ("frame", self.frame != other.frame),
-        ];
-        let first = differs.iter().find(|(_, differs)| *differs);
-        first.map(|(key, _)| *key)
-    }
-}
-
-/// An unusable value of a [`Description`]. The message begins with the value's key.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum SensorError {
-    /// The name cannot be part of a topic, a file name or a log line.
-    #[error("name: found {0:?}, expected a letter a to z, then letters a to z, digits or _")]
-    Name(String),
-    /// A number is out of its range.
-    #[error(transparent)]
-    Range(#[from] OutOfRange),
-    /// The layout of a frame is unusable.
-    #[error("frame.{0}")]
-    Frame(#[from] wire::LayoutError),
-    /// A time between requests, and no request.
-    #[error("frame.request_ms: found a value, expected none without frame.request")]
-    NoRequest,
-    /// The calibration is unusable.
-    #[error("calibration.{0}")]
-    Calibration(#[from] tare::SettingsError),
-    /// The settings of presses are unusable.
-    #[error("press.{0}")]
-    Press(OutOfRange),
-    /// The settings of the arm are unusable.
-    #[error("arm.{0}")]
-    Arm(OutOfRange),
+/// The description of a sensor: the tables of a configuration that hold for it. Its values are
+/// unchecked.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Description {
+    /// The `[[sensor]]` table.
+    #[serde(flatten)]
+    pub sensor: Settings,
+    /// The `[press]` table.
+    pub press: press::Settings,
+    /// The `[model]` table.
+    pub model: verdict::Settings,
 }
 
 /// The frame rate of the paper's sensor.
@@ -105,23 +71,16 @@ pub const DEFAULT_FRAME_RATE_HZ: f64 = 5.0;
 /// sane time to wait.
 pub const FRAME_RATES_HZ: (f64, f64) = (0.01, 10_000.0);
 
-/// The accepted stale times: from a period of the highest rate to an hour. Nobody waits longer for
-/// a frame.
-const STALE_AFTER_MS: (f64, f64) = (0.1, 3_600_000.0);
-
-/// The accepted times between requests, up to an hour.
-const REQUEST_MS: (u32, u32) = (1, 3_600_000);
-
 /// The longest name. A name is part of topics, of file names and of each line of the log.
-const MOST_NAME_CHARS: usize = 64;
+pub const MOST_NAME_CHARS: usize = 64;
 
-/// A frame is late after this many periods.
+/// The first frame after the port was opened is late after this many periods.
 pub const LATE_PERIODS: f64 = 2.5;
 
-/// The least stale time by default. USB adapters deliver every 16 ms, and a busy host reads some
-/// milliseconds later. With 2.5 periods, a sensor at 100 frames/s would often become stale and live
-/// again.
-const LEAST_STALE_AFTER: Duration = Duration::from_millis(50);
+/// The stale time by default: this many periods, but at least this time. A sender whose frames come
+/// unevenly at 50 frames/s was stale 267 times in five minutes with 50 ms.
+const STALE_PERIODS: f64 = 3.0;
+const LEAST_STALE_AFTER: Duration = Duration::from_millis(150);
 
 /// A sensor whose description has been checked.
 #[derive(Debug, Clone, PartialEq)]
@@ -132,84 +91,75 @@ pub struct Sensor {
     stale_after: Duration,
 }
 
+impl Settings {
+    /// Checks every value. Returns the layout of a frame.
+    fn check(&self) -> Result<Layout, OutOfRange> {
+        let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        let name = &self.name;
+        let found = name.chars().count();
+        check(
+            "name",
+            format_args!("{found} characters"),
+            found <= MOST_NAME_CHARS,
+            format_args!("at most {MOST_NAME_CHARS}"),
+        )?;
+        check(
+            "name",
+            name,
+            name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part),
+            "a letter a to z, then letters a to z, digits or _",
+        )?;
+        self.check_ranges()?;
+        let layout = Layout::new(&self.frame).map_err(|error| error.within("frame"))?;
+        let calibration = self.calibration.check(layout.array());
+        calibration.map_err(|error| error.within("calibration"))?;
+        let arm = self.arm.check_ranges();
+        arm.map_err(|error| error.within("arm"))?;
+        Ok(layout)
+    }
+}
+
 impl Sensor {
     /// Checks a description.
     ///
     /// # Errors
     ///
-    /// Returns a [`SensorError`] for the first value that is out of its range or does not fit the
-    /// layout.
+    /// Returns an error for the first value that is out of its range or does not fit the layout. Its
+    /// key begins with the table: `sensor`, `press` or `model`.
     ///
     /// # Example
     ///
     /// ```
     /// use hardnessd_core::sensor::{Description, Sensor};
     ///
-    /// let described = |frame_rate_hz| Description {
-    ///     name: "forearm".to_owned(),
-    ///     frame_rate_hz,
-    ///     ..Description::default()
+    /// let described = |frame_rate_hz| {
+    ///     let mut described = Description::default();
+    ///     described.sensor.frame_rate_hz = frame_rate_hz;
+    ///     described
     /// };
     /// let sensor = Sensor::new(described(100.0))?;
     /// assert_eq!(sensor.period().as_millis(), 10);
-    /// assert_eq!(sensor.stale_after().as_millis(), 50);
+    /// assert_eq!(sensor.stale_after().as_millis(), 150);
     ///
     /// let error = Sensor::new(described(0.0)).unwrap_err();
-    /// assert!(error.to_string().starts_with("frame_rate_hz: found 0.0, expected"));
-    /// # Ok::<(), hardnessd_core::sensor::SensorError>(())
+    /// assert!(error.to_string().starts_with("sensor.frame_rate_hz: found 0.0, expected"));
+    /// # Ok::<(), hardnessd_core::range::OutOfRange>(())
     /// ```
-    pub fn new(description: Description) -> Result<Self, SensorError> {
+    pub fn new(description: Description) -> Result<Self, OutOfRange> {
         let Description {
-            name,
-            frame_rate_hz,
-            stale_after_ms,
-            frame,
-            calibration,
+            sensor,
             press,
-            arm,
-            min_confidence,
-            min_force_n,
-            early_confidence,
+            model,
         } = &description;
-        let part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-        let found = name.chars().count();
-        range::check(
-            "name",
-            format_args!("{found} characters"),
-            found <= MOST_NAME_CHARS,
-            format_args!("at most {MOST_NAME_CHARS}"),
-        )?;
-        if !(name.starts_with(|first: char| first.is_ascii_lowercase()) && name.chars().all(part)) {
-            return Err(SensorError::Name(name.clone()));
-        }
-        within(
-            "frame_rate_hz",
-            *frame_rate_hz,
-            FRAME_RATES_HZ,
-            "frames a second",
-        )?;
-        let stale_after = match *stale_after_ms {
-            None => LEAST_STALE_AFTER.max(late(*frame_rate_hz)),
-            Some(ms) => {
-                within("stale_after_ms", ms, STALE_AFTER_MS, "milliseconds")?;
-                of_ms(ms)
-            }
+        let layout = sensor.check().map_err(|error| error.within("sensor"))?;
+        let thresholds = press.check(layout.array(), sensor.calibration.pitch_mm);
+        let thresholds = thresholds.map_err(|error| error.within("press"))?;
+        let ranges = model.check_ranges();
+        ranges.map_err(|error| error.within("model"))?;
+        let stale_after = match sensor.stale_after_ms {
+            None => LEAST_STALE_AFTER.max(period(sensor.frame_rate_hz).mul_f64(STALE_PERIODS)),
+            Some(ms) => of_ms(ms),
         };
-        let layout = Layout::new(frame)?;
-        if let Some(ms) = frame.request_ms {
-            if frame.request.is_none() {
-                return Err(SensorError::NoRequest);
-            }
-            within("frame.request_ms", ms, REQUEST_MS, "milliseconds")?;
-        }
-        calibration.check(layout.array())?;
-        let thresholds = press.check(layout.array(), calibration.pitch_mm);
-        let thresholds = thresholds.map_err(SensorError::Press)?;
-        arm.check().map_err(SensorError::Arm)?;
-        within("min_confidence", *min_confidence, (0.0, 1.0), "")?;
-        let fits = (0.0..=f64::MAX).contains(min_force_n);
-        range::check("min_force_n", min_force_n, fits, "newtons, 0 or more")?;
-        within("early_confidence", *early_confidence, (0.0, 1.0), "")?;
         Ok(Self {
             layout,
             thresholds,
@@ -225,7 +175,7 @@ impl Sensor {
 
     /// The sensor's name.
     pub fn name(&self) -> &str {
-        &self.description.name
+        &self.description.sensor.name
     }
 
     /// The thresholds of presses, for the size of the sensor's taxels.
@@ -233,20 +183,39 @@ impl Sensor {
         &self.thresholds
     }
 
-    /// The description as a recording holds it. Values whose default is computed are written, so a
-    /// later default does not change what a recording says.
+    /// The `[sensor.calibration]` table.
+    pub fn calibration(&self) -> &tare::Settings {
+        &self.description.sensor.calibration
+    }
+
+    /// The `[sensor.arm]` table.
+    pub fn arm(&self) -> &motion::Settings {
+        &self.description.sensor.arm
+    }
+
+    /// The number of frames that the sensor is expected to send in a second.
+    pub fn frame_rate_hz(&self) -> f64 {
+        self.description.sensor.frame_rate_hz
+    }
+
+    /// The description as a recording holds it, without the port and files of this machine. Values
+    /// whose default is computed are written, so a later default does not change what a recording
+    /// says.
     pub fn for_recording(&self) -> Description {
-        let press = press::Settings {
-            contact_threshold_n: Some(self.thresholds.contact_threshold_n),
-            begin_area_taxels: Some(self.thresholds.begin_area_taxels),
-            end_area_taxels: Some(self.thresholds.end_area_taxels),
-            ..self.description.press.clone()
-        };
-        Description {
-            stale_after_ms: Some(self.stale_after.as_nanos() as f64 / 1e6),
+        let mut description = self.description.clone();
+        let Description {
+            sensor,
             press,
-            ..self.description.clone()
-        }
+            model,
+        } = &mut description;
+        sensor.port = Port::default();
+        sensor.references = None;
+        sensor.stale_after_ms = Some(self.stale_after.as_nanos() as f64 / 1e6);
+        press.contact_threshold_n = Some(self.thresholds.contact_threshold_n);
+        press.begin_area_taxels = Some(self.thresholds.begin_area_taxels);
+        press.end_area_taxels = Some(self.thresholds.end_area_taxels);
+        (model.path, model.sha256) = (None, None);
+        description
     }
 
     /// How the sensor writes a frame.
@@ -256,12 +225,12 @@ impl Sensor {
 
     /// The expected time from frame to frame.
     pub fn period(&self) -> Duration {
-        period(self.description.frame_rate_hz)
+        period(self.frame_rate_hz())
     }
 
     /// The time after which a missing frame is late: 2.5 periods.
     pub fn late_after(&self) -> Duration {
-        late(self.description.frame_rate_hz)
+        self.period().mul_f64(LATE_PERIODS)
     }
 
     /// How long a live sensor may be silent before it is stale.
@@ -272,10 +241,6 @@ impl Sensor {
 
 fn period(frame_rate_hz: f64) -> Duration {
     Duration::from_secs_f64(1.0 / frame_rate_hz)
-}
-
-fn late(frame_rate_hz: f64) -> Duration {
-    period(frame_rate_hz).mul_f64(LATE_PERIODS)
 }
 
 fn of_ms(ms: f64) -> Duration {
@@ -297,47 +262,56 @@ mod tests {
             assert!(error.starts_with(expected), "{error}");
         };
         check(
-            &|d| d.name = "Arm".to_owned(),
-            "name: found \"Arm\", expected a letter a to z, then",
+            &|d| d.sensor.name = "Arm".to_owned(),
+            "sensor.name: found \"Arm\", expected a letter a to z, then",
         );
         check(
-            &|d| d.name = "\u{202e}".to_owned(),
-            "name: found \"\\u{202e}\"",
+            &|d| d.sensor.name = "\u{202e}".to_owned(),
+            "sensor.name: found \"\\u{202e}\"",
         );
-        check(&|d| d.name.clear(), "name: found \"\"");
-        let long = "name: found 300 characters, expected at most 64";
-        check(&|d| d.name = "a".repeat(300), long);
+        check(&|d| d.sensor.name.clear(), "sensor.name: found \"\"");
+        let long = "sensor.name: found 300 characters, expected at most 64";
+        check(&|d| d.sensor.name = "a".repeat(300), long);
         for hz in [0.0, -5.0, 0.009, 10_001.0, f64::NAN, f64::INFINITY] {
-            check(&|d| d.frame_rate_hz = hz, "frame_rate_hz: found");
+            check(
+                &|d| d.sensor.frame_rate_hz = hz,
+                "sensor.frame_rate_hz: found",
+            );
         }
         for ms in [0.0, -1.0, 3.7e6, f64::NAN] {
-            check(&|d| d.stale_after_ms = Some(ms), "stale_after_ms: found");
+            check(
+                &|d| d.sensor.stale_after_ms = Some(ms),
+                "sensor.stale_after_ms: found",
+            );
         }
-        check(&|d| d.frame.rows = Some(65), "frame.rows: found 65");
         check(
-            &|d| d.frame.request_ms = Some(5),
-            "frame.request_ms: found a value",
+            &|d| d.sensor.frame.rows = Some(65),
+            "sensor.frame.rows: found 65",
+        );
+        check(
+            &|d| d.sensor.frame.request_ms = Some(5),
+            "sensor.frame.request_ms: found a value",
         );
         for ms in [0, 3_600_001] {
             check(
                 &|d| {
-                    d.frame.request = Some(HexBytes(vec![0x52]));
-                    d.frame.request_ms = Some(ms);
+                    d.sensor.frame.request = Some(HexBytes(vec![0x52]));
+                    d.sensor.frame.request_ms = Some(ms);
                 },
-                &format!("frame.request_ms: found {ms}, expected 1 to 3600000"),
+                &format!("sensor.frame.request_ms: found {ms}, expected 1 to 3600000"),
             );
         }
-        let dead = "calibration.dead_taxels: found [5, 0]";
+        let dead = "sensor.calibration.dead_taxels: found [5, 0]";
         check(
             &|d| {
-                d.frame.rows = Some(5);
-                d.calibration.dead_taxels = vec![[5, 0]];
+                d.sensor.frame.rows = Some(5);
+                d.sensor.calibration.dead_taxels = vec![[5, 0]];
             },
             dead,
         );
         check(
-            &|d| d.calibration.exponent = 5.0,
-            "calibration.exponent: found 5.0, expected 0.25 to 4",
+            &|d| d.sensor.calibration.exponent = 5.0,
+            "sensor.calibration.exponent: found 5.0, expected 0.25 to 4",
         );
         check(&|d| d.press.end_frames = 0, "press.end_frames: found 0");
         for (change, found) in [
@@ -364,26 +338,35 @@ mod tests {
             ),
         ] {
             check(
-                &|d| d.arm = change.clone(),
-                &format!("arm.{found}, expected"),
+                &|d| d.sensor.arm = change.clone(),
+                &format!("sensor.arm.{found}, expected"),
             );
         }
-        check(&|d| d.early_confidence = 1.1, "early_confidence: found 1.1");
-        check(&|d| d.min_confidence = 1.5, "min_confidence: found 1.5");
-        check(&|d| d.min_force_n = f64::NAN, "min_force_n: found NaN");
+        check(
+            &|d| d.model.early_confidence = 1.1,
+            "model.early_confidence: found 1.1",
+        );
+        check(
+            &|d| d.model.min_confidence = 1.5,
+            "model.min_confidence: found 1.5",
+        );
+        check(
+            &|d| d.model.min_force_n = f64::NAN,
+            "model.min_force_n: found NaN",
+        );
     }
 
     #[test]
     fn a_recording_holds_how_long_a_silence_is_stale() {
         for (hz, ms) in [(5.0, None), (100.0, None), (3.0, None), (100.0, Some(33.3))] {
-            let described = Description {
-                frame_rate_hz: hz,
-                stale_after_ms: ms,
-                ..Description::default()
-            };
+            let mut described = Description::default();
+            (
+                described.sensor.frame_rate_hz,
+                described.sensor.stale_after_ms,
+            ) = (hz, ms);
             let sensor = Sensor::new(described).unwrap();
             let recorded = sensor.for_recording();
-            assert!(recorded.stale_after_ms.is_some());
+            assert!(recorded.sensor.stale_after_ms.is_some());
             assert_eq!(recorded.press.contact_threshold_n, Some(0.07));
             let played = Sensor::new(recorded).unwrap();
             assert_eq!(

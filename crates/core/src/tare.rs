@@ -8,8 +8,7 @@ mod settings;
 
 use serde::{Deserialize, Serialize};
 
-use self::settings::MOST_TARE_FRAMES;
-pub use self::settings::{EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, Settings, SettingsError};
+pub use self::settings::{EXPONENTS, GAINS, Gains, NEWTONS_PER_COUNT, Settings};
 use crate::frame::{Array, Frame, RawFrame};
 
 /// The thresholds at which frames of a tare count as touched.
@@ -25,6 +24,9 @@ pub struct Contact {
 /// second is 1 N in an hour. Film arrays drift by half as much. A touch that is too light for a
 /// press, below 0.07 N on a taxel, takes four minutes to disappear.
 pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
+
+/// The largest force of a taxel: more than any sensor feels.
+const MOST_N: f32 = 1e20;
 
 /// A summary of a baseline over the array's live taxels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -66,13 +68,66 @@ pub struct Retaken {
     pub new: Offsets,
 }
 
+/// Why frames of a tare count as touched.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Touch {
+    /// How the taxels show the touch.
+    pub kind: TouchKind,
+    /// The number of such taxels.
+    pub taxels: usize,
+    /// The row and the column of the taxel that shows it most, and its newtons.
+    pub most: ([usize; 2], f32),
+    /// The newtons that it may show at most.
+    pub limit_n: f32,
+}
+
+/// How taxels show a touch during a tare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum TouchKind {
+    /// They vary from frame to frame.
+    Varies,
+    /// They read more than the array's median.
+    High,
+}
+
+/// What was found, and what to do if nothing touches the sensor.
+impl std::fmt::Display for Touch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let ([row, col], most_n) = self.most;
+        let rounded = |n: f32| (1e3 * f64::from(n)).round() / 1e3;
+        let [most_n, limit_n] = [most_n, self.limit_n].map(rounded);
+        let taxels = match self.taxels {
+            1 => "1 taxel".to_owned(),
+            taxels => format!("{taxels} taxels"),
+        };
+        let (found, key) = match self.kind {
+            TouchKind::Varies => (
+                format!("{taxels} varied by {limit_n} N or more, [{row}, {col}] by {most_n} N"),
+                "contact_threshold_n",
+            ),
+            TouchKind::High => (
+                format!(
+                    "{taxels} read more than {limit_n} N above the array's median, [{row}, {col}] \
+                     {most_n} N"
+                ),
+                "tare_max_n",
+            ),
+        };
+        write!(
+            f,
+            "{found}: free the sensor; if nothing touches it, set a smaller newtons_per_count or a \
+             {key} above {most_n}, or list broken taxels in dead_taxels"
+        )
+    }
+}
+
 /// The purpose of a tare under way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Aim {
     /// The first baseline. It is tried again until nothing touches the sensor.
     First {
-        /// Whether something touched the sensor during an earlier try.
-        met_contact: bool,
+        /// What touched the sensor during the last try.
+        touch: Option<Touch>,
     },
     /// Another baseline, on request. The old baseline stays in force until the new one is taken.
     /// The tare is given up when something touches the sensor.
@@ -91,11 +146,11 @@ pub enum Aim {
 /// let settings = Settings { tare_frames: 1, ..Settings::default() };
 /// let mut tare = Tare::new(&settings, Array::JX255N, contact);
 /// let mut raw = RawFrame::zero(Array::JX255N);
-/// raw.counts.fill(2);
+/// raw.counts.fill(2.0);
 /// tare.observe(&raw);
 /// assert_eq!(tare.aim(), None, "the tare is taken");
 ///
-/// raw.counts[0] = 27;
+/// raw.counts[0] = 27.0;
 /// let frame = tare.apply(&raw);
 /// assert_eq!(frame.newtons[0], 25.0 * 0.04);
 /// assert_eq!(frame.newtons[1], 0.0);
@@ -139,17 +194,18 @@ impl ForceCurve {
         }
     }
 
-    /// The newtons of this many counts above the baseline, at a taxel.
+    /// The newtons of this many counts above the baseline, at a taxel. Counts below the baseline give
+    /// negative newtons: without them, noise would add up to a force.
     fn newtons(&self, counts: f32, place: usize) -> f32 {
-        let counts = counts.max(0.0);
-        // An exponent of 1 skips `powf`, so the result has the same bits as before exponents
-        // existed.
+        // An exponent of 1 skips `powf`, which costs more and rounds.
         let raised = if self.exponent == 1.0 {
             counts
         } else {
-            counts.powf(self.exponent)
+            counts.abs().powf(self.exponent).copysign(counts)
         };
-        raised * self.newtons_per_count * self.gains[place]
+        // Counts may be as large as a float allows. Newtons are finite.
+        let newtons = raised.clamp(-MOST_N, MOST_N) * self.newtons_per_count * self.gains[place];
+        newtons.clamp(-MOST_N, MOST_N)
     }
 
     /// The counts above the baseline that give `newtons`, without the exponent.
@@ -181,52 +237,41 @@ impl Stage {
         Self::Taking { aim, sums }
     }
 
-    /// Begins the first tare again, after a touch. `first` is the first of its frames, if that is known.
-    fn again(frames: u32, array: Array, first: Option<&RawFrame>) -> Self {
+    /// Begins the first tare again, after `touch`. `first` is the first of its frames, if that is known.
+    fn again(frames: u32, array: Array, touch: Touch, first: Option<&RawFrame>) -> Self {
         let mut sums = Sums::new(frames, array);
         if let Some(raw) = first {
             sums.add(raw);
         }
-        let aim = Aim::First { met_contact: true };
+        let touch = Some(touch);
+        let aim = Aim::First { touch };
         Self::Taking { aim, sums }
     }
 }
 
-/// The state of a [`Tare`], without its settings.
+/// The state of a [`Tare`] of which no frame is taken in yet, or that has ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Memory {
+pub struct AtRest {
     baseline: Vec<f32>,
-    taking: Option<(Aim, Sums)>,
+    /// The purpose of the tare that begins with the next frame.
+    aim: Option<Aim>,
 }
 
-impl Memory {
-    /// Whether a tare of `array` can have this state. A recording may hold anything.
-    pub(crate) fn is_possible(&self, array: Array) -> bool {
-        // The mean of counts, with room for rounding.
-        let is_count = |mean: &f32| (0.0..=65_536.0).contains(mean);
-        let are_sums = |(_, sums): &(Aim, Sums)| {
-            let most = u64::from(sums.seen) * u64::from(u16::MAX);
-            sums.seen < sums.wanted
-                && sums.sum.len() == array.taxels()
-                && sums.least.len() == array.taxels()
-                && sums.most.len() == array.taxels()
-                && sums.wanted <= MOST_TARE_FRAMES
-                && sums.sum.iter().all(|&sum| u64::from(sum) <= most)
-        };
-        self.baseline.len() == array.taxels()
-            && self.baseline.iter().all(is_count)
-            && self.taking.as_ref().is_none_or(are_sums)
+impl AtRest {
+    /// Whether a tare of `array` can continue from it. A recording may hold anything.
+    pub(crate) fn is_usable(&self, array: Array) -> bool {
+        self.baseline.len() == array.taxels() && self.baseline.iter().all(|mean| mean.is_finite())
     }
 }
 
 /// The sums over the frames of a tare.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone)]
 struct Sums {
     wanted: u32,
     seen: u32,
-    sum: Vec<u32>,
-    least: Vec<u16>,
-    most: Vec<u16>,
+    sum: Vec<f64>,
+    least: Vec<f32>,
+    most: Vec<f32>,
 }
 
 impl Sums {
@@ -234,16 +279,16 @@ impl Sums {
         Self {
             wanted,
             seen: 0,
-            sum: vec![0; array.taxels()],
-            least: vec![u16::MAX; array.taxels()],
-            most: vec![0; array.taxels()],
+            sum: vec![0.0; array.taxels()],
+            least: vec![f32::MAX; array.taxels()],
+            most: vec![f32::MIN; array.taxels()],
         }
     }
 
     fn add(&mut self, raw: &RawFrame) {
         self.seen += 1;
         for (place, &count) in raw.counts.iter().enumerate() {
-            self.sum[place] += u32::from(count);
+            self.sum[place] += f64::from(count);
             self.least[place] = self.least[place].min(count);
             self.most[place] = self.most[place].max(count);
         }
@@ -255,7 +300,7 @@ impl Tare {
     ///
     /// `settings` have passed [`Settings::check`] for `array`.
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
-        let first = Aim::First { met_contact: false };
+        let first = Aim::First { touch: None };
         Self {
             scale: ForceCurve::new(settings, array),
             frames: settings.tare_frames,
@@ -269,44 +314,26 @@ impl Tare {
         }
     }
 
-    /// Takes over changed settings. The baseline in force stays. If the number of frames of a tare
-    /// changes, a tare under way begins again. If the number becomes 0, a tare under way ends.
-    pub fn reload(&mut self, settings: &Settings, contact: Contact) {
-        let frames = settings.tare_frames;
-        self.stage = match std::mem::replace(&mut self.stage, Stage::Idle) {
-            Stage::Taking {
-                aim: Aim::Request, ..
-            } if frames == 0 => Stage::Ended(Err(RetareError::NoFrames)),
-            Stage::Taking { aim, .. } if frames != self.frames => {
-                Stage::begin(aim, frames, self.array)
-            }
-            stage => stage,
-        };
-        self.scale = ForceCurve::new(settings, self.array);
-        self.frames = frames;
-        self.max_n = settings.tare_max_n;
-        self.follows = settings.auto_tare;
-        self.contact = contact;
-        self.dead = dead(settings, self.array);
+    /// Whether no tare is under way, or the one under way has taken in no frame.
+    pub fn is_at_rest(&self) -> bool {
+        !matches!(&self.stage, Stage::Taking { sums, .. } if sums.seen > 0)
     }
 
-    /// The state of the tare.
-    pub fn memory(&self) -> Memory {
-        Memory {
+    /// The state of the tare at rest.
+    pub fn at_rest(&self) -> AtRest {
+        AtRest {
             baseline: self.baseline.clone(),
-            taking: match &self.stage {
-                Stage::Taking { aim, sums } => Some((*aim, sums.clone())),
-                Stage::Idle | Stage::Ended(_) => None,
-            },
+            aim: self.aim(),
         }
     }
 
     /// Continues from the state of another tare.
-    pub fn recall(&mut self, memory: Memory) {
-        self.baseline = memory.baseline;
-        let taking = memory.taking;
-        let taking = taking.map(|(aim, sums)| Stage::Taking { aim, sums });
-        self.stage = taking.unwrap_or(Stage::Idle);
+    pub fn resume(&mut self, state: AtRest) {
+        let stage = state
+            .aim
+            .map(|aim| Stage::begin(aim, self.frames, self.array));
+        self.stage = stage.unwrap_or(Stage::Idle);
+        self.baseline = state.baseline;
     }
 
     /// The purpose of the tare under way, if there is one.
@@ -363,12 +390,13 @@ impl Tare {
         }
     }
 
-    /// Converts counts to newtons: `newtons_per_count x max(0, counts - baseline)^exponent x gain`.
+    /// Converts counts to newtons: `newtons_per_count x (counts - baseline)^exponent x gain`. Below the
+    /// baseline, the power is that of the difference without its sign, and the newtons are negative.
     /// A dead taxel is replaced by the mean of its live neighbours.
     pub fn apply(&self, raw: &RawFrame) -> Frame {
         let mut frame = Frame::zero(self.array);
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
-            let counts = f32::from(raw.counts[place]) - self.baseline[place];
+            let counts = raw.counts[place] - self.baseline[place];
             *newtons = self.scale.newtons(counts, place);
         }
         for (place, neighbours) in &self.dead {
@@ -387,21 +415,21 @@ impl Tare {
     ///
     /// Call this function once a second at most, and never during a press.
     pub fn follow(&mut self, raw: &RawFrame) {
-        let above = |place: usize| f32::from(raw.counts[place]) - self.baseline[place];
+        let above = |place: usize| raw.counts[place] - self.baseline[place];
         let is_touched =
             |place: &usize| self.scale.newtons(above(*place), *place) >= self.contact.threshold_n;
         if !self.follows || self.live().iter().any(is_touched) {
             return;
         }
         for (place, baseline) in self.baseline.iter_mut().enumerate() {
-            let above = f32::from(raw.counts[place]) - *baseline;
+            let above = raw.counts[place] - *baseline;
             let most = self.scale.counts(MOST_STEP_N, place);
             *baseline += above.clamp(-most, most);
         }
     }
 
     /// Whether a live taxel reads `full_scale` counts.
-    pub fn is_saturated(&self, raw: &RawFrame, full_scale: u16) -> bool {
+    pub fn is_saturated(&self, raw: &RawFrame, full_scale: f32) -> bool {
         raw.counts.iter().enumerate().any(|(place, &count)| {
             count >= full_scale && !self.dead.iter().any(|(dead, _)| *dead == place)
         })
@@ -418,12 +446,16 @@ impl Tare {
         let (aim, sums) = (*aim, sums.clone());
         let means = sums.sum.iter().map(|&sum| sum as f32 / sums.seen as f32);
         let mean: Vec<f32> = means.collect();
-        let moves = self.is_moving(&sums);
         let is_whole = sums.seen == sums.wanted;
-        if moves || (is_whole && self.is_loaded(&mean)) {
+        let moving = self.moving(&sums);
+        let loaded = || is_whole.then(|| self.loaded(&mean)).flatten();
+        if let Some(touch) = moving.or_else(loaded) {
             self.stage = match aim {
                 // A frame unlike those before it may be the first one without a touch.
-                Aim::First { .. } => Stage::again(sums.wanted, self.array, moves.then_some(raw)),
+                Aim::First { .. } => {
+                    let first = moving.map(|_| raw);
+                    Stage::again(sums.wanted, self.array, touch, first)
+                }
                 Aim::Request => Stage::Ended(Err(RetareError::Touched)),
             };
             return;
@@ -442,26 +474,42 @@ impl Tare {
         };
     }
 
-    /// Whether the frames of a tare differ as under a touch that moves.
-    fn is_moving(&self, sums: &Sums) -> bool {
-        let live = self.live();
-        let varying = live.iter().filter(|&&place| {
-            let spread = f32::from(sums.most[place] - sums.least[place]);
-            self.scale.newtons(spread, place) >= self.contact.threshold_n
-        });
-        varying.count() >= self.contact.area_taxels as usize
+    /// The touch, if the frames of a tare differ as under a touch that moves.
+    fn moving(&self, sums: &Sums) -> Option<Touch> {
+        let limit_n = self.contact.threshold_n;
+        let spread = |place: usize| sums.most[place] - sums.least[place];
+        self.touch(TouchKind::Varies, limit_n, spread, |n| n >= limit_n)
     }
 
-    /// Whether the mean of the frames is that of a sensor on which something rests.
-    fn is_loaded(&self, mean: &[f32]) -> bool {
-        let live = self.live();
-        let mut sorted: Vec<f32> = live.iter().map(|&place| mean[place]).collect();
+    /// The touch, if the mean of the frames is that of a sensor on which something rests.
+    fn loaded(&self, mean: &[f32]) -> Option<Touch> {
+        let mut sorted: Vec<f32> = self.live().iter().map(|&place| mean[place]).collect();
         sorted.sort_by(f32::total_cmp);
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
-        let high = live
+        let above = |place: usize| mean[place] - median;
+        self.touch(TouchKind::High, self.max_n, above, |n| n > self.max_n)
+    }
+
+    /// The touch, if enough live taxels show one by the newtons of these counts.
+    fn touch(
+        &self,
+        kind: TouchKind,
+        limit_n: f32,
+        counts: impl Fn(usize) -> f32,
+        shows: impl Fn(f32) -> bool,
+    ) -> Option<Touch> {
+        let newtons = |place: usize| (place, self.scale.newtons(counts(place), place));
+        let found = self.live().into_iter().map(newtons);
+        let found: Vec<(usize, f32)> = found.filter(|&(_, n)| shows(n)).collect();
+        let &(place, newtons) = found
             .iter()
-            .filter(|&&place| self.scale.newtons(mean[place] - median, place) > self.max_n);
-        high.count() >= self.contact.area_taxels as usize
+            .max_by(|one, other| one.1.total_cmp(&other.1))?;
+        (found.len() >= self.contact.area_taxels as usize).then_some(Touch {
+            kind,
+            taxels: found.len(),
+            most: (self.array.position(place).into(), newtons),
+            limit_n,
+        })
     }
 
     /// The places of the array's live taxels.

@@ -5,7 +5,7 @@
     reason = "this is test code, which clippy does not know as such"
 )]
 
-pub mod course_model;
+pub mod noisy_array;
 
 use std::sync::{Arc, LazyLock};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use crate::motion::Point;
 use crate::pipeline::{Clock, Input, Pipeline};
 use crate::recording::{About, Entry, Labels, RecordedSensor, State, Writer};
 use crate::sensor::{Description, Sensor};
-use crate::tare::{self, Gains};
+use crate::tare::Gains;
 use crate::verdict::{BUILT_IN_HRN, Hrn};
 
 /// The built-in model.
@@ -32,23 +32,15 @@ pub fn sensor() -> Sensor {
 }
 
 fn described() -> Description {
-    Description {
-        name: "forearm".to_owned(),
-        calibration: tare::Settings {
-            gains: Some(Gains::Taxels(vec![
-                (1..=Array::JX255N.cols)
-                    .map(|n| n as f32 / 14.3)
-                    .collect();
-                Array::JX255N.rows
-            ])),
-            auto_tare: true,
-            ..tare::Settings::default()
-        },
-        ..Description::default()
-    }
+    let mut described = Description::default();
+    described.sensor.name = "forearm".to_owned();
+    let gains = (1..=Array::JX255N.cols).map(|n| n as f32 / 14.3).collect();
+    described.sensor.calibration.gains = Some(Gains::Taxels(vec![gains; Array::JX255N.rows]));
+    described.sensor.calibration.auto_tare = true;
+    described
 }
 
-/// The moment so many milliseconds after the first.
+/// The moment `ms` milliseconds after the first.
 pub fn at(ms: u64) -> Stamp {
     let mono = Duration::from_millis(1_000_000 + ms) + Duration::from_nanos(7);
     // The calendar is set back in the middle, which must not change any duration.
@@ -78,10 +70,8 @@ pub fn of_a_labelled_press(
     context: Option<Value>,
     sends: bool,
 ) -> (Vec<u8>, Sensor) {
-    let mut described = Description {
-        name: "forearm".to_owned(),
-        ..Description::default()
-    };
+    let mut described = Description::default();
+    described.sensor.name = "forearm".to_owned();
     change(&mut described);
     let (sensor, hrn) = (Sensor::new(described).unwrap(), hrn());
     let about = About {
@@ -96,14 +86,15 @@ pub fn of_a_labelled_press(
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
     let bytes = |counts: u16| {
         let mut raw = RawFrame::default();
-        raw.counts[400..409].fill(counts);
+        raw.counts[400..409].fill(counts.into());
         let mut bytes = Vec::new();
         sensor.layout().encode(&raw, &mut bytes);
         bytes
     };
-    let tare_frames = u64::from(sensor.description().calibration.tare_frames);
+    let tare_frames = u64::from(sensor.calibration().tare_frames);
     for frame in 0..=tare_frames {
-        pipeline.push(&bytes(0), at(200 * frame));
+        let input = Input::Bytes(bytes(0).into());
+        pipeline.take(input, at(200 * frame)).unwrap();
     }
     let begin_ms = 200 * (tare_frames + 1);
     if sends {
@@ -112,11 +103,12 @@ pub fn of_a_labelled_press(
             mm: 0.25 * step as f64,
         };
         let points: Vec<Point> = (0..40).map(point).collect();
-        pipeline.add_positions(&points).unwrap();
+        let input = Input::Motion(points.into());
+        pipeline.take(input, at(begin_ms)).unwrap();
     }
-    pipeline.set_context(context);
-    let state = State::of(&pipeline, labels.clone());
     let came = at(begin_ms);
+    pipeline.take(Input::Context(context), came).unwrap();
+    let state = State::of(&pipeline, labels).unwrap();
     writer
         .entry(0, came, &Entry::State(Box::new(state)))
         .unwrap();

@@ -6,23 +6,20 @@
 //! child is the same program, which calls [`entry`] first. If nobody has called [`entry`], as in a
 //! test of the library, there is no trial.
 
-use std::fs::File;
-use std::io::{self, Read, Seek, Write};
+use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::panic::{self, PanicHookInfo};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::panic;
+use std::path::PathBuf;
+use std::process::{Command, ExitCode, ExitStatus, Stdio};
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, poll};
-use rustix::fs::MemfdFlags;
-use rustix::io::Errno;
 use rustix::process::{Resource, Rlimit, Signal};
 use rustix::time::ClockId;
 use serde::{Deserialize, Serialize};
 
 use crate::verdict::{self, Hrn, ModelError};
+use crate::wording;
 
 /// The name (argv 0) by which a process of the program knows that it is a trial.
 const NAME: &str = "hardnessd-trial";
@@ -35,15 +32,10 @@ const VERDICT_MOST: [Duration; 2] = [Duration::from_millis(1), Duration::from_mi
 const MEMORY_BYTES: u64 = 1 << 30;
 /// The processor time of a trial.
 const PROCESSOR: Duration = Duration::from_secs(10);
-/// The wall-clock time of a trial. It is longer, because other processes may be busy.
-const DEADLINE: Duration = Duration::from_secs(30);
 /// The number of verdicts that are timed.
 const VERDICTS: usize = 15;
 /// After this much processor time, no further verdict is timed.
 const TIMED: Duration = Duration::from_secs(1);
-/// The longest answer of a trial.
-const ANSWER_BYTES: u64 = 64 << 10;
-
 /// The program that runs as a trial. Without it, there is no trial.
 static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
@@ -93,7 +85,7 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
         return Err(ModelError::TooLarge { found: bytes.len() });
     }
     if let Some(program) = PROGRAM.get() {
-        let found = tried(child(program), bytes, DEADLINE)?;
+        let found = tried(Command::new(program).arg0(NAME), bytes)?;
         if let Some(expected) = most
             && found > expected
         {
@@ -103,116 +95,46 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     Hrn::load(bytes)
 }
 
-/// Tries a model file, without a limit for the time of a verdict. Succeeds if the trial completes,
-/// even if it refuses the file: [`Hrn::load`] and [`Hrn::read`] then return an error of their own
-/// here, which names the refused part.
-///
-/// # Errors
-///
-/// Returns [`ModelError::Trial`] if the trial does not complete, and [`ModelError::TooLarge`].
-pub fn survives(bytes: &[u8]) -> Result<(), ModelError> {
-    if bytes.len() > verdict::MAX_FILE_BYTES {
-        return Err(ModelError::TooLarge { found: bytes.len() });
-    }
-    if let Some(program) = PROGRAM.get() {
-        let _ = answered(child(program), bytes, DEADLINE)?;
-    }
-    Ok(())
-}
-
-/// The command that starts a trial.
-fn child(program: &Path) -> Command {
-    let mut command = Command::new(program);
-    command.arg0(NAME);
-    // At its start, the trainer's allocator takes a GiB of address space. That is all that a trial
-    // may have, so good models sometimes failed.
-    command.env("MIMALLOC_ARENA_RESERVE", "64MiB");
-    command
-}
-
 /// Runs a trial of the file in a child. Returns how long a verdict takes.
-fn tried(command: Command, bytes: &[u8], deadline: Duration) -> Result<Duration, ModelError> {
-    answered(command, bytes, deadline)?.map_err(ModelError::Trial)
-}
-
-/// Runs a trial of the file in a child. Returns how long a verdict takes, or why the child refuses
-/// the file. A trial that does not complete is an error.
-fn answered(
-    mut command: Command,
-    bytes: &[u8],
-    deadline: Duration,
-) -> Result<Result<Duration, String>, ModelError> {
-    let trial = |problem: String| ModelError::Trial(format!("model: {problem}"));
-    let file =
-        in_memory(bytes).map_err(|error| trial(format!("no memory to try it from: {error}")))?;
+fn tried(command: &mut Command, bytes: &[u8]) -> Result<Duration, ModelError> {
+    let refused = |problem: String| ModelError::Trial(format!("model: {problem}"));
     let mut child = command
-        .stdin(file)
+        // At its start, the trainer's allocator takes a GiB of address space. That is all that a
+        // trial may have, so good models sometimes failed.
+        .env("MIMALLOC_ARENA_RESERVE", "64MiB")
+        .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
-        .map_err(|error| trial(format!("no process to try it in: {error}")))?;
-    let answer = read_answer(&mut child, deadline);
-    // The child may have answered and still hang.
-    let _ = child.kill();
-    let ended = child.wait();
-    match answer {
+        .map_err(|error| refused(format!("no process to try it in: {error}")))?;
+    let mut stdin = child.stdin.take().expect("it is piped");
+    // A child that does not read says so by its end.
+    let _ = stdin.write_all(bytes);
+    drop(stdin);
+    let output = child.wait_with_output();
+    let output =
+        output.map_err(|error| refused(format!("the process that tried it is lost: {error}")))?;
+    // After a panic, a second answer may follow. Only the first answer counts.
+    let mut answers = serde_json::Deserializer::from_slice(&output.stdout).into_iter();
+    match answers.next().and_then(Result::ok) {
         Some(Answer::Good { verdict_us }) => {
             let verdict = Duration::try_from_secs_f64(verdict_us / 1e6);
-            Ok(Ok(verdict.unwrap_or(Duration::MAX)))
+            Ok(verdict.unwrap_or(Duration::MAX))
         }
-        Some(Answer::Refused(problem)) => Ok(Err(problem)),
-        Some(Answer::Panicked(problem)) => Err(trial(format!(
+        Some(Answer::Refused(problem)) => Err(ModelError::Trial(problem)),
+        Some(Answer::Panicked(problem)) => Err(refused(format!(
             "the inference library failed on it: {problem}"
         ))),
-        None => Err(trial(match ended {
-            Ok(status) => why_silent(status),
-            Err(error) => format!("the process that tried it is lost: {error}"),
-        })),
+        None => Err(refused(why_silent(output.status))),
     }
-}
-
-/// A file that holds `bytes` and is nowhere on a disk. A child that does not read it keeps nobody
-/// waiting, as a pipe would.
-fn in_memory(bytes: &[u8]) -> io::Result<File> {
-    let mut file = File::from(rustix::fs::memfd_create("model", MemfdFlags::CLOEXEC)?);
-    file.write_all(bytes)?;
-    file.rewind()?;
-    Ok(file)
-}
-
-/// Waits for the child's answer, in this thread: there may be no other. `None` if there is no answer.
-fn read_answer(child: &mut Child, deadline: Duration) -> Option<Answer> {
-    let mut stdout = child.stdout.take()?.take(ANSWER_BYTES);
-    let end = Instant::now() + deadline;
-    let mut line = Vec::new();
-    let mut read = 1;
-    while read > 0 {
-        let left = end.checked_duration_since(Instant::now())?;
-        let mut waiting = [PollFd::new(stdout.get_ref(), PollFlags::IN)];
-        match poll(&mut waiting, Some(&left.try_into().ok()?)) {
-            Ok(0) | Err(Errno::INTR) => continue,
-            ready => ready.ok()?,
-        };
-        let mut part = [0; 4096];
-        read = stdout.read(&mut part).ok()?;
-        line.extend(&part[..read]);
-    }
-    // After a panic, a second answer may follow. Only the first answer counts.
-    let mut answers = serde_json::Deserializer::from_slice(&line).into_iter();
-    answers.next()?.ok()
 }
 
 /// The reason why a child that has ended gave no answer.
 fn why_silent(status: ExitStatus) -> String {
-    let signal = status.signal().and_then(Signal::from_named_raw);
-    match signal {
-        Some(Signal::XCPU) => format!(
-            "it takes more than {} s of processor time to load",
+    match status.signal().and_then(Signal::from_named_raw) {
+        Some(Signal::XCPU | Signal::KILL) => format!(
+            "it takes more than {} s of processor time to load, or more memory than there is",
             PROCESSOR.as_secs()
-        ),
-        Some(Signal::KILL) => format!(
-            "it took more than {} s to load, or more memory than there is",
-            DEADLINE.as_secs()
         ),
         Some(Signal::ABORT) => format!(
             "it takes more than {} MB of memory, or the inference library failed on it",
@@ -226,39 +148,44 @@ fn why_silent(status: ExitStatus) -> String {
 fn trial() -> ExitCode {
     limit();
     panic::set_hook(Box::new(|info| {
-        write_answer(&Answer::Panicked(one_line(info)));
+        let text = info.payload_as_str().unwrap_or("a panic");
+        let text = text.chars().take(200).collect::<String>();
+        write_answer(&Answer::Panicked(wording::escaped(&text)));
     }));
     let mut bytes = Vec::new();
     let read = std::io::stdin()
         .take(verdict::MAX_FILE_BYTES as u64 + 1)
         .read_to_end(&mut bytes);
-    let answer = match read {
-        Err(error) => Answer::Refused(error.to_string()),
-        Ok(_) => match Hrn::load(&bytes).and_then(|hrn| median_us(&hrn)) {
-            Ok(verdict_us) => Answer::Good { verdict_us },
-            Err(error) => Answer::Refused(error.to_string()),
-        },
+    let judged = match read {
+        Err(error) => Err(error.to_string()),
+        Ok(_) => Hrn::load(&bytes)
+            .and_then(|hrn| median_us(&hrn))
+            .map_err(|error| error.to_string()),
     };
-    write_answer(&answer);
+    write_answer(&match judged {
+        Ok(verdict_us) => Answer::Good { verdict_us },
+        Err(problem) => Answer::Refused(problem),
+    });
     ExitCode::SUCCESS
 }
 
-/// Limits the resources of this process. Where the system forbids a limit, the deadline still
-/// holds.
+/// Limits the resources of this process.
 fn limit() {
-    let bound = |most: u64| Rlimit {
-        current: Some(most),
-        maximum: Some(most),
-    };
-    let _ = rustix::process::setrlimit(Resource::As, bound(MEMORY_BYTES));
-    let _ = rustix::process::setrlimit(Resource::Core, bound(0));
-    let _ = rustix::process::setrlimit(
-        Resource::Cpu,
-        Rlimit {
-            current: Some(PROCESSOR.as_secs()),
-            maximum: Some(PROCESSOR.as_secs() + 1),
-        },
-    );
+    for (resource, most) in [
+        (Resource::As, MEMORY_BYTES),
+        (Resource::Core, 0),
+        (Resource::Cpu, PROCESSOR.as_secs()),
+    ] {
+        // Where the system forbids a limit, the others still hold.
+        let most = Some(most);
+        let _ = rustix::process::setrlimit(
+            resource,
+            Rlimit {
+                current: most,
+                maximum: most,
+            },
+        );
+    }
     // When memory is short, the system kills this process before the daemon.
     let _ = std::fs::write("/proc/self/oom_score_adj", "1000");
     let _ = rustix::process::set_parent_process_death_signal(Some(Signal::KILL));
@@ -282,14 +209,6 @@ fn median_us(hrn: &Hrn) -> Result<f64, ModelError> {
     }
     times.sort_unstable();
     Ok(times[times.len() / 2].as_secs_f64() * 1e6)
-}
-
-fn one_line(info: &PanicHookInfo<'_>) -> String {
-    let text = info.payload_as_str().unwrap_or("a panic");
-    text.chars()
-        .map(|char| if char.is_control() { ' ' } else { char })
-        .take(200)
-        .collect()
 }
 
 fn write_answer(answer: &Answer) {
@@ -320,50 +239,34 @@ mod tests {
 
     #[test]
     fn a_child_that_fails_in_any_way_is_a_line() {
-        let check = |script: &str, expected: &str| {
-            let mut command = Command::new("sh");
-            command.args(["-c", script]);
-            // A pipe holds less than this, and no child reads it.
-            let bytes = vec![0; 1 << 20];
-            let error = tried(command, &bytes, Duration::from_millis(500)).unwrap_err();
-            let line = error.to_string();
+        // A pipe holds less than this, and no child reads it.
+        let bytes = vec![0; 1 << 20];
+        let tried = |script: &str| tried(Command::new("sh").args(["-c", script]), &bytes);
+        for (script, expected) in [
+            ("kill -ABRT $$", "more than 1024 MB of memory, or"),
+            (
+                "kill -SEGV $$",
+                "the inference library failed on it (signal: 11",
+            ),
+            ("kill -XCPU $$", "more than 10 s of processor time"),
+            ("echo nonsense", "the inference library failed on it"),
+            (
+                r#"echo '{"Panicked":"at sea"}{"Refused":"so"}'"#,
+                "failed on it: at sea",
+            ),
+            (r#"echo '{"Refused":"model of clay"}'"#, "model of clay"),
+        ] {
+            let line = tried(script).unwrap_err().to_string();
             assert!(line.contains(expected), "{script}: {line}");
             assert!(!line.contains('\n'), "{line}");
-        };
-        check("kill -ABRT $$", "more than 1024 MB of memory, or");
-        check(
-            "kill -SEGV $$",
-            "the inference library failed on it (signal: 11",
-        );
-        check("kill -XCPU $$", "more than 10 s of processor time");
-        check("exec sleep 60", "took more than 30 s to load");
-        check("echo nonsense", "the inference library failed on it");
-        check(
-            r#"echo '{"Panicked":"at sea"}{"Refused":"so"}'"#,
-            "failed on it: at sea",
-        );
-        check(r#"echo '{"Refused":"model of clay"}'"#, "model of clay");
-        let none = tried(Command::new("/nonexistent"), b"", DEADLINE).unwrap_err();
+        }
+        let good = tried(r#"echo '{"Good":{"verdict_us":2000.0}}'"#);
+        assert_eq!(good.unwrap(), Duration::from_millis(2));
+        let none = super::tried(&mut Command::new("/nonexistent"), b"").unwrap_err();
         assert!(
             none.to_string().contains("no process to try it in"),
             "{none}"
         );
-    }
-
-    #[test]
-    fn a_refusal_is_told_from_a_trial_that_does_not_complete() {
-        let answered = |script: &str| {
-            let mut command = Command::new("sh");
-            command.args(["-c", script]);
-            answered(command, b"", DEADLINE).map_err(|error| error.to_string())
-        };
-        let refused = answered(r#"echo '{"Refused":"model of clay"}'"#).unwrap();
-        assert_eq!(refused, Err("model of clay".to_owned()));
-        let good = answered(r#"echo '{"Good":{"verdict_us":2000.0}}'"#).unwrap();
-        assert_eq!(good, Ok(Duration::from_millis(2)));
-        let panicked = answered(r#"echo '{"Panicked":"at sea"}'"#).unwrap_err();
-        assert!(panicked.contains("failed on it: at sea"), "{panicked}");
-        assert!(answered("exit 3").is_err());
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
 //!
 //! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons
-//! (format 1) or the course of a press (formats 2 and 3). Out: [`Verdict`]s. This module refuses a file
+//! (format 1) or the course of a press (format 3). Out: [`Verdict`]s. This module refuses a file
 //! unless all of it follows the format and it reproduces the probabilities that its trainer wrote
 //! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
 //! never prints and never trains.
@@ -14,29 +14,38 @@ mod file;
 mod grid;
 mod guard;
 mod inputs;
+pub mod parts;
 mod probabilities;
 mod references;
+mod settings;
 mod shore;
+mod tried;
 
 use sha2::{Digest, Sha256};
+use tract_onnx::pb;
 use tract_onnx::prelude::*;
 
-pub use self::card::{Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Range};
-pub use self::course::{COURSE_FRAMES, Course, CourseMoment, Extents, extents};
+pub use self::card::{
+    Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Limits, Range, TAIL,
+};
+pub use self::course::{COURSE_FRAMES, Course, Extents, Sample, extents};
 pub use self::error::{
     CHECK_TOLERANCE, LevelsError, MAX_FILE_BYTES, MIN_OPSET, ModelError, NodeProblem,
     ReferencesError, SHORE_TOLERANCE,
 };
-pub use self::file::{check_levels, describe};
-pub use self::grid::{COLS, Laying, ModelFrame, ROWS, TAXELS};
+use self::file::Outputs;
+pub use self::file::{check_levels, check_line};
+pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
 use self::inputs::{Input, Lengths, Query};
-pub use self::inputs::{course_inputs, identified_inputs};
 pub use self::probabilities::argmax;
 use self::probabilities::{largest_difference, softmax};
 pub use self::references::{
-    MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
+    Knowledge, MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
 };
+pub use self::settings::{BuiltIn, Settings};
 pub use self::shore::{Borders, BordersError, Distribution, Level, Shore};
+pub use self::tried::Tried;
+use crate::frame::Array;
 
 /// The default model, built into the binary; `models/course.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
@@ -109,73 +118,6 @@ pub struct Hrn {
     references: References,
 }
 
-/// The places of a model's outputs.
-#[derive(Debug, Clone)]
-enum Outputs {
-    /// Formats 1 and 2.
-    Levels {
-        logits: usize,
-        probabilities: usize,
-        /// A model of format 2 always has this output; a model of format 1 may.
-        shore: Option<usize>,
-    },
-    /// Format 3.
-    Bins {
-        bins: usize,
-        reference: usize,
-        borders: Borders,
-    },
-}
-
-impl Outputs {
-    fn of(graph: &tract_onnx::pb::GraphProto, card: &Card) -> Result<Self, ModelError> {
-        let position = |name: &str| graph.output.iter().position(|output| output.name == name);
-        let missing = || ModelError::Graph("no outputs".into());
-        let place = |name: &str| position(name).ok_or_else(missing);
-        if card.format != "3" {
-            return Ok(Self::Levels {
-                logits: place("logits")?,
-                probabilities: place("probabilities")?,
-                shore: position("shore"),
-            });
-        }
-        Ok(Self::Bins {
-            bins: place("bins")?,
-            reference: place("reference")?,
-            borders: Borders::of(&card.levels).map_err(|_| missing())?,
-        })
-    }
-
-    /// The name, the place and the length of each output.
-    fn shapes(
-        &self,
-        card: &Card,
-        signature: &file::Signature,
-    ) -> Vec<(&'static str, usize, usize)> {
-        let levels = card.levels.len();
-        match *self {
-            Self::Levels {
-                logits,
-                probabilities,
-                shore,
-            } => {
-                let of_levels = [
-                    ("logits", logits, levels),
-                    ("probabilities", probabilities, levels),
-                ];
-                let shore = shore.map(|place| ("shore", place, 3));
-                of_levels.into_iter().chain(shore).collect()
-            }
-            Self::Bins {
-                bins, reference, ..
-            } => vec![
-                ("bins", bins, signature.bins),
-                ("reference", reference, signature.lengths.features),
-            ],
-        }
-    }
-}
-
 impl Hrn {
     /// Loads a model file and reproduces its check frames.
     ///
@@ -196,26 +138,19 @@ impl Hrn {
     ///
     /// Returns the errors of [`Hrn::load`], except those of the check frames.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
-        if bytes.len() > MAX_FILE_BYTES {
-            return Err(ModelError::TooLarge { found: bytes.len() });
-        }
         // The file's types and shapes of values inside the graph are not needed, and are unchecked.
         let onnx = tract_onnx::onnx().with_ignore_value_info(true);
-        let mut reader = bytes;
-        let mut proto = onnx
-            .proto_model_for_read(&mut reader)
-            .map_err(|error| ModelError::NotOnnx(root_cause(&error)))?;
-        let graph = match &proto.graph {
-            Some(graph) if proto.ir_version > 0 => graph,
-            _ => return Err(ModelError::NotOnnx("no graph in it".into())),
-        };
-        file::check_opset(&proto)?;
-        file::check_tensors_inside(graph)?;
-        let (card, checks) = file::read_metadata(&proto)?;
-        let signature = file::check_signature(graph, &card, &checks)?;
-        guard::check_operators(graph)?;
-        let outputs = Outputs::of(graph, &card)?;
-        let agreed = outputs.shapes(&card, &signature);
+        let mut problems = Vec::new();
+        let examined = examine(bytes, &mut problems);
+        if let Some(first) = problems.into_iter().next() {
+            return Err(first);
+        }
+        let Examined {
+            mut proto,
+            card,
+            checks,
+            signature,
+        } = examined.expect("what is not read has a problem");
 
         let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
         // The inference library would keep a copy of the metadata.
@@ -224,7 +159,7 @@ impl Hrn {
         // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
         let shapes = match signature.format {
-            Format::Frame => vec![vec![1, 1, ROWS, COLS]],
+            Format::Frame | Format::Parts => vec![signature.format.shape(card.grid)],
             Format::Course { .. } => {
                 let inputs = signature.inputs.iter();
                 inputs.map(|input| input.shape(signature.lengths)).collect()
@@ -242,7 +177,7 @@ impl Hrn {
         guard::check_values(&optimized)?;
         optimized.optimize().map_err(graph_error)?;
         // The inference library does not compare a graph with the shapes that it declares.
-        for (name, output, length) in agreed {
+        for (name, output, length) in signature.shapes(card.levels.len()) {
             let agreed = f32::fact([1, length]);
             let computed = optimized.output_fact(output).map_err(graph_error)?;
             if computed.without_value() != agreed {
@@ -260,7 +195,7 @@ impl Hrn {
             format: signature.format,
             inputs: signature.inputs,
             lengths: signature.lengths,
-            outputs,
+            outputs: signature.outputs,
             card,
             checks: Arc::new(checks),
             sha256: sha256_hex(bytes),
@@ -286,10 +221,10 @@ impl Hrn {
     /// Returns an error if the model gives no distribution over the scale, or the levels are no parts
     /// of it.
     pub fn with_levels(mut self, levels: Vec<Level>) -> Result<Self, LevelsError> {
-        let Outputs::Bins { borders, .. } = &mut self.outputs else {
+        let Outputs::Bins { .. } = self.outputs else {
             return Err(LevelsError::Fixed);
         };
-        *borders = Borders::of(&levels)?;
+        Borders::of(&levels)?;
         self.card.levels = levels;
         Ok(self)
     }
@@ -304,22 +239,50 @@ impl Hrn {
         &self.checks
     }
 
-    /// Judges one frame. A model of format 2 judges it as a press with one frame and an unknown
+    /// Judges what a model of format 1 takes: the taxels of a frame, or of the parts of a press, in the
+    /// array of its card.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Self::judge`].
+    ///
+    /// # Panics
+    ///
+    /// Panics if the model takes another number of taxels.
+    pub fn judge_taxels(&self, newtons: &[f32]) -> Result<Verdict, ModelError> {
+        let shape = self.format.shape(self.card.grid);
+        let input = match self.format {
+            // As [`ModelFrame::pressed`].
+            Format::Frame => {
+                let pressed: Vec<f32> = newtons.iter().map(|newtons| newtons.max(0.0)).collect();
+                Tensor::from_shape(&shape, &pressed)
+            }
+            _ => Tensor::from_shape(&shape, newtons),
+        };
+        let input = input.map_err(inference_error)?;
+        self.verdict(&self.run(tvec!(input.into()))?, Knowledge::None)
+    }
+
+    /// Judges one frame on the model's grid. A model of courses judges it as a press with one
+    /// frame and an unknown
     /// approach.
     ///
     /// # Errors
     ///
-    /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite, and
-    /// [`ModelError::Inference`] if the inference library fails.
+    /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite,
+    /// [`ModelError::Inference`] if the inference library fails, and [`ModelError::Grid`] if the model
+    /// takes frames of another array.
     pub fn judge(&self, frame: &ModelFrame) -> Result<Verdict, ModelError> {
         match self.format {
-            Format::Frame => {
-                let input = Tensor::from_shape(&[1, 1, ROWS, COLS], &frame.newtons);
-                let input = input.map_err(inference_error)?;
-                self.verdict(&self.run(tvec!(input.into()))?)
+            Format::Frame | Format::Parts => {
+                self.card.check_array(Array::JX255N)?;
+                match self.format {
+                    Format::Parts => self.judge_taxels(&frame.newtons.repeat(parts::PARTS)),
+                    _ => self.judge_taxels(&frame.newtons),
+                }
             }
             Format::Course { .. } => self.judge_course(&Course {
-                moments: vec![CourseMoment {
+                moments: vec![Sample {
                     time_s: 0.0,
                     approach_mm: None,
                     frame: *frame,
@@ -329,7 +292,7 @@ impl Hrn {
         }
     }
 
-    /// The most references that the model takes. A model of format 1 or 2 takes none.
+    /// The most references that the model takes. Some models take none.
     pub fn most_references(&self) -> usize {
         self.lengths.references
     }
@@ -345,7 +308,11 @@ impl Hrn {
     ///
     /// Panics if a press has no frame or too many, or there are more presses than the model takes.
     pub fn references(&self, presses: &[ReferencePress]) -> Result<References, ModelError> {
-        let Outputs::Bins { reference, .. } = self.outputs else {
+        let Outputs::Bins {
+            reference: Some(reference),
+            ..
+        } = self.outputs
+        else {
             return Ok(References::NONE);
         };
         let (found, most) = (presses.len(), self.lengths.references);
@@ -368,17 +335,15 @@ impl Hrn {
     ///
     /// Returns an error if another model computed the references.
     pub fn identified(&self, references: References) -> Result<Self, ReferencesError> {
-        let Lengths {
-            references: most,
-            features,
-            ..
-        } = self.lengths;
-        let found = references.features.len();
-        let is_of_this = references.count <= most && found == references.count * features;
-        if references.count > 0 && !is_of_this {
+        if !self.takes(&references) {
+            let Lengths {
+                references: most,
+                features,
+                ..
+            } = self.lengths;
             return Err(ReferencesError {
                 count: references.count,
-                numbers: found,
+                numbers: references.features.len(),
                 most,
                 features,
             });
@@ -387,6 +352,18 @@ impl Hrn {
             references,
             ..self.clone()
         })
+    }
+
+    /// Whether the model can take these references: none, or those that it computed.
+    pub(crate) fn takes(&self, references: &References) -> bool {
+        let Lengths {
+            references: most,
+            features,
+            ..
+        } = self.lengths;
+        let is_of_this =
+            references.count <= most && references.features.len() == references.count * features;
+        references.count == 0 || is_of_this
     }
 
     /// The references of the sensor whose presses this model judges.
@@ -407,20 +384,49 @@ impl Hrn {
         self.judge_beside(course, &self.references)
     }
 
+    /// Judges the course of a press with `own` presses of the sensor beside the known references.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Self::judge`].
+    ///
+    /// # Panics
+    ///
+    /// Panics as [`Self::judge_course`] does.
+    pub fn judge_course_with(
+        &self,
+        course: &Course,
+        own: &References,
+    ) -> Result<(Verdict, ReferenceKinds), ModelError> {
+        let references = self.references.and(own, self.lengths.references);
+        let verdict = self.judge_beside(course, &references)?;
+        Ok((verdict, references.kinds()))
+    }
+
     fn judge_beside(
         &self,
         course: &Course,
         references: &References,
     ) -> Result<Verdict, ModelError> {
         let last = course.moments.last().expect("a press has a frame");
-        if self.format == Format::Frame {
-            return self.judge(&last.frame);
+        match self.format {
+            Format::Frame => return self.judge(&last.frame),
+            Format::Parts => {
+                self.card.check_array(Array::JX255N)?;
+                let moments = course.moments.iter();
+                let moments: Vec<(f32, &[f32])> = moments
+                    .map(|moment| (moment.time_s, &moment.frame.newtons[..]))
+                    .collect();
+                return self.judge_taxels(&parts::parts(&moments));
+            }
+            Format::Course { .. } => {}
         }
-        self.verdict(&self.run_course(&Query {
+        let outputs = self.run_course(&Query {
             course,
             piece: None,
             references,
-        })?)
+        })?;
+        self.verdict(&outputs, references.kinds().knowledge())
     }
 
     /// Judges one of [`Self::checks`].
@@ -430,11 +436,7 @@ impl Hrn {
     /// Returns the errors of [`Self::judge`].
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
         match &*self.checks {
-            Checks::Frames(check) => {
-                let mut frame = ModelFrame::default();
-                frame.newtons.copy_from_slice(&check.frames[index]);
-                self.judge(&frame)
-            }
+            Checks::Frames(check) => self.judge_taxels(&check.frames[index]),
             Checks::Courses(check) => {
                 let press = &check.presses[index];
                 let references = match press.identified {
@@ -459,7 +461,9 @@ impl Hrn {
     }
 
     /// What the outputs say.
-    fn verdict(&self, outputs: &[TValue]) -> Result<Verdict, ModelError> {
+    fn verdict(&self, outputs: &[TValue], knowledge: Knowledge) -> Result<Verdict, ModelError> {
+        let promised = self.card.conformal.as_ref();
+        let limits = promised.map(|promised| promised.limits(knowledge));
         let (logits, probabilities, shore) = match &self.outputs {
             Outputs::Levels {
                 logits,
@@ -484,12 +488,19 @@ impl Hrn {
                     shore,
                 )
             }
-            Outputs::Bins { bins, borders, .. } => {
+            Outputs::Bins { bins, .. } => {
                 let distribution = Distribution::of(&read(outputs, *bins, "bins")?);
+                let borders = Borders::of(&self.card.levels);
+                let borders = &borders.expect("the levels were checked when they came");
                 let probabilities = distribution.levels(borders);
                 let logits = probabilities.iter();
                 let logits = logits.map(|p| p.max(f32::MIN_POSITIVE).ln()).collect();
-                (logits, probabilities, Some(distribution.shore(borders)))
+                let tail = limits.map_or(TAIL, |limits| limits.tail);
+                (
+                    logits,
+                    probabilities,
+                    Some(distribution.shore(borders, tail)),
+                )
             }
         };
         let (best, confidence) = argmax(&probabilities);
@@ -497,7 +508,7 @@ impl Hrn {
             level: self.card.levels[best].level,
             logits,
             shore,
-            levels: self.card.conformal.map(|set| set.set(&probabilities)),
+            levels: limits.map(|limits| limits.set(&probabilities)),
             probabilities,
             confidence,
         })
@@ -516,36 +527,95 @@ impl Hrn {
 
     /// Judges every check frame or press. The first judgement also warms up the plan.
     fn reproduce_check(&self) -> Result<(), ModelError> {
-        for index in 0..self.checks.count() {
-            let verdict = self.judge_check(index)?;
-            let expected = self.checks.probabilities(index);
-            let difference = largest_difference(&verdict.probabilities, expected);
-            if difference > CHECK_TOLERANCE {
-                return Err(ModelError::CheckDiffers {
-                    frame: index,
-                    difference,
-                });
-            }
-            let difference = largest_difference(&verdict.probabilities, &softmax(&verdict.logits));
-            if difference > CHECK_TOLERANCE {
-                return Err(ModelError::NotSoftmax {
-                    frame: index,
-                    difference,
-                });
-            }
-            if let (Some(found), Some(expected)) = (verdict.shore, self.checks.shore(index)) {
-                let [found, expected] = [found, expected].map(<[f32; 3]>::from);
-                let difference = largest_difference(&found, &expected);
-                if difference > SHORE_TOLERANCE {
-                    return Err(ModelError::ShoreDiffers {
-                        press: index,
+        for check in 0..self.checks.count() {
+            let verdict = self.judge_check(check)?;
+            let same = |found: &[f32], expected: &[f32], most, what| {
+                let difference = largest_difference(found, expected);
+                match difference > most {
+                    true => Err(ModelError::Differs {
+                        check,
+                        what,
                         difference,
-                    });
+                        most,
+                    }),
+                    false => Ok(()),
                 }
+            };
+            let found = &verdict.probabilities;
+            let expected = self.checks.probabilities(check);
+            let what = "probabilities differ from the trainer's";
+            same(found, expected, CHECK_TOLERANCE, what)?;
+            let what = "`probabilities` differs from softmax(`logits`)";
+            same(found, &softmax(&verdict.logits), CHECK_TOLERANCE, what)?;
+            if let (Some(found), Some(expected)) = (verdict.shore, self.checks.shore(check)) {
+                let [found, expected] = [found, expected].map(<[f32; 3]>::from);
+                let what = "`shore` differs from the trainer's";
+                same(&found, &expected, SHORE_TOLERANCE, what)?;
             }
         }
         Ok(())
     }
+}
+
+/// Reads a file's messages.
+fn decode(bytes: &[u8]) -> Result<pb::ModelProto, ModelError> {
+    if bytes.len() > MAX_FILE_BYTES {
+        return Err(ModelError::TooLarge { found: bytes.len() });
+    }
+    let mut reader = bytes;
+    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader);
+    proto.map_err(|error| ModelError::NotOnnx(root_cause(&error)))
+}
+
+fn graph_of(proto: &pb::ModelProto) -> Result<&pb::GraphProto, ModelError> {
+    let graph = proto.graph.as_ref().filter(|_| proto.ir_version > 0);
+    graph.ok_or_else(|| ModelError::NotOnnx("no graph in it".into()))
+}
+
+/// What a file says before the inference library builds its graph.
+struct Examined {
+    proto: pb::ModelProto,
+    card: Card,
+    checks: Checks,
+    signature: file::Signature,
+}
+
+/// Everything in a model file that breaks the format, in the order in which [`Hrn::load`] reads it.
+/// What only running the graph shows is not among it.
+pub fn problems(bytes: &[u8]) -> Vec<ModelError> {
+    let mut problems = Vec::new();
+    examine(bytes, &mut problems);
+    problems
+}
+
+/// Reads a file, and adds a problem for each part that breaks the format.
+fn examine(bytes: &[u8], problems: &mut Vec<ModelError>) -> Option<Examined> {
+    let proto = file::kept(decode(bytes), problems)?;
+    let graph = file::kept(graph_of(&proto), problems)?;
+    file::kept(file::check_opset(&proto), problems);
+    file::kept(file::check_tensors_inside(graph), problems);
+    let described = file::metadata(&proto, problems);
+    let (format, levels, grid) = match &described {
+        Some((card, _)) => (card.format.as_str(), Some(card.levels.len()), card.grid),
+        None => (file::format_of(graph), None, None),
+    };
+    let signature = file::signature(graph, format, levels, grid, problems);
+    if let (Some((card, checks)), Some(signature)) = (&described, &signature) {
+        if let Outputs::Bins { .. } = signature.outputs {
+            file::kept(file::check_borders(&card.levels), problems);
+        }
+        if let Checks::Courses(check) = checks {
+            file::kept(file::check_lengths(check, signature.lengths), problems);
+        }
+    }
+    problems.extend(guard::operator_problems(graph));
+    let ((card, checks), signature) = described.zip(signature)?;
+    Some(Examined {
+        proto,
+        card,
+        checks,
+        signature,
+    })
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]

@@ -5,8 +5,7 @@
 //! Nothing here reads a port, waits or asks the time.
 //!
 //! A frame of a free layout is `sync, length, header bytes, cells, footer bytes, checksum, tail`, or
-//! several packets of these parts. Each part but the cells is optional, but a layout needs a `sync`
-//! or a `tail`. The vendor of the JX255N publishes no protocol: these layouts are those of
+//! several packets of these parts. Each part but the cells is optional. The vendor of the JX255N publishes no protocol: these layouts are those of
 //! comparable film arrays.
 //!
 //! The files below are in reading order. Each uses only those above it.
@@ -20,15 +19,14 @@ mod scan;
 mod text;
 mod preset;
 mod fixed;
-mod zero_run;
 mod layout;
 mod decoder;
 
 pub use self::checksum::{Checksum, ChecksumOver};
-pub use self::decoder::{Damage, Decoded, Decoder, Memory};
+pub use self::decoder::{Damage, Decoded, Decoder, Place, TELNET, is_telnet};
 pub use self::layout::Layout;
 pub use self::settings::{
-    Cell, FooterBytes, HexBytes, HexError, LayoutError, LengthField, Order, Packets, Preset,
-    Settings,
+    Cell, FooterBytes, Framing, HexBytes, HexError, LengthField, Order, PacketNumber, Packets,
+    Preset, Settings,
 };
 pub use self::text::is_separator;

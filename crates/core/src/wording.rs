@@ -5,12 +5,14 @@ use std::error::Error;
 use serde::de::{DeserializeOwned, IntoDeserializer as _, value};
 
 /// Writes a line to stderr, like `eprintln!`, but goes on if nobody can read it: the disk is full, or the
-/// terminal has gone. `eprintln!` panics then, and a panic ends the process.
+/// terminal has gone. `eprintln!` panics then, and a panic ends the process. What is hidden is escaped, and
+/// a text without end is cut: it may come from a file or a process of somebody else.
 #[macro_export]
 macro_rules! stderr_line {
     ($($text:tt)*) => {{
         use std::io::Write as _;
-        let _ = writeln!(std::io::stderr(), $($text)*);
+        let text = $crate::wording::shown(&format!($($text)*));
+        let _ = writeln!(std::io::stderr(), "{text}");
     }};
 }
 
@@ -21,6 +23,17 @@ macro_rules! stderr_part {
         use std::io::Write as _;
         let _ = write!(std::io::stderr(), $($text)*);
     }};
+}
+
+/// The longest text that is shown at once, in characters.
+const LONGEST_SHOWN: usize = 16_384;
+
+/// The text as a terminal may show it: hidden characters escaped, and not longer than a person reads.
+pub fn shown(text: &str) -> String {
+    match text.char_indices().nth(LONGEST_SHOWN) {
+        Some((end, _)) => lines(&text[..end]) + "...",
+        None => lines(text),
+    }
 }
 
 /// The value of this name, as commands, files and events write it.
@@ -81,7 +94,7 @@ pub fn of_usage(rendered: &str) -> String {
 
 /// The error of a TOML text on one line: its place, the text's line there, and the parser's message.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
-    let message = error.message().trim().replace('\n', ", ");
+    let message = in_words(&error.message().trim().replace('\n', ", "));
     let Some(span) = error.span() else {
         return message;
     };
@@ -92,6 +105,46 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let found = text[line_start..].lines().next().unwrap_or_default().trim();
     format!("line {line}, column {column}, `{found}`: {message}")
 }
+
+/// The parser's message in words: the name of a type becomes what it holds, and the list of all names
+/// becomes the most similar one, if one is similar.
+fn in_words(message: &str) -> String {
+    const TYPES: [(&str, &str); 11] = [
+        ("u8", "a whole number from 0 to 255"),
+        ("u16", "a whole number from 0 to 65535"),
+        ("u32", "a whole number from 0 to 4294967295"),
+        ("u64", "a whole number from 0 on"),
+        ("usize", "a whole number from 0 on"),
+        ("a nonzero u32", "a whole number from 1 on"),
+        ("a nonzero usize", "a whole number from 1 on"),
+        ("f32", "a number"),
+        ("f64", "a number"),
+        ("a string", "a text in quotes"),
+        ("a boolean", "true or false"),
+    ];
+    let Some((found, expected)) = message.split_once(", expected ") else {
+        return message.to_owned();
+    };
+    if let Some((_, words)) = TYPES.iter().find(|(name, _)| *name == expected) {
+        return format!("{found}, expected {words}");
+    }
+    let names = |text: &str| -> Vec<String> {
+        let names = text.split('`').skip(1).step_by(2);
+        names.map(str::to_owned).collect()
+    };
+    let Some(unknown) = names(found).pop() else {
+        return message.to_owned();
+    };
+    let likeness = |name: &String| strsim::jaro_winkler(&unknown, name);
+    let known = names(expected).into_iter();
+    match known.max_by(|a, b| likeness(a).total_cmp(&likeness(b))) {
+        Some(name) if likeness(&name) >= SIMILAR => format!("{found}: did you mean `{name}`?"),
+        _ => message.to_owned(),
+    }
+}
+
+/// Names with at least this Jaro-Winkler similarity count as similar.
+const SIMILAR: f64 = 0.75;
 
 /// Whether `text` looks the same wherever it is shown. It then has no control characters, and no
 /// characters that end a line or change the direction of the following text.
@@ -136,35 +189,34 @@ mod tests {
         Whole(#[source] io::Error),
         #[error("x: cannot read")]
         Bare(#[source] io::Error),
-        #[error("x: {0}, expected a new file")]
-        Within(#[source] io::Error),
     }
 
     #[test]
-    fn a_cause_is_told_once() {
-        let cause = || io::Error::other("no such file");
-        for error in [Wrapped::Whole(cause()), Wrapped::Bare(cause())] {
-            assert_eq!(line(&error), "x: cannot read: no such file");
-        }
-        let error = Wrapped::Within(cause());
-        assert_eq!(line(&error), "x: no such file, expected a new file");
+    fn what_is_shown_says_nothing_to_the_terminal_and_has_an_end() {
+        let shown = shown("one\u{1b}[2J\u{2028}\u{202e}\ntwo");
+        assert_eq!(shown, "one\\u{1b}[2J\\u{2028}\\u{202e}\ntwo");
+        assert_eq!(super::shown(&shown), shown, "escaped once");
+        let endless = "é".repeat(1 << 20);
+        assert_eq!(super::shown(&endless).chars().count(), LONGEST_SHOWN + 3);
     }
 
     #[test]
-    fn the_number_of_an_error_is_not_told() {
-        let cause = |errno| io::Error::from_raw_os_error(errno);
-        assert_eq!(
-            line(&Wrapped::Bare(cause(2))),
-            "x: cannot read: No such file or directory"
-        );
-        let two = format!("{}, then {}", cause(2), cause(13));
-        assert_eq!(
-            without_numbers(&two),
-            "No such file or directory, then Permission denied"
-        );
-        for other in ["a (os error x) b", "a (os error 2"] {
-            assert_eq!(without_numbers(other), other);
+    fn an_error_is_one_line_with_each_cause_once_and_without_its_number() {
+        let missing = || io::Error::from_raw_os_error(2);
+        for error in [Wrapped::Whole(missing()), Wrapped::Bare(missing())] {
+            let expected = "x: cannot read: No such file or directory";
+            assert_eq!(line(&error), expected);
         }
+        let two = io::Error::other(format!("{}, then {}", missing(), missing()));
+        let expected = "No such file or directory, then No such file or directory";
+        assert_eq!(line(&two), expected);
+        for strange in ["a (os error x) b", "a (os error 2"] {
+            assert_eq!(line(&io::Error::other(strange)), strange);
+        }
+        // Whatever a file is called.
+        let error = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
+        let expected = "a\\nb\\u{1b}[2J\\t\u{e9}\\u{202e}: cannot read";
+        assert_eq!(line(&error), expected);
     }
 
     #[test]
@@ -180,15 +232,6 @@ mod tests {
         assert_eq!(
             of_usage(missing),
             "the following required arguments were not provided: <FILE>"
-        );
-    }
-
-    #[test]
-    fn an_error_is_one_line_whatever_a_file_is_called() {
-        let error = io::Error::other("a\nb\u{1b}[2J\t\u{e9}\u{202e}: cannot read");
-        assert_eq!(
-            line(&error),
-            "a\\nb\\u{1b}[2J\\t\u{e9}\\u{202e}: cannot read"
         );
     }
 
@@ -211,8 +254,31 @@ mod tests {
     }
 
     #[test]
-    fn hidden_characters_are_escaped() {
-        assert_eq!(escaped("a\u{202e}b\u{9b}é"), "a\\u{202e}b\\u{9b}é");
+    fn a_name_that_is_not_known_gets_the_most_similar_one_and_types_get_words() {
+        for (message, expected) in [
+            (
+                "unknown field `boud`, expected one of `name`, `port`, `baud`, `arm`",
+                "unknown field `boud`: did you mean `baud`?",
+            ),
+            (
+                "unknown field `col`, expected one of `rows`, `cols`, `cell`",
+                "unknown field `col`: did you mean `cols`?",
+            ),
+            (
+                "unknown variant `xml`, expected `text` or `json`",
+                "unknown variant `xml`, expected `text` or `json`",
+            ),
+            (
+                "invalid value: integer `-1`, expected u32",
+                "invalid value: integer `-1`, expected a whole number from 0 to 4294967295",
+            ),
+            (
+                "invalid type: string \"3\", expected f64",
+                "invalid type: string \"3\", expected a number",
+            ),
+        ] {
+            assert_eq!(in_words(message), expected);
+        }
     }
 
     #[test]

@@ -45,13 +45,114 @@ pub(super) enum Local<'a> {
 pub(super) struct Problem<'a> {
     /// h, mm, `[width, width]`, with the displacement that earlier steps left.
     pub(super) gap_mm: &'a [f32],
-    /// Spectrum of the influence of object and cover together, mm per MPa.
+    /// Spectrum of the influence that is the same everywhere, mm per MPa: of object and cover together,
+    /// or of the cover alone if the object is a block.
     pub(super) spectrum: &'a [f32],
+    /// The object, if it is a block with free sides.
+    pub(super) block: Option<Standing<'a>>,
     pub(super) local: Local<'a>,
     pub(super) force_n: f64,
     pub(super) cell_mm: f64,
     /// Relative tolerance; see [`TOLERANCE`].
     pub(super) tolerance: f64,
+}
+
+/// A block under a part of the sensor: see [`super::block`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Standing<'a> {
+    /// Spectrum of the short waves' influence, mm per MPa.
+    pub(super) spectrum: &'a [f32],
+    /// The factor on a cell's pressure and on its displacement, `[width, width]`.
+    pub(super) factor: &'a [f32],
+    pub(super) column: Column,
+    pub(super) axes: Axes,
+}
+
+/// A column between the ground and the sensor.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Column {
+    /// Displacement in mm under an even pressure of 1 MPa.
+    pub(super) compliance: f64,
+    pub(super) area_mm2: f64,
+    /// Second moments of the face along its sides, over its area.
+    pub(super) moments_mm2: [f64; 2],
+}
+
+/// The places of cells in the axes of a face, mm from its middle.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Axes {
+    /// The place of the first cell.
+    pub(super) first: [f64; 2],
+    /// From a cell to the next one in its row.
+    pub(super) across: [f64; 2],
+}
+
+impl Axes {
+    /// The place of a cell.
+    pub(super) fn at(&self, row: usize, column: usize) -> [f64; 2] {
+        let (row, column) = (row as f64, column as f64);
+        let [cos, sin] = [self.across[0], -self.across[1]];
+        [
+            self.first[0] + column * cos + row * sin,
+            self.first[1] + row * cos - column * sin,
+        ]
+    }
+}
+
+impl Standing<'_> {
+    /// Adds the displacement under a pressure to `displacement`.
+    pub(super) fn displace(
+        &self,
+        convolver: &mut Convolver,
+        [loaded, sunk]: [&mut Vec<f32>; 2],
+        pressure_mpa: &[f32],
+        displacement: &mut [f32],
+    ) {
+        let width = convolver.width;
+        loaded.clear();
+        loaded.extend(pressure_mpa.iter().zip(self.factor).map(|(p, s)| p * s));
+        sunk.resize(loaded.len(), 0.0);
+        convolver.convolve(self.spectrum, loaded, sunk);
+        // The force over the area, and the moments over the second moments.
+        let mut means = [0.0; 3];
+        for (k, &pressure) in pressure_mpa.iter().enumerate() {
+            if pressure != 0.0 {
+                let [u, v] = self.axes.at(k / width, k % width);
+                let pressure = f64::from(pressure);
+                means[0] += pressure;
+                means[1] += pressure * u;
+                means[2] += pressure * v;
+            }
+        }
+        let [cos, sin] = self.axes.across;
+        let cell_mm2 = cos * cos + sin * sin;
+        let unit = self.column.compliance * cell_mm2 / self.column.area_mm2;
+        let even = unit * means[0];
+        let [along_u, along_v] = [0, 1].map(|k| unit * means[1 + k] / self.column.moments_mm2[k]);
+        for (k, displacement) in displacement.iter_mut().enumerate() {
+            let factor = self.factor[k];
+            if factor > 0.0 {
+                let [u, v] = self.axes.at(k / width, k % width);
+                *displacement += factor * sunk[k] + (even + along_u * u + along_v * v) as f32;
+            }
+        }
+    }
+}
+
+impl Problem<'_> {
+    /// Computes the displacement under a pressure.
+    fn displace(
+        &self,
+        convolver: &mut Convolver,
+        work: [&mut Vec<f32>; 2],
+        pressure_mpa: &[f32],
+        displacement: &mut [f32],
+    ) {
+        convolver.convolve(self.spectrum, pressure_mpa, displacement);
+        if let Some(block) = &self.block {
+            block.displace(convolver, work, pressure_mpa, displacement);
+        }
+    }
 }
 
 /// The solver's results besides the pressure.
@@ -83,6 +184,8 @@ pub(super) struct Fields {
     response: Vec<f32>,
     slope: Vec<f32>,
     inverse: Vec<f32>,
+    /// Work fields of a block.
+    pub(super) work: [Vec<f32>; 2],
 }
 
 impl Fields {
@@ -117,7 +220,10 @@ pub(super) fn solve(
     // The preconditioner uses the kernel's value at a wavelength of 16 cells.
     let elastic = {
         let padded = 2 * convolver.width;
-        problem.spectrum[padded / 16] * (padded * padded) as f32
+        let block = problem
+            .block
+            .map_or(0.0, |block| block.spectrum[padded / 16]);
+        (problem.spectrum[padded / 16] + block) * (padded * padded) as f32
     };
     let mut radius_mm = contact_radius(pressure_mpa, area);
     let mut restart = true;
@@ -132,7 +238,8 @@ pub(super) fn solve(
     while contact.iterations < MAX_ITERATIONS {
         contact.iterations += 1;
         if !is_displacement_known {
-            convolver.convolve(problem.spectrum, pressure_mpa, &mut fields.displacement);
+            let (work, out) = (&mut fields.work, &mut fields.displacement);
+            problem.displace(convolver, work.each_mut(), pressure_mpa, out);
         }
         // Late in the solve, single cells at the rim switch on and off. The radius must not follow
         // them.
@@ -158,7 +265,13 @@ pub(super) fn solve(
         } as f32;
         rz_before = misfit.rz.max(1e-30);
         fields.turn(pressure_mpa, beta, balance.sum_inverse);
-        convolver.convolve(problem.spectrum, &fields.direction, &mut fields.response);
+        let Fields {
+            work,
+            direction,
+            response,
+            ..
+        } = fields;
+        problem.displace(convolver, work.each_mut(), direction, response);
         let step = fields.step_length();
         let change = fields.advance(pressure_mpa, step, slack);
         restart = change.loaded;

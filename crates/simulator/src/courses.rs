@@ -15,18 +15,19 @@ use super::body::{Body, draw_patch};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
-use super::object::{POSTURES, Pose};
+use super::object::{Family, POSTURES, Pose, Shapes};
 use super::press::{Bench, Cover, Specimen};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
 use super::solved::SolvedPress;
 use super::subject::{Subject, shared_out, units, weights};
+use super::substance::Law;
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
-use hardnessd_core::verdict::{COURSE_FRAMES, Laying};
+use hardnessd_core::verdict::{COURSE_FRAMES, Resampling};
 
 /// The settings of a simulated data set of presses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -35,6 +36,10 @@ pub struct CourseSettings {
     /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
     /// stops by force.
     pub objects: DatasetSettings,
+    /// The share of the objects of `matched` and `wide` shapes that have flat faces.
+    pub flat_share: f64,
+    /// The greatest force, N.
+    pub highest_force_n: f32,
     /// Least and greatest frame rate, drawn log-uniformly.
     pub frame_rate_hz: [f64; 2],
     /// Least and greatest speed of the arm, drawn log-uniformly.
@@ -65,6 +70,8 @@ impl Default for CourseSettings {
                 presses: 6,
                 ..DatasetSettings::default()
             },
+            flat_share: 1.0 / 3.0,
+            highest_force_n: HIGHEST_FORCE_N as f32,
             frame_rate_hz: [5.0, 100.0],
             speed_mm_s: [2.0, 20.0],
             arm_n_per_mm: [3.0, 30.0],
@@ -78,6 +85,22 @@ impl Default for CourseSettings {
     }
 }
 
+impl CourseSettings {
+    fn has_broad_sensors(&self) -> bool {
+        let designs = self.sensors.map(|sensors| sensors.designs);
+        designs == Some(SensorDesigns::Broad)
+    }
+
+    /// The share of the objects that have flat faces whatever the shapes. The paper's shapes tell the
+    /// level, and flat ones are flat.
+    pub(super) fn flat_share(&self) -> f64 {
+        match self.objects.shapes {
+            Shapes::Matched | Shapes::Wide => self.flat_share,
+            Shapes::Flat | Shapes::Paper => 0.0,
+        }
+    }
+}
+
 /// The number of frames kept before the frame that begins the press.
 const BEFORE: usize = 2;
 
@@ -85,7 +108,7 @@ const BEFORE: usize = 2;
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledCourse {
     /// The kept frames, ascending in time.
-    pub moments: Vec<CourseMoment>,
+    pub moments: Vec<Sample>,
     /// Index of the frame that a model of one frame judges.
     pub best: usize,
     /// The arm's stiffness as reported; 0 if it is not reported.
@@ -106,6 +129,11 @@ pub struct LabelledCourse {
     pub sensor: u32,
     /// The rigid piece that was pressed. Its level is 0 and its Shore hardness NaN.
     pub reference: Option<Reference>,
+    /// The family of the object's shape.
+    pub family: Family,
+    /// Whether the object is a soft layer on a stiff core: the durometer reads the layer, a press feels
+    /// the core.
+    pub layered: bool,
     /// The object's Young's modulus, MPa.
     pub young_mpa: f32,
     /// Frames per second.
@@ -116,9 +144,9 @@ pub struct LabelledCourse {
 
 /// One frame of a press.
 #[derive(Debug, Clone, PartialEq)]
-pub struct CourseMoment {
-    /// Millinewtons after an ideal tare, on the grid of a model whose taxels are 3.5 mm apart.
-    pub millinewtons: Box<[u16]>,
+pub struct Sample {
+    /// Millinewtons after a tare, as a model gets them, on a grid of taxels 3.5 mm apart.
+    pub millinewtons: Box<[i16]>,
     /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
     /// How far the arm went since the begin, as reported; 0 if it is not reported.
@@ -131,7 +159,7 @@ pub struct CourseMoment {
 #[derive(Clone, Copy)]
 enum Stop {
     Force(f64),
-    /// The arm stops at this distance in mm beyond the touch, or at 25 N.
+    /// The arm stops at this distance in mm beyond the touch, or at the greatest force.
     Position(f64),
 }
 
@@ -149,6 +177,8 @@ pub(super) struct Plan {
     posture: usize,
     pose: Stream,
     stop: Stop,
+    /// Where an arm that stops by position stops at the latest.
+    highest_force_n: f64,
     pub(super) arm: Arm,
     pub(super) hold_s: f64,
     pub(super) reading: Reading,
@@ -176,7 +206,20 @@ impl Plan {
     pub(super) fn draw(settings: &CourseSettings, stream: &mut Stream) -> Self {
         let posture = stream.below(POSTURES);
         let lowest = f64::from(settings.objects.lowest_force_n);
-        let force = Stop::Force(stream.range(lowest, HIGHEST_FORCE_N));
+        let highest = f64::from(settings.highest_force_n);
+        // Many sensors meet great forces, too, but most presses are gentle.
+        let is_broad = settings.has_broad_sensors();
+        let force = |stream: &mut Stream| {
+            let part = stream.uniform();
+            lowest + (highest - lowest) * if is_broad { part * part } else { part }
+        };
+        let force_n = force(stream);
+        let highest_force_n = if is_broad {
+            force_n.max(force(&mut stream.child(1)))
+        } else {
+            highest
+        };
+        let force = Stop::Force(force_n);
         let position = Stop::Position(log_even(TRAVEL_MM, stream));
         let stop = if stream.uniform() < 0.5 {
             force
@@ -200,6 +243,7 @@ impl Plan {
             posture,
             pose: stream.child(0),
             stop,
+            highest_force_n,
             arm,
             hold_s: stream.range(least, most).max(HOLD_FRAMES * period_s),
             reading: Reading {
@@ -227,7 +271,7 @@ pub fn courses(
     let weights = weights(of);
     let bench = || Bench::under(Cover::of(of.cover_young_mpa));
     shared_out(&units(of), threads, bench, |bench, object, unit| {
-        let subject = Subject::draw(of, unit, &weights);
+        let subject = Subject::draw(of, unit, &weights, settings.flat_share());
         let mut made = Vec::with_capacity(of.presses as usize);
         for press in 0..u64::from(of.presses) {
             let mut paired = subject.draws.geometry.child(3).child(press);
@@ -276,7 +320,9 @@ impl Subject {
         let noise = self.draws.body.child(4).child(press);
         let mut force_n = match plan.stop {
             Stop::Force(force_n) => force_n,
-            Stop::Position(travel_mm) => bench.force_at(&specimen, plan.arm, travel_mm),
+            Stop::Position(travel_mm) => {
+                bench.force_at(&specimen, plan.arm, travel_mm, plan.highest_force_n)
+            }
         };
         for attempt in 0..TRIES as u64 {
             let mut noise = noise.child(attempt);
@@ -308,7 +354,7 @@ impl Subject {
         let ramp_s = force_n / plan.arm.n_per_mm / plan.arm.speed_mm_s;
         let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, 0.0);
         let forces = self.sensor.grid.taxel_forces(&pressure, window);
-        begins_press(&self.sensor.tared(&self.sensor.read(&forces, 1.0, noise)))
+        begins_press(&self.sensor.felt(&self.sensor.read(&forces, 1.0, noise)))
     }
 
     pub(super) fn labelled(
@@ -331,6 +377,8 @@ impl Subject {
             shore: self.body.shore as f32,
             sensor: 0,
             reference: None,
+            family: self.object.family(),
+            layered: matches!(self.body.substance.law, Law::Layered { .. }),
             young_mpa: self.body.young_mpa as f32,
             frame_rate_hz: (1.0 / reading.period_s) as f32,
             speed_mm_s: plan.arm.speed_mm_s as f32,
@@ -356,7 +404,7 @@ impl Plan {
 
 /// A press as a data set holds it.
 pub(super) struct ReadPress {
-    pub(super) moments: Vec<CourseMoment>,
+    pub(super) moments: Vec<Sample>,
     /// Index of the best frame.
     pub(super) best: usize,
 }
@@ -396,7 +444,7 @@ fn frames(
         .map(|time_s| {
             let forces = felt.taxels_n(time_s);
             let film_n = film.advance(&sensor.design, &forces, reading.period_s);
-            (time_s, sensor.tared(&sensor.read(&film_n, gain, noise)))
+            (time_s, sensor.felt(&sensor.read(&film_n, gain, noise)))
         })
         .collect()
 }
@@ -427,12 +475,12 @@ fn kept(
     } = reading.errors;
     let late_s = late_frames * reading.period_s;
     let reported_mm = |time_s: f64| position_factor * solved.motion.approach_mm(time_s - late_s);
-    let laying = Laying::new(&frames[seen.best].1, pitch, Pitch::JX255N.rows_mm);
+    let resampling = Resampling::new(&frames[seen.best].1, pitch, Pitch::JX255N.rows_mm);
     let moment = |&place: &usize| {
         let (time_s, frame) = &frames[place];
         let approach_mm = reported_mm(*time_s) - reported_mm(begin_s);
-        CourseMoment {
-            millinewtons: millinewtons(&laying.lay(frame).newtons),
+        Sample {
+            millinewtons: millinewtons(&resampling.apply(frame).newtons),
             time_s: (time_s - begin_s) as f32,
             approach_mm: if is_known { approach_mm as f32 } else { 0.0 },
             known: is_known,
@@ -446,17 +494,17 @@ fn kept(
     }
 }
 
-/// Newtons as a data set holds them. A u16 holds up to 65 N on a taxel.
-fn millinewtons(newtons: &[f32]) -> Box<[u16]> {
+/// Newtons as a data set holds them. An i16 holds up to 32 N on a taxel.
+fn millinewtons(newtons: &[f32]) -> Box<[i16]> {
     let rounded = newtons
         .iter()
-        .map(|newtons| (newtons / 1e-3).round() as u16);
+        .map(|newtons| (newtons / 1e-3).round() as i16);
     rounded.collect()
 }
 
 impl Bench {
-    /// The force at which an arm has gone `travel_mm` beyond the touch, at most 25 N.
-    fn force_at(&mut self, specimen: &Specimen, arm: Arm, travel_mm: f64) -> f64 {
+    /// The force at which an arm has gone `travel_mm` beyond the touch, at most `most_n`.
+    fn force_at(&mut self, specimen: &Specimen, arm: Arm, travel_mm: f64, most_n: f64) -> f64 {
         let ramp_s = travel_mm / arm.speed_mm_s;
         let mut travel = |force_n: f64| {
             let approach_mm = self.press(specimen, force_n, ramp_s, 0.0).2.approach_mm;
@@ -464,16 +512,16 @@ impl Bench {
         };
         // Use the secant method on ln F against ln z, where the contact is nearly a power law.
         // Start from above.
-        let mut forces = [HIGHEST_FORCE_N, 0.3 * HIGHEST_FORCE_N];
+        let mut forces = [most_n, 0.3 * most_n];
         let first = (travel(forces[0]) / travel_mm).ln();
         if first <= 0.0 {
-            return HIGHEST_FORCE_N;
+            return most_n;
         }
         let mut off = [first, (travel(forces[1]) / travel_mm).ln()];
         for _ in 0..4 {
             let slope = (off[1] - off[0]) / (forces[1] / forces[0]).ln();
             let next = forces[1] * (-off[1] / slope.max(0.2)).clamp(-2.0, 2.0).exp();
-            forces = [forces[1], next.clamp(LEAST_FORCE_N, HIGHEST_FORCE_N)];
+            forces = [forces[1], next.clamp(LEAST_FORCE_N, most_n)];
             if (forces[1] / forces[0]).ln().abs() < 0.02 {
                 break;
             }

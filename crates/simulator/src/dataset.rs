@@ -66,7 +66,7 @@ pub fn dataset(
     let bench = || Bench::under(Cover::of(settings.cover_young_mpa));
     shared_out(&units(settings), threads, bench, |bench, object, unit| {
         let mut samples = Vec::with_capacity(settings.presses as usize);
-        Subject::draw(settings, unit, &weights).press_all(settings, bench, |sample| {
+        Subject::draw(settings, unit, &weights, 0.0).press_all(settings, bench, |sample| {
             samples.push(LabelledSample { object, ..sample });
             progress(done.fetch_add(1, Ordering::Relaxed) + 1);
         });
@@ -131,7 +131,7 @@ impl Subject {
             let forces = self.sensor.grid.taxel_forces(&pressure, window);
             let design = &self.sensor.design;
             let crept = Film::new(design).advance(design, &forces, hold_s + 0.5 * ramp_s);
-            let frame = self.sensor.tared(&self.sensor.read(&crept, gain, noise));
+            let frame = self.sensor.felt(&self.sensor.read(&crept, gain, noise));
             tries += 1;
             if begins_press(&frame) || tries == TRIES {
                 return (force_n, frame);

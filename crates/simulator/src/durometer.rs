@@ -163,6 +163,7 @@ impl Durometer {
         let problem = Problem {
             gap_mm: &self.gap_mm,
             spectrum: &self.spectrum,
+            block: None,
             local: self.local,
             force_n,
             cell_mm: CELL_MM,

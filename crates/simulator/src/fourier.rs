@@ -102,7 +102,8 @@ impl Convolver {
         self.column_forward
             .process_with_scratch(&mut self.columns, &mut self.scratch);
         for (value, &factor) in self.columns.iter_mut().zip(spectrum) {
-            *value *= factor;
+            value.re *= factor;
+            value.im *= factor;
         }
         self.column_inverse
             .process_with_scratch(&mut self.columns, &mut self.scratch);

@@ -18,6 +18,7 @@ mod substance;
 mod contact;
 mod texture;
 mod object;
+mod block;
 mod press;
 mod sensor;
 mod material;
@@ -38,18 +39,18 @@ mod rig;
 
 pub use broad::{LawName, Laws, NoLaw};
 pub use courses::{
-    BroadSensors, CourseMoment, CourseSettings, LabelledCourse, REFERENCES, SensorDesigns,
-    SensorSummary, courses,
+    BroadSensors, CourseSettings, LabelledCourse, REFERENCES, Sample, SensorDesigns, SensorSummary,
+    courses,
 };
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
 pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
-pub use object::Shapes;
+pub use object::{Family, Shapes};
 pub use rig::{Rig, Touched};
 pub use rigid::Reference;
 pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};
-pub use sequence::{REST_S, Sequence, SequenceFrame, SequenceSettings};
+pub use sequence::{Pressed, REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials};
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;

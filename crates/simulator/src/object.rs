@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::contact::Axes;
 use super::texture::Patch;
 use crate::random::{Stream, log_even};
 
@@ -18,9 +19,44 @@ pub enum Shapes {
     /// Like `matched`, but with radii from 8 to 60 mm, and with edges and points. One frame then
     /// says little of the hardness, because it fixes only R / E*.
     Wide,
+    /// Plates, bars, boxes and discs with flat faces only, the same for all materials.
+    Flat,
     /// As the paper's pictures suggest: rigid objects are mostly flat boxes, soft ones round. Part
     /// of any accuracy on these shapes comes from the shape.
     Paper,
+}
+
+/// The family of an object's shape.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Family {
+    /// A ball.
+    Ball,
+    /// A cylinder.
+    Cylinder,
+    /// A box with crowned faces.
+    Box,
+    /// A wedge.
+    Wedge,
+    /// A pebble.
+    Pebble,
+    /// A cone, tip up.
+    Point,
+    /// A flat plate.
+    Plate,
+    /// A flat-faced bar.
+    Bar,
+    /// A flat-faced box.
+    FlatBox,
+    /// A flat round face.
+    Disc,
+}
+
+impl Family {
+    /// The names of the families, by their numbers.
+    pub const NAMES: [&str; 10] = [
+        "ball", "cylinder", "box", "wedge", "pebble", "point", "plate", "bar", "flat-box", "disc",
+    ];
 }
 
 /// The number of postures that an object is pressed in (paper: "at least six").
@@ -62,6 +98,19 @@ enum Solid {
         tip: f64,
         flank_deg: f64,
     },
+    /// A body with a flat face and free sides.
+    Flat {
+        family: Family,
+        face: FlatFace,
+        height: f64,
+    },
+}
+
+/// The outline of a flat face.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum FlatFace {
+    Rectangle { sides_mm: [f64; 2] },
+    Round { radius_mm: f64 },
 }
 
 /// The face that the sensor meets in one posture.
@@ -75,6 +124,9 @@ pub(super) struct Face {
     pub(super) tilt_sd_deg: f64,
     /// Factor on the texture's rms.
     pub(super) roughness: f64,
+    /// The face of a body with flat faces and free sides. Such a face is pressed tilted and off its
+    /// middle.
+    pub(super) flat: Option<FlatFace>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -117,9 +169,23 @@ pub(super) struct Pose {
 }
 
 impl Pose {
-    /// Draws a pose: the turn is uniform, the shift uniform within 6 mm, the tilt normal.
+    /// Draws a pose: the turn is uniform, the shift uniform within 6 mm, the tilt normal. A flat face
+    /// shifts further and tilts up to 10 degrees, half of them less than 2.5.
     pub(super) fn draw(face: &Face, stream: &mut Stream) -> Self {
         let turn_rad = stream.range(0.0, std::f64::consts::TAU);
+        if face.flat.is_some() {
+            let mut shift = || stream.range(-FLAT_SHIFT_MM, FLAT_SHIFT_MM);
+            let shift_mm = [shift(), shift()];
+            let slope = (FLAT_TILT_DEG * stream.uniform().powi(2))
+                .to_radians()
+                .tan();
+            let (sin, cos) = stream.range(0.0, std::f64::consts::TAU).sin_cos();
+            return Self {
+                turn_rad,
+                shift_mm,
+                tilt: [slope * cos, slope * sin],
+            };
+        }
         let shift_mm = [stream.range(-6.0, 6.0), stream.range(-6.0, 6.0)];
         let mut tilt = || (face.tilt_sd_deg * stream.normal()).to_radians().tan();
         Self {
@@ -128,7 +194,39 @@ impl Pose {
             tilt: [tilt(), tilt()],
         }
     }
+
+    /// A face in the middle of the sensor, parallel to it.
+    #[cfg(test)]
+    pub(super) const LEVEL: Self = Self {
+        turn_rad: 0.0,
+        shift_mm: [0.0; 2],
+        tilt: [0.0; 2],
+    };
+
+    /// The same pose with another slope along x.
+    #[cfg(test)]
+    pub(super) fn tilted(self, slope: f64) -> Self {
+        Self {
+            tilt: [slope, 0.0],
+            ..self
+        }
+    }
+
+    /// The axes of the face on `width` x `width` cells around the sensor's centre.
+    pub(super) fn axes(&self, width: usize, cell_mm: f64) -> Axes {
+        let (sin, cos) = self.turn_rad.sin_cos();
+        let first_mm = (0.5 - 0.5 * width as f64) * cell_mm;
+        let (x, y) = (first_mm - self.shift_mm[0], first_mm - self.shift_mm[1]);
+        Axes {
+            first: [cos * x + sin * y, cos * y - sin * x],
+            across: [cos * cell_mm, -sin * cell_mm],
+        }
+    }
 }
+
+/// How far a flat face shifts, and how far it tilts.
+const FLAT_SHIFT_MM: f64 = 15.0;
+const FLAT_TILT_DEG: f64 = 10.0;
 
 /// Weights of ball, cylinder, box, wedge, pebble and point for the paper's rigid objects.
 const RIGID: [f64; 6] = [0.05, 0.15, 0.62, 0.08, 0.10, 0.0];
@@ -144,6 +242,26 @@ const WIDE_RADIUS_MM: (f64, f64) = (8.0, 60.0);
 /// Radii of edges and points of the wide shapes in mm. Sharper ones would fit between the taxels.
 const WIDE_TIP_MM: (f64, f64) = (2.0, 10.0);
 
+/// Weights of plate, bar, box and disc.
+const FLAT: [f64; 4] = [0.3, 0.3, 0.25, 0.15];
+/// Sides of plates, of the share of plates that is larger than most arrays, the narrow and the long
+/// side of bars, sides of boxes, and diameters of discs, mm, log-uniform.
+const PLATE_MM: (f64, f64) = (15.0, 60.0);
+const LARGE_MM: (f64, f64) = (60.0, 120.0);
+const LARGE_SHARE: f64 = 0.1;
+const BAR_MM: (f64, f64) = (1.0, 15.0);
+const LONG_MM: (f64, f64) = (15.0, 60.0);
+const BOX_MM: (f64, f64) = (5.0, 60.0);
+const DISC_MM: (f64, f64) = (3.0, 60.0);
+/// Heights of plates, and of the others, mm, log-uniform.
+const THIN_MM: (f64, f64) = (2.0, 20.0);
+const HIGH_MM: (f64, f64) = (2.0, 40.0);
+/// The most of a height over the narrow side. A more slender thing is part of a body, or gives way.
+const SLENDER: f64 = 2.0;
+/// Radii of the edges, mm, log-uniform, and of the faces' crown.
+const EDGE_MM: (f64, f64) = (0.2, 4.0);
+const FLAT_CROWN_MM: f64 = 1e6;
+
 impl Object {
     /// Draws an object. `level` only matters for the paper's shapes.
     ///
@@ -153,6 +271,7 @@ impl Object {
     pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Self {
         let (weights, flat) = match shapes {
             Shapes::Wide => return Self::wide(stream),
+            Shapes::Flat => return Self::flat(stream),
             Shapes::Matched => (MATCHED, false),
             Shapes::Paper if level == 1 => (RIGID, true),
             Shapes::Paper => (SOFT, false),
@@ -229,6 +348,64 @@ impl Object {
         }
     }
 
+    /// Draws an object with flat faces, which stands or lies on something rigid.
+    pub(super) fn flat(stream: &mut Stream) -> Self {
+        let rectangle = |sides_mm| FlatFace::Rectangle { sides_mm };
+        let (family, face) = match family(&FLAT, stream) {
+            0 => {
+                let sides = if stream.uniform() < LARGE_SHARE {
+                    LARGE_MM
+                } else {
+                    PLATE_MM
+                };
+                let sides_mm = [log_even(sides, stream), log_even(sides, stream)];
+                (Family::Plate, rectangle(sides_mm))
+            }
+            1 => {
+                let sides_mm = [log_even(BAR_MM, stream), log_even(LONG_MM, stream)];
+                (Family::Bar, rectangle(sides_mm))
+            }
+            2 => {
+                let sides_mm = [log_even(BOX_MM, stream), log_even(BOX_MM, stream)];
+                (Family::FlatBox, rectangle(sides_mm))
+            }
+            _ => {
+                let radius_mm = 0.5 * log_even(DISC_MM, stream);
+                (Family::Disc, FlatFace::Round { radius_mm })
+            }
+        };
+        let narrow_mm = match face {
+            FlatFace::Rectangle { sides_mm: [a, b] } => a.min(b),
+            FlatFace::Round { radius_mm } => 2.0 * radius_mm,
+        };
+        let height = match family {
+            Family::Plate => log_even(THIN_MM, stream),
+            _ => log_even(HIGH_MM, stream),
+        };
+        Self {
+            solid: Solid::Flat {
+                family,
+                face,
+                height: height.min(SLENDER * narrow_mm),
+            },
+            edge_mm: log_even(EDGE_MM, stream).min(0.4 * narrow_mm),
+            crown_mm: [FLAT_CROWN_MM; 3],
+        }
+    }
+
+    /// The family of its shape.
+    pub(super) fn family(&self) -> Family {
+        match self.solid {
+            Solid::Ball { .. } => Family::Ball,
+            Solid::Cylinder { .. } => Family::Cylinder,
+            Solid::Block { .. } => Family::Box,
+            Solid::Wedge { .. } => Family::Wedge,
+            Solid::Pebble { .. } => Family::Pebble,
+            Solid::Point { .. } => Family::Point,
+            Solid::Flat { family, .. } => family,
+        }
+    }
+
     /// The upper face in posture `posture` (0 to 5).
     pub(super) fn face(&self, posture: usize) -> Face {
         let edge = self.edge_mm;
@@ -237,6 +414,7 @@ impl Object {
             height_mm,
             tilt_sd_deg: 0.1,
             roughness: 1.0,
+            flat: None,
         };
         match self.solid {
             Solid::Ball { radius } => Face {
@@ -248,6 +426,7 @@ impl Object {
                 height_mm: 2.0 * radius,
                 tilt_sd_deg: 1.5,
                 roughness: 1.0,
+                flat: None,
             },
             Solid::Pebble { axes } => {
                 let up = posture % 3;
@@ -257,6 +436,7 @@ impl Object {
                     height_mm: 2.0 * z,
                     tilt_sd_deg: 1.5,
                     roughness: 2.0,
+                    flat: None,
                 }
             }
             // A cylinder has four postures on its side and one on each end.
@@ -308,6 +488,26 @@ impl Object {
                 },
                 WEDGE_HEIGHT_MM,
             ),
+            Solid::Flat { face, height, .. } => {
+                let crown = FLAT_CROWN_MM;
+                let outline = match face {
+                    FlatFace::Rectangle { sides_mm: [a, b] } => Outline::Rectangle {
+                        half_x: 0.5 * a,
+                        half_y: 0.5 * b,
+                        edge,
+                        crown,
+                    },
+                    FlatFace::Round { radius_mm } => Outline::Disc {
+                        radius: radius_mm,
+                        edge,
+                        crown,
+                    },
+                };
+                Face {
+                    flat: Some(face),
+                    ..flat(outline, height)
+                }
+            }
         }
     }
 }
@@ -346,7 +546,23 @@ impl Face {
             height_mm: 20.0,
             tilt_sd_deg,
             roughness: 1.0,
+            flat: None,
         }
+    }
+
+    /// The face of a block.
+    #[cfg(test)]
+    pub(super) fn block(flat: FlatFace, height_mm: f64, edge_mm: f64) -> Self {
+        let object = Object {
+            solid: Solid::Flat {
+                family: Family::FlatBox,
+                face: flat,
+                height: height_mm,
+            },
+            edge_mm,
+            crown_mm: [FLAT_CROWN_MM; 3],
+        };
+        object.face(0)
     }
 
     /// The top of a ball.
@@ -361,6 +577,7 @@ impl Face {
             height_mm: 2.0 * radius,
             tilt_sd_deg: 0.0,
             roughness: 1.0,
+            flat: None,
         }
     }
 
@@ -475,4 +692,40 @@ fn crowned(crown: f64, r: f64) -> f64 {
 
 fn cap(radius: f64, r: f64) -> f64 {
     radius - (radius * radius - r * r).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flat_objects_have_faces_of_one_to_sixty_mm_and_more() {
+        let mut narrow = Vec::new();
+        let mut families = [0; Family::NAMES.len()];
+        for k in 0..2000 {
+            let object = Object::flat(&mut Stream::new(3, "flat").child(k));
+            let Solid::Flat {
+                family,
+                face,
+                height,
+            } = object.solid
+            else {
+                panic!("{object:?} is not flat");
+            };
+            families[family as usize] += 1;
+            let narrow_mm = match face {
+                FlatFace::Rectangle { sides_mm: [a, b] } => a.min(b),
+                FlatFace::Round { radius_mm } => 2.0 * radius_mm,
+            };
+            assert!(height <= 40.0 && height <= 2.0 * narrow_mm, "{object:?}");
+            assert!((0.2..=4.0).contains(&object.edge_mm), "{object:?}");
+            assert!(2.0 * object.edge_mm < narrow_mm, "{object:?}");
+            narrow.push(narrow_mm);
+        }
+        narrow.sort_by(f64::total_cmp);
+        assert!(narrow[0] < 1.1 && narrow[1900] > 30.0 && narrow[1999] > 60.0);
+        let flat = &families[Family::Plate as usize..];
+        assert!(flat.iter().all(|&count| count > 200), "{families:?}");
+        assert_eq!(flat.iter().sum::<i32>(), 2000);
+    }
 }

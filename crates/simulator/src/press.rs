@@ -6,7 +6,8 @@
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use super::contact::{self, Contact, Fields, Local, Problem, TOLERANCE};
+use super::block::{Block, LOCAL_NU};
+use super::contact::{self, Axes, Column, Contact, Fields, Local, Problem, Standing, TOLERANCE};
 use super::fourier::Convolver;
 use super::kernel::{self, Base, Layer};
 use super::object::{Face, Pose};
@@ -41,6 +42,14 @@ impl Cover {
             thickness_mm: COVER_MM,
         }
     }
+
+    /// A guess at the compliance under a contact of this radius, mm per MPa: that of a layer, or of a
+    /// half-space if the cover is thick.
+    fn compliance(self, radius_mm: f64) -> f64 {
+        let plane_strain = self.young_mpa / (1.0 - COVER_NU * COVER_NU);
+        let layer = self.thickness_mm * kernel::confined_compliance(COVER_NU) / plane_strain;
+        layer.min(radius_mm / (0.42 * plane_strain))
+    }
 }
 
 /// An object's face in its pose.
@@ -50,6 +59,20 @@ pub(super) struct Specimen {
     height_mm: f64,
     /// Undeformed gap over the whole sensor, `[CELLS, CELLS]`.
     gap_mm: Vec<f32>,
+    /// The layer that bears the load; `None` for a half-space.
+    layer: Option<LayerKey>,
+    /// What a block with free sides has beyond its layer.
+    block: Option<Blocked>,
+    is_flat: bool,
+}
+
+/// A block under the sensor.
+struct Blocked {
+    /// See [`Block::factor`], `[CELLS, CELLS]`.
+    factor: Vec<f32>,
+    /// For Young's modulus 1 MPa.
+    column: Column,
+    axes: Axes,
 }
 
 /// The part of the sensor on which a press is solved.
@@ -62,7 +85,7 @@ pub(super) struct Window {
 
 /// Plans, kernels and fields, kept between presses.
 pub(super) struct Bench {
-    cover: Cover,
+    pub(super) cover: Cover,
     widths: BTreeMap<usize, Width>,
     layers: Vec<((f64, Base), Layer)>,
     fields: Fields,
@@ -100,12 +123,21 @@ impl Specimen {
         patch: &Patch,
     ) -> Self {
         let gap_mm = face.gap_mm(pose, patch, CELLS, CELL_MM);
+        let (layer, block) = bearing(&substance, young_mpa, face, pose);
         Self {
             substance,
             young_mpa,
             height_mm: face.height_mm,
             gap_mm,
+            layer,
+            block,
+            is_flat: face.flat.is_some(),
         }
+    }
+
+    /// Whether the face is flat.
+    pub(super) fn is_flat(&self) -> bool {
+        self.is_flat
     }
 
     /// The plane-strain modulus E / (1 - nu^2), MPa.
@@ -146,25 +178,26 @@ impl Specimen {
 
     /// The gap on a window, `[width, width]`.
     pub(super) fn gap_on(&self, window: Window) -> Vec<f32> {
-        let mut gap = Vec::with_capacity(window.width * window.width);
-        for i in 0..window.width {
-            let at = (window.corner.0 + i) * CELLS + window.corner.1;
-            gap.extend_from_slice(&self.gap_mm[at..at + window.width]);
-        }
-        gap
+        on_window(&self.gap_mm, window)
+    }
+
+    /// The factors of a block on a window; empty if there is none.
+    fn factor_on(&self, window: Window) -> Vec<f32> {
+        self.block
+            .as_ref()
+            .map_or_else(Vec::new, |block| on_window(&block.factor, window))
     }
 
     /// A guess at the contact under `force_n`: cells with a gap below this depth close.
     ///
     /// With overlap volume V at depth d, and radius a of half the overlap's area, a sphere and a
     /// flat punch both obey `F = 0.42 E* V / a` within 7 %. The cover adds its own compliance.
-    fn closing_depth_mm(&self, force_n: f64) -> f64 {
+    fn closing_depth_mm(&self, cover: Cover, force_n: f64) -> f64 {
         let soft = match self.substance.law {
             Law::Foam { .. } => 0.4,
             Law::Solid | Law::Plastic { .. } | Law::Layered { .. } => 0.9,
         };
         let stiffness = 0.42 * self.plane_strain_mpa() * soft;
-        let cover = cover_compliance();
         let (mut low, mut high) = (0.0_f32, 16.0_f32);
         for _ in 0..16 {
             let depth = 0.5 * (low + high);
@@ -177,7 +210,7 @@ impl Specimen {
             let area = CELL_MM * CELL_MM;
             let (volume, covered) = (f64::from(sum) * area, f64::from(count) * area);
             let radius = (0.5 * covered / std::f64::consts::PI).sqrt();
-            let force = volume / (radius / stiffness + cover);
+            let force = volume / (radius / stiffness + cover.compliance(radius));
             if force < force_n {
                 low = depth;
             } else {
@@ -219,6 +252,91 @@ impl Specimen {
     }
 }
 
+/// The part of a field of the whole sensor that lies on a window.
+fn on_window(field: &[f32], window: Window) -> Vec<f32> {
+    let rows = (0..window.width).flat_map(|i| {
+        let at = (window.corner.0 + i) * CELLS + window.corner.1;
+        &field[at..at + window.width]
+    });
+    rows.copied().collect()
+}
+
+/// A stiffer block counts as a layer, which is cheaper to solve: beside the cover it does not yield.
+const STIFF_MPA: f64 = 50.0;
+/// The solver's tolerance for flat faces. Their rough contacts are large and slow to solve.
+const FLAT_TOLERANCE: f64 = 2e-3;
+
+/// The layer that bears a load on a face, and the block that it is a part of.
+fn bearing(
+    substance: &Substance,
+    young_mpa: f64,
+    face: &Face,
+    pose: &Pose,
+) -> (Option<LayerKey>, Option<Blocked>) {
+    let key = |nu, base, height_mm: f64| LayerKey {
+        nu,
+        base,
+        height: height_mm / CELL_MM,
+    };
+    let own = |(base, height_mm)| key(substance.nu, base, height_mm);
+    let layer = substance.layer(face.height_mm).map(own);
+    let Some(flat) = face.flat else {
+        return (layer, None);
+    };
+    // What lies on a stiff core yields, and the core hardly.
+    let (yields_mm, core) = match substance.law {
+        Law::Layered { thickness_mm, core } if thickness_mm < face.height_mm => {
+            (thickness_mm, (face.height_mm - thickness_mm) / core)
+        }
+        _ => (face.height_mm, 0.0),
+    };
+    let block = Block::new(flat, yields_mm).filter(|_| young_mpa < STIFF_MPA);
+    let Some(block) = block else {
+        return (
+            layer.or(Some(key(substance.nu, Base::Rigid, yields_mm))),
+            None,
+        );
+    };
+    let axes = pose.axes(CELLS, CELL_MM);
+    let factor = (0..CELLS * CELLS).map(|k| {
+        let [u, v] = axes.at(k / CELLS, k % CELLS);
+        block.factor(u, v)
+    });
+    let mut column = block.column(substance.nu);
+    column.compliance += core;
+    let blocked = Blocked {
+        factor: factor.collect(),
+        column,
+        axes,
+    };
+    (
+        Some(key(LOCAL_NU, Base::Rigid, block.local_mm())),
+        Some(blocked),
+    )
+}
+
+impl Blocked {
+    /// The block on a window, with `unit` times its influence for Young's modulus 1 and `spectrum`.
+    fn on<'a>(
+        &self,
+        window: Window,
+        factor: &'a [f32],
+        spectrum: &'a [f32],
+        unit: f64,
+    ) -> Standing<'a> {
+        let first = self.axes.at(window.corner.0, window.corner.1);
+        Standing {
+            spectrum,
+            factor,
+            column: Column {
+                compliance: unit * self.column.compliance,
+                ..self.column
+            },
+            axes: Axes { first, ..self.axes },
+        }
+    }
+}
+
 impl Window {
     /// Whether the window is the whole sensor.
     pub(super) fn is_whole(self) -> bool {
@@ -241,16 +359,10 @@ impl Window {
     }
 
     /// The next wider window for the same contact, if there is one.
-    pub(super) fn wider(self, specimen: &Specimen, force_n: f64) -> Option<Self> {
-        let depth_mm = specimen.closing_depth_mm(force_n);
+    pub(super) fn wider(self, specimen: &Specimen, cover: Cover, force_n: f64) -> Option<Self> {
+        let depth_mm = specimen.closing_depth_mm(cover, force_n);
         (!self.is_whole()).then(|| specimen.window_around(depth_mm, self.width + 1))
     }
-}
-
-/// H / M of the default cover, mm per MPa. It serves for any cover, because it only enters a guess.
-fn cover_compliance() -> f64 {
-    let plane_strain = COVER_YOUNG_MPA / (1.0 - COVER_NU * COVER_NU);
-    COVER_MM * kernel::confined_compliance(COVER_NU) / plane_strain
 }
 
 /// The force, creep and flow of one solve.
@@ -293,7 +405,7 @@ impl Bench {
         ramp_s: f64,
         hold_s: f64,
     ) -> (Window, Vec<f32>, Contact) {
-        let depth_mm = specimen.closing_depth_mm(force_n);
+        let depth_mm = specimen.closing_depth_mm(self.cover, force_n);
         let mut window = specimen.window_around(depth_mm, 0);
         loop {
             let gap = specimen.gap_on(window);
@@ -309,7 +421,7 @@ impl Bench {
                 history_mpa: &[],
                 time_s: hold_s + 0.2 * ramp_s,
             };
-            let contact = self.solve(specimen, window.width, &gap, step, &mut pressure);
+            let contact = self.solve(specimen, window, &gap, step, &mut pressure);
             if window.is_whole() || !touches_border(&pressure, window.width) {
                 return (window, pressure, contact);
             }
@@ -321,31 +433,45 @@ impl Bench {
     pub(super) fn solve(
         &mut self,
         specimen: &Specimen,
-        width: usize,
+        window: Window,
         gap_mm: &[f32],
         step: Step,
         pressure_mpa: &mut [f32],
     ) -> Contact {
-        let object = self.object_spectrum(specimen, width);
+        let object = self.object_spectrum(specimen, window.width);
         let held = self
             .widths
-            .get_mut(&width)
+            .get_mut(&window.width)
             .expect("object_spectrum has made the width");
         let unit = (step.factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
+        let influence = object.iter().map(|&o| unit * o);
         self.combined.clear();
-        self.combined.extend(
-            object
-                .iter()
-                .zip(&held.cover)
-                .map(|(&o, &cover)| unit * o + cover),
-        );
+        let factor = specimen.factor_on(window);
+        let (spectrum, block) = match &specimen.block {
+            Some(block) => {
+                self.combined.extend(influence);
+                let unit = step.factor / specimen.young_mpa;
+                let standing = block.on(window, &factor, &self.combined, unit);
+                (&held.cover, Some(standing))
+            }
+            None => {
+                let both = influence.zip(&held.cover).map(|(o, &cover)| o + cover);
+                self.combined.extend(both);
+                (&self.combined, None)
+            }
+        };
         let problem = Problem {
             gap_mm,
-            spectrum: &self.combined,
+            spectrum,
+            block,
             local: specimen.local(step.factor, step.history_mpa, step.time_s),
             force_n: step.force_n,
             cell_mm: CELL_MM,
-            tolerance: TOLERANCE,
+            tolerance: if specimen.is_flat {
+                FLAT_TOLERANCE
+            } else {
+                TOLERANCE
+            },
         };
         contact::solve(
             &mut held.convolver,
@@ -359,19 +485,30 @@ impl Bench {
     pub(super) fn displacement(
         &mut self,
         specimen: &Specimen,
-        width: usize,
+        window: Window,
         pressure_mpa: &[f32],
     ) -> Vec<f32> {
-        let object = self.object_spectrum(specimen, width);
+        let object = self.object_spectrum(specimen, window.width);
         let held = self
             .widths
-            .get_mut(&width)
+            .get_mut(&window.width)
             .expect("object_spectrum has made the width");
         let mut displacement = vec![0.0; pressure_mpa.len()];
-        held.convolver
-            .convolve(&object, pressure_mpa, &mut displacement);
         let unit = (CELL_MM / specimen.plane_strain_mpa()) as f32;
-        displacement.iter_mut().for_each(|u| *u *= unit);
+        match &specimen.block {
+            Some(block) => {
+                let factor = specimen.factor_on(window);
+                let spectrum: Vec<f32> = object.iter().map(|&o| unit * o).collect();
+                let standing = block.on(window, &factor, &spectrum, 1.0 / specimen.young_mpa);
+                let work = self.fields.work.each_mut();
+                standing.displace(&mut held.convolver, work, pressure_mpa, &mut displacement);
+            }
+            None => {
+                held.convolver
+                    .convolve(&object, pressure_mpa, &mut displacement);
+                displacement.iter_mut().for_each(|u| *u *= unit);
+            }
+        }
         displacement
     }
 
@@ -382,19 +519,14 @@ impl Bench {
             let made = Width::new(width, &self.layers[layer].1, self.cover);
             self.widths.insert(width, made);
         }
-        let Some((base, height_mm)) = specimen.substance.layer(specimen.height_mm) else {
+        let Some(key) = specimen.layer else {
             return Rc::clone(&self.widths[&width].half_space);
-        };
-        let key = LayerKey {
-            nu: specimen.substance.nu,
-            base,
-            height: height_mm / CELL_MM,
         };
         let recent = &self.widths[&width].recent;
         if let Some((_, spectrum)) = recent.iter().find(|(held, _)| *held == key) {
             return Rc::clone(spectrum);
         }
-        let at = self.layer(key.nu, base);
+        let at = self.layer(key.nu, key.base);
         let layer = &self.layers[at].1;
         let held = self.widths.get_mut(&width).expect("made above");
         let spectrum = Rc::new(

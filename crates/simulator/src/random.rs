@@ -4,6 +4,8 @@
 //! function is SplitMix64's finaliser (Steele, Lea, Flood 2014), which is enough for simulation and
 //! initial weights, not for secrets.
 
+use std::sync::OnceLock;
+
 /// A stream of random numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stream {
@@ -74,6 +76,25 @@ impl Stream {
         radius * (std::f64::consts::TAU * self.uniform()).cos()
     }
 
+    /// Adds a normal number of this standard deviation to each of `values`. Faster than [`normal`]: the
+    /// numbers are picked from 65,536 that were drawn once.
+    ///
+    /// [`normal`]: Self::normal
+    pub(crate) fn add_noise(&mut self, values: &mut [f32], sd: f32) {
+        static DRAWN: OnceLock<Vec<f32>> = OnceLock::new();
+        let drawn = DRAWN.get_or_init(|| {
+            let mut stream = Self::new(0, "noise");
+            (0..1 << 16).map(|_| stream.normal() as f32).collect()
+        });
+        for four in values.chunks_mut(4) {
+            let mut word = self.next_u64();
+            for value in four {
+                *value += sd * drawn[word as usize & 0xFFFF];
+                word >>= 16;
+            }
+        }
+    }
+
     /// Shuffles `items` (Fisher-Yates).
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for last in (1..items.len()).rev() {
@@ -119,6 +140,11 @@ mod tests {
         let n = f64::from(n);
         assert!((sum / n).abs() < 0.015, "mean {}", sum / n);
         assert!((square / n - 1.0).abs() < 0.02, "variance {}", square / n);
+        let mut noise = vec![1.0; 100_000];
+        stream.add_noise(&mut noise, 2.0);
+        let mean = noise.iter().sum::<f32>() / 1e5;
+        let variance = noise.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / 1e5;
+        assert!((mean - 1.0).abs() < 0.03 && (variance / 4.0 - 1.0).abs() < 0.02);
         assert!(
             (uniform / n - 0.5).abs() < 0.005,
             "uniform mean {}",

@@ -136,7 +136,7 @@ impl Placed {
         let place = object.saturating_sub(1);
         let mut draws = root.child(1).child(u64::from(place));
         let material = settings.materials[place as usize % settings.materials.len()];
-        let (Body { shore, .. }, specimen) = presented(settings.shapes, material, &mut draws);
+        let (Body { shore, .. }, specimen) = presented(settings.shapes, Some(material), &mut draws);
         let window = bench.press(&specimen, FIRST_N, 1.0, 0.0).0;
         Self {
             at: State::new(&specimen, window),

@@ -97,7 +97,7 @@ impl Sensor {
     fn weighs(&self, weight: &Weight, noise: &mut Stream) -> f64 {
         let forces = self.grid.taxel_forces(&weight.pressure, weight.window);
         let felt = Film::new(&self.design).advance(&self.design, &forces, WEIGHT_S);
-        self.tared(&self.read(&felt, 1.0, noise)).force_n()
+        self.felt(&self.read(&felt, 1.0, noise)).force_n()
     }
 
     /// Sets the newtons of a count so that the sums under the weights are right on average. A user

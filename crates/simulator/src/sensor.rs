@@ -2,9 +2,9 @@
 //! counts.
 //!
 //! A [`Design`] is what sensors of one make have in common. A [`Sensor`] is one instance, whose
-//! gains, activation thresholds and dead taxels are drawn once. There is no noise without load:
-//! below its activation threshold a taxel's layers do not touch, and the taxel reads exactly 0, as
-//! film arrays do.
+//! gains, activation thresholds and dead taxels are drawn once. Below its activation threshold the
+//! layers of a film do not touch, and a taxel reads exactly 0. Arrays without such a threshold have
+//! noise on every taxel, around the counts at which it rests.
 
 mod design;
 mod grid;
@@ -18,6 +18,7 @@ pub(super) use self::grid::Grid;
 use crate::random::Stream;
 use hardnessd_core::frame::{Array, Frame, RawFrame};
 use hardnessd_core::press::{Settings, Thresholds};
+use hardnessd_core::tare;
 
 /// The array of a sequence.
 pub(super) const ARRAY: Array = Array::JX255N;
@@ -43,9 +44,16 @@ pub(super) struct Sensor {
     pub(super) grid: Arc<Grid>,
     gain: Vec<f32>,
     threshold_n: Vec<f32>,
+    /// The counts at which taxels rest, and what a tare took them for. Empty for a film, which rests at 0.
+    rest_counts: Vec<f32>,
+    baseline: Vec<f32>,
     /// What its user takes a count for.
     pub(super) newtons_per_count: f32,
 }
+
+/// A user raises the contact threshold above this many standard deviations of the noise: else the
+/// noise of a tare's frames would count as a touch.
+const QUIET_SIGMAS: f32 = 6.5;
 
 impl Sensor {
     /// Draws a JX255N.
@@ -84,13 +92,39 @@ impl Sensor {
         let threshold_n = (0..count)
             .map(|_| (median_n * (sigma * draws.normal()).exp()).min(bound_n) as f32)
             .collect();
-        Self {
+        let rest_counts = design.rest.map_or_else(Vec::new, |rest| {
+            let mut draws = stream.child(5);
+            let mut taxel = || rest.counts + rest.spread * draws.normal();
+            (0..count).map(|_| taxel().max(0.0) as f32).collect()
+        });
+        let mut sensor = Self {
             newtons_per_count: design.count_n,
             design,
             grid,
             gain,
             threshold_n,
+            rest_counts,
+            baseline: Vec::new(),
+        };
+        sensor.tare(&mut stream.child(6));
+        sensor
+    }
+
+    /// Takes the mean of some frames without load as the baseline, as the daemon does.
+    fn tare(&mut self, noise: &mut Stream) {
+        if self.rest_counts.is_empty() {
+            return;
         }
+        let unloaded = vec![0.0; self.grid.array.taxels()];
+        let frames = tare::Settings::default().tare_frames;
+        let mut sums = vec![0.0; unloaded.len()];
+        for _ in 0..frames {
+            let raw = self.read(&unloaded, 1.0, noise);
+            for (sum, &counts) in sums.iter_mut().zip(&raw.counts) {
+                *sum += counts;
+            }
+        }
+        self.baseline = sums.iter().map(|sum| sum / frames as f32).collect();
     }
 
     /// The gain of each taxel; 0 for a dead one.
@@ -103,9 +137,16 @@ impl Sensor {
         (1.0 + self.design.spread.press * stream.normal()).max(0.3) as f32
     }
 
-    /// The daemon's default thresholds for this array.
+    /// The daemon's thresholds for this array: the default ones, with a contact threshold above the
+    /// noise of a restless array.
     pub(super) fn thresholds(&self) -> Thresholds {
-        let settings = Settings::default();
+        let noise_counts = (self.design.noise_n as f32 / self.design.count_n).powi(2) + 1.0 / 12.0;
+        let noise_n = noise_counts.sqrt() * self.newtons_per_count;
+        let usual_n = self.grid.pitch.contact_threshold_n();
+        let settings = Settings {
+            contact_threshold_n: (self.design.rest).map(|_| usual_n.max(QUIET_SIGMAS * noise_n)),
+            ..Settings::default()
+        };
         settings
             .check(self.grid.array, self.grid.pitch)
             .expect("the default settings fit every array")
@@ -122,6 +163,8 @@ impl Sensor {
             columns[k % array.cols] += force;
         }
         let mut raw = RawFrame::zero(array);
+        let mut resting = self.rest_counts.clone();
+        noise.add_noise(&mut resting, design.noise_n as f32 / design.count_n);
         for (k, counts) in raw.counts.iter_mut().enumerate() {
             let (row, column) = array.position(k);
             let own = forces_n[k];
@@ -141,38 +184,51 @@ impl Sensor {
             // Force through the cover can close a taxel. Crosstalk along the lines cannot, and an
             // open taxel reads nothing. Otherwise 25 N on one point would draw a cross.
             let pressed = own + design.crosstalk_neighbour * near;
-            if pressed <= self.threshold_n[k] {
+            let is_closed = match design.rest {
+                Some(_) => pressed > 0.0,
+                None => pressed > self.threshold_n[k],
+            };
+            if !is_closed {
+                *counts = resting.get(k).map_or(0.0, |&read| design.counts(read));
                 continue;
             }
             let line = rows[row] + columns[column] - 2.0 * own;
             let felt = design.response.of(pressed + design.crosstalk_line * line);
             let ratio = 1.0 + (design.noise_ratio * noise.normal()) as f32;
-            let read = felt * self.gain[k] * press_gain * ratio
-                + if self.gain[k] > 0.0 {
+            let read = felt * self.gain[k] * press_gain * ratio;
+            *counts = if let Some(&resting) = resting.get(k) {
+                design.counts(resting + read / design.count_n)
+            } else {
+                let noise_n = if self.gain[k] > 0.0 {
                     (design.noise_n * noise.normal()) as f32
                 } else {
                     0.0
                 };
-            let rounded = (read / design.count_n)
-                .round()
-                .clamp(0.0, f32::from(design.full_scale_counts));
-            *counts = if rounded < design.least_counts {
-                0
-            } else {
-                rounded as u16
+                let counts = design.counts((read + noise_n) / design.count_n);
+                if counts < design.least_counts {
+                    0.0
+                } else {
+                    counts
+                }
             };
         }
         raw
     }
 
-    /// The frame after a tare with baseline 0.
-    pub(super) fn tared(&self, raw: &RawFrame) -> Frame {
-        let newtons = raw.counts.iter();
+    /// The frame after the tare as presses and models get it: the contact and its margin.
+    pub(super) fn felt(&self, raw: &RawFrame) -> Frame {
+        self.tared(raw).felt(self.thresholds().contact_threshold_n)
+    }
+
+    /// The frame after the tare, in newtons with their sign.
+    fn tared(&self, raw: &RawFrame) -> Frame {
+        let newtons = raw.counts.iter().enumerate().map(|(k, &counts)| {
+            let above = counts - self.baseline.get(k).copied().unwrap_or(0.0);
+            above * self.newtons_per_count
+        });
         Frame {
             array: raw.array,
-            newtons: newtons
-                .map(|&counts| f32::from(counts) * self.newtons_per_count)
-                .collect(),
+            newtons: newtons.collect(),
         }
     }
 }

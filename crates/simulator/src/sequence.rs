@@ -6,7 +6,9 @@
 use std::collections::VecDeque;
 
 use super::body::{Body, draw_patch};
+use super::broad::{self, LawName, Laws};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
+use super::level::Borders;
 use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
@@ -27,6 +29,8 @@ pub struct SequenceSettings {
     pub frame_rate_hz: f64,
     /// Press k is of `materials[(k - 1) % n]`, each time on another object.
     pub materials: Vec<Material>,
+    /// Whether every second round is of random materials, each press of another one.
+    pub has_random: bool,
     /// Greatest forces of the presses, used in turn. If empty, they are drawn from 5 to 25 N.
     pub forces_n: Vec<f32>,
     /// The number of presses; `None` for an endless sequence.
@@ -48,6 +52,7 @@ impl Default for SequenceSettings {
             seed: 0,
             frame_rate_hz: 5.0,
             materials: Material::ALL[4..].to_vec(),
+            has_random: false,
             forces_n: Vec::new(),
             presses: None,
             rest_s: REST_S,
@@ -58,6 +63,54 @@ impl Default for SequenceSettings {
     }
 }
 
+impl SequenceSettings {
+    /// The material of press `number`, from 1; `None` for a random one.
+    fn material(&self, number: u32) -> Option<Material> {
+        let (before, round) = (number as usize - 1, self.materials.len());
+        let is_random = self.has_random && before / round % 2 == 1;
+        (!is_random).then(|| self.materials[before % round])
+    }
+
+    /// What press `number`, from 1, presses.
+    pub fn pressed(&self, number: u32) -> Pressed {
+        let body = body(self.material(number), &draws(&root(self), number - 1));
+        let name = match self.material(number) {
+            Some(material) => material.name().to_owned(),
+            None => {
+                let law = LawName::ALL[usize::from(body.material) - Material::ALL.len()];
+                law.material_name().replace("broad", "random")
+            }
+        };
+        Pressed {
+            name,
+            shore: body.shore,
+            level: body.level,
+        }
+    }
+}
+
+/// The object of a press.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pressed {
+    /// The name of the material, or `random-` and its law.
+    pub name: String,
+    /// What a durometer reads, in Shore OO.
+    pub shore: f64,
+    /// The hardness level, 1 to 4.
+    pub level: u8,
+}
+
+/// The stream of a sequence. It has a name of its own, so that a sequence shares no object and no sensor
+/// with a data set.
+fn root(settings: &SequenceSettings) -> Stream {
+    Stream::new(settings.seed, "sequence")
+}
+
+/// The stream that a press is drawn from, which comes after `before` others.
+fn draws(root: &Stream, before: u32) -> Stream {
+    root.child(1).child(before.into())
+}
+
 /// One frame, with the state of the press.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceFrame {
@@ -65,7 +118,7 @@ pub struct SequenceFrame {
     pub raw: RawFrame,
     /// Number of the press, from 1, which includes the rest after it. 0 before the first press.
     pub press: u32,
-    /// Material of the current or last press; `None` before the first press.
+    /// Material of the current or last press; `None` before the first press, and for a random one.
     pub material: Option<Material>,
     /// Whether the object is being touched.
     pub loaded: bool,
@@ -124,9 +177,7 @@ impl Sequence {
             rate.is_finite() && rate > 0.0,
             "frame rate {rate} is not a positive number"
         );
-        // The stream has a name of its own, so that a sequence shares no object and no sensor with
-        // a data set.
-        let root = Stream::new(settings.seed, "sequence");
+        let root = root(&settings);
         let sensor = Sensor::new(settings.profile, &root.child(0));
         Self {
             free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
@@ -150,7 +201,7 @@ impl Sequence {
     /// The touch time of the next press, and the stream that the press is drawn from, after its
     /// first draw, the delay.
     fn next_draws(&self) -> (f64, Stream) {
-        let mut draws = self.root.child(1).child(u64::from(self.made));
+        let mut draws = draws(&self.root, self.made);
         let delay_s = draws.range(0.0, DELAY_S);
         (self.free_s + delay_s, draws)
     }
@@ -178,12 +229,12 @@ impl Sequence {
             1.0 / self.settings.frame_rate_hz,
         );
         self.frames += 1;
-        let materials = &self.settings.materials;
-        let pressed = self.made.checked_sub(1);
         SequenceFrame {
             raw: RawFrame::zero(ARRAY),
             press: self.made,
-            material: pressed.map(|press| materials[press as usize % materials.len()]),
+            material: (self.made > 0)
+                .then(|| self.settings.material(self.made))
+                .flatten(),
             loaded: false,
             approach,
         }
@@ -192,8 +243,8 @@ impl Sequence {
     /// Makes the next press.
     fn press(&mut self) {
         let (touch_s, mut draws) = self.next_draws();
-        let material = self.settings.materials[self.made as usize % self.settings.materials.len()];
         self.made += 1;
+        let material = self.settings.material(self.made);
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
         let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
@@ -212,7 +263,7 @@ impl Sequence {
             let (frames, next) = self.play(&course, touch_s, &mut film, &mut noise);
             let seen: Vec<_> = frames
                 .iter()
-                .map(|(raw, _)| self.sensor.tared(raw))
+                .map(|(raw, _)| self.sensor.felt(raw))
                 .collect();
             let is_seen = one_press(&seen, &self.sensor.thresholds(), 1.0 / rate).is_some();
             if attempt as usize == TRIES || is_seen {
@@ -225,7 +276,7 @@ impl Sequence {
                     .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
                         raw,
                         press: self.made,
-                        material: Some(material),
+                        material,
                         loaded,
                         approach,
                     }));
@@ -263,15 +314,24 @@ impl Sequence {
     }
 }
 
-/// Draws an object of the material, and one of its faces in a pose.
+/// Draws what an object of the material is made of; of a random material without one.
+fn body(material: Option<Material>, draws: &Stream) -> Body {
+    let mut draws = draws.child(3);
+    match material {
+        Some(material) => Body::named(material, &mut draws),
+        None => broad::draw(Laws::default(), Borders::Touching, &mut draws),
+    }
+}
+
+/// Draws an object of the material, or of a random one, and one of its faces in a pose.
 pub(super) fn presented(
     shapes: Shapes,
-    material: Material,
+    material: Option<Material>,
     draws: &mut Stream,
 ) -> (Body, Specimen) {
-    let object = Object::draw(shapes, material.level(), &mut draws.child(0));
+    let body = body(material, draws);
+    let object = Object::draw(shapes, body.level, &mut draws.child(0));
     let face = object.face(draws.below(POSTURES));
-    let body = Body::named(material, &mut draws.child(3));
     let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
     let pose = Pose::draw(&face, &mut draws.child(2));
     let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
@@ -466,6 +526,33 @@ mod tests {
     }
 
     #[test]
+    fn every_second_round_is_of_random_materials_whose_hardness_is_known() {
+        let settings = SequenceSettings {
+            seed: 8,
+            has_random: true,
+            presses: Some(8),
+            ..SequenceSettings::default()
+        };
+        let pressed: Vec<Pressed> = (1..=8).map(|press| settings.pressed(press)).collect();
+        for (one, material) in pressed.iter().zip(&settings.materials) {
+            assert_eq!((&*one.name, one.level), (material.name(), material.level()));
+        }
+        for one in &pressed[4..] {
+            assert!(one.name.starts_with("random-"), "{one:?}");
+            assert_eq!(one.level, crate::level_of(one.shore));
+        }
+        let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
+        let numbers: Vec<u32> = tracked(&frames, 5.0)
+            .iter()
+            .map(|&(press, _)| press)
+            .collect();
+        assert_eq!(numbers, (1..=8).collect::<Vec<u32>>());
+        for frame in frames.iter().filter(|frame| frame.press > 0) {
+            assert_eq!(frame.material.is_none(), frame.press > 4);
+        }
+    }
+
+    #[test]
     fn the_same_seed_gives_the_same_frames() {
         let settings = |seed| SequenceSettings {
             seed,
@@ -490,6 +577,7 @@ mod tests {
                         seed,
                         frame_rate_hz,
                         materials: Material::ALL.to_vec(),
+                        has_random: false,
                         forces_n,
                         presses: Some(40),
                         rest_s: REST_S,

@@ -151,7 +151,13 @@ pub(super) struct Subject {
 }
 
 impl Subject {
-    pub(super) fn draw(settings: &DatasetSettings, unit: Unit, weights: &[Weight]) -> Self {
+    /// Draws a subject. A share of the objects has flat faces, whatever the shapes of the others.
+    pub(super) fn draw(
+        settings: &DatasetSettings,
+        unit: Unit,
+        weights: &[Weight],
+        flat_share: f64,
+    ) -> Self {
         let draws = Draws::new(settings, unit);
         let mut hardness = draws.body.child(0);
         let body = match unit.origin {
@@ -171,9 +177,14 @@ impl Subject {
         if settings.calibrated {
             sensor.calibrate(weights);
         }
+        let object = if draws.geometry.child(4).uniform() < flat_share {
+            Object::flat(&mut draws.geometry.child(5))
+        } else {
+            Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0))
+        };
         Self {
             split: unit.split,
-            object: Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0)),
+            object,
             body,
             sensor,
             draws,
@@ -190,6 +201,7 @@ mod tests {
         for (shapes, is_paired) in [
             (Shapes::Matched, true),
             (Shapes::Wide, true),
+            (Shapes::Flat, true),
             (Shapes::Paper, false),
         ] {
             let settings = DatasetSettings {

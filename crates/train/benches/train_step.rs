@@ -12,7 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use hardnessd_core::npz::Writer;
 use hardnessd_simulator::random::Stream;
 use hrn_train::learn::learner::Learner;
-use hrn_train::learn::{fit, gan};
+use hrn_train::learn::{gan, hrn as learn_hrn};
 use hrn_train::net::losses::Game;
 use hrn_train::net::network::numbers;
 use hrn_train::net::{generator, hrn};
@@ -93,8 +93,8 @@ impl Networks {
         let gan = gan::initial(GAME, LEVELS, 1, &device);
         let sgd = OptimiserSettings::default();
         let sides = |settings| {
-            let sides = [gan.generator.clone(), gan.discriminator.clone()];
-            sides.map(|weights| Learner::fresh(weights, settings, 0.0))
+            gan.clone()
+                .map(|weights| Learner::fresh(weights, settings, 0.0))
         };
         Self {
             hrn: Learner::fresh(hrn::initial(LEVELS, Pooling::Max, 1, &device), sgd, 0.0),
@@ -112,7 +112,7 @@ impl Networks {
         let step = |_| match name {
             "hrn" => {
                 let (images, targets) = (self.images.clone(), self.targets.clone());
-                fit::step(&mut self.hrn, images, targets, RATE).0
+                learn_hrn::step(&mut self.hrn, images, targets, RATE).0
             }
             "gan" => gan_step(&mut self.gan, &self.images, &self.eta),
             "gan-sgd" => gan_step(&mut self.gan_sgd, &self.images, &self.eta),
@@ -154,14 +154,13 @@ fn processor_seconds() -> f64 {
 
 /// The sum of both sides' losses.
 fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 {
-    let batch = gan::Batch {
+    let batch = gan::Images {
         real: images.clone(),
         labelled: None,
     };
     let rules = gan::Rules {
         game: GAME,
         sigma_penalty: GanSettings::default().sigma_penalty,
-        gradient_penalty: None,
         rate: RATE,
         sensing: None,
     };

@@ -1,7 +1,9 @@
-//! Sources of frames (data set files, the simulator, recordings), and the variation of a frame.
+//! Presses, as the simulator and recordings give them, and as files keep them.
 
-pub mod dataset;
-pub mod courses;
+pub mod source;
+pub mod presses;
+pub mod findings;
+pub mod split;
+pub mod augment;
 pub mod simulated;
 pub mod collect;
-pub mod augment;

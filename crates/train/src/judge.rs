@@ -1,9 +1,5 @@
-//! The quality of recognisers and generated frames, compared with trivial methods; and pictures.
+//! The quality of recognisers, and what the paper reports.
 
-pub mod features;
-pub mod baseline;
-pub mod likeness;
 pub mod paper;
 pub mod metrics;
-mod canvas;
-pub mod sheet;
+pub mod interval;

@@ -1,11 +1,6 @@
-//! Exports trained recognisers to the ONNX file that the daemon loads, and adapts other ONNX files
-//! to the format.
+//! Model files: how they are written, how they judge presses, and how good their verdicts are.
 
 pub mod file;
+pub mod verdicts;
 pub mod evaluated;
 pub mod export;
-pub mod course;
-pub mod learners;
-pub mod foreign;
-pub mod adopt;
-pub mod review;

@@ -17,7 +17,7 @@ use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
-use crate::data::dataset::{LabelChoice, Source};
+use crate::data::source::Source;
 use crate::net::network::Weights;
 use crate::settings::{Profile, Settings, SettingsError};
 use checkpoint::Checkpoint;
@@ -38,8 +38,6 @@ pub struct Description {
     pub seed: u64,
     /// The number of labelled samples that the run may use.
     pub labels: usize,
-    /// How the labelled samples are chosen.
-    pub label_choice: LabelChoice,
     /// Settings of the method.
     pub settings: Settings,
     /// The files from which the run learns.

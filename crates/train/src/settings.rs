@@ -5,26 +5,24 @@
 
 use serde::{Deserialize, Serialize};
 
-pub mod augmentation;
 mod bounds;
-pub mod gan;
 pub mod network;
 pub mod optimiser;
 pub mod reports;
 
 use hardnessd_core::wording;
 
-pub use augmentation::AugmentationSettings;
 pub use bounds::SettingsError;
-pub use gan::GanSettings;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
 pub use reports::ArmReports;
 
-use bounds::{MOST_SAMPLES_A_COMPONENT, check, check_loop};
+use optimiser::Rule;
 
 /// How long a run may take.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, clap::ValueEnum,
+)]
 #[serde(rename_all = "lowercase")]
 pub enum Profile {
     /// As the paper: what the committed tables are made with.
@@ -35,41 +33,26 @@ pub enum Profile {
     Smoke,
 }
 
-/// The choice of the weights that a run keeps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Keep {
-    /// The weights of the last step, as in the paper.
-    Last,
-    /// The weights with the least loss on the validation objects.
-    Best,
+impl Profile {
+    /// The profile's name in commands and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::Quick => "quick",
+            Self::Smoke => "smoke",
+        }
+    }
 }
 
-/// The validation objects: training objects held out to choose weights and temperature.
+/// The objects that are held out of the labelled ones, to fit the temperature and to follow the training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Validation {
-    /// Share of the training objects of each level, from 0 to 0.5. With 0, as in the paper, there
-    /// are no validation objects.
+    /// Share of the labelled objects of each level, from 0 to 0.5. With 0, as in the paper, none are
+    /// held out.
     pub share: f64,
-    /// The number of epochs between two validations.
+    /// The number of epochs between two judgements of the held-out objects.
     pub every_epochs: u32,
-    /// The weights to keep: `last` or `best`.
-    pub keep: Keep,
-}
-
-impl Validation {
-    /// Refuses [`Keep::Best`], for a network that uses its validation objects only after training.
-    ///
-    /// # Errors
-    ///
-    /// Returns [`SettingsError::Keep`].
-    pub fn check_last(&self) -> Result<(), SettingsError> {
-        match self.keep {
-            Keep::Last => Ok(()),
-            Keep::Best => Err(SettingsError::Keep),
-        }
-    }
 }
 
 impl Default for Validation {
@@ -77,12 +60,21 @@ impl Default for Validation {
         Self {
             share: 0.0,
             every_epochs: 5,
-            keep: Keep::Last,
         }
     }
 }
 
-/// Settings for the training of a recogniser on labelled frames. The defaults are the paper's
+/// The changes made to a training frame before each use.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AugmentationSettings {
+    /// Whether frames are turned and mirrored.
+    pub symmetries: bool,
+    /// The largest shift along each axis, in taxels. The taxels that come in are background.
+    pub shift_taxels: u8,
+}
+
+/// Settings for the training of a recogniser on labelled presses. The defaults are the paper's
 /// ("Training of HRN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -97,10 +89,8 @@ pub struct Training {
     /// The number of epochs between two checkpoints. The last epoch always ends with one.
     pub checkpoint_every_epochs: u32,
     /// How far the weights of levels with few samples are raised, from 0 to 1. With 0 all samples
-    /// count the same, with 1 all levels do. `None` is the network's own: 1 for a network that
-    /// judges a frame, and for one that judges a whole press. The paper's networks ignore it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub level_balance: Option<f64>,
+    /// count the same, with 1 all levels do. Only the network of whole presses uses it.
+    pub level_balance: f64,
     /// Settings of the optimiser.
     pub optimiser: OptimiserSettings,
     /// The changes made to a frame before each use.
@@ -114,9 +104,52 @@ impl Default for Training {
             epochs: 200,
             averaging: 0.0,
             checkpoint_every_epochs: 5,
-            level_balance: None,
+            level_balance: 1.0,
             optimiser: OptimiserSettings::default(),
             augmentation: AugmentationSettings::default(),
+        }
+    }
+}
+
+/// Settings for the training of generator and discriminator. The defaults are the paper's
+/// ("Training of STGAN and USTGAN").
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GanSettings {
+    /// Real samples per step. The last batch of an epoch may be smaller.
+    pub batch: usize,
+    /// Generated samples of each component per step.
+    pub samples_a_component: usize,
+    /// Passes over the real samples: what the paper calls iterations. If its 500 were steps, they
+    /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
+    /// iteration.
+    pub epochs: u32,
+    /// Lambda of Eq. (7), which weighs the penalty's mean over all of sigma.
+    pub sigma_penalty: f64,
+    /// Decay per step of the running average of the discriminator's weights. The average is kept at
+    /// the end. With 0, the weights themselves are.
+    pub averaging: f64,
+    /// The number of epochs between two checkpoints. The last epoch always ends with one.
+    pub checkpoint_every_epochs: u32,
+    /// The optimiser of generator and discriminator.
+    pub optimiser: OptimiserSettings,
+}
+
+impl Default for GanSettings {
+    fn default() -> Self {
+        Self {
+            batch: 100,
+            samples_a_component: 2,
+            epochs: 500,
+            sigma_penalty: 0.1,
+            averaging: 0.0,
+            checkpoint_every_epochs: 5,
+            optimiser: OptimiserSettings {
+                rule: Rule::Adam,
+                // The paper gives no betas. DeLiGAN's code has 0.5.
+                beta1: 0.5,
+                ..OptimiserSettings::default()
+            },
         }
     }
 }
@@ -156,8 +189,7 @@ pub struct Settings {
     pub generation: Generation,
     /// The training of HRN on the generated samples.
     pub pretraining: Training,
-    /// The training of HRN on the labelled samples, from random weights or as the fine-tuning of
-    /// other weights.
+    /// The training on the labelled samples, from random weights or as the fine-tuning of other weights.
     pub training: Training,
     /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
     pub reports: ArmReports,
@@ -174,7 +206,6 @@ impl Default for Settings {
             stgan: GanSettings {
                 // An epoch of an STGAN has 4 steps, and one of USTGAN has 85.
                 checkpoint_every_epochs: 50,
-                picture_every_epochs: 100,
                 ..GanSettings::default()
             },
             generation: Generation::default(),
@@ -187,14 +218,13 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The default settings of a profile. A method may have others:
-    /// [`crate::methods::Method::settings`].
+    /// The default settings of a profile. A recipe may have others.
     pub fn of(profile: Profile) -> Self {
         let paper = Self::default();
         match profile {
             Profile::Paper => paper,
             // A tenth of the paper's steps in every stage. All methods take about an hour of one
-            // core per seed (`results/quick`).
+            // core per seed.
             Profile::Quick => paper.with_epochs(50, 20),
             Profile::Smoke => Self {
                 generation: Generation {
@@ -209,7 +239,6 @@ impl Settings {
         let gan = |settings: GanSettings| GanSettings {
             epochs: gan_epochs,
             checkpoint_every_epochs: settings.checkpoint_every_epochs.min(gan_epochs / 2),
-            picture_every_epochs: settings.picture_every_epochs.min(gan_epochs / 2),
             ..settings
         };
         let training = |settings: Training| Training {
@@ -225,78 +254,33 @@ impl Settings {
         }
     }
 
-    /// Gives these settings, with the values in `text` in place of their own.
+    /// Gives these settings, with the values in `given` in place of their own.
     ///
     /// # Errors
     ///
-    /// Returns an error if `text` is not TOML with known keys, or a value lies outside its range.
-    pub fn overridden(&self, text: &str) -> Result<Self, SettingsError> {
-        // Parse the text twice: alone, so that an error can show the line, and merged over these
-        // settings.
-        let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
-        let _: Self = toml::from_str(text).map_err(syntax)?;
+    /// Returns an error if a key is unknown, or a value lies outside its range.
+    pub fn with(&self, given: toml::Table) -> Result<Self, SettingsError> {
         let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
-        let given: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let merged: Self = merged(own, given).try_into().map_err(syntax)?;
-        merged.checked()
-    }
-
-    /// Gives the same settings if every value is within its range.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if a value lies outside its range.
-    pub fn checked(self) -> Result<Self, SettingsError> {
-        let scale = self.full_scale_n;
-        check("", "full_scale_n", scale, scale > 0.0, "above 0")?;
-        self.network.check()?;
-        self.ustgan.check("ustgan.")?;
-        self.stgan.check("stgan.")?;
-        let generated = self.generation.samples_a_component;
-        let key = "samples_a_component";
-        let fits = (1..=MOST_SAMPLES_A_COMPONENT).contains(&generated);
-        check("generation.", key, generated, fits, "1 to 10000")?;
-        self.pretraining.check("pretraining.")?;
-        self.training.check("training.")?;
-        self.reports.check()?;
-        let Validation {
-            share,
-            every_epochs,
-            keep,
-        } = self.validation;
-        let check = |key, found, fits, expected| check("validation.", key, found, fits, expected);
-        check("share", share, (0.0..=0.5).contains(&share), "0 to 0.5")?;
-        let expected = "above 0 with `validation.keep` best";
-        check("share", share, keep == Keep::Last || share > 0.0, expected)?;
-        check(
-            "every_epochs",
-            every_epochs.into(),
-            every_epochs > 0,
-            "1 or more",
-        )?;
-        Ok(self)
+        let merged: Result<Self, _> = merged(own, given).try_into();
+        let settings = merged.map_err(|error| SettingsError::Syntax(error.message().to_owned()))?;
+        bounds::check(&settings)?;
+        Ok(settings)
     }
 }
 
-impl Training {
-    fn check(&self, table: &str) -> Result<(), SettingsError> {
-        check_loop(
-            table,
-            self.batch,
-            self.epochs,
-            self.averaging,
-            self.checkpoint_every_epochs,
-        )?;
-        let balance = self.level_balance.unwrap_or_default();
-        let fits = (0.0..=1.0).contains(&balance);
-        check(table, "level_balance", balance, fits, "0 to 1")?;
-        self.optimiser.check(table)?;
-        let shift = self.augmentation.shift_taxels;
-        let key = "augmentation.shift_taxels";
-        check(table, key, shift, shift <= 4, "0 to 4")
-    }
+/// Reads a file of settings, whose values take the place of others.
+///
+/// # Errors
+///
+/// Returns an error if the text is not TOML with known keys.
+pub fn parse(text: &str) -> Result<toml::Table, SettingsError> {
+    let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
+    // The settings are read only so that an error can show the line.
+    let _: Settings = toml::from_str(text).map_err(syntax)?;
+    toml::from_str(text).map_err(syntax)
 }
 
+/// The values of `under`, with those of `over` in place of its own.
 fn merged(mut under: toml::Table, over: toml::Table) -> toml::Table {
     for (key, value) in over {
         let value = match (under.remove(&key), value) {
@@ -319,22 +303,16 @@ mod tests {
         let text = include_str!("../../../config/hrn-train.toml");
         let shown: toml::Table = toml::from_str(text).unwrap();
         assert_eq!(shown, toml::Table::try_from(Settings::default()).unwrap());
-        assert_eq!(
-            toml::from_str::<Settings>(text).unwrap(),
-            Settings::default()
-        );
     }
 
     #[test]
     fn a_file_overrides_only_what_it_names() {
         let smoke = Settings::of(Profile::Smoke);
-        let settings = smoke
-            .overridden("[training]\nbatch = 50\noptimiser.rule = \"adam\"")
-            .unwrap();
+        let given = parse("[training]\nbatch = 50\noptimiser.rule = \"adam\"").unwrap();
         let mut expected = smoke;
         expected.training.batch = 50;
-        expected.training.optimiser.rule = optimiser::Rule::Adam;
-        assert_eq!(settings, expected);
+        expected.training.optimiser.rule = Rule::Adam;
+        assert_eq!(smoke.with(given).unwrap(), expected);
     }
 
     #[test]
@@ -360,25 +338,20 @@ mod tests {
             ),
             (
                 "[ustgan]\nsamples_a_component = 9223372036854775807",
-                "expected 1 to 10000",
+                "expected 1 to 10,000",
             ),
             (
                 "[training]\nbatch = 4611686018427387904",
-                "expected 2 to 1000000",
+                "expected 2 to 1,000,000",
             ),
-            (
-                "[validation]\nkeep = \"best\"",
-                "`validation.share`: found 0",
-            ),
+            ("[validation]\nshare = nan", "`validation.share`: found NaN"),
             (
                 "[pretraining]\naugmentation.shift_taxels = 5",
                 "`pretraining.augmentation.shift_taxels`: found 5",
             ),
         ] {
-            let error = Settings::default()
-                .overridden(text)
-                .unwrap_err()
-                .to_string();
+            let given = parse(text).and_then(|given| Settings::default().with(given));
+            let error = given.unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");
             assert!(!error.contains('\n'), "{text}: {error}");
         }

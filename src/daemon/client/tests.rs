@@ -1,43 +1,30 @@
 use serde_json::Value;
-use tokio::io::{AsyncBufReadExt, AsyncReadExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::unix;
 
 use super::*;
-use crate::daemon::hub::tests::{hello, live, press};
-use crate::daemon::record::EventRecorder;
-use crate::daemon::sensor::{SensorHandle, Vitals};
+use crate::daemon::hub::tests::{hello, press, state};
+use crate::daemon::sensor::{Command, SensorHandle};
+use hardnessd_core::tare::RetareError;
 
 /// Far longer than any step of the test takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A service for a sensor called "a", and the commands to the sensor.
+/// A service for a live sensor called "a", and the commands to the sensor.
 fn service(access: Access) -> (Service, mpsc::Receiver<Command>) {
-    let hub = hub::start(hello(), EventRecorder::default());
+    let hub = Hub::new(hello());
+    hub.report(state("a"));
     let (commands, inbox) = mpsc::channel(1);
     let name = "a".to_owned();
     let (_, sensors) = Sensors::new(vec![SensorHandle { name, commands }]);
     let service = Service {
         access,
         max_clients: 1,
-        snapshots: Snapshots::new(hub.clone(), sensors.clone()),
         hub,
         sensors,
-        turns: Arc::new(Semaphore::new(1)),
         writers: Handle::current(),
     };
     (service, inbox)
-}
-
-/// Answers for the sensor.
-async fn answer_statuses(mut inbox: mpsc::Receiver<Command>) {
-    while let Some(Command::Status(reply)) = inbox.recv().await {
-        let _ = reply.send(Vitals {
-            status: live("a"),
-            last_frame_age: None,
-            contact_threshold_n: 0.0,
-            unjudged: 0,
-            motion: (0, 0),
-        });
-    }
 }
 
 /// The client's end of a connection.
@@ -67,17 +54,15 @@ impl Client {
 async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
     let (service, mut inbox) = service(Access::Control);
     let mut client = Client::connect(&service);
-    // A connection begins with the sensors' statuses. This sensor does not answer.
-    let Some(Command::Status(_)) = inbox.recv().await else {
-        panic!("another command");
-    };
-    assert_eq!(client.next().await["type"], "hello");
+    for kind in ["hello", "status"] {
+        assert_eq!(client.next().await["type"], kind);
+    }
     let asked = b"{\"tare\":\"a\",\"id\":1}\n{\"get\":\"last\",\"id\":2}\n";
     client.output.write_all(asked).await.unwrap();
     let Some(Command::Tare(tare)) = inbox.recv().await else {
         panic!("another command");
     };
-    service.hub.publish(vec![press("a")]).await;
+    service.hub.publish(vec![press("a")]);
     assert_eq!(client.next().await["type"], "press");
     tare.send(Err(RetareError::NotLive)).unwrap();
     for (kind, id) in [("error", 1), ("ok", 2)] {
@@ -90,8 +75,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
 #[tokio::test(start_paused = true)]
 async fn a_client_that_reads_nothing_keeps_no_other_from_its_answers() {
     for asked in [&b"{\"get\":\"status\"}\n"[..], b"{\"subscribe\":[]}\n"] {
-        let (service, inbox) = service(Access::ReadOnly);
-        tokio::spawn(answer_statuses(inbox));
+        let (service, _inbox) = service(Access::ReadOnly);
         let mut deaf = Client::connect(&service);
         while let Ok(written) = tokio::time::timeout(PATIENCE, deaf.output.write_all(asked)).await {
             written.unwrap();
@@ -105,26 +89,15 @@ async fn a_client_that_reads_nothing_keeps_no_other_from_its_answers() {
     }
 }
 
-#[tokio::test(start_paused = true)]
-async fn a_connection_keeps_nothing_of_what_it_has_sent() {
-    let (service, inbox) = service(Access::ReadOnly);
-    tokio::spawn(answer_statuses(inbox));
-    let mut client = Client::connect(&service);
-    while client.next().await["type"] != "status" {}
-    let sent = service.snapshots.recent().await.unwrap();
-    assert_eq!(Arc::strong_count(&sent.statuses[0].json), 1);
-    assert_eq!(sent.statuses[0].event, None, "only the text is sent");
-}
-
 #[tokio::test]
 async fn a_buffer_that_has_grown_shrinks_again() {
     let (service, _inbox) = service(Access::ReadOnly);
     let (mut ours, theirs) = UnixStream::pair().unwrap();
-    let (_, output) = theirs.into_split();
+    let output = theirs.into_socket().unwrap();
     let (_asked, inbox) = mpsc::channel(1);
+    let joined = service.hub.join(Subscription::default()).await.unwrap();
     let mut writer = Writer {
-        id: 0,
-        service,
+        subscriber: joined.unwrap().0,
         output,
         outgoing: Vec::new(),
         inbox,
@@ -135,7 +108,8 @@ async fn a_buffer_that_has_grown_shrinks_again() {
         ours.read_to_end(&mut read).await.unwrap();
         read
     });
-    writer.send(vec![error(message, None)]).await.unwrap();
+    let line = requests::end(Err(message), None);
+    writer.write(&[line]).await.unwrap();
     assert!(writer.outgoing.capacity() <= KEPT_BYTES);
     drop(writer);
     assert!(read.await.unwrap().len() > 10 * KEPT_BYTES);

@@ -1,13 +1,14 @@
 //! Checks that every value can be used, and that all of them can be used together.
 
 use std::collections::{HashMap, HashSet};
-use std::net::{IpAddr, SocketAddr};
+use std::fmt::Display;
 
 use super::error::Problem;
-use super::{Config, Model, Publish, Record, Ros2, SensorTable, Unix, Zenoh};
-use crate::daemon::port::Port;
-use hardnessd_core::sensor::Sensor;
-use hardnessd_core::wording;
+use super::{Config, Publish, Ros2, Unix, Zenoh};
+use crate::daemon::baud::Load;
+use hardnessd_core::port::Port;
+use hardnessd_core::sensor::{self, Sensor};
+use hardnessd_core::{verdict, wording};
 
 /// Checks a configuration whose paths are already resolved, and returns its sensors.
 pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
@@ -18,7 +19,8 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
     check_model(&config.model)?;
     check_unix(&publish.unix)?;
     if let Some(record) = &config.record {
-        check_record(record)?;
+        let ranges = record.check_ranges();
+        ranges.map_err(|error| error.within("record"))?;
     }
     if let Some(zenoh) = &publish.zenoh {
         check_zenoh(zenoh, &config.robot)?;
@@ -26,23 +28,12 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
     if let Some(ros2) = &publish.ros2 {
         check_ros2(ros2, &config.sensors)?;
     }
-    check_listeners(config)?;
     Ok(sensors)
 }
 
-fn value(key: impl Into<String>, found: String, expected: &'static str) -> Problem {
-    Problem::Value {
-        key: key.into(),
-        found,
-        expected,
-    }
-}
-
-fn clash(key: impl Into<String>, problem: String) -> Problem {
-    Problem::Clash {
-        key: key.into(),
-        problem,
-    }
+/// The problem of a value.
+fn value(key: &str, found: impl Display, expected: &str) -> Problem {
+    Problem::found(key, found, expected)
 }
 
 /// Checks that this program was built with the features that the tables need.
@@ -57,7 +48,11 @@ fn check_built(publish: &Publish) -> Result<(), Problem> {
         ("ros2", cfg!(feature = "ros2"), publish.ros2.is_some()),
     ] {
         if given && !built {
-            return Err(Problem::NotBuilt { feature });
+            let problem = format_args!(
+                "this hardnessd was built without {feature}: build it with --features {feature}, or \
+                 remove the table"
+            );
+            return Err(Problem::because(&format!("publish.{feature}"), problem));
         }
     }
     Ok(())
@@ -81,7 +76,8 @@ const MOST_SENSORS: usize = 1000;
 
 fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     if config.sensors.is_empty() {
-        return Err(Problem::NoSensor);
+        let problem = "no sensor: add a [[sensor]] with a port";
+        return Err(Problem::Syntax(problem.to_owned()));
     }
     let count = config.sensors.len();
     if count > MOST_SENSORS {
@@ -90,80 +86,41 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     }
     let mut sensors = Vec::with_capacity(count);
     let mut taken = Taken::default();
-    for given in &config.sensors {
-        let sensor = Sensor::new(config.describe(given));
-        sensors.push(sensor.map_err(|problem| Problem::Sensor {
-            sensor: given.name.clone(),
-            problem,
-        })?);
-        taken.add(given)?;
+    for (index, given) in config.sensors.iter().enumerate() {
+        let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
+        let sensor = sensor.and_then(|sensor| {
+            taken.add(given)?;
+            check_load(given, &sensor)?;
+            Ok(sensor)
+        });
+        sensors.push(sensor.map_err(|problem| problem.of((index, given)))?);
     }
     Ok(sensors)
 }
 
-/// More connections than a process may have open files.
-const MOST_CLIENTS: usize = 1_000_000;
+/// Checks that the line of a sensor can carry its frames. A warning is enough where that is uncertain.
+fn check_load(given: &sensor::Settings, sensor: &Sensor) -> Result<(), Problem> {
+    match Load::of(given, sensor.layout()).excess {
+        Some(excess) if excess.is_certain => Err(Problem::because("sensor.frame_rate_hz", excess)),
+        _ => Ok(()),
+    }
+}
 
 fn check_unix(unix: &Unix) -> Result<(), Problem> {
-    if !(1..=MOST_CLIENTS).contains(&unix.max_clients) {
-        let (key, found) = ("publish.unix.max_clients", unix.max_clients.to_string());
-        return Err(value(key, found, "1 to 1000000"));
-    }
+    let ranges = unix.check_ranges();
+    ranges.map_err(|error| error.within("publish.unix"))?;
     if unix.enabled && unix.control_path() == unix.path() {
         let problem = format!(
             "{} is the socket of events too: set another path",
             unix.control_path().display()
         );
-        return Err(clash("publish.unix.control_path", problem));
-    }
-    Ok(())
-}
-
-fn check_record(record: &Record) -> Result<(), Problem> {
-    for (key, found, least) in [
-        ("record.rotate_mb", record.rotate_mb, 1),
-        ("record.rotate_s", record.rotate_s, 1),
-        ("record.keep_free_mb", record.keep_free_mb, 0),
-    ] {
-        if !(least..=MOST).contains(&found) {
-            let expected = "1 to 1000000000 (keep_free_mb also 0)";
-            return Err(value(key, found.to_string(), expected));
-        }
-    }
-    Ok(())
-}
-
-/// Checks that all tables that listen on the network can do so at the same time.
-fn check_listeners(config: &Config) -> Result<(), Problem> {
-    let publish = &config.publish;
-    let listeners = [
-        (
-            "publish.tcp.listen",
-            publish.tcp.as_ref().map(|tcp| tcp.listen),
-        ),
-        (
-            "publish.foxglove.listen",
-            publish.foxglove.as_ref().map(|foxglove| foxglove.listen),
-        ),
-        ("http.listen", config.http.as_ref().map(|http| http.listen)),
-    ];
-    for (index, &(key, listen)) in listeners.iter().enumerate() {
-        for &(other_key, other) in &listeners[..index] {
-            if let (Some(listen), Some(other)) = (listen, other)
-                && meet(listen, other)
-            {
-                let problem = format!(
-                    "{listen} cannot be used beside {other_key} = {other}: set another address or port"
-                );
-                return Err(clash(key, problem));
-            }
-        }
+        return Err(Problem::because("publish.unix.control_path", problem));
     }
     Ok(())
 }
 
 fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
-    // These characters have a meaning in zenoh's key expressions. The log and `fleet` show a site.
+    // These characters have a meaning in zenoh's key expressions. The log shows a site.
     let is_key = |key: &str| {
         !key.split('/').any(str::is_empty)
             && !key.contains(['*', '$', '?', '#'])
@@ -187,7 +144,7 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
     Ok(())
 }
 
-fn check_ros2(ros2: &Ros2, sensors: &[SensorTable]) -> Result<(), Problem> {
+fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> {
     let found = match ros2.chosen_domain_id() {
         Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
         Ok(_) => None,
@@ -221,20 +178,20 @@ fn check_ros2(ros2: &Ros2, sensors: &[SensorTable]) -> Result<(), Problem> {
         let tokens = topic.strip_prefix('/');
         if !tokens.is_some_and(|tokens| tokens.split('/').all(token)) {
             return Err(value(
-                format!("publish.ros2.motion.{sensor}"),
+                &format!("publish.ros2.motion.{sensor}"),
                 format!("{topic:?}"),
                 "a topic of ROS such as \"/arm_7/approach\"",
             ));
         }
     }
-    match sensors.iter().find(|sensor| !token(&sensor.name)) {
-        Some(sensor) => Err(clash(
-            format!("sensor.name of {:?}", sensor.name),
-            "ROS takes no name with two _ in a row: rename the sensor, or remove publish.ros2"
-                .to_owned(),
-        )),
-        None => Ok(()),
+    for (index, sensor) in sensors.iter().enumerate() {
+        if !token(&sensor.name) {
+            let problem =
+                "ROS takes no name with two _ in a row: rename the sensor, or remove publish.ros2";
+            return Err(Problem::because("sensor.name", problem).of((index, sensor)));
+        }
     }
+    Ok(())
 }
 
 /// The most characters of a robot's name, as many as in the longest host name.
@@ -243,49 +200,46 @@ const MOST_ROBOT_CHARS: usize = 255;
 /// The highest domain ID. The ports of a higher domain would exceed 65535 (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN_ID: u16 = 232;
 
-/// Whether two listeners cannot use these addresses at the same time. For port 0, the system
-/// chooses a free port.
-fn meet(one: SocketAddr, other: SocketAddr) -> bool {
-    // `[::]` also covers all IPv4 addresses, by the kernel's default (bindv6only of ipv6(7)).
-    let covers = |all: IpAddr, ip: IpAddr| all.is_unspecified() && (all.is_ipv6() || ip.is_ipv4());
-    let (a, b) = (one.ip(), other.ip());
-    one.port() == other.port() && one.port() != 0 && (a == b || covers(a, b) || covers(b, a))
-}
-
-/// The largest number in `[record]`. As megabytes it is more than any disk has, and the number of
-/// bytes still fits in a `u64`. As seconds it is 31 years.
-const MOST: u64 = 1_000_000_000;
-
 /// The names and the ports that sensors have so far.
 #[derive(Default)]
 struct Taken<'a> {
     names: HashSet<&'a str>,
-    /// The sensor of each port. A device that exists may have several names.
-    ports: HashMap<Port, &'a str>,
+    /// The first sensor of each port. A device that exists may have several names.
+    ports: HashMap<Port, &'a sensor::Settings>,
 }
 
 impl<'a> Taken<'a> {
-    /// Checks that a sensor has a name and a port of its own.
-    fn add(&mut self, sensor: &'a SensorTable) -> Result<(), Problem> {
+    /// Checks that a sensor has a name of its own, and that sensors that share a port agree on it.
+    fn add(&mut self, sensor: &'a sensor::Settings) -> Result<(), Problem> {
         let name = &sensor.name;
-        let key = |key| format!("sensor.{key} of {name:?}");
         if !self.names.insert(name) {
-            let problem = "two sensors have this name: give each a name of its own".to_owned();
-            return Err(clash(key("name"), problem));
+            let problem = "two sensors have this name: give each a name of its own";
+            return Err(Problem::because("sensor.name", problem));
         }
         let port = &sensor.port;
         let device = port.device().and_then(|path| path.canonicalize().ok());
         let one = device.map_or_else(|| port.clone(), Port::Device);
-        if let Some(other) = self.ports.insert(one, name) {
-            let problem =
-                format!("{port} is the port of {other:?} too: give each sensor a port of its own");
-            return Err(clash(key("port"), problem));
+        let first = *self.ports.entry(one).or_insert(sensor);
+        let other = &first.name;
+        if first.port != *port {
+            let problem = format!(
+                "{port} is the port of {other:?} too, which calls it {}: write the same name for both",
+                first.port
+            );
+            return Err(Problem::because("sensor.port", problem));
+        }
+        if first.baud != sensor.baud {
+            let problem = format!(
+                "found {}, expected {} as for {other:?}, which has the same port",
+                sensor.baud, first.baud
+            );
+            return Err(Problem::because("sensor.baud", problem));
         }
         Ok(())
     }
 }
 
-fn check_model(model: &Model) -> Result<(), Problem> {
+fn check_model(model: &verdict::Settings) -> Result<(), Problem> {
     match &model.sha256 {
         Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
             let found = format!("{hash:?}");

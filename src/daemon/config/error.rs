@@ -1,10 +1,13 @@
-//! The errors of a configuration. Each error names the file, and the line or the key.
+//! The errors of a configuration. Each error names the file, the line and the key.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
+use toml::de::{DeTable, DeValue};
+
 use hardnessd_core::exit::{CONFIG, Coded, NO_INPUT};
-use hardnessd_core::sensor::SensorError;
-use hardnessd_core::verdict::LevelsError;
+use hardnessd_core::range::OutOfRange;
+use hardnessd_core::sensor;
 
 /// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
 /// dead.
@@ -13,19 +16,28 @@ pub(super) const MAX_BYTES: usize = 1 << 20;
 /// The reason a configuration cannot be used. Each message names the file and the key, what was
 /// found and what was expected.
 #[derive(Debug, thiserror::Error)]
-#[error("{path}: {problem}")]
+#[error("{}: {}{problem}", path.display(), line.map_or(String::new(), |line| format!("line {line}: ")))]
 pub struct Error {
     /// The path of the configuration.
     path: PathBuf,
+    /// The line of the value, if it is written.
+    line: Option<usize>,
     #[source]
     problem: Problem,
 }
 
 impl Error {
-    /// Makes the error of a problem in the configuration at `path`.
-    pub(super) fn at(path: &Path) -> impl FnOnce(Problem) -> Self {
+    /// Makes the error of a problem in the configuration at `path`, which has this text.
+    pub(super) fn at(path: &Path, text: &Text) -> impl FnOnce(Problem) -> Self {
         move |problem| Self {
             path: path.to_owned(),
+            line: match &problem {
+                Problem::Value { sensor, value } => {
+                    let index = sensor.as_ref().map_or(0, |sensor| sensor.index);
+                    text.line(index, &value.key)
+                }
+                _ => None,
+            },
             problem,
         }
     }
@@ -37,82 +49,70 @@ pub(super) enum Problem {
     /// The configuration file cannot be read.
     #[error("cannot read: {0}")]
     Unreadable(#[source] std::io::Error),
-    /// The file is longer than any configuration. It may be another file, or an endless device.
-    #[error("more than {MAX_BYTES} bytes: no configuration is so long: name another file")]
-    TooLong,
     /// The file is not TOML, or has an unknown key or a value of the wrong type. The text is the
     /// place in the file, and the parser's message.
     #[error("{0}")]
     Syntax(String),
-    /// The file has `[sensor]` in place of `[[sensor]]`.
-    #[error("write [[sensor]], not [sensor]: there may be several")]
-    SingleBrackets,
-    /// A `[[sensor]]` has no port.
-    #[error("sensor.port of {sensor:?} is missing: set it to a path under /dev/serial/by-id/")]
-    NoPort {
-        /// The sensor's name.
-        sensor: String,
-    },
     /// A value cannot be used.
-    #[error("{key}: found {found}, expected {expected}")]
+    #[error("{}{}: {}", value.key, of(sensor.as_ref()), value.problem)]
     Value {
-        /// The key, as it is written in the file.
-        key: String,
-        /// The value found.
-        found: String,
-        /// The values that can be used.
-        expected: &'static str,
+        /// The sensor, if the key is one of a `[[sensor]]`.
+        sensor: Option<Named>,
+        /// The key, what was found and what was expected.
+        value: OutOfRange,
     },
-    /// Two values cannot be used together.
-    #[error("{key}: {problem}")]
-    Clash {
-        /// The key to change, as it is written in the file.
-        key: String,
-        /// The problem, and the remedy.
-        problem: String,
-    },
-    /// The configuration has no sensor.
-    #[error("no sensor: add a [[sensor]] with a port")]
-    NoSensor,
-    /// A value of a sensor's description cannot be used.
-    #[error("{}{problem}", table_of(sensor, problem))]
-    Sensor {
-        /// The sensor's name.
-        sensor: String,
-        /// The value found, and the values that can be used.
-        problem: SensorError,
-    },
-    /// A table belongs to a feature that this program was built without. Such a table is never
-    /// ignored.
-    #[error(
-        "publish.{feature}: this hardnessd was built without {feature}: build it with \
-         --features {feature}, or remove the table"
-    )]
-    NotBuilt {
-        /// The feature of the package, which is also the table's name.
-        feature: &'static str,
-    },
-    /// A file that the configuration names cannot be used.
-    #[error("{key}: {file}: {source}")]
-    File {
-        /// The key, as it is written in the file.
-        key: String,
-        /// The path of the file, or "the model built in".
-        file: PathBuf,
-        /// The reason the file cannot be used.
-        source: Box<dyn std::error::Error + Send + Sync>,
-    },
-    /// The model cannot have the levels of the configuration.
-    #[error("level: {0}")]
-    Levels(#[from] LevelsError),
-    /// The model has another hash than `model.sha256`.
-    #[error("model.sha256: found a model of {found}, expected {expected}")]
-    ModelHash {
-        /// The hash of the model.
-        found: String,
-        /// The hash in `model.sha256`.
-        expected: String,
-    },
+}
+
+impl From<OutOfRange> for Problem {
+    fn from(value: OutOfRange) -> Self {
+        Self::Value {
+            sensor: None,
+            value,
+        }
+    }
+}
+
+impl Problem {
+    /// The problem of a value. `found` is shown as it is.
+    pub(super) fn found(key: &str, found: impl fmt::Display, expected: impl fmt::Display) -> Self {
+        OutOfRange::new(key, format_args!("{found}"), expected).into()
+    }
+
+    /// A problem and its remedy.
+    pub(super) fn because(key: &str, problem: impl fmt::Display) -> Self {
+        OutOfRange::because(key, problem).into()
+    }
+
+    /// The same problem in the table of a sensor, if its key is there.
+    pub(super) fn of(self, (index, sensor): (usize, &sensor::Settings)) -> Self {
+        match self {
+            Self::Value { value, .. } if value.key.starts_with("sensor.") => Self::Value {
+                sensor: Some(Named {
+                    index,
+                    name: sensor.name.clone(),
+                }),
+                value,
+            },
+            other => other,
+        }
+    }
+}
+
+/// A sensor of the configuration.
+#[derive(Debug)]
+pub(super) struct Named {
+    index: usize,
+    name: String,
+}
+
+/// The name of a sensor after a key. A name that cannot be one is not repeated.
+fn of(sensor: Option<&Named>) -> String {
+    match sensor {
+        Some(Named { name, .. }) if name.len() <= sensor::MOST_NAME_CHARS => {
+            format!(" of {name:?}")
+        }
+        _ => String::new(),
+    }
 }
 
 impl Coded for Error {
@@ -124,17 +124,41 @@ impl Coded for Error {
     }
 }
 
-/// The table to name before the key with which `problem` begins.
-fn table_of(sensor: &str, problem: &SensorError) -> String {
-    match problem {
-        SensorError::Press(_) => String::new(),
-        // The name cannot be used, so it cannot identify the table.
-        SensorError::Name(_) => "sensor.".to_owned(),
-        SensorError::Range(found) => match found.key {
-            "name" => "sensor.".to_owned(),
-            "min_confidence" | "min_force_n" | "early_confidence" => "model.".to_owned(),
-            _ => format!("sensor[{sensor:?}]."),
-        },
-        _ => format!("sensor[{sensor:?}]."),
+/// The text of a configuration. It is empty for one that is no file.
+#[derive(Debug, Clone, Default)]
+pub struct Text(pub(super) String);
+
+impl Text {
+    /// The line of a key or of the closest table above it. `index` is that of the `[[sensor]]`.
+    fn line(&self, index: usize, key: &str) -> Option<usize> {
+        let (start, _) = self.place(index, key)?;
+        Some(self.0[..start].matches('\n').count() + 1)
+    }
+
+    /// Whether the key is written. `index` is that of the `[[sensor]]`.
+    pub fn is_written(&self, index: usize, key: &str) -> bool {
+        self.place(index, key).is_some_and(|(_, is_whole)| is_whole)
+    }
+
+    /// Where the value of a key begins, or else the closest table above it, and whether it is the key.
+    fn place(&self, index: usize, key: &str) -> Option<(usize, bool)> {
+        let root = DeTable::parse(&self.0).ok()?.into_inner();
+        let mut table = &root;
+        let mut start = None;
+        for part in key.split('.') {
+            let Some(found) = table.get(part) else {
+                return start.map(|start| (start, false));
+            };
+            let found = match found.get_ref() {
+                DeValue::Array(list) if part == "sensor" => list.get(index)?,
+                _ => found,
+            };
+            start = Some(found.span().start);
+            match found.get_ref() {
+                DeValue::Table(below) => table = below,
+                _ => return start.map(|start| (start, key.ends_with(part))),
+            }
+        }
+        start.map(|start| (start, true))
     }
 }

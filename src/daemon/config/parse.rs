@@ -1,42 +1,45 @@
 //! Reads the file into a [`Config`], and loads the model that the file names.
 
-use std::error::Error;
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::error::{MAX_BYTES, Problem};
-use super::read::{Until, read};
+use super::error::{Error, MAX_BYTES, Problem, Text};
 use super::{Config, LevelTable};
-use crate::daemon::port::Port;
+use hardnessd_core::port::Port;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, Hrn, Level};
-use hardnessd_core::{npy, references, trial, wording};
+use hardnessd_core::{npy, references, sensor, trial, wording};
 
-pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
-    let bytes = read(path, MAX_BYTES, until).map_err(Problem::Unreadable)?;
+/// The configuration at `path` with its paths resolved and its gains read, and its text.
+pub(super) fn load(path: &Path) -> Result<(Config, Text), Error> {
+    let text = text(path).map_err(Error::at(path, &Text::default()))?;
+    let config = config(&text, path);
+    let config = config.map_err(Error::at(path, &text))?;
+    Ok((config, text))
+}
+
+fn text(path: &Path) -> Result<Text, Problem> {
+    let bytes = read(path, MAX_BYTES).map_err(Problem::Unreadable)?;
     if bytes.len() > MAX_BYTES {
-        return Err(Problem::TooLong);
+        let problem = "no configuration is so long: name another file";
+        return Err(Problem::Syntax(format!(
+            "more than {MAX_BYTES} bytes: {problem}"
+        )));
     }
-    let text = std::str::from_utf8(&bytes).map_err(|error| Problem::Syntax(error.to_string()))?;
+    let text = String::from_utf8(bytes);
+    text.map(Text)
+        .map_err(|error| Problem::Syntax(error.utf8_error().to_string()))
+}
+
+fn config(Text(text): &Text, path: &Path) -> Result<Config, Problem> {
     let mut config: Config = toml::from_str(text).map_err(|error| syntax(text, &error))?;
     let directory = path.parent().unwrap_or(Path::new(""));
-    for sensor in &mut config.sensors {
-        if let Port::Device(device) = &mut sensor.port {
-            if device.as_os_str().is_empty() {
-                return Err(Problem::NoPort {
-                    sensor: sensor.name.clone(),
-                });
-            }
-            let key = format!("sensor.port of {:?}", sensor.name);
-            resolve(device, directory, &key, "the path of a device")?;
-        }
-        if let Some(file) = &mut sensor.references {
-            let key = format!("sensor.references of {:?}", sensor.name);
-            resolve(file, directory, &key, "the path of an .npz file")?;
-        }
-        if let Some(given) = &mut sensor.calibration.gains {
-            *given = gains(given, directory, &sensor.name, until)?;
-        }
+    for (index, sensor) in config.sensors.iter_mut().enumerate() {
+        let resolved = resolve_of(sensor, directory);
+        resolved.map_err(|problem| problem.of((index, sensor)))?;
     }
     let unix = &mut config.publish.unix;
     let paths = [
@@ -56,39 +59,62 @@ pub(super) fn load(path: &Path, until: Until) -> Result<Config, Problem> {
     Ok(config)
 }
 
+/// Resolves the paths of a sensor, and reads its gains.
+fn resolve_of(sensor: &mut sensor::Settings, directory: &Path) -> Result<(), Problem> {
+    if let Port::Device(device) = &mut sensor.port {
+        if device.as_os_str().is_empty() {
+            let expected = "a path under /dev/serial/by-id/";
+            return Err(Problem::found("sensor.port", "none", expected));
+        }
+        resolve(device, directory, "sensor.port", "the path of a device")?;
+    }
+    if let Some(file) = &mut sensor.references {
+        resolve(
+            file,
+            directory,
+            "sensor.references",
+            "the path of an .npz file",
+        )?;
+    }
+    if let Some(given) = &mut sensor.calibration.gains {
+        *given = gains(given, directory)?;
+    }
+    Ok(())
+}
+
 /// Reads the gains from the file that the configuration names.
-fn gains(given: &Gains, directory: &Path, sensor: &str, until: Until) -> Result<Gains, Problem> {
-    let key = format!("sensor.calibration.gains of {sensor:?}");
+fn gains(given: &Gains, directory: &Path) -> Result<Gains, Problem> {
+    let (key, expected) = ("sensor.calibration.gains", "the path of an .npy file");
     let Gains::File(file) = given else {
-        return Err(Problem::Value {
-            key,
-            found: "a list".to_owned(),
-            expected: "the path of an .npy file",
-        });
+        return Err(Problem::found(key, "a list", expected));
     };
     let mut file = file.clone();
-    resolve(&mut file, directory, &key, "the path of an .npy file")?;
-    let bytes = read_named(&key, &file, MAX_BYTES, until)?;
+    resolve(&mut file, directory, key, expected)?;
+    let bytes = read_named(key, &file, MAX_BYTES)?;
     let rows = npy::table(&mut bytes.as_slice()).map_err(|found| {
         let problem = format!("found {found}, expected f32 [rows, cols]");
-        unusable(&key, &file, problem)
+        unusable(key, &file, problem)
     })?;
     Ok(Gains::Taxels(rows))
 }
 
+/// Reads at most one byte more than `most` from a file. That byte shows that the file is too long.
+fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let file = File::open(path)?;
+    file.take(most as u64 + 1).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
 /// Reads the file that the configuration names at `key`.
-fn read_named(key: &str, file: &Path, most: usize, until: Until) -> Result<Vec<u8>, Problem> {
-    let bytes = read(file, most, until);
+fn read_named(key: &str, file: &Path, most: usize) -> Result<Vec<u8>, Problem> {
+    let bytes = read(file, most);
     bytes.map_err(|error| unusable(key, file, format!("cannot read: {error}")))
 }
 
 /// The problem of the file that the configuration names at `key`.
-fn unusable(key: &str, file: &Path, source: impl Into<Box<dyn Error + Send + Sync>>) -> Problem {
-    Problem::File {
-        key: key.to_owned(),
-        file: file.to_owned(),
-        source: source.into(),
-    }
+fn unusable(key: &str, file: &Path, problem: impl Display) -> Problem {
+    Problem::because(key, format_args!("{}: {problem}", file.display()))
 }
 
 /// Resolves a path of the configuration against its directory. An empty path is refused, because it
@@ -102,11 +128,7 @@ fn resolve(
 ) -> Result<(), Problem> {
     let text = given.to_string_lossy();
     if text.is_empty() || !wording::is_plain(&text) {
-        return Err(Problem::Value {
-            key: key.to_owned(),
-            found: format!("{text:?}"),
-            expected,
-        });
+        return Err(Problem::found(key, format_args!("{text:?}"), expected));
     }
     *given = directory.join(&*given);
     Ok(())
@@ -116,14 +138,15 @@ fn resolve(
 fn syntax(text: &str, error: &toml::de::Error) -> Problem {
     let table = text.parse::<toml::Table>().unwrap_or_default();
     if table.get("sensor").is_some_and(toml::Value::is_table) {
-        return Problem::SingleBrackets;
+        let problem = "write [[sensor]], not [sensor]: there may be several";
+        return Problem::Syntax(problem.to_owned());
     }
     Problem::Syntax(wording::of_toml(text, error))
 }
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
-pub(super) fn model(config: &Config, most: Duration, until: Until) -> Result<Hrn, Problem> {
+pub(super) fn model(config: &Config, most: Duration) -> Result<Hrn, Problem> {
     let (key, model) = ("model.path", &config.model);
     let (file, hrn) = match &model.path {
         None => (
@@ -131,18 +154,16 @@ pub(super) fn model(config: &Config, most: Duration, until: Until) -> Result<Hrn
             Hrn::load(model.built_in.bytes()),
         ),
         Some(file) => {
-            let bytes = read_named(key, file, verdict::MAX_FILE_BYTES, until)?;
+            let bytes = read_named(key, file, verdict::MAX_FILE_BYTES)?;
             (file.as_path(), trial::load(&bytes, Some(most)))
         }
     };
-    let hrn = hrn.map_err(|error| unusable(key, file, error))?;
+    let hrn = hrn.map_err(|error| unusable(key, file, wording::line(&error)))?;
     if let Some(expected) = &model.sha256
         && !expected.eq_ignore_ascii_case(hrn.sha256())
     {
-        return Err(Problem::ModelHash {
-            found: hrn.sha256().to_owned(),
-            expected: expected.clone(),
-        });
+        let found = format_args!("a model of {}", hrn.sha256());
+        return Err(Problem::found("model.sha256", found, expected));
     }
     if config.levels.is_empty() {
         return Ok(hrn);
@@ -153,30 +174,33 @@ pub(super) fn model(config: &Config, most: Duration, until: Until) -> Result<Hrn
         shore: format!("{}-{}", table.shore[0], table.shore[1]),
     };
     let levels: Vec<Level> = (1..=u8::MAX).zip(&config.levels).map(level).collect();
-    Ok(hrn.with_levels(levels)?)
+    let levelled = hrn.with_levels(levels);
+    levelled.map_err(|error| Problem::because("level", error))
 }
 
 /// The model with the references in `file`, which are those of `sensor`.
 pub(super) fn identified(
     hrn: &Hrn,
     file: &Path,
-    sensor: &str,
-    until: Until,
+    sensor: (usize, &sensor::Settings),
 ) -> Result<Hrn, Problem> {
-    let key = format!("sensor.references of {sensor:?}");
-    let bytes = read_named(&key, file, references::MAX_FILE_BYTES, until)?;
-    let presses = references::read(&bytes).map_err(|error| unusable(&key, file, error))?;
-    let (found, most) = (presses.len(), hrn.most_references());
-    if most == 0 {
-        return Ok(hrn.clone());
-    }
-    if found > most {
-        let problem =
-            format!("found {found} presses, expected at most {most}, as many as the model takes");
-        return Err(unusable(&key, file, problem));
-    }
-    let references = hrn.references(&presses);
-    let references = references.map_err(|error| unusable(&key, file, error))?;
-    let identified = hrn.identified(references);
-    identified.map_err(|error| unusable(&key, file, error))
+    let key = "sensor.references";
+    let own = || {
+        let bytes = read_named(key, file, references::MAX_FILE_BYTES)?;
+        let presses = references::read(&bytes).map_err(|error| unusable(key, file, error))?;
+        let (found, most) = (presses.len(), hrn.most_references());
+        if most == 0 {
+            return Ok(hrn.clone());
+        }
+        if found > most {
+            let problem = format!(
+                "found {found} presses, expected at most {most}, as many as the model takes"
+            );
+            return Err(unusable(key, file, problem));
+        }
+        let identified = hrn.identified_by(&presses);
+        let (identified, _) = identified.map_err(|error| unusable(key, file, error))?;
+        Ok(identified)
+    };
+    own().map_err(|problem: Problem| problem.of(sensor))
 }

@@ -9,22 +9,24 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::directory_of_service;
+use hardnessd_core::range::from_to;
+use hardnessd_core::settings;
 
-/// The `[publish]` tables.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Publish {
-    /// The Unix socket.
-    pub unix: Unix,
-    /// The same protocol over TCP. Without the table, it is off.
-    pub tcp: Option<Tcp>,
-    /// A server for Foxglove and Lichtblick. Without the table, it is off. It needs the feature
-    /// `foxglove`.
-    pub foxglove: Option<Foxglove>,
-    /// The keys of a zenoh session. Without the table, it is off. It needs the feature `zenoh`.
-    pub zenoh: Option<Zenoh>,
-    /// The topics of a ROS 2 node. Without the table, it is off. It needs the feature `ros2`.
-    pub ros2: Option<Ros2>,
+settings! {
+    /// The `[publish]` tables.
+    pub struct Publish {
+        /// The Unix socket.
+        pub unix: Unix = Unix::default();
+        /// The same protocol over TCP. Without the table, it is off.
+        pub tcp: Option<Tcp>;
+        /// A server for Foxglove and Lichtblick. Without the table, it is off. It needs the feature
+        /// `foxglove`.
+        pub foxglove: Option<Foxglove>;
+        /// The keys of a zenoh session. Without the table, it is off. It needs the feature `zenoh`.
+        pub zenoh: Option<Zenoh>;
+        /// The topics of a ROS 2 node. Without the table, it is off. It needs the feature `ros2`.
+        pub ros2: Option<Ros2>;
+    }
 }
 
 impl Publish {
@@ -61,32 +63,29 @@ impl<const PORT: u16> Default for Listen<PORT> {
 pub type Tcp = Listen<8255>;
 /// The `[publish.foxglove]` table. The applications propose this port.
 pub type Foxglove = Listen<8765>;
-/// The `[http]` table.
-pub type Http = Listen<8256>;
 
-/// The `[publish.zenoh]` table. A session uses only the endpoints of the table, and does not look
-/// for other peers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Zenoh {
-    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-    pub listen: Vec<Endpoint>,
-    /// Endpoints of routers or peers to connect to. The session retries until they answer.
-    pub connect: Vec<Endpoint>,
-    /// The part after `tactile/` in every key. The default is the robot's name.
-    site: Option<String>,
-    /// The key at which the robot reports the positions of its arms. `None`: it reports none.
-    pub motion: Option<String>,
+settings! {
+    /// The `[http]` table.
+    pub struct Http {
+        /// The address and port to listen on.
+        pub listen: SocketAddr = Listen::<8256>::default().listen;
+        /// Whether the live page may set what is being pressed, as `object` and `level` of the context.
+        pub set_context: bool = false;
+    }
 }
 
-impl Default for Zenoh {
-    fn default() -> Self {
-        Self {
-            listen: vec![Endpoint("tcp/127.0.0.1:7447".to_owned())],
-            connect: Vec::new(),
-            site: None,
-            motion: None,
-        }
+settings! {
+    /// The `[publish.zenoh]` table. A session uses only the endpoints of the table, and does not look
+    /// for other peers.
+    pub struct Zenoh {
+        /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
+        pub listen: Vec<Endpoint> = vec![Endpoint("tcp/127.0.0.1:7447".to_owned())];
+        /// Endpoints of routers or peers to connect to. The session retries until they answer.
+        pub connect: Vec<Endpoint> = Vec::new();
+        /// The part after `tactile/` in every key. The default is the robot's name.
+        site: Option<String>;
+        /// The key at which the robot reports the positions of its arms. `None`: it reports none.
+        pub motion: Option<String>;
     }
 }
 
@@ -145,29 +144,18 @@ impl From<Endpoint> for String {
     }
 }
 
-/// The `[publish.ros2]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Ros2 {
-    /// The domain ID. The default is `$ROS_DOMAIN_ID`, else 0.
-    domain_id: Option<u16>,
-    /// Namespace of the node and its topics.
-    pub namespace: String,
-    /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
-    pub networks: Vec<IpAddr>,
-    /// The topic on which the robot reports the positions of its arm, by the sensor's name.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub motion: BTreeMap<String, String>,
-}
-
-impl Default for Ros2 {
-    fn default() -> Self {
-        Self {
-            domain_id: None,
-            namespace: "/".to_owned(),
-            networks: Vec::new(),
-            motion: BTreeMap::new(),
-        }
+settings! {
+    /// The `[publish.ros2]` table.
+    pub struct Ros2 {
+        /// The domain ID. The default is `$ROS_DOMAIN_ID`, else 0.
+        domain_id: Option<u16>;
+        /// Namespace of the node and its topics.
+        pub namespace: String = "/".to_owned();
+        /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
+        pub networks: Vec<IpAddr> = Vec::new();
+        /// The topic on which the robot reports the positions of its arm, by the sensor's name.
+        #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+        pub motion: BTreeMap<String, String> = BTreeMap::new();
     }
 }
 
@@ -197,31 +185,24 @@ impl Ros2 {
 #[error("$ROS_DOMAIN_ID {0:?}")]
 pub(super) struct DomainIdError(String);
 
-/// The `[publish.unix]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Unix {
-    /// Whether the daemon opens its Unix sockets.
-    pub enabled: bool,
-    /// The path of the socket. [`Unix::path`] has the default.
-    pub(super) path: Option<PathBuf>,
-    /// The permissions of the socket's file.
-    pub mode: Mode,
-    /// The path of the control socket. The default is `control.sock` beside the other socket.
-    pub(super) control_path: Option<PathBuf>,
-    /// The most subscribers at a time, on each socket and on TCP.
-    pub max_clients: usize,
-}
-
-impl Default for Unix {
-    fn default() -> Self {
-        Self {
-            enabled: true,
-            path: None,
-            mode: Mode(0o660),
-            control_path: None,
-            max_clients: 256,
-        }
+settings! {
+    /// The `[publish.unix]` table.
+    pub struct Unix {
+        /// Whether the daemon opens its Unix sockets.
+        pub enabled: bool = true;
+        /// The path of the socket. [`Unix::path`] has the default.
+        pub(super) path: Option<PathBuf>;
+        /// The permissions of the socket's file.
+        pub mode: Mode = Mode(0o660);
+        /// The path of the control socket. The default is `control.sock` beside the other socket.
+        pub(super) control_path: Option<PathBuf>;
+        /// The permissions of the control socket's file.
+        pub control_mode: Mode = Mode(0o600);
+        /// The group of the control socket's file: a name, or a number. Without it, it is the daemon's own.
+        pub control_group: Option<String>;
+        /// The most subscribers at a time, on each socket and on TCP. No process may have more open
+        /// files.
+        pub max_clients: usize = 256, in from_to((1.0, 1e6), "");
     }
 }
 

@@ -1,9 +1,8 @@
 use std::path::Path;
-use std::time::Duration;
 
 use super::*;
 use hardnessd_core::exit::CONFIG;
-use hardnessd_core::npy;
+use hardnessd_core::{npy, tare};
 
 fn load(text: &str) -> Result<Config, String> {
     let directory = tempfile::tempdir().unwrap();
@@ -13,8 +12,7 @@ fn load(text: &str) -> Result<Config, String> {
 }
 
 fn checked(path: &Path) -> Result<Config, String> {
-    let checked = Config::load(path).and_then(|config| config.check(path).map(|_| config));
-    checked.map_err(|error| error.to_string())
+    Config::load(path).map_err(|error| error.to_string())
 }
 
 const LEAST: &str = "[[sensor]]\nport = \"/dev/ttyUSB0\"\n";
@@ -24,7 +22,7 @@ fn every_key_but_port_has_a_default() {
     let config = load(LEAST).unwrap();
     assert_eq!(
         config,
-        Config::new(vec![SensorTable::new(PathBuf::from("/dev/ttyUSB0"))])
+        Config::new(vec![sensor::Settings::new(PathBuf::from("/dev/ttyUSB0"))])
     );
     let config = load(&format!(
         "{LEAST}[publish.tcp]\n[http]\n[publish.unix]\npath = \"/x/y.sock\""
@@ -38,73 +36,47 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let cases: [(&str, &[&str]); 41] = [
+    let cases: &[(&str, &[&str])] = &[
         (
             "[[sensor]]\nname = \"a\"",
-            &["sensor.port of \"a\" is missing: set it to a path under /dev/serial/by-id/"],
+            &["line 1: sensor.port of \"a\": found none, expected a path under /dev/serial/by-id/"],
         ),
         (
             "# Two.\n[[sensor]]\nport = \"p\"\n\n[[sensor]]\nname = \"b\"",
-            &["sensor.port of \"b\" is missing: set it"],
+            &["line 5: sensor.port of \"b\": found none"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[[sensor]]\nname = \"b\"\nport = \"./p\"",
-            &[
-                "sensor.port of \"b\"",
-                "is the port of \"sensor\"",
-                "of its own",
-            ],
+            "[[sensor]]\nport = \"p\"\n[[sensor]]\nname = \"b\"\nport = \"./p\"\nbaud = 9600",
+            &["line 6: sensor.baud of \"b\": found 9600, expected 115200 as for \"sensor\""],
         ),
         (
             "[[sensor]]\nport = \"\"",
-            &["sensor.port of \"sensor\" is missing"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nmask = 65536",
-            &["line 4, column 8, `mask = 65536`", "integer `65536`"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = -1",
-            &["line 4, column 8, `rows = -1`", "integer `-1`"],
+            &["line 2: sensor.port of \"sensor\": found none"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.calibration]\npitch_mm = \"3\"",
-            &["`pitch_mm = \"3\"`", "string \"3\""],
+            &["`pitch_mm = \"3\"`", "a number, or [rows, columns]"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.calibration]\npitch_mm = 1e200",
-            &["calibration.pitch_mm: found 1e200,", "at most 1000"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[sensor.calibration]\nnewtons_per_count = 1e38",
-            &["newtons_per_count: found 1e38,", "at most 1000"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[http]\nlisten = \"127.0.0.1:99\"\n\
-             [publish.tcp]\nlisten = \"0.0.0.0:99\"",
-            &["http.listen: 127.0.0.1:99 cannot", "0.0.0.0:99", "another"],
+            &[
+                "line 4: sensor.calibration.pitch_mm of \"sensor\": found 1e200,",
+                "0.01 to 1000 mm",
+            ],
         ),
         (
             "robot = \"\\u202Eevil\"\n[[sensor]]\nport = \"p\"",
             &["robot: found \"\\u{202e}evil\"", "bidirectional characters"],
         ),
-        (
-            "robot = \"\"\n[[sensor]]\nport = \"p\"",
-            &["robot: found \"\"", "expected a name"],
-        ),
         ("bad", &["line 1, "]),
         ("[log]", &["no sensor: add a [[sensor]] with a port"]),
         (
             "[[sensor]]\nport = \"p\"\nbauds = 9",
-            &["line 3, column 1", "`bauds`", "`baud`"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\nbaud = \"9\"",
-            &["`baud = \"9\"`", "string \"9\""],
+            &["line 3, column 1", "`bauds`: did you mean `baud`?"],
         ),
         (
             "[[sensor]]\nport = \"p\"\nbaud = 0",
-            &["`baud = 0`", "integer `0`", "nonzero"],
+            &["line 3: sensor.baud of \"sensor\": found 0, expected 50 to 20000000"],
         ),
         ("[[sensor]]\nport = \"p\"\nname = \"Arm\"", &["name", "Arm"]),
         (
@@ -113,27 +85,28 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\nstale_after_ms = 0",
-            &["stale_after_ms: found 0.0, expected 0.1 to 3600000 milli"],
+            &[
+                "line 3: sensor.stale_after_ms of \"sensor\": found 0.0, expected 0.1 to 3600000 milli",
+            ],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nrows = 65",
-            &["sensor[\"sensor\"].frame.rows", "65", "64"],
+            &["line 4: sensor.frame.rows of \"sensor\": found 65, expected 1 to 64"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[sensor.frame]\nsync = \"xyz\"",
             &["line 4, ", "sync", "xyz", "hex"],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[sensor.frame]\npreset = \"ascii\"\nsync = \"AA\"",
-            &["frame.sync", "frames of preset ascii have no such part"],
+            "[[sensor]]\nport = \"p\"\n[sensor.frame]\npreset = \"csv\"\nsync = \"AA\"",
+            &[
+                "line 5: sensor.frame.sync",
+                "frames of preset csv have no such part",
+            ],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[press]\nend_area_taxels = 9",
-            &["press.end_area_taxels", "9"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[model]\nmin_confidence = 2.0",
-            &["model.min_confidence", "2"],
+            &["line 4: press.end_area_taxels: found 9"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[model]\nsha256 = \"12\"",
@@ -145,11 +118,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[[sensor]]\nport = \"p\"\n[publish.unix]\nmax_clients = 0",
-            &["publish.unix.max_clients", "0"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[publish.unix]\nmax_clients = 9223372036854775807",
-            &["publish.unix.max_clients", "1 to 1000000"],
+            &["line 4: publish.unix.max_clients: found 0"],
         ),
         (
             "[[sensor]]\nport = \"p\u{202e}\"",
@@ -164,10 +133,6 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             ],
         ),
         (
-            "[[sensor]]\nport = \"p\"\n[http]\nlisten = 8256",
-            &["line 4, column 10", "listen", "8256"],
-        ),
-        (
             "[[sensor]]\nport = \"p\"\n[publish.unix]\npath = \"/control.sock\"",
             &["publish.unix.control_path", "/control.sock"],
         ),
@@ -180,31 +145,15 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &["publish.unix.control_path", r#""a\nb""#],
         ),
         (
-            "[[sensor]]\nport = \"a\\u0000b\"",
-            &["sensor.port", r#""a\0b""#, "the path of a device"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[model]\npath = \"\"",
-            &["model.path", "found \"\""],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[record]\ndir = \"\"",
-            &["record.dir", "found \"\""],
-        ),
-        (
             "[[sensor]]\nport = \"p\"\n[publish.zenoh]\nlisten = [\"udp/here:1\"]",
             &["line 4, ", "listen", "udp/here:1", "tcp/127.0.0.1:7447"],
-        ),
-        (
-            "[[sensor]]\nport = \"p\"\n[record]\nrotate_mb = 0",
-            &["record.rotate_mb", "0"],
         ),
         (
             "[[sensor]]\nport = \"p\"\n[log]\nformat = \"xml\"",
             &["line 4, ", "format", "xml", "journald"],
         ),
     ];
-    for (text, expected) in cases {
+    for &(text, expected) in cases {
         let error = load(text).unwrap_err();
         assert!(
             !error.contains('\n') && error.contains("hardnessd.toml:"),
@@ -254,7 +203,7 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
     let write = |bytes: &[u8]| std::fs::write(directory.path().join("gains.npy"), bytes).unwrap();
     let gains = [1.0, 1.1, 0.9, 1.0, 0.5, 2.0];
     let error = checked(&path).unwrap_err();
-    let expected = "hardnessd.toml: sensor.calibration.gains of \"sensor\": ";
+    let expected = "hardnessd.toml: line 7: sensor.calibration.gains of \"sensor\": ";
     assert!(
         error.contains(expected) && error.contains("gains.npy: cannot read: No such file"),
         "{error}"
@@ -266,7 +215,7 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
         read.sensors[0].calibration.gains,
         Some(tare::Gains::Taxels(rows))
     );
-    // The gains may change while the daemon runs.
+    // The sensor begins anew with other gains.
     write(&npy::to_bytes(&gains.map(|gain| 2.0 * gain), 2, 3));
     let changed = checked(&path).unwrap();
     assert_ne!(read, changed);
@@ -282,7 +231,7 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
         ),
         (
             npy::to_bytes(&gains, 3, 2),
-            "sensor[\"sensor\"].calibration.gains: found 3 rows of 2, expected 2 of 3",
+            "sensor.calibration.gains of \"sensor\": found 3 rows of 2, expected 2 of 3",
         ),
     ] {
         write(&bytes);
@@ -324,25 +273,6 @@ fn two_names_of_one_device_are_one_port() {
 }
 
 #[test]
-fn listeners_may_share_an_address_or_a_port_but_not_both() {
-    for (tcp, http, allowed) in [
-        ("127.0.0.1:99", "127.0.0.1:99", false),
-        ("0.0.0.0:99", "127.0.0.1:99", false),
-        ("127.0.0.1:99", "[::]:99", false),
-        ("[::1]:99", "[::]:99", false),
-        ("127.0.0.1:99", "127.0.0.1:98", true),
-        ("127.0.0.1:99", "127.0.0.2:99", true),
-        ("0.0.0.0:99", "[::1]:99", true),
-        ("127.0.0.1:0", "127.0.0.1:0", true),
-    ] {
-        let loaded = load(&format!(
-            "{LEAST}[publish.tcp]\nlisten = \"{tcp}\"\n[http]\nlisten = \"{http}\""
-        ));
-        assert_eq!(loaded.is_ok(), allowed, "{tcp}, {http}: {loaded:?}");
-    }
-}
-
-#[test]
 fn paths_are_relative_to_the_file() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("hardnessd.toml");
@@ -373,82 +303,13 @@ fn a_model_of_another_hash_is_refused() {
     );
 }
 
-/// Makes a pipe that no program writes to.
-fn pipe(path: &Path) {
-    let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
-    rustix::fs::mknodat(rustix::fs::CWD, path, rustix::fs::FileType::Fifo, mode, 0).unwrap();
-}
-
 #[test]
-fn a_reload_gives_a_pipe_up_and_a_pipe_that_a_program_writes_is_read() {
-    let directory = tempfile::tempdir().unwrap();
-    let place = |name: &str| directory.path().join(name);
-    let config = place("hardnessd.toml");
-    let text = format!(
-        "{LEAST}[sensor.frame]\nrows = 1\ncols = 2\n[sensor.calibration]\ngains = \"gains.npy\"\n\
-         [model]\npath = \"model.onnx\"\n"
-    );
-    let files = [
-        (
-            "hardnessd.toml",
-            text.into_bytes(),
-            "cannot read: it did not end in time",
-        ),
-        (
-            "gains.npy",
-            npy::to_bytes(&[1.0, 1.5], 1, 2),
-            "gains.npy: cannot read: it did not end in time",
-        ),
-        (
-            "model.onnx",
-            hardnessd_core::verdict::BUILT_IN_HRN.to_vec(),
-            "model.onnx: cannot read: it did not end in time",
-        ),
-    ];
-    for (name, bytes, _) in &files {
-        std::fs::write(place(name), bytes).unwrap();
-    }
-    let load = |wait: Duration| {
-        let loaded = Setup::load_until(&config, None, Instant::now() + wait);
-        loaded.map(drop).map_err(|error| error.to_string())
-    };
-    let patience = Duration::from_secs(60);
-    assert_eq!(load(patience), Ok(()));
-    for (name, bytes, expected) in &files {
-        let place = place(name);
-        std::fs::remove_file(&place).unwrap();
-        pipe(&place);
-        let begun = Instant::now();
-        let error = load(Duration::from_millis(500)).unwrap_err();
-        assert!(error.contains(expected), "{error}");
-        assert!(
-            error.contains("hardnessd.toml: ") && !error.contains('\n'),
-            "{error}"
-        );
-        assert!(begun.elapsed() < Duration::from_secs(30));
-        std::thread::scope(|scope| {
-            // Opening the pipe for writing waits for its reader.
-            scope.spawn(|| std::fs::write(&place, bytes));
-            assert_eq!(load(patience), Ok(()), "{name}");
-        });
-        std::fs::remove_file(&place).unwrap();
-        std::fs::write(&place, bytes).unwrap();
-        assert_eq!(load(patience), Ok(()), "{name}");
-    }
-}
-
-#[test]
-fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
+fn only_what_describes_the_sensors_the_model_and_the_log_may_differ_in_a_reload() {
     let old = load(LEAST).unwrap();
     for (text, expected) in [
-        ("[[sensor]]\nport = \"/dev/ttyUSB1\"", Some("sensor.port")),
         (
-            "[[sensor]]\nport = \"/dev/ttyUSB0\"\nbaud = 9600",
-            Some("sensor.baud"),
-        ),
-        (
-            "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[sensor.frame]\npreset = \"jq\"",
-            Some("sensor.frame"),
+            "robot = \"b\"\n[[sensor]]\nport = \"/dev/ttyUSB0\"",
+            Some("robot"),
         ),
         (
             "[[sensor]]\nport = \"/dev/ttyUSB0\"\n[publish.unix]\npath = \"/x\"",
@@ -464,8 +325,8 @@ fn only_what_a_sensor_can_change_while_it_runs_may_differ_in_a_reload() {
         ),
         ("[[sensor]]\nport = \"/dev/ttyUSB0\"\n[http]", Some("http")),
         (
-            "[[sensor]]\nport = \"/dev/ttyUSB0\"\nstale_after_ms = 900\n\
-             [sensor.calibration]\npitch_mm = 2.0\n\
+            "[[sensor]]\nport = \"/dev/ttyUSB1\"\nbaud = 9600\nframe_rate_hz = 1.0\n\
+             [sensor.frame]\npreset = \"jq\"\n[sensor.calibration]\npitch_mm = 2.0\n\
              [press]\nmin_frames = 3\n[model]\nmin_force_n = 1.0\n[log]\nformat = \"json\"",
             None,
         ),
@@ -583,6 +444,5 @@ fn many_sensors_are_checked_at_once_and_more_are_refused() {
     let error = load(&format!("{most}{}", table(1000))).unwrap_err();
     assert!(error.contains("sensor: found 1001 tables"), "{error}");
     let twice = most + "[[sensor]]\nname = \"twice\"\nport = \"p7\"\n";
-    let error = load(&twice.replacen(&table(8), "", 1)).unwrap_err();
-    assert!(error.contains("is the port of \"s7\" too"), "{error}");
+    assert!(load(&twice.replacen(&table(8), "", 1)).is_ok());
 }

@@ -1,7 +1,7 @@
 //! `/metrics`: the state of the daemon as numbers, in the OpenMetrics text format that Prometheus
 //! reads.
 //!
-//! Every scrape asks the hub and the sensors, so nothing is counted twice. A series exists from the
+//! Every scrape asks the hub, so nothing is counted twice. A series exists from the
 //! start with the value 0, so that its first change is seen.
 
 use std::sync::atomic::AtomicU64;
@@ -13,9 +13,8 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
-use crate::daemon::busy;
-use crate::daemon::hub::{Counts, Survey, Verdicts};
-use crate::daemon::sensor::Vitals;
+use crate::daemon::hub::{SensorSnapshot, Snapshot, Verdicts};
+use crate::daemon::sensor::SensorState;
 use hardnessd_core::event::{self, LinkState};
 
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -25,8 +24,8 @@ type Counters = Family<Labels, Counter>;
 type Gauges = Family<Labels, Gauge<f64, AtomicU64>>;
 
 /// The state of the hub and the sensors in the text format. Every series has the label `robot`.
-pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
-    let hello = &survey.hello;
+pub(super) fn encode(now: &Snapshot) -> String {
+    let hello = &now.hello;
     let robot = ("robot".into(), escaped(&hello.robot).into());
     let mut registry = Registry::with_prefix_and_labels("hardnessd", [robot].into_iter());
     registry.register(
@@ -38,33 +37,25 @@ pub(super) fn encode(survey: &Survey, vitals: &[Vitals]) -> String {
             ("model", hello.model.sha256.clone()),
         ]),
     );
-    links(&mut registry, vitals);
-    presses(&mut registry, survey);
+    links(&mut registry, now);
+    presses(&mut registry, now);
     let subscribers: Gauge = Gauge::default();
-    subscribers.set(i64::try_from(survey.subscribers).unwrap_or(i64::MAX));
+    subscribers.set(i64::try_from(now.subscribers).unwrap_or(i64::MAX));
     let help = "Subscribers there are, on sockets and pages";
     registry.register("subscribers", help, subscribers);
     for (name, help, count) in [
         ("events", "Numbered events published", hello.seq),
-        (
-            "gaps",
-            "Gaps that subscribers were told of",
-            survey.tally.gaps,
-        ),
+        ("gaps", "Gaps that subscribers were told of", now.gaps),
         (
             "events_dropped",
             "Events dropped because a subscriber was too slow",
-            survey.tally.dropped,
+            now.dropped,
         ),
     ] {
         let counter: Counter = Counter::default();
         counter.inc_by(count);
         registry.register(name, help, counter);
     }
-    let busy: Gauge<f64, AtomicU64> = Gauge::default();
-    busy.set(busy::longest().as_secs_f64());
-    let help = "Longest time that the daemon worked without a wait";
-    registry.register_with_unit("longest_work", help, Unit::Seconds, busy);
     let mut text = String::new();
     text::encode(&mut text, &registry).expect("writing to a string cannot fail");
     text
@@ -77,24 +68,29 @@ fn escaped(value: &str) -> String {
 }
 
 /// The series of the links.
-fn links(registry: &mut Registry, vitals: &[Vitals]) {
-    let (frames, damaged, skipped, unjudged) =
-        <(Counters, Counters, Counters, Counters)>::default();
+fn links(registry: &mut Registry, now: &Snapshot) {
+    let (frames, damaged, dropped) = <(Counters, Counters, Counters)>::default();
+    let (skipped, failed) = <(Counters, Counters)>::default();
     let (positions, late) = <(Counters, Counters)>::default();
     let (state, rate, age) = <(Gauges, Gauges, Gauges)>::default();
-    for Vitals {
-        status,
-        last_frame_age,
-        unjudged: failed,
-        motion,
-        ..
-    } in vitals
-    {
+    for sensor in &now.sensors {
+        let SensorSnapshot {
+            state:
+                SensorState {
+                    status,
+                    unjudged,
+                    motion,
+                    ..
+                },
+            last_frame_age,
+            ..
+        } = sensor;
         let labels = vec![("sensor", status.sensor.clone())];
         frames.get_or_create(&labels).inc_by(status.frames);
         damaged.get_or_create(&labels).inc_by(status.frames_damaged);
+        dropped.get_or_create(&labels).inc_by(status.frames_dropped);
         skipped.get_or_create(&labels).inc_by(status.bytes_skipped);
-        unjudged.get_or_create(&labels).inc_by(*failed);
+        failed.get_or_create(&labels).inc_by(*unjudged);
         positions.get_or_create(&labels).inc_by(motion.0);
         late.get_or_create(&labels).inc_by(motion.1);
         if let Some(hz) = status.frame_rate_hz {
@@ -112,10 +108,12 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
     }
     registry.register("frames", "Whole frames", frames);
     registry.register("frames_damaged", "Damaged frames", damaged);
+    let help = "Whole frames that were dropped: more than twice frame_rate_hz";
+    registry.register("frames_dropped", help, dropped);
     let help = "Bytes that belonged to no whole frame";
     registry.register_with_unit("skipped", help, Unit::Bytes, skipped);
     let help = "Verdicts that did not come: the model failed, the log says how";
-    registry.register("verdicts_failed", help, unjudged);
+    registry.register("verdicts_failed", help, failed);
     let help = "Positions of the arm that the robot told";
     registry.register("motion_points", help, positions);
     let help = "Positions of the arm that came after the verdict that they belong to";
@@ -129,16 +127,14 @@ fn links(registry: &mut Registry, vitals: &[Vitals]) {
 }
 
 /// The series of presses and verdicts.
-fn presses(registry: &mut Registry, survey: &Survey) {
+fn presses(registry: &mut Registry, now: &Snapshot) {
     let (presses, verdicts, rejected) = <(Counters, Counters, Counters)>::default();
-    let none = Counts::default();
-    for card in &survey.hello.sensors {
+    for SensorSnapshot { state, counts, .. } in &now.sensors {
         let with = |more: &[(&'static str, &str)]| {
-            let mut labels = vec![("sensor", card.name.clone())];
+            let mut labels = vec![("sensor", state.status.sensor.clone())];
             labels.extend(more.iter().map(|&(key, value)| (key, value.to_owned())));
             labels
         };
-        let counts = survey.tally.sensors.get(&card.name).unwrap_or(&none);
         for (state, count) in [
             ("begin", counts.begun),
             ("end", counts.ended),
@@ -149,7 +145,7 @@ fn presses(registry: &mut Registry, survey: &Survey) {
         }
         for (phase, made) in [("early", &counts.early), ("final", &counts.finals)] {
             // Keep the series for the levels of a model that a reload has replaced.
-            let known = survey.hello.model.levels.iter().map(|level| level.level);
+            let known = now.hello.model.levels.iter().map(|level| level.level);
             let mut levels: Vec<u8> = known.chain(made.levels.keys().copied()).collect();
             levels.sort_unstable();
             levels.dedup();

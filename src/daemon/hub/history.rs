@@ -1,6 +1,7 @@
 //! The force and the contact area of a sensor in the last two minutes, for views that open later.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 use serde_json::json;
@@ -32,10 +33,12 @@ impl Point {
 }
 
 impl History {
+    /// Adds a frame. A frame before the first tare has no force.
     pub(super) fn add(&mut self, frame: &FrameEvent) {
+        let Some(force_n) = frame.force_n else { return };
         let point = Point {
             at: frame.time,
-            force_n: frame.newtons.iter().sum(),
+            force_n: force_n as f32,
             contact_area_taxels: frame.contact_area_taxels,
         };
         match self.0.back_mut() {
@@ -57,7 +60,7 @@ impl History {
     }
 
     /// The line of the history. A point has its age at `time` in seconds, newtons and taxels.
-    pub(crate) fn line(&self, sensor: &str) -> Line {
+    pub(crate) fn line(&self, sensor: &str) -> Arc<Line> {
         let newest = self.0.back().map(|point| point.at);
         let point = |point: &Point| {
             let age = newest.unwrap_or(point.at).duration_since(point.at);
@@ -73,11 +76,7 @@ impl History {
             "time": newest.map(|time| format!("{time:.6}")),
             "points": self.0.iter().map(point).collect::<Vec<_>>(),
         });
-        Line {
-            seq: None,
-            json: format!("{line}\n").into(),
-            event: None,
-        }
+        Line::of_text(format!("{line}\n"))
     }
 }
 
@@ -96,13 +95,14 @@ mod tests {
             cols: 2,
             newtons: vec![newtons, 1.0],
             contact_area_taxels: newtons as u32,
+            force_n: Some(f64::from(newtons) + 1.0),
             tared: true,
             approach_mm: None,
         }
     }
 
     fn points(history: &History) -> Value {
-        let line: Value = serde_json::from_str(&history.line("forearm").json).unwrap();
+        let line: Value = serde_json::from_str(history.line("forearm").json()).unwrap();
         line["points"].clone()
     }
 

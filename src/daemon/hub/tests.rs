@@ -2,9 +2,11 @@ use std::time::Duration;
 
 use serde_json::Value;
 
+use super::cursor::QUEUE;
+use super::log::HELD;
 use super::*;
 use crate::daemon::request::{Policy, Since};
-use hardnessd_core::event::{FrameEvent, LinkState, ModelCard, PressState, Status};
+use hardnessd_core::event::{FrameEvent, Kind, LinkState, ModelCard, PressState, SensorCard};
 
 const RUN: &str = "5eed";
 
@@ -17,7 +19,15 @@ pub(in crate::daemon) fn hello() -> Hello {
         run: RUN.to_owned(),
         boot_id: String::new(),
         seq: 0,
-        sensors: Vec::new(),
+        sensors: vec![SensorCard {
+            name: "a".to_owned(),
+            rows: 28,
+            cols: 28,
+            pitch_mm: hardnessd_core::frame::Pitch {
+                rows_mm: 3.5,
+                cols_mm: 3.5,
+            },
+        }],
         model: ModelCard {
             sha256: String::new(),
             validation: String::new(),
@@ -29,8 +39,19 @@ pub(in crate::daemon) fn hello() -> Hello {
     }
 }
 
-fn hub() -> Hub {
-    Hub::new(hello())
+fn log() -> Log {
+    Log::new(hello())
+}
+
+/// The state of a live sensor.
+pub(in crate::daemon) fn state(sensor: &str) -> SensorState {
+    SensorState {
+        status: live(sensor),
+        last_frame: None,
+        contact_threshold_n: 0.0,
+        unjudged: 0,
+        motion: (0, 0),
+    }
 }
 
 /// The status of a live sensor.
@@ -41,8 +62,10 @@ pub(in crate::daemon) fn live(sensor: &str) -> Status {
         time: jiff::Timestamp::UNIX_EPOCH,
         state: LinkState::Live,
         reason: None,
+        detail: None,
         frames: 0,
         frames_damaged: 0,
+        frames_dropped: 0,
         bytes_skipped: 0,
         frame_rate_hz: None,
     }
@@ -76,26 +99,36 @@ fn frame(sensor: &str, number: u64) -> Event {
         cols: shown.array.cols,
         newtons: shown.newtons.into_vec(),
         contact_area_taxels: 0,
+        force_n: Some(0.0),
         tared: true,
         approach_mm: None,
     })
 }
 
-impl Hub {
+impl Log {
     fn publish_now(&mut self, event: Event) {
         self.publish(event, Duration::ZERO);
+    }
+
+    /// The numbers of frames that are held in order, and of those that are the newest.
+    fn frames_held(&self) -> (usize, usize) {
+        (self.frames.len(), self.newest_frames.len())
+    }
+
+    fn joins(&mut self, wanted: &Subscription) -> u64 {
+        self.join(wanted).unwrap()
     }
 
     /// All lines that a subscriber gets now, each as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
     fn drain(&mut self, id: u64) -> Vec<String> {
         let mut drained = Vec::new();
         loop {
-            let lines = self.take(id);
+            let lines = self.read(id);
             if lines.is_empty() {
                 return drained;
             }
             drained.extend(lines.iter().map(|line| {
-                let event: Value = serde_json::from_str(&line.json).unwrap();
+                let event: Value = serde_json::from_str(line.json()).unwrap();
                 let number = match event["type"].as_str().unwrap() {
                     "gap" => &event["lost"],
                     "frame" => &event["frame"],
@@ -125,135 +158,137 @@ fn numbers(kind: &str, seqs: impl Iterator<Item = u64>) -> Vec<String> {
 
 #[test]
 fn events_are_numbered_over_all_sensors_and_frames_are_not() {
-    let mut hub = hub();
-    let (id, _) = hub.join();
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
     let every = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
-    hub.subscribe(id, &wanting(&every, Policy::Queue, None))
+    log.subscribe(id, &wanting(&every, Policy::Queue, None))
         .unwrap();
-    hub.publish_now(status("a"));
-    hub.publish_now(frame("a", 7));
-    hub.publish_now(press("b"));
-    assert_eq!(hub.drain(id), ["status:1", "frame:7", "press:2"]);
+    log.publish_now(status("a"));
+    log.publish_now(frame("a", 7));
+    log.publish_now(press("b"));
+    assert_eq!(log.drain(id), ["status:1", "frame:7", "press:2"]);
 }
 
 #[test]
 fn a_subscriber_gets_the_kinds_it_asked_for_and_by_default_no_frames() {
-    let mut hub = hub();
-    let (usual, _) = hub.join();
-    let (presses, _) = hub.join();
-    hub.subscribe(presses, &wanting(&[Kind::Press], Policy::Queue, None))
+    let mut log = log();
+    let usual = log.joins(&Subscription::default());
+    let presses = log.joins(&Subscription::default());
+    log.subscribe(presses, &wanting(&[Kind::Press], Policy::Queue, None))
         .unwrap();
-    hub.publish_now(status("a"));
-    hub.publish_now(frame("a", 0));
-    hub.publish_now(press("a"));
-    assert_eq!(hub.drain(usual), ["status:1", "press:2"]);
-    assert_eq!(hub.drain(presses), ["press:2"]);
+    log.publish_now(status("a"));
+    log.publish_now(frame("a", 0));
+    log.publish_now(press("a"));
+    assert_eq!(log.drain(usual), ["status:1", "press:2"]);
+    assert_eq!(log.drain(presses), ["press:2"]);
 }
 
 #[test]
 fn a_stalled_subscriber_loses_the_oldest_and_learns_exactly_how_many() {
-    let mut hub = hub();
-    let (stalled, _) = hub.join();
-    let (awake, _) = hub.join();
+    let mut log = log();
+    let stalled = log.joins(&Subscription::default());
+    let awake = log.joins(&Subscription::default());
     let mut drained = Vec::new();
     for _ in 0..3000 {
-        hub.publish_now(status("a"));
-        drained.extend(hub.drain(awake));
+        log.publish_now(status("a"));
+        drained.extend(log.drain(awake));
     }
     assert_eq!(drained, numbers("status", 1..=3000));
     let mut expected = vec!["gap:1976".to_owned()];
     expected.extend(numbers("status", 1977..=3000));
-    assert_eq!(hub.drain(stalled), expected);
-    hub.publish_now(status("a"));
-    assert_eq!(hub.drain(stalled), ["status:3001"]);
-    assert_eq!((hub.tally.gaps, hub.tally.dropped), (1, 1976));
+    assert_eq!(log.drain(stalled), expected);
+    log.publish_now(status("a"));
+    assert_eq!(log.drain(stalled), ["status:3001"]);
+    let now = log.snapshot();
+    assert_eq!((now.gaps, now.dropped), (1, 1976));
 }
 
 #[test]
 fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
-    let mut hub = hub();
-    let (id, _) = hub.join();
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
     let kinds = [Kind::Status, Kind::Press, Kind::Frame];
-    hub.subscribe(id, &wanting(&kinds, Policy::Latest, None))
+    log.subscribe(id, &wanting(&kinds, Policy::Latest, None))
         .unwrap();
     for number in 0..5 {
-        hub.publish_now(status("a"));
-        hub.publish_now(frame("a", number));
+        log.publish_now(status("a"));
+        log.publish_now(frame("a", number));
     }
-    hub.publish_now(status("b"));
-    hub.publish_now(press("a"));
+    log.publish_now(status("b"));
+    log.publish_now(press("a"));
     assert_eq!(
-        hub.drain(id),
+        log.drain(id),
         ["gap:4", "status:5", "frame:4", "status:6", "press:7"]
     );
 }
 
 #[test]
 fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
-    let mut hub = hub();
-    let (id, _) = hub.join();
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
     let kinds = [Kind::Status, Kind::Frame];
-    hub.subscribe(id, &wanting(&kinds, Policy::LatestFrames, None))
+    log.subscribe(id, &wanting(&kinds, Policy::LatestFrames, None))
         .unwrap();
     for number in 0..3 {
-        hub.publish_now(status("a"));
-        hub.publish_now(frame("a", number));
-        hub.publish_now(frame("b", number));
+        log.publish_now(status("a"));
+        log.publish_now(frame("a", number));
+        log.publish_now(frame("b", number));
     }
     assert_eq!(
-        hub.drain(id),
+        log.drain(id),
         ["status:1", "status:2", "status:3", "frame:2", "frame:2"]
     );
-    assert_eq!((hub.tally.gaps, hub.tally.dropped), (0, 0));
+    let now = log.snapshot();
+    assert_eq!((now.gaps, now.dropped), (0, 0));
 }
 
 #[test]
 fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
-    let mut hub = hub();
+    let mut log = log();
     for _ in 0..10 {
-        hub.publish_now(press("a"));
+        log.publish_now(press("a"));
     }
-    let (id, _) = hub.join();
-    hub.publish_now(press("a"));
+    let id = log.joins(&Subscription::default());
+    log.publish_now(press("a"));
     // The default subscription delivered number 11 before the request came.
-    assert_eq!(hub.drain(id), ["press:11"]);
-    hub.publish_now(press("a"));
-    hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
+    assert_eq!(log.drain(id), ["press:11"]);
+    log.publish_now(press("a"));
+    log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
         .unwrap();
-    hub.publish_now(press("a"));
+    log.publish_now(press("a"));
     assert_eq!(
-        hub.drain(id),
+        log.drain(id),
         ["press:8", "press:9", "press:10", "press:12", "press:13"]
     );
 }
 
 #[test]
 fn another_subscription_reaches_what_since_asked_for() {
-    let mut hub = hub();
+    let mut log = log();
     for _ in 0..5 {
-        hub.publish_now(press("a"));
-        hub.publish_now(status("a"));
+        log.publish_now(press("a"));
+        log.publish_now(status("a"));
     }
-    let (id, _) = hub.join();
-    hub.subscribe(id, &wanting(&Kind::NUMBERED, Policy::Queue, Some(0)))
+    let id = log.joins(&Subscription::default());
+    log.subscribe(id, &wanting(&Kind::NUMBERED, Policy::Queue, Some(0)))
         .unwrap();
-    hub.subscribe(id, &wanting(&[Kind::Status], Policy::Queue, None))
+    log.subscribe(id, &wanting(&[Kind::Status], Policy::Queue, None))
         .unwrap();
-    assert_eq!(hub.drain(id), numbers("status", (2..=10).step_by(2)));
+    assert_eq!(log.drain(id), numbers("status", (2..=10).step_by(2)));
 }
 
 #[test]
 fn since_older_than_what_is_held_says_how_much_is_gone() {
-    let mut hub = hub();
+    let mut log = log();
     for _ in 0..HELD + 100 {
-        hub.publish_now(press("a"));
+        log.publish_now(press("a"));
     }
     let held = numbers("press", 101..=HELD as u64 + 100);
     let mut check = |kinds: &[Kind], since, lost: &str| {
-        let (id, _) = hub.join();
-        hub.subscribe(id, &wanting(kinds, Policy::Queue, Some(since)))
+        let id = log.joins(&Subscription::default());
+        log.subscribe(id, &wanting(kinds, Policy::Queue, Some(since)))
             .unwrap();
-        let lines = hub.drain(id);
+        let lines = log.drain(id);
         assert_eq!(lines[0], format!("gap:{lost}"));
         assert_eq!(lines[1..], held);
     };
@@ -265,9 +300,9 @@ fn since_older_than_what_is_held_says_how_much_is_gone() {
 
 #[test]
 fn since_of_another_run_gives_an_unknown_gap_and_all_that_is_held() {
-    let mut hub = hub();
-    hub.publish_now(press("a"));
-    let (id, _) = hub.join();
+    let mut log = log();
+    log.publish_now(press("a"));
+    let id = log.joins(&Subscription::default());
     let since = Since {
         run: "0ther".to_owned(),
         seq: 900,
@@ -276,34 +311,34 @@ fn since_of_another_run_gives_an_unknown_gap_and_all_that_is_held() {
         since: Some(since),
         ..Subscription::default()
     };
-    hub.subscribe(id, &subscription).unwrap();
-    assert_eq!(hub.drain(id), ["gap:null", "press:1"]);
+    log.subscribe(id, &subscription).unwrap();
+    assert_eq!(log.drain(id), ["gap:null", "press:1"]);
 }
 
 #[test]
 fn since_beyond_the_latest_number_is_refused() {
-    let mut hub = hub();
-    let (id, _) = hub.join();
-    let refused = hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(1)));
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
+    let refused = log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(1)));
     let expected = "since: found 1, expected at most 0";
     assert_eq!(refused.unwrap_err().to_string(), expected);
 }
 
 #[test]
 fn what_is_forgotten_during_a_slow_replay_is_counted() {
-    let mut hub = hub();
+    let mut log = log();
     for _ in 0..HELD {
-        hub.publish_now(press("a"));
+        log.publish_now(press("a"));
     }
-    let (id, _) = hub.join();
-    hub.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
+    let id = log.joins(&Subscription::default());
+    log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
         .unwrap();
-    let had = hub.take(id).len() as u64;
+    let had = log.read(id).len() as u64;
     assert!((1..1000).contains(&had), "a batch of {had} lines");
     for _ in 0..had + 10 {
-        hub.publish_now(press("a"));
+        log.publish_now(press("a"));
     }
-    let lines = hub.drain(id);
+    let lines = log.drain(id);
     assert_eq!(lines[0], "gap:10");
     assert_eq!(
         lines[1..],
@@ -311,15 +346,175 @@ fn what_is_forgotten_during_a_slow_replay_is_counted() {
     );
 }
 
+#[test]
+fn events_that_came_before_a_since_and_between_two_come_once() {
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
+    for _ in 0..3 {
+        log.publish_now(press("a"));
+        log.publish_now(status("a"));
+    }
+    assert_eq!(log.drain(id).len(), 6);
+    let presses = wanting(&[Kind::Press], Policy::Queue, None);
+    log.subscribe(id, &presses).unwrap();
+    log.publish_now(press("a"));
+    log.publish_now(status("a"));
+    assert_eq!(log.drain(id), ["press:7"]);
+    for expected in [&["status:8"][..], &[]] {
+        let all = wanting(&Kind::NUMBERED, Policy::Queue, Some(0));
+        log.subscribe(id, &all).unwrap();
+        assert_eq!(log.drain(id), expected);
+    }
+}
+
+#[test]
+fn events_that_were_announced_as_lost_come_after_a_since() {
+    let mut log = log();
+    let id = log.joins(&Subscription::default());
+    for _ in 0..QUEUE + 10 {
+        log.publish_now(press("a"));
+    }
+    assert_eq!(log.drain(id)[0], "gap:10");
+    let all = wanting(&Kind::NUMBERED, Policy::Queue, Some(0));
+    log.subscribe(id, &all).unwrap();
+    assert_eq!(log.drain(id), numbers("press", 1..=10));
+}
+
+#[test]
+fn a_kind_that_is_wanted_later_comes_from_then_on() {
+    let mut log = log();
+    let id = log.joins(&wanting(&[Kind::Press], Policy::Queue, None));
+    let watching = log.joins(&wanting(&[Kind::Frame], Policy::Queue, None));
+    log.publish_now(press("a"));
+    log.publish_now(frame("a", 0));
+    log.publish_now(status("a"));
+    log.subscribe(id, &wanting(&Kind::ALL, Policy::Queue, None))
+        .unwrap();
+    log.publish_now(frame("a", 1));
+    log.publish_now(status("a"));
+    assert_eq!(log.drain(id), ["press:1", "frame:1", "status:3"]);
+    assert_eq!(log.drain(watching), ["frame:0", "frame:1"]);
+}
+
+#[test]
+fn frames_are_held_only_for_those_who_read_them() {
+    let mut log = log();
+    log.publish_now(frame("a", 0));
+    assert_eq!(log.frames_held(), (0, 0));
+    let slow = log.joins(&wanting(&[Kind::Frame], Policy::Queue, None));
+    let page = log.joins(&wanting(&[Kind::Frame], Policy::LatestFrames, None));
+    for number in 1..=QUEUE + 5 {
+        log.publish_now(frame("a", number));
+    }
+    assert_eq!(log.frames_held(), (QUEUE as usize, 1));
+    assert_eq!(log.drain(page), [format!("frame:{}", QUEUE + 5)]);
+    let mut expected = vec!["gap:5".to_owned()];
+    expected.extend(numbers("frame", 6..=QUEUE + 5));
+    assert_eq!(log.drain(slow), expected);
+    log.publish_now(frame("a", QUEUE + 6));
+    assert_eq!(log.drain(slow).len(), 1);
+    log.leave(slow);
+    assert_eq!(log.frames_held(), (0, 1), "the newest, for the page");
+    log.leave(page);
+    assert_eq!(log.frames_held(), (0, 0));
+}
+
 #[tokio::test]
 async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
-    let hub = start(hello(), EventRecorder::default());
-    let (id, hello) = hub.join().await.unwrap();
-    assert!(hello.json.starts_with(r#"{"type":"hello""#));
-    let lines = hub.take(id).await.unwrap();
-    hub.publish(vec![status("a"), press("a")]).await;
-    assert_eq!(lines.await.unwrap().len(), 2);
-    let last = hub.take(id).await.unwrap();
-    hub.close().await;
-    assert!(last.await.is_err());
+    let hub = Hub::new(hello());
+    hub.report(state("a"));
+    let joined = hub.join(Subscription::default()).await.unwrap();
+    let (mut subscriber, now) = joined.unwrap();
+    let lines = now.greeting();
+    assert!(lines[0].json().starts_with(r#"{"type":"hello""#));
+    let waiting = tokio::spawn(async move { (subscriber.next().await, subscriber) });
+    tokio::task::yield_now().await;
+    hub.publish(vec![status("a"), press("a")]);
+    let (lines, mut subscriber) = waiting.await.unwrap();
+    assert_eq!(lines.unwrap().len(), 2);
+    hub.publish(vec![press("a")]);
+    hub.close();
+    assert_eq!(subscriber.next().await.unwrap().len(), 1);
+    assert!(subscriber.next().await.is_none());
+    assert_eq!(hub.snapshot().await.unwrap().subscribers, 1);
+    drop(subscriber);
+    assert_eq!(hub.snapshot().await.unwrap().subscribers, 0);
+}
+
+#[test]
+fn a_sensor_that_floods_takes_no_place_from_the_others() {
+    let mut log = log();
+    let kinds = |frames: bool| Subscription {
+        kinds: match frames {
+            true => [Kind::Frame].into(),
+            false => [Kind::Press].into(),
+        },
+        policy: Policy::Queue,
+        since: None,
+    };
+    let (presses, frames) = (log.joins(&kinds(false)), log.joins(&kinds(true)));
+    let begun = log.snapshot().hello.seq;
+    for number in 0..20 {
+        log.publish_now(press("good"));
+        log.publish_now(frame("good", number));
+        for flood in ["flood1", "flood2", "flood3"] {
+            for number in 0..300 {
+                log.publish_now(press(flood));
+                log.publish_now(frame(flood, 1_000 + number));
+            }
+        }
+    }
+    // What is held beside the newest events is bounded.
+    assert!(
+        log.frames_held().0 < 3 * QUEUE as usize,
+        "{:?}",
+        log.frames_held()
+    );
+    let good = |lines: &[String]| {
+        let numbers = (0..20).map(|number| format!("frame:{number}"));
+        numbers.filter(|number| lines.contains(number)).count()
+    };
+    let lines = log.drain(frames);
+    assert_eq!(good(&lines), 20);
+    let lost: u64 = lines
+        .iter()
+        .filter_map(|line| line.strip_prefix("gap:")?.parse::<u64>().ok())
+        .sum();
+    let got = lines
+        .iter()
+        .filter(|line| line.starts_with("frame:"))
+        .count() as u64;
+    assert_eq!(got + lost, 20 + 20 * 900, "none is lost without a gap");
+
+    let seqs = |lines: &[String]| -> Vec<u64> {
+        let seqs = lines.iter().filter_map(|line| line.strip_prefix("press:"));
+        seqs.map(|seq| seq.parse().unwrap()).collect()
+    };
+    let lost = |lines: &[String]| -> u64 {
+        let lost = lines.iter().filter_map(|line| line.strip_prefix("gap:"));
+        lost.map(|lost| lost.parse::<u64>().unwrap()).sum()
+    };
+    let lines = log.drain(presses);
+    let got = seqs(&lines);
+    assert!(got.is_sorted());
+    let of_good: Vec<u64> = (0..20).map(|number| begun + 1 + number * 901).collect();
+    assert!(of_good.iter().all(|seq| got.contains(seq)), "{got:?}");
+    assert_eq!(got.len() as u64 + lost(&lines), 20 * 901);
+
+    // Whoever comes back gets what is held, and learns what is not.
+    for since in [0, of_good[3], of_good[3] + 5, 20 * 901] {
+        let again = log.joins(&Subscription {
+            kinds: Kind::NUMBERED.into(),
+            since: Some(Since {
+                run: RUN.to_owned(),
+                seq: since,
+            }),
+            ..kinds(false)
+        });
+        let lines = log.drain(again);
+        let got = seqs(&lines);
+        let after = of_good.iter().filter(|&&seq| seq > since);
+        assert!(after.into_iter().all(|seq| got.contains(seq)));
+        assert_eq!(got.len() as u64 + lost(&lines), 20 * 901 - since, "{since}");
+    }
 }

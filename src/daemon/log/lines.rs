@@ -1,29 +1,24 @@
-//! Passes log lines to a thread that writes them to stderr or to the journal.
+//! Passes log lines to a thread that writes them to stderr.
 //!
 //! The program that reads the log may stop reading, and the sensor must not wait for that program.
-//! So when [`WAITING`] lines wait, further lines are dropped. As soon as the next line is written,
-//! another line gives the number of dropped lines.
+//! So when [`WAITING`] lines wait, further lines are dropped. After the next line that is written,
+//! another line gives the number of dropped lines. (`tracing-appender` does not fit: where the
+//! system has no thread for it, it panics, and at the end it may wait longer than a second and print
+//! to stdout.)
 
 use std::io::{self, Write};
-use std::os::unix::net::UnixDatagram;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tracing_subscriber::fmt::MakeWriter;
-
-use super::journal;
-use super::limit::Limit;
 
 /// The most lines that wait, about 150 kB.
 const WAITING: usize = 1024;
 
 enum Message {
-    /// A line for stderr.
     Line(Vec<u8>),
-    /// An entry for the journal.
-    Entry(Vec<u8>),
     /// From now on, clear the terminal's line before each line.
     ClearProgress,
     /// A request for an answer as soon as all earlier lines are written.
@@ -38,14 +33,13 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// Starts the thread, which also makes `limit` log the number of lines left out.
+    /// Starts the thread.
     ///
     /// # Errors
     ///
-    /// Fails if the system cannot make the thread or its socket.
-    pub(super) fn start(limit: Limit) -> io::Result<Self> {
+    /// Fails if the system cannot make the thread.
+    pub(super) fn start() -> io::Result<Self> {
         let (thread, messages) = mpsc::sync_channel(WAITING);
-        let journal = UnixDatagram::unbound()?;
         let lost = Arc::new(AtomicU64::new(0));
         let lines = Self {
             thread,
@@ -53,24 +47,13 @@ impl Lines {
         };
         std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write(&messages, &journal, &lost, &limit))?;
+            .spawn(move || write(&messages, &lost))?;
         Ok(lines)
-    }
-
-    /// Sends an entry to the journal.
-    pub(super) fn enter(&self, entry: Vec<u8>) {
-        self.pass(Message::Entry(entry));
     }
 
     /// Clears the terminal's line before each line from now on.
     pub(super) fn clear_progress(&self) {
-        self.pass(Message::ClearProgress);
-    }
-
-    fn pass(&self, message: Message) {
-        if let Err(TrySendError::Full(_)) = self.thread.try_send(message) {
-            self.lost.fetch_add(1, Ordering::Relaxed);
-        }
+        let _ = self.thread.try_send(Message::ClearProgress);
     }
 
     /// Waits until all lines are written, but not longer than `patience`.
@@ -83,24 +66,16 @@ impl Lines {
     }
 }
 
-fn write(messages: &Receiver<Message>, journal: &UnixDatagram, lost: &AtomicU64, limit: &Limit) {
+fn write(messages: &Receiver<Message>, lost: &AtomicU64) {
     let mut before: &[u8] = b"";
     while let Ok(message) = messages.recv() {
-        limit.report(Instant::now());
-        // A write that fails cannot be logged: stderr is closed, or the journal is gone.
+        // A write that fails cannot be logged: stderr is closed.
         match message {
             Message::Line(line) => {
                 let _ = io::stderr().write_all(&[before, &line].concat());
                 let lines = lost.swap(0, Ordering::Relaxed);
                 if lines > 0 {
                     let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
-                }
-            }
-            Message::Entry(entry) => {
-                let _ = journal.send_to(&entry, journal::SOCKET);
-                let lines = lost.swap(0, Ordering::Relaxed);
-                if lines > 0 {
-                    let _ = journal.send_to(&journal::lost(lines), journal::SOCKET);
                 }
             }
             Message::ClearProgress => before = b"\r\x1b[K",
@@ -122,7 +97,9 @@ impl<'a> MakeWriter<'a> for Lines {
 /// The formatter writes each line in one call.
 impl Write for &Lines {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        self.pass(Message::Line(line.to_vec()));
+        if let Err(TrySendError::Full(_)) = self.thread.try_send(Message::Line(line.to_vec())) {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
         Ok(line.len())
     }
 

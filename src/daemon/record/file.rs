@@ -68,6 +68,19 @@ pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)
     Ok((path, file))
 }
 
+/// The number of the files of black boxes in a directory, and their bytes.
+pub(super) fn blackboxes(directory: &Path) -> (usize, u64) {
+    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
+    let boxes = entries.filter(|entry| {
+        let name = entry.file_name();
+        name.to_string_lossy().starts_with("blackbox-")
+    });
+    boxes.fold((0, 0), |(count, bytes), entry| {
+        let size = entry.metadata().map_or(0, |file| file.len());
+        (count + 1, bytes + size)
+    })
+}
+
 fn named(path: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }

@@ -4,6 +4,7 @@ use super::*;
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
+use hardnessd_core::sensor::Sensor;
 use hardnessd_core::test_support;
 
 fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
@@ -11,12 +12,15 @@ fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
     let active = Active {
         jobs: Jobs {
             sender,
-            dropped: Arc::default(),
+            load: Arc::default(),
         },
         index: 0,
         labels: Labels::new(),
         noted: None,
+        was_busy: false,
         bytes: 0,
+        left_out: 0,
+        looked: None,
         counted: (0, 0),
     };
     let recorder = SensorRecorder {
@@ -80,6 +84,51 @@ fn after_a_gap_comes_a_state() {
 }
 
 #[test]
+fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
+    let (sender, inbox) = sync_channel(4096);
+    let (mut recorder, _) = recorder(sender);
+    let pressed = test_support::of_a_press(|_| {}, None, false);
+    let entries = hardnessd_core::recording::Reader::new(&pressed.0[..]);
+    let inputs: Vec<_> = entries
+        .map(Result::unwrap)
+        .filter_map(|found| match found.entry {
+            Entry::Input(input) => Some((input, found.at)),
+            _ => None,
+        })
+        .collect();
+    let mut pipeline = Pipeline::new(pressed.1, test_support::hrn(), Clock::Arrival);
+    let mut note = |pipeline: &mut Pipeline, (input, at): &(Input<'static>, Stamp)| {
+        recorder.note(pipeline, input, *at);
+        pipeline.take(input.to_owned(), *at).unwrap();
+    };
+    // The zero is taken of five frames of a free sensor, which come as the last one here.
+    for _ in 0..5 {
+        pipeline
+            .take(inputs.last().unwrap().0.to_owned(), at(0))
+            .unwrap();
+    }
+    pipeline.take(inputs[0].0.to_owned(), inputs[0].1).unwrap();
+    assert!(!pipeline.is_at_rest(), "a press is under way");
+    for input in &inputs[1..] {
+        note(&mut pipeline, input);
+    }
+    assert!(pipeline.is_at_rest(), "it is released");
+    note(&mut pipeline, inputs.last().unwrap());
+    drop(recorder);
+    let entries: Vec<Entry> = inbox
+        .into_iter()
+        .map(|job| match job {
+            Job::Entry { entry, .. } => entry,
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert!(
+        matches!(entries[..], [Entry::State(_), Entry::Input(_)]),
+        "{entries:?}"
+    );
+}
+
+#[test]
 fn a_flood_is_bounded_in_the_black_box() {
     // The context takes less than 1 KiB as text, but 100 objects in memory.
     let context = serde_json::json!({ "tags": vec![serde_json::json!({ "": 0 }); 100] });
@@ -128,19 +177,27 @@ fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
 }
 
 #[test]
-fn viewers_get_the_settings_after_a_reload() {
-    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
+fn viewers_and_the_recording_get_each_new_beginning() {
+    let (sender, inbox) = sync_channel(4);
+    let (recorder, pipeline) = recorder(sender);
     let (viewers, mut shown) = mpsc::channel(1);
-    let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
-    let mut description = test_support::sensor().description().clone();
-    description.calibration.pitch_mm = Pitch::square(2.0);
-    let changed = Sensor::new(description).unwrap();
-    recorder.reload(&pipeline, &changed, &test_support::hrn(), at(7));
-    let Entry::Settings(settings) = shown.try_recv().unwrap().entry else {
-        panic!("no settings");
-    };
-    assert_eq!(
-        settings.description.calibration.pitch_mm,
-        Pitch::square(2.0)
-    );
+    let mut recorder = recorder.with_viewers(Some(viewers));
+    recorder.note(&pipeline, &Input::Tick, at(6));
+    let mut description = pipeline.sensor().description().clone();
+    description.sensor.calibration.pitch_mm = Pitch::square(2.0);
+    let (changed, hrn) = (Sensor::new(description).unwrap(), test_support::hrn());
+    recorder.begin_anew(&pipeline.restarted(changed, hrn), at(7));
+    drop(recorder);
+    let recorded = inbox.into_iter().filter_map(|job| match job {
+        Job::Entry { entry, .. } => Some(entry),
+        _ => None,
+    });
+    let last = recorded.last().unwrap();
+    for entry in [shown.try_recv().unwrap().entry, last] {
+        let Entry::State(state) = entry else {
+            panic!("{entry:?}");
+        };
+        let pitch_mm = state.sensor.description.sensor.calibration.pitch_mm;
+        assert_eq!(pitch_mm, Pitch::square(2.0));
+    }
 }

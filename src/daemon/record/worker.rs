@@ -4,23 +4,27 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::file::{MB, Open, create, has_room};
-use super::{Error, Job, NoBlackbox, Progress, Target};
+use super::file::{MB, Open, blackboxes, create, has_room};
+use super::{Error, Job, Load, MOST_BLACKBOX_MB, MOST_BLACKBOXES, NoBlackbox, Progress, Target};
 use crate::daemon::config;
-use hardnessd_core::event::{Event, LinkState, PressState};
+use hardnessd_core::event::{Event, LinkState, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, About, Entry, Ring};
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
+/// At least this many bytes are in a chunk, unless [`FLUSH_EVERY`] ends it.
+const CHUNK_BYTES: usize = 1 << 20;
+/// The shortest time between two reports of dropped entries.
+const REPORT_EVERY: Duration = Duration::from_secs(60);
 /// How long the recorder waits before it tries again after the disk failed or was full.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// The shortest time between black boxes of one sensor's faults.
@@ -35,8 +39,10 @@ const ROOM_SHARE: u64 = 16;
 pub(super) struct Worker {
     target: Target,
     about: About,
-    dropped: Arc<AtomicU64>,
+    load: Arc<Load>,
     dropped_reported: u64,
+    /// When dropped entries may be reported next.
+    report_at: Instant,
     sensors: Vec<Watched>,
     open: Option<Open>,
     /// The time of the next try, if a file should be open and is not.
@@ -53,6 +59,8 @@ pub(super) struct Worker {
 #[derive(Default)]
 struct Watched {
     ring: Ring,
+    /// Whether the file has a state of the sensor, from which its entries can be played.
+    is_begun: bool,
     /// Whether the sensor's port is open. `None`: this is not known yet.
     is_open: Option<bool>,
     last_fault: Option<Instant>,
@@ -76,15 +84,16 @@ impl Worker {
     pub(super) fn new(
         target: Target,
         about: About,
-        dropped: Arc<AtomicU64>,
+        load: Arc<Load>,
         stop: oneshot::Sender<()>,
     ) -> Self {
         Self {
             sensors: about.sensors.iter().map(|_| Watched::default()).collect(),
             target,
             about,
-            dropped,
+            load,
             dropped_reported: 0,
+            report_at: Instant::now(),
             open: None,
             retry: None,
             paused: false,
@@ -99,17 +108,24 @@ impl Worker {
     pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
         self.begin()?;
         let mut flush = Instant::now() + FLUSH_EVERY;
+        // The bytes that were taken since the last look at the disk.
+        let mut unchecked = 0;
         loop {
             let left = flush.saturating_duration_since(Instant::now());
             match jobs.recv_timeout(left) {
                 Ok(job) => {
+                    let bytes = job.weight();
+                    self.load.bytes.fetch_sub(bytes, Ordering::Relaxed);
+                    unchecked += bytes;
                     let done = self.take(job);
                     self.settle(done)?;
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return self.end(),
             }
-            if Instant::now() >= flush {
+            // Much may come in that time. So the free room is checked before each chunk.
+            if Instant::now() >= flush || unchecked >= CHUNK_BYTES {
+                unchecked = 0;
                 let done = self.look_after();
                 self.settle(done)?;
                 flush = Instant::now() + FLUSH_EVERY;
@@ -211,12 +227,14 @@ impl Worker {
     }
 
     fn entry(&mut self, sensor: usize, at: Stamp, entry: Entry) -> Result<(), Failure> {
-        if let Entry::Settings(settings) = &entry {
-            self.about.sensors[sensor] = (**settings).clone();
+        if let Entry::State(state) = &entry {
+            self.about.sensors[sensor].clone_from(&state.sensor);
         }
+        let watched = &mut self.sensors[sensor];
+        watched.is_begun |= matches!(entry, Entry::State(_));
         let written = match &mut self.open {
-            Some(open) => open.writer.entry(sensor, at, &entry),
-            None => Ok(()),
+            Some(open) if watched.is_begun => open.writer.entry(sensor, at, &entry),
+            _ => Ok(()),
         };
         let gone = match &entry {
             Entry::Input(Input::Opened) => {
@@ -258,6 +276,16 @@ impl Worker {
                 self.progress.tared += u64::from(frame.tared);
             }
             Event::Press(press) if press.state == PressState::End => self.progress.presses += 1,
+            Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+                let truth = match &self.target {
+                    Target::File { labels, .. } => labels.get("level").and_then(|l| l.parse().ok()),
+                    Target::Directory(_) => None,
+                };
+                let is_right = verdict.level.is_some() && verdict.level == truth;
+                self.progress.verdicts += 1;
+                self.progress.right += u64::from(is_right);
+                self.progress.said = verdict.level;
+            }
             _ => {}
         }
         if let Target::File { progress, .. } = &self.target {
@@ -303,8 +331,20 @@ impl Worker {
             return;
         }
         self.sensors[sensor].last_fault = Some(now);
-        if let Err(reason) = self.blackbox(sensor, fault) {
+        let written = self.has_few().and_then(|()| self.blackbox(sensor, fault));
+        if let Err(reason) = written {
             self.report_no_blackbox(sensor, &reason);
+        }
+    }
+
+    /// Whether there are few enough black boxes for another one of a fault. Nothing is deleted.
+    fn has_few(&self) -> Result<(), NoBlackbox> {
+        let directory = self.directory().ok_or(NoBlackbox::OneFile)?.dir();
+        let (count, bytes) = blackboxes(&directory);
+        let mb = bytes / MB;
+        match count < MOST_BLACKBOXES && mb < MOST_BLACKBOX_MB {
+            true => Ok(()),
+            false => Err(NoBlackbox::Full { count, mb }),
         }
     }
 
@@ -325,6 +365,10 @@ impl Worker {
         let Some(settings) = self.directory() else {
             return Err(NoBlackbox::OneFile);
         };
+        let ring = &self.sensors[sensor].ring;
+        if ring.is_waiting() {
+            return Err(NoBlackbox::LongPress);
+        }
         let name = self.about.sensors[sensor].name();
         let about = About {
             reason: Some(reason.to_owned()),
@@ -339,7 +383,7 @@ impl Worker {
             let path = std::path::absolute(&path).unwrap_or(path);
             or_removed(&path, || {
                 let mut open = Open::new(path.clone(), file, &about)?;
-                for (at, entry) in self.sensors[sensor].ring.all() {
+                for (at, entry) in ring.all() {
                     open.writer.entry(0, *at, entry)?;
                 }
                 open.finish()
@@ -353,8 +397,9 @@ impl Worker {
 
     /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), Failure> {
-        let dropped = self.dropped.load(Ordering::Relaxed);
-        if dropped > self.dropped_reported {
+        let dropped = self.load.dropped.load(Ordering::Relaxed);
+        if dropped > self.dropped_reported && Instant::now() >= self.report_at {
+            self.report_at = Instant::now() + REPORT_EVERY;
             let count = dropped - self.dropped_reported;
             warn!(count, "no room in the recorder's queue: entries dropped");
             self.dropped_reported = dropped;
@@ -418,14 +463,22 @@ impl Worker {
         }
     }
 
-    /// Begins a file with every sensor's last state and the entries since.
-    fn next_file(&self, directory: &Path) -> Result<Open, recording::Error> {
+    /// Begins a file with every sensor's last state at rest and the entries since.
+    fn next_file(&mut self, directory: &Path) -> Result<Open, recording::Error> {
         let (path, file) = create(directory, "hardnessd")?;
         or_removed(&path, || {
             let mut open = Open::new(path.clone(), file, &self.about)?;
-            for (index, sensor) in self.sensors.iter().enumerate() {
+            for (index, sensor) in self.sensors.iter_mut().enumerate() {
                 for (at, entry) in sensor.ring.latest() {
                     open.writer.entry(index, *at, entry)?;
+                }
+                sensor.is_begun = sensor.ring.latest().next().is_some();
+                if sensor.ring.is_waiting() {
+                    let sensor = self.about.sensors[index].name();
+                    info!(
+                        sensor,
+                        "recording begins at its next rest: its press is too long to repeat"
+                    );
                 }
             }
             open.writer.flush()?;

@@ -1,14 +1,20 @@
 //! Bytes of a sensor over TCP or UDP.
 
-use std::io;
+use std::io::{self, Read};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
+use rustix::io::Errno;
 use tokio::net::UdpSocket;
 use tokio::time::Instant;
 
+use hardnessd_core::wire;
+
 /// How long a connection may take.
 const CONNECTING: Duration = Duration::from_secs(5);
+
+/// A telnet server sends its options within this time.
+const GREETING: Duration = Duration::from_millis(500);
 
 /// A peer that has gone without a word, such as a board without power, is noticed after this time. A
 /// sensor that is only silent answers to the system's probes.
@@ -20,6 +26,7 @@ pub(super) fn connect(address: &str) -> io::Result<TcpStream> {
     for address in address.to_socket_addrs()? {
         match TcpStream::connect_timeout(&address, CONNECTING) {
             Ok(stream) => {
+                refuse_self(&stream)?;
                 stream.set_nodelay(true)?;
                 stream.set_nonblocking(true)?;
                 probe(&stream)?;
@@ -29,6 +36,25 @@ pub(super) fn connect(address: &str) -> io::Result<TcpStream> {
         }
     }
     Err(last.unwrap_or_else(|| io::Error::other("the name has no address")))
+}
+
+/// Fails for a connection to itself. The system makes one where nothing listens and it happens to choose
+/// the wanted port as its own. Such a connection would keep the port from the server.
+fn refuse_self(stream: &TcpStream) -> io::Result<()> {
+    if stream.local_addr()? != stream.peer_addr()? {
+        return Ok(());
+    }
+    // Without a wait for late packets, the port is free at once.
+    rustix::net::sockopt::set_socket_linger(stream, Some(Duration::ZERO))?;
+    Err(Errno::CONNREFUSED.into())
+}
+
+/// Whether the other end says within a moment that it is a telnet server.
+pub(super) fn is_telnet(mut stream: &TcpStream) -> bool {
+    let mut bytes = [0; 3];
+    let is_set =
+        stream.set_nonblocking(false).is_ok() && stream.set_read_timeout(Some(GREETING)).is_ok();
+    is_set && stream.read_exact(&mut bytes).is_ok() && wire::is_telnet(&bytes)
 }
 
 /// Has the system ask a silent peer whether it is still there.
@@ -70,9 +96,18 @@ pub(super) struct Udp {
 #[derive(Debug)]
 struct Sender {
     address: SocketAddr,
+    /// When its last frame came, or its first bytes.
     last: Instant,
+    sends_frames: bool,
     /// Whether another one was reported.
     reported: bool,
+}
+
+impl Sender {
+    /// Whether its last frame, or its first bytes, came less than `stale_after` ago.
+    fn is_new(&self, stale_after: Duration) -> bool {
+        self.last.elapsed() < stale_after
+    }
 }
 
 impl Udp {
@@ -83,25 +118,26 @@ impl Udp {
         })
     }
 
-    /// Waits for the next datagram. Another sender is taken when the first has been silent for
-    /// `stale_after`.
+    /// Waits for the next datagram. Another sender is taken when the first has sent no frame for
+    /// `stale_after`. Bytes without frames keep no place.
     pub(super) async fn read(
         &mut self,
         buffer: &mut [u8],
         stale_after: Duration,
     ) -> io::Result<Datagram> {
         let (bytes, address) = self.socket.recv_from(buffer).await?;
-        let now = Instant::now();
         Ok(match &mut self.sender {
-            Some(sender) if sender.address == address => {
-                sender.last = now;
+            Some(sender)
+                if sender.address == address
+                    && (sender.sends_frames || sender.is_new(stale_after)) =>
+            {
                 // An empty datagram is no end.
                 match bytes {
                     0 => Datagram::Ignored,
                     bytes => Datagram::Bytes(bytes),
                 }
             }
-            Some(sender) if now.duration_since(sender.last) < stale_after => {
+            Some(sender) if sender.address != address && sender.is_new(stale_after) => {
                 match std::mem::replace(&mut sender.reported, true) {
                     true => Datagram::Ignored,
                     false => Datagram::Stranger(address),
@@ -110,7 +146,8 @@ impl Udp {
             sender => {
                 let last = sender.replace(Sender {
                     address,
-                    last: now,
+                    last: Instant::now(),
+                    sends_frames: false,
                     reported: false,
                 });
                 match last {
@@ -121,10 +158,48 @@ impl Udp {
         })
     }
 
+    /// Records that the sender has sent a frame.
+    pub(super) fn proven(&mut self) {
+        if let Some(sender) = &mut self.sender {
+            sender.last = Instant::now();
+            sender.sends_frames = true;
+        }
+    }
+
+    /// Whether there is a sender that has sent frames, or has had no time for one yet.
+    pub(super) fn may_be_a_sensor(&self, stale_after: Duration) -> bool {
+        let sender = self.sender.as_ref();
+        sender.is_some_and(|sender| sender.sends_frames || sender.is_new(stale_after))
+    }
+
     /// Sends bytes to the sender, if there is one and there is room.
     pub(super) fn send(&self, bytes: &[u8]) {
         if let Some(sender) = &self.sender {
             let _ = self.socket.try_send_to(bytes, sender.address);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::net::{
+        AddressFamily, SocketAddrV4, SocketType, bind, connect, getsockname, socket,
+    };
+
+    use super::*;
+
+    #[test]
+    fn a_connection_to_itself_is_refused_and_leaves_the_port_to_the_server() {
+        let itself = socket(AddressFamily::INET, SocketType::STREAM, None).unwrap();
+        let any = SocketAddrV4::new(std::net::Ipv4Addr::LOCALHOST, 0);
+        bind(&itself, &any).unwrap();
+        let address: SocketAddr = getsockname(&itself).unwrap().try_into().unwrap();
+        connect(&itself, &address).unwrap();
+        let stream = TcpStream::from(itself);
+        assert_eq!(stream.local_addr().unwrap(), stream.peer_addr().unwrap());
+        let refused = refuse_self(&stream).unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::ConnectionRefused);
+        drop(stream);
+        std::net::TcpListener::bind(address).unwrap();
     }
 }

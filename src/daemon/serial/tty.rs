@@ -4,23 +4,47 @@
 //! bytes. Another program may change them while the port is open, so they can be compared and set
 //! again.
 
-use std::collections::BTreeSet;
 use std::io;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::Path;
 
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
-use rustix::termios::{
-    ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, SpecialCodeIndex, Termios,
-    tcgetattr, tcsetattr,
-};
+use rustix::termios::{OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcsetattr};
+use rustix::thread::{CapabilitySet, CapabilitySets, capabilities, set_capabilities};
 use serialport::{ClearBuffer, ErrorKind, SerialPort, TTYPort};
 
+use crate::holders::holders;
+
 /// Opens the port at `path`. No other process can open it until it is dropped: TIOCEXCL keeps others
-/// out, and a lock also keeps root out.
+/// out, and a lock also keeps root out. A port that another process keeps for itself in one of these ways
+/// is not opened, not even by root.
 pub(super) fn open(path: &Path, baud: u32) -> io::Result<(TTYPort, LineSettings)> {
+    // This capability passes over the TIOCEXCL of others. Only this thread goes without it.
+    let before = capabilities(None)?;
+    let admin = CapabilitySet::SYS_ADMIN;
+    if !before.effective.contains(admin) {
+        return open_alone(path, baud);
+    }
+    let effective = before.effective.difference(admin);
+    set_capabilities(
+        None,
+        CapabilitySets {
+            effective,
+            ..before
+        },
+    )?;
+    let opened = open_alone(path, baud);
+    set_capabilities(None, before)?;
+    let is_busy = |error: &io::Error| error.raw_os_error() == Some(Errno::BUSY.raw_os_error());
+    // A pty stays exclusive when the process that made it so is killed, until its other end closes too.
+    if opened.as_ref().is_err_and(is_busy) && holders(Path::new("/"), path).next().is_none() {
+        return open_alone(path, baud);
+    }
+    opened
+}
+
+fn open_alone(path: &Path, baud: u32) -> io::Result<(TTYPort, LineSettings)> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     // From TIOCEXCL on, not even this process can open the port again.
     let file = rustix::fs::open(path, flags, Mode::empty())?;
@@ -61,20 +85,6 @@ fn lower_latency(path: &Path) {
     }
 }
 
-/// Whether this process has the device of `path` open, perhaps under another name.
-pub(super) fn is_held_here(path: &Path) -> bool {
-    let device = |path: &Path| {
-        let file = std::fs::metadata(path).ok()?;
-        file.file_type().is_char_device().then(|| file.rdev())
-    };
-    let Some(wanted) = device(path) else {
-        return false;
-    };
-    let files = std::fs::read_dir("/proc/self/fd").into_iter().flatten();
-    let mut files = files.flatten();
-    files.any(|file| device(&file.path()) == Some(wanted))
-}
-
 /// The settings of an open serial line, on a descriptor of their own: that of the port is not
 /// reachable.
 #[derive(Debug)]
@@ -91,117 +101,52 @@ impl LineSettings {
         Ok(())
     }
 
-    /// Sets the settings again if another program has changed them. Returns what it found.
-    pub(super) fn restore(&self) -> Result<Option<Changed>, Errno> {
-        let changed = Changed::between(&tcgetattr(&self.file)?, &self.settings);
-        if changed.is_some() {
+    /// Sets the settings again if another program has changed them.
+    pub(super) fn restore(&self) -> Result<(), Errno> {
+        if !are_same(&tcgetattr(&self.file)?, &self.settings) {
             tcsetattr(&self.file, OptionalActions::Now, &self.settings)?;
         }
-        Ok(changed)
+        Ok(())
     }
 }
 
-/// Sets 8N1 at `baud`, without flow control and without processing of the bytes.
-pub(crate) fn make_plain(settings: &mut Termios, baud: u32) -> Result<(), Errno> {
-    settings.make_raw();
-    settings.input_modes -= InputModes::INPCK | InputModes::IXOFF;
-    settings.input_modes |= InputModes::IGNPAR;
-    settings.control_modes -= ControlModes::CSTOPB | ControlModes::PARODD | ControlModes::CRTSCTS;
-    settings.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;
-    settings.set_speed(baud)
-}
-
-/// The settings of a line that are not as expected, in the words of stty(1).
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Changed {
-    pub(crate) found: String,
-    pub(crate) expected: String,
-}
-
-impl Changed {
-    /// The settings that differ, if any do.
-    pub(crate) fn between(found: &Termios, expected: &Termios) -> Option<Self> {
-        let (found, expected) = (named(found), named(expected));
-        let only = |one: &BTreeSet<String>, other| {
-            let names: Vec<String> = one.difference(other).cloned().collect();
-            names.join(" ")
-        };
-        (found != expected).then(|| Self {
-            found: only(&found, &expected),
-            expected: only(&expected, &found),
-        })
-    }
-}
-
-/// The settings that change what is read or written.
-fn named(settings: &Termios) -> BTreeSet<String> {
-    let input = settings.input_modes;
-    let output = settings.output_modes;
-    let local = settings.local_modes;
-    let control = settings.control_modes;
-    let flags = [
-        ("brkint", input.contains(InputModes::BRKINT)),
-        ("icrnl", input.contains(InputModes::ICRNL)),
-        ("igncr", input.contains(InputModes::IGNCR)),
-        ("inlcr", input.contains(InputModes::INLCR)),
-        ("inpck", input.contains(InputModes::INPCK)),
-        ("istrip", input.contains(InputModes::ISTRIP)),
-        ("ixoff", input.contains(InputModes::IXOFF)),
-        ("ixon", input.contains(InputModes::IXON)),
-        ("parmrk", input.contains(InputModes::PARMRK)),
-        ("opost", output.contains(OutputModes::OPOST)),
-        ("echo", local.contains(LocalModes::ECHO)),
-        ("icanon", local.contains(LocalModes::ICANON)),
-        ("iexten", local.contains(LocalModes::IEXTEN)),
-        ("isig", local.contains(LocalModes::ISIG)),
-        ("cread", control.contains(ControlModes::CREAD)),
-        ("crtscts", control.contains(ControlModes::CRTSCTS)),
-        ("cstopb", control.contains(ControlModes::CSTOPB)),
-        ("parenb", control.contains(ControlModes::PARENB)),
-        ("parodd", control.contains(ControlModes::PARODD)),
-    ];
-    let size = match control & ControlModes::CSIZE {
-        ControlModes::CS5 => "cs5",
-        ControlModes::CS6 => "cs6",
-        ControlModes::CS7 => "cs7",
-        _ => "cs8",
+/// Whether two settings read and write bytes alike.
+fn are_same(one: &Termios, other: &Termios) -> bool {
+    let speeds = |settings: &Termios| (settings.input_speed(), settings.output_speed());
+    let codes = |settings: &Termios| {
+        let code = |index| settings.special_codes[index];
+        (code(SpecialCodeIndex::VMIN), code(SpecialCodeIndex::VTIME))
     };
-    let code = |index| settings.special_codes[index];
-    let sign = |is_set| if is_set { "" } else { "-" };
-    let mut names: BTreeSet<String> = flags
-        .iter()
-        .map(|(name, is_set)| format!("{}{name}", sign(*is_set)))
-        .collect();
-    names.insert(size.to_owned());
-    names.insert(format!("ispeed {}", settings.input_speed()));
-    names.insert(format!("ospeed {}", settings.output_speed()));
-    names.insert(format!("min {}", code(SpecialCodeIndex::VMIN)));
-    names.insert(format!("time {}", code(SpecialCodeIndex::VTIME)));
-    names
+    one.input_modes == other.input_modes
+        && one.output_modes == other.output_modes
+        && one.local_modes == other.local_modes
+        && one.control_modes == other.control_modes
+        && speeds(one) == speeds(other)
+        && codes(one) == codes(other)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::process::Command;
+
+    use rustix::termios::{InputModes, LocalModes};
+
     use super::*;
     use crate::tools::pty::Pty;
 
     #[test]
-    fn settings_that_another_program_changed_are_named_and_set_again() {
+    fn settings_that_another_program_changed_are_set_again() {
         let pty = Pty::open(None).unwrap();
         let (_port, line) = open(pty.path(), 57_600).unwrap();
-        assert_eq!(line.restore(), Ok(None));
         // What a getty sets.
         let mut cooked = line.settings.clone();
         cooked.local_modes |= LocalModes::ICANON | LocalModes::ECHO;
         cooked.input_modes |= InputModes::ICRNL;
         cooked.set_speed(9_600).unwrap();
         tcsetattr(&line.file, OptionalActions::Now, &cooked).unwrap();
-        let changed = Changed {
-            found: "echo icanon icrnl ispeed 9600 ospeed 9600".to_owned(),
-            expected: "-echo -icanon -icrnl ispeed 57600 ospeed 57600".to_owned(),
-        };
-        assert_eq!(line.restore(), Ok(Some(changed)));
-        assert_eq!(line.restore(), Ok(None));
+        line.restore().unwrap();
+        assert!(are_same(&tcgetattr(&line.file).unwrap(), &line.settings));
+        assert!(!are_same(&cooked, &line.settings));
     }
 
     #[test]
@@ -213,6 +158,24 @@ mod tests {
         assert_eq!(errno(pty.path()), Some(Errno::BUSY));
         drop(opened);
         open(pty.path(), 250_000).unwrap();
+        // Another program keeps the port for itself, without a lock. Root could open it nevertheless.
+        let flags = OFlags::RDWR | OFlags::NOCTTY;
+        let other = rustix::fs::open(pty.path(), flags, Mode::empty()).unwrap();
+        rustix::termios::ioctl_tiocexcl(&other).unwrap();
+        let mut command = Command::new("sleep");
+        let mut program = command.arg("60").stdin(other).spawn().unwrap();
+        drop(command);
+        assert_eq!(errno(pty.path()), Some(Errno::BUSY));
+        // It is killed, and the pty is still for itself. Only root can open it.
+        program.kill().unwrap();
+        program.wait().unwrap();
+        if capabilities(None)
+            .unwrap()
+            .effective
+            .contains(CapabilitySet::SYS_ADMIN)
+        {
+            open(pty.path(), 250_000).unwrap();
+        }
         let file = tempfile::NamedTempFile::new().unwrap();
         assert_eq!(errno(file.path()), Some(Errno::NOTTY));
     }

@@ -4,7 +4,10 @@
 //! way behind the sensor's face. It is a little bent, because the sensor's cover stiffens. With the
 //! right delay, the arm returns on the same curve. With another delay, there is a loop.
 
+use anyhow::{Context as _, Result, bail};
+
 use super::gather::Press;
+use hardnessd_core::line::Sums;
 
 /// A value, and its least and greatest over single presses.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,58 +28,6 @@ pub(super) struct Fit {
     pub(super) delay_ms: Spread,
     /// Root mean square of the distance from the curve.
     pub(super) residual_mm: f64,
-}
-
-/// The reason why presses give no values.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Unfit {
-    /// Positions are missing.
-    #[error(
-        "only {known} of {presses} presses have positions of the arm from before their begin until \
-         after their end: does the robot send them to the control socket of this configuration?"
-    )]
-    Unknown {
-        /// The number of presses with positions.
-        known: usize,
-        /// The number of all presses.
-        presses: usize,
-    },
-    /// There are too few frames with a fair force.
-    #[error(
-        "only {found} frames with a fair force in {presses} presses: press more slowly, harder or \
-         more often"
-    )]
-    Few {
-        /// The number of frames with a fair force.
-        found: usize,
-        /// The number of presses.
-        presses: usize,
-    },
-    /// The force does not grow with the way.
-    #[error(
-        "the force does not grow with the way of the arm: do positions grow towards the object?"
-    )]
-    Falling,
-    /// All delays fit alike.
-    #[error(
-        "the delay cannot be told: the arm went {moved_mm:.2} mm while the sensor was pressed. Press \
-         deeper, and keep the arm moving"
-    )]
-    NoDelay {
-        /// The way of the arm while the sensor was pressed.
-        moved_mm: f64,
-    },
-    /// The best delay is not between the least and the greatest that are tried.
-    #[error(
-        "no delay from {least} to {most} ms fits: the best is {tried_ms:.0} ms or beyond. Do the stamps \
-         of the positions come from a clock that agrees with the clock of this machine?",
-        least = DELAYS_MS.0,
-        most = DELAYS_MS.1
-    )]
-    Beyond {
-        /// The delay at the end of the range.
-        tried_ms: f64,
-    },
 }
 
 /// The least and the greatest delay that are tried.
@@ -119,25 +70,28 @@ impl Press {
 
 impl Fit {
     /// Computes the values from `presses`.
-    pub(super) fn of(presses: &[Press]) -> Result<Self, Unfit> {
+    pub(super) fn of(presses: &[Press]) -> Result<Self> {
         let known: Vec<&Press> = presses.iter().filter(|press| press.is_known()).collect();
         if known.len() < 2 {
-            return Err(Unfit::Unknown {
-                known: known.len(),
-                presses: presses.len(),
-            });
+            bail!(
+                "only {} of {} presses have positions of the arm from before their begin until after \
+                 their end: does the robot send them to the control socket of this configuration?",
+                known.len(),
+                presses.len()
+            );
         }
         let fair = |press: &&Press| {
             press
                 .points(0.0, FAIR_SHARE)
                 .map_or(0, |points| points.len())
         };
-        let found = known.iter().map(fair).sum();
+        let found: usize = known.iter().map(fair).sum();
         if found < LEAST_FRAMES {
-            return Err(Unfit::Few {
-                found,
-                presses: known.len(),
-            });
+            bail!(
+                "only {found} frames with a fair force in {} presses: press more slowly, harder or more \
+                 often",
+                known.len()
+            );
         }
         let (delay_ms, residual_mm) = best_delay(&known);
         let wrong = [delay_ms - WRONG_MS, delay_ms + WRONG_MS]
@@ -150,16 +104,25 @@ impl Fit {
                 .filter_map(|press| press.points(delay_ms, 0.0))
                 .flatten();
             let moved_mm = way.map(|(mm, _)| mm).fold(0.0, f64::max);
-            return Err(Unfit::NoDelay { moved_mm });
+            bail!(
+                "the delay cannot be told: the arm went {moved_mm:.2} mm while the sensor was pressed. \
+                 Press deeper, and keep the arm moving"
+            );
         }
         // The second search goes a step beyond the ends of the first, so a delay just inside is
         // found.
         for end_ms in [DELAYS_MS.0, DELAYS_MS.1] {
             if (delay_ms - end_ms) * end_ms.signum() >= 0.0 {
-                return Err(Unfit::Beyond { tried_ms: end_ms });
+                let (least, most) = DELAYS_MS;
+                bail!(
+                    "no delay from {least} to {most} ms fits: the best is {end_ms:.0} ms or beyond. Do the \
+                     stamps of the positions come from a clock that agrees with the clock of this machine?"
+                );
             }
         }
-        let n_per_mm = slope(&known, delay_ms).ok_or(Unfit::Falling)?;
+        let n_per_mm = slope(&known, delay_ms).context(
+            "the force does not grow with the way of the arm: do positions grow towards the object?",
+        )?;
         let one = |press: &&Press| {
             let alone = [*press];
             let is_enough = fair(press) >= LEAST_FRAMES;
@@ -261,13 +224,9 @@ fn slope(presses: &[&Press], delay_ms: f64) -> Option<f64> {
     let (mut ff, mut fx) = (0.0, 0.0);
     for press in presses {
         let points = press.points(delay_ms, STEEP_SHARE)?;
-        let own = points.len() as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / own;
-        let (x, f) = (mean(|p| p.0), mean(|p| p.1));
-        for (way, force) in &points {
-            ff += (force - f) * (force - f);
-            fx += (force - f) * (way - x);
-        }
+        let own = Sums::of(&points);
+        ff += own.yy;
+        fx += own.xy;
     }
     (fx > 0.0 && ff > 0.0).then(|| ff / fx)
 }
@@ -359,24 +318,21 @@ mod tests {
         let good = || press(10.0, 50.0, 2.0, 20.0);
         let mut mute = good();
         mute.track = Track::default();
-        let unknown = Unfit::Unknown {
-            known: 1,
-            presses: 2,
+        let check = |presses: &[Press], expected: &str| {
+            let error = Fit::of(presses).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
         };
-        assert_eq!(Fit::of(&[good(), mute]), Err(unknown));
+        check(&[good(), mute], "only 1 of 2 presses have positions");
         let mut short = [good(), good()];
         for press in &mut short {
             press.moments.truncate(3);
             press.forces_n.truncate(3);
         }
-        assert!(matches!(
-            Fit::of(&short),
-            Err(Unfit::Few { presses: 2, .. })
-        ));
+        check(&short, "frames with a fair force in 2 presses");
         // The delay is far beyond those that are tried, or just at their end.
-        for (delay_ms, tried_ms) in [(650.0, 600.0), (600.0, 600.0), (-340.0, -300.0)] {
+        for (delay_ms, tried_ms) in [(650.0, 600), (600.0, 600), (-340.0, -300)] {
             let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
-            assert_eq!(Fit::of(&late), Err(Unfit::Beyond { tried_ms }));
+            check(&late, &format!("the best is {tried_ms} ms or beyond"));
         }
         for delay_ms in [590.0, -290.0] {
             let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
@@ -392,6 +348,6 @@ mod tests {
                 press.track.push(&[Point { at_ns, mm: 1.0 }]).unwrap();
             }
         }
-        assert_eq!(Fit::of(&still), Err(Unfit::NoDelay { moved_mm: 0.0 }));
+        check(&still, "the arm went 0.00 mm");
     }
 }

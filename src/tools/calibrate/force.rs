@@ -2,10 +2,13 @@
 //!
 //! A weight of N newtons gives c1, c2, ... counts on taxels with the gains g1, g2, ..., so
 //! N = a (g1 c1^e + g2 c2^e + ...). With e = 1, this is a line whose a is `newtons_per_count`. Film
-//! arrays are often nearer to another power.
+//! arrays are often nearer to another power. Noise is as often negative as positive, so the counts
+//! keep their sign, and each is the mean over the frames in which the weight rests.
+
+use anyhow::{Result, bail, ensure};
 
 use super::gather::Press;
-use hardnessd_core::frame::{Array, RawFrame};
+use hardnessd_core::frame::{Array, Frame, RawFrame};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::{self, Tare};
 
@@ -24,53 +27,7 @@ pub(super) struct Fit {
     pub(super) power: Option<(f64, f64)>,
 }
 
-/// The reason why weights give no values.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Unfit {
-    /// A press shows no force.
-    #[error("press {press}, of {newtons} N, shows no force: was the weight on the sensor?")]
-    Nothing {
-        /// The number of the press, from 1.
-        press: usize,
-        /// The weight in newtons.
-        newtons: f64,
-    },
-    /// A heavier weight gives fewer counts.
-    #[error(
-        "the weight of {heavy} N gives fewer counts than that of {light} N: was each weight on the \
-         sensor when its turn was?"
-    )]
-    Falling {
-        /// The heavier weight in newtons.
-        heavy: f64,
-        /// The lighter one.
-        light: f64,
-    },
-    /// No law fits all weights.
-    #[error(
-        "the weights do not fit one law: that of {newtons} N would read {read:.1} N. Put all weights on \
-         the same foot and repeat it; with four weights or more, a curve is tried too"
-    )]
-    Scattered {
-        /// The weight that fits worst, in newtons.
-        newtons: f64,
-        /// Its reading with the values that fit best.
-        read: f64,
-    },
-    /// A taxel reads full scale, so the weight may be larger than the sum of the taxels.
-    #[error(
-        "press {press}, of {newtons} N, reaches full scale on a taxel: put the weight on more taxels, \
-         or take a lighter one"
-    )]
-    Saturated {
-        /// The number of the press, from 1.
-        press: usize,
-        /// The weight in newtons.
-        newtons: f64,
-    },
-}
-
-/// The counts of a taxel.
+/// The counts of a taxel, above its baseline or below it.
 #[derive(Debug, Clone, Copy)]
 struct Count {
     counts: f64,
@@ -80,6 +37,12 @@ struct Count {
 
 /// The weight is at rest while the sum of counts has at least this share of its maximum.
 const RESTING_SHARE: f64 = 0.8;
+/// The part of these frames, by their sums, that is left out at either end: the weight was still
+/// being put on or taken off.
+const LEFT_OUT: f64 = 0.25;
+/// The weight is on the taxels with at least this share of the greatest force on one, and on those
+/// around them. The present scale may be far off, so no threshold in newtons can say it.
+const ON_SHARE: f32 = 0.05;
 /// An exponent needs at least this number of different weights.
 const LEAST_WEIGHTS: usize = 4;
 /// For an exponent, the heaviest weight must be at least this many times the lightest.
@@ -97,16 +60,19 @@ impl Fit {
     /// Computes the values from `weights` in newtons, each with its press. The values are for the
     /// gains and the dead taxels of `sensor`. A press without a description was recorded with the
     /// settings of `sensor`.
-    pub(super) fn of(weights: &[(f64, &Press)], sensor: &Sensor) -> Result<Self, Unfit> {
+    pub(super) fn of(weights: &[(f64, &Press)], sensor: &Sensor) -> Result<Self> {
         let mut resting = Vec::with_capacity(weights.len());
         for (press, &(newtons, recorded)) in (1..).zip(weights) {
-            if recorded.saturated {
-                return Err(Unfit::Saturated { press, newtons });
-            }
+            ensure!(
+                !recorded.saturated,
+                "press {press}, of {newtons} N, reaches full scale on a taxel: put the weight on more \
+                 taxels, or take a lighter one"
+            );
             let counts = rest(recorded, sensor);
-            if counts.is_empty() {
-                return Err(Unfit::Nothing { press, newtons });
-            }
+            ensure!(
+                !counts.is_empty(),
+                "press {press}, of {newtons} N, shows no force: was the weight on the sensor?"
+            );
             resting.push((newtons, counts));
         }
         let (_, line_error) = scale(&resting, 1.0);
@@ -167,75 +133,91 @@ impl Fit {
 }
 
 /// Checks that readings grow with their weights, and that each is near its weight.
-fn check(mut weights: Vec<(f64, f64)>) -> Result<(), Unfit> {
+fn check(mut weights: Vec<(f64, f64)>) -> Result<()> {
     weights.sort_by(|one, other| one.0.total_cmp(&other.0));
     for pair in weights.windows(2) {
         let [(light, less), (heavy, more)] = [pair[0], pair[1]];
         if heavy > light && more < less {
-            return Err(Unfit::Falling { heavy, light });
+            bail!(
+                "the weight of {heavy} N gives fewer counts than that of {light} N: was each weight on \
+                 the sensor when its turn was?"
+            );
         }
     }
     let error = |&(newtons, read): &(f64, f64)| (read / newtons - 1.0).abs();
     let worst = weights
         .iter()
         .max_by(|one, other| error(one).total_cmp(&error(other)));
-    match worst {
-        Some(&(newtons, read)) if error(&(newtons, read)) > MOST_ERROR => {
-            Err(Unfit::Scattered { newtons, read })
-        }
-        _ => Ok(()),
+    if let Some(&(newtons, read)) = worst.filter(|weight| error(weight) > MOST_ERROR) {
+        bail!(
+            "the weights do not fit one law: that of {newtons} N would read {read:.1} N. Put all weights \
+             on the same foot and repeat it; with four weights or more, a curve is tried too"
+        );
     }
+    Ok(())
 }
 
-/// The counts of one frame of a press: the median frame, by its sum, of those in which the weight
-/// is at rest.
+/// The mean counts of the taxels under the weight, over the frames of a press in which it rests.
 fn rest(press: &Press, sensor: &Sensor) -> Vec<Count> {
     let described = press.described.as_deref().cloned();
     let recorded = described.and_then(|described| Sensor::new(described).ok());
     let recorded = recorded.as_ref().unwrap_or(sensor);
-    let settings = &recorded.description().calibration;
+    let settings = recorded.calibration();
+    let array = recorded.layout().array();
     let (a, e) = (
         f64::from(settings.newtons_per_count),
         f64::from(settings.exponent),
     );
-    let gains = effects(settings, recorded.layout().array());
+    let gains: Vec<f64> = effects(settings, array).iter().map(|own| own[0]).collect();
     let shares = shares(sensor, recorded);
-    let taxels: Vec<(f64, f64)> = gains
-        .iter()
-        .zip(shares)
-        .map(|(&[gain, _], share)| (gain, share))
-        .collect();
-    let counts = press.frames.iter().map(|frame| -> Vec<Count> {
-        let taxels = frame.iter().zip(&taxels);
-        let loaded = taxels.filter(|&(&newtons, &(gain, share))| {
-            // The newtons of a dead taxel are no measurement.
-            newtons > 0.0 && gain > 0.0 && share > 0.0
-        });
-        loaded
-            .map(|(&newtons, &(gain, share))| Count {
-                counts: (f64::from(newtons) / (a * gain)).powf(1.0 / e),
-                share,
-            })
-            .collect()
+    // The newtons of a dead taxel are no measurement.
+    let is_live = |place: usize| gains[place] > 0.0 && shares[place] > 0.0;
+    let counts = press.frames.iter().map(|frame| -> Vec<f64> {
+        let counts = |(place, &newtons): (usize, &f32)| match is_live(place) {
+            true => signed_power(f64::from(newtons) / (a * gains[place]), 1.0 / e),
+            false => 0.0,
+        };
+        frame.iter().enumerate().map(counts).collect()
     });
-    let sum = |counts: &[Count]| counts.iter().map(|one| one.counts).sum::<f64>();
-    let mut counts: Vec<(f64, Vec<Count>)> = counts.map(|c| (sum(&c), c)).collect();
-    let most = counts.iter().map(|one| one.0).fold(0.0, f64::max);
-    counts.retain(|one| one.0 > 0.0 && one.0 >= RESTING_SHARE * most);
-    counts.sort_by(|one, other| one.0.total_cmp(&other.0));
-    let middle = counts.len() / 2;
-    counts
-        .into_iter()
-        .nth(middle)
-        .map_or_else(Vec::new, |one| one.1)
+    let sum = |counts: &Vec<f64>| counts.iter().sum::<f64>();
+    let mut frames: Vec<Vec<f64>> = counts.collect();
+    let most = frames.iter().map(sum).fold(0.0, f64::max);
+    frames.retain(|counts| sum(counts) > 0.0 && sum(counts) >= RESTING_SHARE * most);
+    frames.sort_by(|one, other| sum(one).total_cmp(&sum(other)));
+    let ends = (LEFT_OUT * frames.len() as f64) as usize;
+    let resting = &frames[ends..frames.len() - ends];
+    if resting.is_empty() {
+        return Vec::new();
+    }
+    let mean = |place: usize| {
+        let sum: f64 = resting.iter().map(|counts| counts[place]).sum();
+        sum / resting.len() as f64
+    };
+    let means: Vec<f64> = (0..array.taxels()).map(mean).collect();
+    let newtons: Vec<f32> = means.iter().map(|&counts| counts as f32).collect();
+    let greatest = newtons.iter().copied().fold(0.0, f32::max);
+    let newtons = newtons.into();
+    let felt = Frame { array, newtons }.felt(ON_SHARE * greatest);
+    let under = (0..array.taxels()).filter(|&place| is_live(place) && felt.newtons[place] != 0.0);
+    under
+        .map(|place| Count {
+            counts: means[place],
+            share: shares[place],
+        })
+        .collect()
+}
+
+/// A power that keeps the sign.
+fn signed_power(base: f64, exponent: f64) -> f64 {
+    base.abs().powf(exponent).copysign(base)
 }
 
 /// The share of each taxel of a frame in the total force that `sensor` reads. A taxel that was dead
 /// in the recording has no counts, so it counts as dead here too.
 fn shares(sensor: &Sensor, recorded: &Sensor) -> Vec<f64> {
-    let mut settings = sensor.description().calibration.clone();
+    let mut settings = sensor.calibration().clone();
     let array = sensor.layout().array();
-    let dead = recorded.description().calibration.dead_taxels.iter();
+    let dead = recorded.calibration().dead_taxels.iter();
     let is_here = |&&[row, col]: &&[usize; 2]| row < array.rows && col < array.cols;
     settings.dead_taxels.extend(dead.filter(is_here));
     let effects = effects(&settings, array);
@@ -259,25 +241,26 @@ fn effects(settings: &tare::Settings, array: Array) -> Vec<[f64; 2]> {
     let tare = Tare::new(&settings, array, contact);
     let mut raw = RawFrame::zero(array);
     let of_place = |place: usize| {
-        raw.counts[place] = 1;
+        raw.counts[place] = 1.0;
         let newtons = tare.apply(&raw).newtons;
-        raw.counts[place] = 0;
+        raw.counts[place] = 0.0;
         [newtons[place], newtons.iter().sum()].map(f64::from)
     };
     (0..array.taxels()).map(of_place).collect()
 }
 
 fn raised(counts: &[Count], exponent: f64) -> f64 {
-    let raised = |one: &Count| one.share * one.counts.powf(exponent);
+    let raised = |one: &Count| one.share * signed_power(one.counts, exponent);
     counts.iter().map(raised).sum()
 }
 
 /// The a that fits the weights best with this exponent, and the root mean square error that is
 /// left, as a part of the weight.
 fn scale(weights: &[(f64, Vec<Count>)], exponent: f64) -> (f64, f64) {
+    // With a small exponent, noise may outweigh a light weight.
     let logs = weights
         .iter()
-        .map(|(newtons, counts)| (newtons / raised(counts, exponent)).ln());
+        .map(|(newtons, counts)| (newtons / raised(counts, exponent).max(f64::MIN_POSITIVE)).ln());
     let count = weights.len() as f64;
     let mean = logs.clone().sum::<f64>() / count;
     let squares: f64 = logs.map(|log| (log - mean).powi(2)).sum();
@@ -286,18 +269,20 @@ fn scale(weights: &[(f64, Vec<Count>)], exponent: f64) -> (f64, f64) {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
     use std::sync::Arc;
 
     use super::*;
+    use crate::tools::calibrate::gather;
     use hardnessd_core::sensor::Description;
     use hardnessd_core::tare::Gains;
+    use hardnessd_core::test_support::hrn;
+    use hardnessd_core::test_support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
 
     fn sensor(calibration: tare::Settings) -> Sensor {
-        Sensor::new(Description {
-            calibration,
-            ..Description::default()
-        })
-        .unwrap()
+        let mut described = Description::default();
+        described.sensor.calibration = calibration;
+        Sensor::new(described).unwrap()
     }
 
     /// Gains of 0.5 to 2, and two dead taxels under the weight.
@@ -315,7 +300,7 @@ mod tests {
     /// gain g gives c counts under a g c^e newtons. The taxels are those of `film`.
     fn press(newtons: f64, (a, e): (f64, f64), film: &Sensor, settings: &tare::Settings) -> Press {
         let loaded: Vec<usize> = (0..20).map(|n| 28 * (10 + n / 5) + 10 + n % 5).collect();
-        let own = effects(&film.description().calibration, film.layout().array());
+        let own = effects(film.calibration(), film.layout().array());
         // The total of all taxels, with the dead ones replaced, is `newtons` at this scale.
         let shape: Vec<f64> = (1..=20)
             .map(|n| (f64::from(n) / 20.0).powf(1.0 / e))
@@ -385,6 +370,45 @@ mod tests {
     }
 
     #[test]
+    fn noise_does_not_bias_the_scale() {
+        // A scale of the configuration that is a third too small, and one that is a third too large. With one
+        // that is twice too large, the noise of 6 counts passes for a touch, and there is no zero.
+        for present in [0.0009, 0.0018] {
+            for (noise, most_rest) in [(0.0, 300.0), (3.0, 300.0), (6.0, 300.0), (6.0, 0.0)] {
+                let sensor = noisy_sensor(present);
+                let mut array = NoisyArray::new(3, most_rest, noise);
+                let mut bytes = Vec::new();
+                let mut send = |force_n: f64, frames: usize| {
+                    for _ in 0..frames {
+                        let raw = array.read(&foot(force_n));
+                        sensor.layout().encode(&raw, &mut bytes);
+                    }
+                };
+                let weights = [4.905, 9.81, 19.62];
+                send(0.0, 6);
+                for newtons in weights {
+                    send(0.6 * newtons, 1);
+                    send(newtons, 12);
+                    send(0.0, 3);
+                }
+                let path = Path::new("w.bin");
+                let presses =
+                    gather::presses(bytes.as_slice(), path, &sensor, hrn(), false).unwrap();
+                assert_eq!(presses.len(), weights.len(), "{present}, {noise}");
+                let weights: Vec<(f64, &Press)> = weights.into_iter().zip(&presses).collect();
+                let fit = Fit::of(&weights, &sensor).unwrap();
+                let off = fit.newtons_per_count / COUNT_N - 1.0;
+                // A converter that rests at 0 cuts off the lower half of its noise.
+                let most_off = if most_rest > 0.0 { 0.02 } else { 0.04 };
+                assert!(
+                    off.abs() < most_off,
+                    "{present}, {noise} on {most_rest}: {off}"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn a_press_is_read_with_the_settings_of_its_recording() {
         // The sensor of the configuration has gains, and another scale than the recordings.
         let present = tare::Settings {
@@ -417,55 +441,46 @@ mod tests {
     }
 
     #[test]
-    fn a_taxel_that_was_dead_in_the_recording_is_dead_for_the_fit() {
-        let recorded = sensor(tare::Settings {
-            dead_taxels: vec![[11, 12]],
-            ..tare::Settings::default()
-        });
-        let settings = &recorded.description().calibration;
-        let press = Press {
-            described: Some(Arc::new(recorded.description().clone())),
-            ..press(8.0, (0.031, 1.0), &recorded, settings)
-        };
-        let fit = Fit::of(&[(8.0, &press)], &sensor(tare::Settings::default())).unwrap();
-        assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
-    }
-
-    #[test]
-    fn a_press_that_measures_no_weight_is_named() {
+    fn presses_that_measure_no_weight_or_fit_no_law_are_named() {
         let settings = tare::Settings::default();
         let sensor = sensor(settings.clone());
-        let good = press(5.0, (0.04, 1.0), &sensor, &settings);
-        let newtons = 7.0;
-        let of = |other: &Press| Fit::of(&[(5.0, &good), (newtons, other)], &sensor);
-        let none = Press::default();
-        assert_eq!(of(&none), Err(Unfit::Nothing { press: 2, newtons }));
+        let on = |newtons| press(newtons, (0.04, 1.0), &sensor, &settings);
         let full = Press {
             saturated: true,
-            ..press(newtons, (0.04, 1.0), &sensor, &settings)
+            ..on(7.0)
         };
-        assert_eq!(of(&full), Err(Unfit::Saturated { press: 2, newtons }));
-    }
-
-    #[test]
-    fn weights_that_do_not_fit_one_law_give_no_values() {
-        let sensor = Sensor::new(Description::default()).unwrap();
-        let settings = sensor.description().calibration.clone();
-        let fit = |weights: &[(f64, f64)]| {
-            let presses: Vec<(f64, Press)> = weights
-                .iter()
-                .map(|&(newtons, on_it)| (newtons, press(on_it, (0.04, 1.0), &sensor, &settings)))
-                .collect();
-            let named: Vec<(f64, &Press)> = presses.iter().map(|(n, press)| (*n, press)).collect();
-            Fit::of(&named, &sensor)
-        };
-        assert!(fit(&[(5.0, 5.0), (10.0, 10.5), (20.0, 19.0)]).is_ok());
-        // Two weights were swapped.
-        let (heavy, light) = (20.0, 10.0);
-        let swapped = fit(&[(5.0, 5.0), (light, heavy), (heavy, light)]);
-        assert_eq!(swapped, Err(Unfit::Falling { heavy, light }));
-        // One weight was not the named one.
-        let wrong = fit(&[(5.0, 5.0), (10.0, 10.0), (20.0, 11.0)]);
-        assert!(matches!(wrong, Err(Unfit::Scattered { .. })), "{wrong:?}");
+        let swapped = "the weight of 20 N gives fewer counts than that of 10 N";
+        for (presses, expected) in [
+            (
+                vec![(5.0, on(5.0)), (10.0, on(10.5)), (20.0, on(19.0))],
+                None,
+            ),
+            (
+                vec![(5.0, on(5.0)), (7.0, Press::default())],
+                Some("press 2, of 7 N, shows no force"),
+            ),
+            (
+                vec![(5.0, on(5.0)), (7.0, full)],
+                Some("press 2, of 7 N, reaches full scale"),
+            ),
+            (
+                vec![(5.0, on(5.0)), (10.0, on(20.0)), (20.0, on(10.0))],
+                Some(swapped),
+            ),
+            (
+                vec![(5.0, on(5.0)), (10.0, on(10.0)), (20.0, on(11.0))],
+                Some("the weights do not fit one law"),
+            ),
+        ] {
+            let weights: Vec<(f64, &Press)> = presses.iter().map(|(n, on)| (*n, on)).collect();
+            let error = Fit::of(&weights, &sensor)
+                .err()
+                .map(|error| error.to_string());
+            let is_expected = match (&error, expected) {
+                (Some(error), Some(expected)) => error.starts_with(expected),
+                (error, expected) => error.is_none() && expected.is_none(),
+            };
+            assert!(is_expected, "{error:?}, expected {expected:?}");
+        }
     }
 }

@@ -1,16 +1,18 @@
 //! The presses of a recording, each with the positions of the arm.
 
-use std::io::{BufReader, Read};
+use std::io::{BufReader, ErrorKind, Read};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::tools::Unreadable;
+use crate::tools::exit::Failure;
+use crate::tools::unplayable;
 use hardnessd_core::event::{Event, Note, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
-use hardnessd_core::pipeline::{Clock, Pipeline};
+use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::recording::{Entry, FileKind, Playback, Reader};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::Hrn;
@@ -20,9 +22,9 @@ use hardnessd_core::verdict::Hrn;
 pub(super) struct Press {
     /// The moments of the frames in contact.
     pub(super) moments: Vec<Duration>,
-    /// The newtons on each taxel, for each of these frames.
+    /// The newtons on each taxel, for each of these frames. Noise makes some negative.
     pub(super) frames: Vec<Vec<f32>>,
-    /// The total force of each of these frames, in newtons.
+    /// The force of the contact in each of these frames, in newtons.
     pub(super) forces_n: Vec<f64>,
     /// The positions of the arm.
     pub(super) track: Track,
@@ -47,24 +49,31 @@ struct Taken {
     number: u64,
     mono: Duration,
     newtons: Vec<f32>,
+    force_n: f64,
 }
 
 /// This long after a press, all its positions have come.
 const AFTER: Duration = Duration::from_millis(800);
 
-/// The presses of `sensor` in a file. A recording tells sensors apart by name. In a file of raw
+/// The presses of `sensor` in the file at `path`. A recording tells sensors apart by name. In a file of raw
 /// bytes, all bytes are those of `sensor`. The presses have the positions of the arm `with_track`.
 pub(super) fn presses(
     file: impl Read,
+    path: &Path,
     sensor: &Sensor,
     hrn: Arc<Hrn>,
     with_track: bool,
-) -> Result<Vec<Press>, Unreadable> {
-    let (kind, file) = FileKind::read(file)?;
-    match kind {
-        FileKind::Recording => of_recording(BufReader::new(file), sensor.name(), hrn, with_track),
-        FileKind::Raw => Ok(of_bytes(file, sensor, hrn)?),
-    }
+) -> Result<Vec<Press>, Failure> {
+    let read = || -> anyhow::Result<_> {
+        let (kind, file) = FileKind::read(file)?;
+        match kind {
+            FileKind::Recording => {
+                of_recording(BufReader::new(file), sensor.name(), hrn, with_track)
+            }
+            FileKind::Raw => Ok(of_bytes(file, sensor, hrn)?),
+        }
+    };
+    read().map_err(unplayable(path))
 }
 
 fn of_recording(
@@ -72,7 +81,7 @@ fn of_recording(
     sensor: &str,
     hrn: Arc<Hrn>,
     with_track: bool,
-) -> Result<Vec<Press>, Unreadable> {
+) -> anyhow::Result<Vec<Press>> {
     let (mut playback, none) = (Playback::new(hrn), Track::default());
     let mut gathered = Gathered {
         with_track,
@@ -85,24 +94,19 @@ fn of_recording(
         }
         let at = found.at;
         let track = playback.track(sensor).unwrap_or(&none);
-        match &found.entry {
-            Entry::Settings(sensor) => gathered.describe(&sensor.description),
-            Entry::State(state) => {
-                // A state no longer has the positions of presses that have ended.
-                gathered.settle(Duration::MAX, track);
-                gathered.describe(&state.sensor.description);
-            }
-            Entry::Input(_) => {}
+        if let Entry::State(state) = &found.entry {
+            gathered.describe(&state.sensor.description);
         }
         gathered.settle(at.mono, track);
         gathered.take(playback.feed(found)?, at);
+    }
+    for note in playback.left_out() {
+        hardnessd_core::stderr_line!("warning: {note}");
     }
     Ok(gathered.end(playback.track(sensor).unwrap_or(&none)))
 }
 
 fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Result<Vec<Press>> {
-    let mut bytes = Vec::new();
-    file.read_to_end(&mut bytes)?;
     // The frames of raw bytes get their times from the frame rate, counted from here.
     let start = Stamp {
         mono: Duration::ZERO,
@@ -111,8 +115,16 @@ fn of_bytes(mut file: impl Read, sensor: &Sensor, hrn: Arc<Hrn>) -> std::io::Res
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
     let (mut gathered, none) = (Gathered::default(), Track::default());
     gathered.describe(sensor.description());
-    for chunk in bytes.chunks(CHUNK_BYTES) {
-        gathered.take(pipeline.push(chunk, start), start);
+    let mut chunk = vec![0; CHUNK_BYTES];
+    loop {
+        let read = match file.read(&mut chunk) {
+            Ok(0) => break,
+            Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+            read => read?,
+        };
+        let bytes = Input::Bytes((&chunk[..read]).into());
+        let events = pipeline.take(bytes, start);
+        gathered.take(events.unwrap_or_default(), start);
         gathered.settle(Duration::MAX, &none);
     }
     gathered.take(pipeline.end_of_recording(None), start);
@@ -147,7 +159,10 @@ impl Gathered {
     fn take(&mut self, events: Vec<Event>, at: Stamp) {
         for event in events {
             match event {
-                Event::Frame(frame) if frame.tared => {
+                Event::Frame(frame) => {
+                    let Some(force_n) = frame.force_n else {
+                        continue;
+                    };
                     if self.began.is_none() && self.ended.is_empty() {
                         self.frames.clear();
                     }
@@ -155,6 +170,7 @@ impl Gathered {
                         number: frame.frame,
                         mono: at.mono_of(frame.time),
                         newtons: frame.newtons,
+                        force_n,
                     });
                 }
                 Event::Press(press) => match press.state {
@@ -205,8 +221,7 @@ impl Gathered {
             let own = self.frames.iter();
             for frame in own.filter(|frame| (first..=last).contains(&frame.number)) {
                 press.moments.push(frame.mono);
-                let newtons = frame.newtons.iter().map(|&n| f64::from(n));
-                press.forces_n.push(newtons.sum());
+                press.forces_n.push(frame.force_n);
                 press.frames.push(frame.newtons.clone());
             }
             self.presses.push(press);
@@ -227,7 +242,7 @@ mod tests {
     #[test]
     fn a_press_has_the_positions_from_before_its_recording() {
         let (recording, sensor) = of_a_press(|_| {}, None, true);
-        let presses = presses(recording.as_slice(), &sensor, hrn(), true).unwrap();
+        let presses = presses(recording.as_slice(), Path::new("x"), &sensor, hrn(), true).unwrap();
         let [press] = &presses[..] else {
             panic!("one press");
         };

@@ -6,6 +6,8 @@
 //! taxel is also compared with the array's median. The gains that fit all comparisons best are
 //! found by least squares, and drawn towards 1 where there are few presses.
 
+use anyhow::{Result, bail};
+
 use hardnessd_core::frame::Array;
 
 /// A press without gains.
@@ -49,24 +51,6 @@ pub(super) struct Fit {
     pub(super) dead: Vec<[usize; 2]>,
 }
 
-/// The reason why presses give no gains.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Unfit {
-    /// Too few taxels were loaded well.
-    #[error(
-        "only {found} of {taxels} taxels were in the middle of two presses or more: press harder, at \
-         more places, or with something wide and soft ({presses} presses found)"
-    )]
-    Few {
-        /// The number of taxels that were loaded well in two presses or more.
-        found: usize,
-        /// The number of live taxels.
-        taxels: usize,
-        /// The number of presses.
-        presses: usize,
-    },
-}
-
 /// A taxel is loaded well from this force on: five counts of 0.04 N.
 const LEAST_N: f32 = 0.2;
 /// The pressure on an array is even if this share of its taxels is loaded well.
@@ -94,7 +78,7 @@ const STEPS: usize = 400;
 impl Fit {
     /// Computes the gains from presses on `array`. `dead` are the taxels whose newtons are no
     /// measurement.
-    pub(super) fn of(presses: &[Plain], array: Array, dead: &[[usize; 2]]) -> Result<Self, Unfit> {
+    pub(super) fn of(presses: &[Plain], array: Array, dead: &[[usize; 2]]) -> Result<Self> {
         let mut is_dead = vec![false; array.taxels()];
         for &[row, col] in dead {
             is_dead[array.place(row, col)] = true;
@@ -105,11 +89,12 @@ impl Fit {
         let taxels = places.iter().filter(|&&place| !is_dead[place]).count();
         let measured: Vec<usize> = places.iter().copied().filter(|&p| reached[p] > 1).collect();
         if measured.len() < LEAST_TAXELS {
-            return Err(Unfit::Few {
-                found: measured.len(),
-                taxels,
-                presses: presses.len(),
-            });
+            bail!(
+                "only {} of {taxels} taxels were in the middle of two presses or more: press harder, at \
+                 more places, or with something wide and soft ({} presses found)",
+                measured.len(),
+                presses.len()
+            );
         }
         let halves = [0, 1].map(|half| {
             let half: Vec<&Plain> = all.iter().copied().skip(half).step_by(2).collect();

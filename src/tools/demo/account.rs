@@ -4,14 +4,14 @@
 
 use serde_json::Value;
 
-use crate::tools::answer::{self, Answer};
-use hardnessd_simulator::Material;
+use crate::tools::answer::{self, Answer, with_shore};
+use hardnessd_simulator::{Pressed, SequenceSettings};
 
 /// The counts of the presses so far.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Account {
-    /// The materials in the order of the presses. After the last one, the first one follows again.
-    materials: Vec<Material>,
+    /// What is pressed.
+    sequence: SequenceSettings,
     /// The labels of the model's levels.
     labels: Vec<String>,
     presses: u32,
@@ -20,10 +20,13 @@ pub(super) struct Account {
 }
 
 impl Account {
-    pub(super) fn new(materials: &[Material]) -> Self {
+    pub(super) fn new(sequence: &SequenceSettings) -> Self {
         Self {
-            materials: materials.to_vec(),
-            ..Self::default()
+            sequence: sequence.clone(),
+            labels: Vec::new(),
+            presses: 0,
+            right: 0,
+            wrong: 0,
         }
     }
 
@@ -37,12 +40,9 @@ impl Account {
             }
             ("hardness", "final", _) => Some(self.verdict(event)),
             ("press", _, "aborted") => {
-                let (number, pressed) = self.pressed(event)?;
+                let begin = begin(event, &self.pressed(event)?);
                 self.presses += 1;
-                let reason = text("reason");
-                Some(format!(
-                    "press {number:<2} {pressed}  ->  no verdict ({reason})"
-                ))
+                Some(format!("{begin}no verdict ({})", text("reason")))
             }
             ("gap", ..) => {
                 let lost = event["lost"].as_u64();
@@ -56,56 +56,41 @@ impl Account {
     }
 
     fn verdict(&mut self, event: &Value) -> String {
-        let Some((number, pressed)) = self.pressed(event) else {
+        let Some(pressed) = self.pressed(event) else {
             return String::new();
         };
         self.presses += 1;
-        let answer = Answer::of(event, &self.labels).text;
-        let percent = 100.0 * event["confidence"].as_f64().unwrap_or_default();
-        let force_n = event["force_n"].as_f64().unwrap_or_default();
-        let level = event["level"].as_u64();
-        let (shown, mark) = match level {
-            None => (answer, "-"),
-            Some(level) => {
-                let is_right = self
-                    .material(event)
-                    .is_some_and(|m| u64::from(m.level()) == level);
-                let count = if is_right {
-                    &mut self.right
-                } else {
-                    &mut self.wrong
-                };
-                *count += 1;
-                let shown = format!("{answer} {percent:.0} %");
-                (shown, if is_right { "ok" } else { "wrong" })
+        let mark = match event["level"].as_u64() {
+            None => "-",
+            Some(level) if level == u64::from(pressed.level) => {
+                self.right += 1;
+                "ok"
+            }
+            Some(_) => {
+                self.wrong += 1;
+                "wrong"
             }
         };
-        let columns = self.answer_columns();
-        format!("press {number:<2} {pressed}  ->  {shown:<columns$}  {mark:<5}  {force_n:4.1} N")
+        let (begin, columns) = (begin(event, &pressed), self.answer_columns());
+        let shown = with_shore(&Answer::of(event, &self.labels).text, event);
+        let force_n = event["force_n"].as_f64().unwrap_or_default();
+        let line = format!("{begin}{shown:<columns$}  {mark:<5} {force_n:4.1} N");
+        let notes = answer::items(event, "notes").filter_map(Value::as_str);
+        notes.fold(line, |line, note| line + "  " + &note.replace('_', " "))
     }
 
     /// The columns of the longest answer of one or two neighbouring levels.
     fn answer_columns(&self) -> usize {
         let columns = |label: &String| label.chars().count();
-        let single = self.labels.iter().map(|one| columns(one) + " 100 %".len());
         let pairs = self.labels.windows(2);
         let pairs = pairs.map(|pair| columns(&pair[0]) + " or ".len() + columns(&pair[1]));
-        single.chain(pairs).max().unwrap_or_default()
+        "84 +- 12 OO, ".len() + pairs.max().unwrap_or_default()
     }
 
-    /// Number of a press, and the material that was pressed.
-    fn pressed(&self, event: &Value) -> Option<(u64, String)> {
-        let material = self.material(event)?;
-        let pressed = format!("{} (level {})", material.name(), material.level());
-        let named = self.materials.iter().map(|material| material.name().len());
-        let columns = named.max().unwrap_or_default() + " (level 1)".len();
-        Some((event["press"].as_u64()?, format!("{pressed:<columns$}")))
-    }
-
-    fn material(&self, event: &Value) -> Option<Material> {
-        let before = event["press"].as_u64()?.checked_sub(1)?;
-        let index = usize::try_from(before).ok()? % self.materials.len().max(1);
-        self.materials.get(index).copied()
+    /// What the press of an event pressed.
+    fn pressed(&self, event: &Value) -> Option<Pressed> {
+        let number = event["press"].as_u64().filter(|&number| number > 0)?;
+        Some(self.sequence.pressed(number.try_into().ok()?))
     }
 
     /// The line with the counts.
@@ -117,18 +102,20 @@ impl Account {
             ..
         } = self;
         let plural = if *presses == 1 { "" } else { "es" };
-        let mut line = format!("{presses} press{plural}: {right} right, {wrong} wrong");
+        let mut line = format!("{right} of {presses} press{plural} right, {wrong} wrong");
         let without = presses - right - wrong;
         if without > 0 {
             line += &format!(", {without} without a level");
         }
-        let judged = right + wrong;
-        if judged > 0 {
-            let share = 100.0 * f64::from(*right) / f64::from(judged);
-            line += &format!(" ({share:.0} % right, on simulated presses)");
-        }
-        line
+        line + " (simulated presses)"
     }
+}
+
+/// The begin of a line: the number of the press, and what was pressed.
+fn begin(event: &Value, pressed: &Pressed) -> String {
+    let number = event["press"].as_u64().unwrap_or_default();
+    let Pressed { name, shore, .. } = pressed;
+    format!("press {number:<2} {name:<14} {shore:2.0} OO -> ")
 }
 
 #[cfg(test)]
@@ -139,40 +126,46 @@ mod tests {
 
     #[test]
     fn each_press_stands_beside_what_it_is_and_all_are_counted() {
-        let mut account = Account::new(&[Material::HardPlastic, Material::Foam]);
+        let mut account = Account::new(&SequenceSettings::default());
         let hello = json!({"type": "hello", "model": {"levels": [
             {"level": 1, "label": "hard"}, {"level": 2, "label": "medium"}]}});
         assert_eq!(account.line(&hello), None);
         let verdict = |press: u64, level: Option<u8>, label: &str, confidence: f64| {
             json!({"type": "hardness", "phase": "final", "press": press, "level": level,
-                "label": label, "confidence": confidence, "force_n": 7.41,
+                "label": label, "confidence": confidence, "force_n": 7.41, "notes": ["at_edge"],
+                "shore": {"value": 84.2, "low": 72.4, "high": 90.0},
                 "rejected": level.is_none().then_some("ambiguous"), "levels": [1, 2]})
         };
+        let [first, second, third, tenth] = [1, 2, 3, 10].map(|press| {
+            let pressed = SequenceSettings::default().pressed(press);
+            format!("{:<14} {:.0} OO -> ", pressed.name, pressed.shore)
+        });
+        assert!(first.starts_with("hard-plastic   8"), "{first}");
         for (event, expected) in [
             (
                 verdict(1, Some(1), "hard", 1.0),
-                "press 1  hard-plastic (level 1)  ->  hard 100 %      ok      7.4 N",
+                format!("press 1  {first}84 +- 12 OO, hard            ok     7.4 N  at edge"),
             ),
             (
                 verdict(2, Some(1), "hard", 0.61),
-                "press 2  foam (level 2)          ->  hard? 61 %      wrong   7.4 N",
+                format!("press 2  {second}84 +- 12 OO, hard?           wrong  7.4 N  at edge"),
             ),
             (
                 verdict(3, None, "", 0.3),
-                "press 3  hard-plastic (level 1)  ->  hard or medium  -       7.4 N",
+                format!("press 3  {third}84 +- 12 OO, hard or medium  -      7.4 N  at edge"),
             ),
             (
                 json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"}),
-                "press 10 foam (level 2)          ->  no verdict (short)",
+                format!("press 10 {tenth}no verdict (short)"),
             ),
         ] {
-            assert_eq!(account.line(&event).as_deref(), Some(expected));
+            assert_eq!(account.line(&event), Some(expected));
         }
         let early = json!({"type": "hardness", "phase": "early", "press": 5, "level": 1});
         assert_eq!(account.line(&early), None);
         assert_eq!(
             account.close(),
-            "4 presses: 1 right, 1 wrong, 2 without a level (50 % right, on simulated presses)"
+            "1 of 4 presses right, 1 wrong, 2 without a level (simulated presses)"
         );
     }
 }

@@ -1,20 +1,18 @@
 //! The checks of a port. They read the file trees under a root, which is `/` except in tests.
 
-mod daemon;
-pub(super) mod network;
-mod service;
-
 use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{Access, AtFlags, CWD, accessat};
 
-use crate::daemon::realtime::Standing;
+use crate::daemon::serial;
+use crate::holders::{holders, processes, under};
+use hardnessd_core::port::Port;
 
 /// A fault and its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -33,9 +31,6 @@ impl fmt::Display for Fault {
 #[derive(Debug, Clone)]
 pub(super) struct User {
     pub(super) name: String,
-    pub(super) uid: u32,
-    /// The groups of the process. `/etc/group` may list others.
-    pub(super) gids: Vec<u32>,
     /// Asks the kernel whether this user may read and write. The kernel also knows access lists and
     /// containers.
     pub(super) access: fn(&Path) -> io::Result<()>,
@@ -44,16 +39,8 @@ pub(super) struct User {
 impl User {
     pub(super) fn of_this_process(root: &Path) -> Self {
         let uid = rustix::process::geteuid().as_raw();
-        let groups = rustix::process::getgroups().unwrap_or_default();
-        let mut gids: Vec<u32> = groups.into_iter().map(rustix::fs::Gid::as_raw).collect();
-        gids.push(rustix::process::getegid().as_raw());
         let name = entry(root, "etc/passwd", uid).map_or(uid.to_string(), |line| field(&line, 0));
-        Self {
-            name,
-            uid,
-            gids,
-            access,
-        }
+        Self { name, access }
     }
 }
 
@@ -110,11 +97,39 @@ fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
 pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let mut faults = in_the_way(root, port, user);
     if let Some(device) = device(root, port) {
-        faults.extend(service::faults(root, &device));
         faults.extend(modem_manager(root, &device));
         faults.extend(latency(root, &device));
     }
     faults
+}
+
+/// The fault of a port that is no device. It connects, or binds the address, for a moment.
+pub(super) fn unreachable(port: &Port) -> Option<Fault> {
+    let error = match serial::probe(port) {
+        Err(error) => error,
+        Ok(false) => return None,
+        Ok(true) => {
+            return Some(Fault {
+                what: "the other end is a telnet server (RFC 2217), which doubles each FF"
+                    .to_owned(),
+                cure: "set it to raw mode, as in `connection: raw` of ser2net or its menu"
+                    .to_owned(),
+            });
+        }
+    };
+    let cure = match (port, error.kind()) {
+        (Port::Udp(_), ErrorKind::AddrInUse) => {
+            "another program receives there, such as the running daemon: `sudo ss -ulpn` names it"
+        }
+        (_, ErrorKind::ConnectionRefused) => {
+            "nothing listens there: start the server on the board or the other computer, or correct the port"
+        }
+        _ => "correct the address, or look for the way there with `ping`",
+    };
+    Some(Fault {
+        what: serial::reason(port, &error),
+        cure: cure.to_owned(),
+    })
 }
 
 /// The faults that keep `user` from opening `port`.
@@ -176,19 +191,10 @@ fn others(ports: &[PathBuf]) -> String {
 
 fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     let path = under(root, device);
-    let refusal = (user.access)(&path).err()?;
+    (user.access)(&path).err()?;
     let file = fs::metadata(path).ok()?;
     let (mode, gid) = (file.mode(), file.gid());
-    let by_mode = lets_in(&file, user.uid, &user.gids);
     let (line, name, shown) = (entry(root, "etc/group", gid), &user.name, device.display());
-    if by_mode {
-        return Some(Fault {
-            what: format!("refused to {name}, whom its mode would let in ({refusal})"),
-            cure: format!(
-                "see `getfacl {shown}`; a container or service must be given the device itself"
-            ),
-        });
-    }
     let group = line.as_ref().map_or(gid.to_string(), |line| field(line, 0));
     let is_listed = line.is_some_and(|line| field(&line, 3).split(',').any(|one| one == name));
     let cure = if gid == 0 || !allows(mode, 3) {
@@ -209,20 +215,6 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     })
 }
 
-/// Whether a file's mode lets a user read and write, by its owner, its group or everybody.
-fn lets_in(file: &fs::Metadata, uid: u32, gids: &[u32]) -> bool {
-    let mode = file.mode();
-    if uid == 0 {
-        true
-    } else if uid == file.uid() {
-        allows(mode, 6)
-    } else if gids.contains(&file.gid()) {
-        allows(mode, 3)
-    } else {
-        allows(mode, 0)
-    }
-}
-
 fn allows(mode: u32, shift: u32) -> bool {
     const READ_WRITE: u32 = 0o6;
     (mode >> shift) & READ_WRITE == READ_WRITE
@@ -232,56 +224,26 @@ fn allows(mode: u32, shift: u32) -> bool {
 /// other users' processes.
 fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
     let mut faults = Vec::new();
-    // Another file may lead to the same device.
-    let wanted = number_of(&under(root, device));
-    for pid in processes(root).filter(|&pid| pid != own) {
-        let files = root.join("proc").join(pid.to_string()).join("fd");
-        let Ok(files) = fs::read_dir(files) else {
+    for pid in holders(root, device).filter(|&pid| pid != own) {
+        let tool = subcommand(root, pid);
+        // A simulator made the port and does not keep others from opening it.
+        if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
             continue;
-        };
-        let is_device = |file: fs::DirEntry| {
-            fs::read_link(file.path()).is_ok_and(|target| target == device)
-                || number_of(&file.path()).is_some_and(|number| Some(number) == wanted)
-        };
-        if files.flatten().any(is_device) {
-            let tool = subcommand(root, pid);
-            // A simulator made the port and does not keep others from opening it.
-            if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
-                continue;
-            }
-            let mut line = None;
-            let fault = if tool.as_deref() == Some(b"run") {
-                let standing = Standing::of(&root.join("proc").join(pid.to_string()));
-                let how =
-                    standing.map_or(String::new(), |how| format!("; its scheduling is {how}"));
-                let sensor = daemon::sensor(root, pid, device);
-                line = daemon::line(root, device, sensor.as_ref());
-                let reads = sensor.map_or(String::new(), |sensor| {
-                    format!(", which reads it as {} for {:?}", sensor.port, sensor.name)
-                });
-                Fault {
-                    what: format!("held by process {pid}, the daemon (hardnessd run{how}){reads}"),
-                    cure: format!(
-                        "sudo systemctl stop hardnessd; where it is no service, kill {pid}"
-                    ),
-                }
-            } else {
-                Fault {
-                    what: format!("held by process {pid} ({})", command(root, pid)),
-                    cure: format!("kill {pid}"),
-                }
-            };
-            faults.push(fault);
-            faults.extend(line);
         }
+        let fault = if tool.as_deref() == Some(b"run") {
+            Fault {
+                what: format!("held by process {pid}, the daemon (hardnessd run)"),
+                cure: format!("sudo systemctl stop hardnessd; where it is no service, kill {pid}"),
+            }
+        } else {
+            Fault {
+                what: format!("held by process {pid} ({})", command(root, pid)),
+                cure: format!("kill {pid}"),
+            }
+        };
+        faults.push(fault);
     }
     faults
-}
-
-/// The number of the character device that a file is.
-fn number_of(path: &Path) -> Option<u64> {
-    let file = fs::metadata(path).ok()?;
-    file.file_type().is_char_device().then(|| file.rdev())
 }
 
 /// The subcommand of `hardnessd` that a process runs.
@@ -369,15 +331,6 @@ fn is_usb(device: &Path) -> bool {
     name.starts_with("ttyUSB") || name.starts_with("ttyACM")
 }
 
-fn processes(root: &Path) -> impl Iterator<Item = u32> {
-    let mut pids: Vec<u32> = names(root, "proc")
-        .iter()
-        .filter_map(|name| name.parse().ok())
-        .collect();
-    pids.sort_unstable();
-    pids.into_iter()
-}
-
 fn command(root: &Path, pid: u32) -> String {
     let name = fs::read_to_string(root.join("proc").join(pid.to_string()).join("comm"));
     name.map_or("?".to_owned(), |name| name.trim().to_owned())
@@ -394,16 +347,12 @@ fn names(root: &Path, folder: &str) -> Vec<String> {
 }
 
 /// The line of `etc/passwd` or `etc/group` whose third field is `id`.
-fn entry(root: &Path, file: &str, id: u32) -> Option<String> {
+pub(super) fn entry(root: &Path, file: &str, id: u32) -> Option<String> {
     let text = fs::read_to_string(root.join(file)).ok()?;
     let line = text.lines().find(|line| field(line, 2) == id.to_string())?;
     Some(line.to_owned())
 }
 
-fn field(line: &str, index: usize) -> String {
+pub(super) fn field(line: &str, index: usize) -> String {
     line.split(':').nth(index).unwrap_or_default().to_owned()
-}
-
-fn under(root: &Path, path: &Path) -> PathBuf {
-    root.join(path.strip_prefix("/").unwrap_or(path))
 }

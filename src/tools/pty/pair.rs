@@ -9,6 +9,7 @@ use std::path::PathBuf;
 
 use rustix::fs::{Mode, OFlags};
 use rustix::pty::OpenptFlags;
+use rustix::termios::OptionalActions;
 
 /// Both sides of a pseudo-terminal, and the path of the device.
 #[derive(Debug)]
@@ -38,5 +39,18 @@ impl Pair {
             device,
             path,
         })
+    }
+
+    /// The same, but the device neither echoes nor edits lines, as a sensor's port.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the system has no pair to give.
+    pub(crate) fn raw() -> io::Result<Self> {
+        let pair = Self::open()?;
+        let mut settings = rustix::termios::tcgetattr(&pair.device)?;
+        settings.make_raw();
+        rustix::termios::tcsetattr(&pair.device, OptionalActions::Now, &settings)?;
+        Ok(pair)
     }
 }

@@ -45,7 +45,7 @@ impl Error {
 
 /// Reads all positions of a file, in its order.
 pub(super) fn load(path: &Path) -> Result<Vec<Point>, Error> {
-    let file = crate::tools::open(path).map_err(|error| Error::Unreadable(error.source))?;
+    let file = crate::tools::open_file(path).map_err(Error::Unreadable)?;
     let mut text = String::new();
     let read = file.take(MOST_BYTES + 1).read_to_string(&mut text);
     read.map_err(Error::Unreadable)?;

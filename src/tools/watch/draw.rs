@@ -7,7 +7,6 @@
 mod curve;
 mod map;
 
-use std::borrow::Cow;
 use std::time::Duration;
 
 use ratatui_core::buffer::Buffer;
@@ -19,7 +18,7 @@ use self::map::MapSize;
 use super::look::Look;
 use super::view::{Link, Sensor, Verdict, View, age};
 
-/// Pictures up to this width have one column.
+/// Pictures up to this width have no map.
 const NARROW: u16 = 64;
 
 /// The blank columns between the left and the right part of a picture.
@@ -40,18 +39,15 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     }
     if let Some(hello) = &view.hello
         && !hello.without_effect.is_empty()
-        && let Some(row) = rows.take(1)
     {
         let keys = hello.without_effect.join(", ");
-        page.text(
-            row,
-            &format!("{keys}: changes no verdict of this model"),
-            look.aside(),
-        );
+        let line = format!("{keys}: changes no verdict of this model");
+        page.wrapped(&mut rows, &line, look.aside());
     }
     let Some(sensor) = view.sensor() else {
-        if let (Some(row), Some((link, reason))) = (rows.take(1), view.trouble(now)) {
-            page.band(row, &format!(" {}  {reason}", link.name()), look.link(link));
+        if let Some((link, reason)) = view.trouble(now) {
+            let line = format!("{}  {reason}", link.name());
+            page.wrapped(&mut rows, &line, look.link(link));
         }
         page.keys(foot, view);
         return;
@@ -62,25 +58,16 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     {
         page.tabs(row, view);
     }
-    if let Some(row) = rows.take(1) {
-        page.link(row, sensor, link, reason.as_deref());
-    }
-    let body = rows.0;
-    let side_by_side = body.width > NARROW && body.height > 10;
-    if side_by_side {
-        let map = page.map_size(sensor, body.width / 2, body.height.saturating_sub(5));
+    page.link(&mut rows, sensor, link, reason.as_deref());
+    let mut body = rows.0;
+    if body.width > NARROW && body.height > 10 {
+        let map = page.map_size(sensor, body.width / 2, body.height.saturating_sub(4));
         let width = map.cols.max(30);
-        let left = Rect { width, ..body };
-        let right = Rect {
-            x: body.x + width + GAP,
-            width: body.width - width - GAP,
-            ..body
-        };
-        page.map_and_counters(left, map, view, sensor, link);
-        page.curves_and_verdicts(right, view, sensor, link);
-    } else {
-        page.stack(body, view, sensor, link);
+        page.map_and_counters(Rect { width, ..body }, map, sensor, link);
+        body.x += width + GAP;
+        body.width -= width + GAP;
     }
+    page.curves_and_verdicts(body, view, sensor, link);
     page.keys(foot, view);
 }
 
@@ -123,12 +110,6 @@ impl Rows {
 impl Page<'_> {
     fn text(&mut self, area: Rect, text: &str, style: Style) -> Rect {
         let width = usize::from(area.width);
-        let shown = |c: char| if c.is_ascii() { c } else { '?' };
-        // A configured name may hold any character.
-        let text = match self.look.unicode {
-            true => Cow::Borrowed(text),
-            false => text.chars().map(shown).collect(),
-        };
         let (end, _) = self.buffer.set_stringn(area.x, area.y, text, width, style);
         Rect {
             x: end,
@@ -137,10 +118,14 @@ impl Page<'_> {
         }
     }
 
-    /// Writes a text into a row and gives the whole row its style.
-    fn band(&mut self, row: Rect, text: &str, style: Style) {
-        self.buffer.set_style(row, style);
-        self.text(row, text, style);
+    /// Writes a text into as many rows as it needs, and gives these rows its style.
+    fn wrapped(&mut self, rows: &mut Rows, text: &str, style: Style) {
+        // A blank column on each side.
+        for line in lines(text, usize::from(rows.0.width).saturating_sub(2)) {
+            let Some(row) = rows.take(1) else { return };
+            self.buffer.set_style(row, style);
+            self.text(row, &format!(" {line}"), style);
+        }
     }
 
     fn title(&mut self, row: Rect, view: &View) {
@@ -149,14 +134,13 @@ impl Page<'_> {
             return;
         };
         let rest = self.text(row, &hello.robot, self.look.strong());
-        let dot = self.look.separator();
         // Several sensors have tabs.
         let sensor = match &view.sensors[..] {
-            [only] => format!("{dot}{}", only.name),
+            [only] => format!(" · {}", only.name),
             _ => String::new(),
         };
         let line = format!(
-            "{sensor}{dot}hardnessd {}{dot}model {} ({}): {}",
+            "{sensor} · hardnessd {} · model {} ({}): {}",
             hello.version, hello.model, hello.validation, hello.needs
         );
         self.text(rest, &line, self.look.aside());
@@ -190,68 +174,30 @@ impl Page<'_> {
         }
     }
 
-    /// One row: the state of the link, the age of the last frame, and the frame rate.
-    fn link(&mut self, row: Rect, sensor: &Sensor, link: Link, reason: Option<&str>) {
-        let mut line = format!(" {} ", link.name());
+    /// The state of the link, the age of the last frame, and the frame rate.
+    fn link(&mut self, rows: &mut Rows, sensor: &Sensor, link: Link, reason: Option<&str>) {
+        let mut line = format!("{} ", link.name());
         if let Some(frame) = &sensor.frame {
             let old = age(self.now.saturating_sub(frame.at));
             line += &match link {
-                Link::Live => format!(" frame {old} old"),
+                Link::Live | Link::NoZero => format!(" frame {old} old"),
                 _ => format!(" last frame {old} ago"),
             };
         }
         if link == Link::Lost && reason.is_some_and(is_unplugged) {
-            line.insert_str(" LOST ".len(), &format!(" {UNPLUGGED_WORDS};"));
+            line.insert_str("LOST ".len(), &format!(" {UNPLUGGED_WORDS};"));
         }
         let rate_hz = sensor.status.as_ref().and_then(|one| one.frame_rate_hz);
         if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
-            line += &format!("{}{rate_hz:.1} frames/s", self.look.separator());
+            line += &format!(" · {rate_hz:.1} frames/s");
         }
         if let Some(reason) = reason {
             line += &format!("  ({reason})");
         }
-        self.band(row, &line, self.look.link(link));
+        self.wrapped(rows, &line, self.look.link(link));
     }
 
-    /// One column. The most important parts come first; the rest as far as there is room.
-    fn stack(&mut self, body: Rect, view: &View, sensor: &Sensor, link: Link) {
-        let mut rows = Rows(body);
-        if let Some(row) = rows.take(1) {
-            self.press(row, sensor, link);
-        }
-        let spare = rows.0.height.saturating_sub(4);
-        let map = self.map_size(sensor, body.width, spare.saturating_sub(1));
-        let verdicts = if map.rows == 0 {
-            4
-        } else {
-            spare - map.rows + 3
-        };
-        let curves = verdicts >= 14;
-        if let Some(area) = rows.take(if curves {
-            5
-        } else {
-            verdicts.min(rows.0.height)
-        }) {
-            self.verdicts(area, view, sensor, link);
-        }
-        if map.rows > 0
-            && let Some(area) = rows.take(map.rows + 1)
-        {
-            self.map(area, map, sensor, link);
-        }
-        let (force, contact) = halves(rows.0);
-        self.force(force, sensor, link);
-        self.contact(contact, sensor, link);
-    }
-
-    fn map_and_counters(
-        &mut self,
-        area: Rect,
-        map: MapSize,
-        view: &View,
-        sensor: &Sensor,
-        link: Link,
-    ) {
+    fn map_and_counters(&mut self, area: Rect, map: MapSize, sensor: &Sensor, link: Link) {
         let mut rows = Rows(area);
         if map.rows > 0
             && let Some(area) = rows.take(map.rows + 1)
@@ -259,31 +205,19 @@ impl Page<'_> {
             self.map(area, map, sensor, link);
         }
         let Some(status) = &sensor.status else { return };
-        let missed = view
-            .missed
-            .map_or("?".to_owned(), |missed| missed.to_string());
-        // A count of damage stands out if it is not 0.
-        let plain = self.look.aside();
-        let alarm = |count: u64| match count {
-            0 => plain,
-            _ => self
-                .look
-                .style(Style::new().fg(Color::Indexed(214)), Modifier::BOLD),
-        };
-        for (name, count, style) in [
-            ("frames", status.frames.to_string(), plain),
-            (
-                "damaged",
-                status.frames_damaged.to_string(),
-                alarm(status.frames_damaged),
-            ),
-            (
-                "bytes skipped",
-                status.bytes_skipped.to_string(),
-                alarm(status.bytes_skipped),
-            ),
-            ("events missed", missed, alarm(view.missed.unwrap_or(1))),
+        for (name, count) in [
+            ("frames", status.frames),
+            ("damaged", status.frames_damaged),
+            ("dropped", status.frames_dropped),
+            ("bytes skipped", status.bytes_skipped),
         ] {
+            // A count of damage stands out if it is not 0.
+            let style = if name == "frames" || count == 0 {
+                self.look.aside()
+            } else {
+                let orange = Style::new().fg(Color::Indexed(214));
+                self.look.style(orange, Modifier::BOLD)
+            };
             if let Some(row) = rows.take(1) {
                 self.text(row, &format!("{name:<14} {count:>14}"), style);
             }
@@ -295,18 +229,17 @@ impl Page<'_> {
         if let Some(row) = rows.take(1) {
             self.press(row, sensor, link);
         }
+        let labels = view.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
+        if let Some(line) = sensor.score.line(labels) {
+            self.wrapped(&mut rows, &format!("pressing {line}"), Style::new());
+        }
         // Verdicts get the rest, but at least 6 rows.
-        let is_way = sensor.way(1).is_some() && rows.0.height >= 16;
-        let curves = if is_way { 4 } else { 3 };
-        let curve = (rows.0.height.saturating_sub(6) / curves).clamp(2, 12);
+        let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 12);
         if let Some(area) = rows.take(curve) {
             self.force(area, sensor, link);
         }
         if let Some(area) = rows.take(curve) {
             self.contact(area, sensor, link);
-        }
-        if is_way && let Some(area) = rows.take(curve) {
-            self.way(area, sensor);
         }
         self.verdicts(rows.0, view, sensor, link);
     }
@@ -338,7 +271,7 @@ impl Page<'_> {
         let Some(row) = rows.take(1) else { return };
         let rest = self.text(row, "verdicts ", self.look.heading());
         let labels = view.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
-        let of = format!("% of {}", labels.join(", "));
+        let of = format!("Shore OO, level, age; % of {}", labels.join(", "));
         self.text(rest, &of, self.look.aside());
         if sensor.verdicts.is_empty()
             && let Some(row) = rows.take(1)
@@ -362,10 +295,20 @@ impl Page<'_> {
 
     fn keys(&mut self, row: Option<Rect>, view: &View) {
         let Some(row) = row else { return };
+        if let Some(text) = &view.entry {
+            let ask = "pressing (a level, a name, or both; Enter): ";
+            let rest = self.text(row, ask, self.look.heading());
+            self.text(rest, &format!("{text}_"), self.look.strong());
+            return;
+        }
+        if let Some(said) = &view.said {
+            self.text(row, said, self.look.strong());
+            return;
+        }
         let line = if view.sensors.len() > 1 {
-            "q quit   Tab or 1-9 another sensor   Ctrl-L draw again"
+            "q quit   p what you press   Tab or 1-9 another sensor   Ctrl-L draw again"
         } else {
-            "q quit   Ctrl-L draw again"
+            "q quit   p what you press   Ctrl-L draw again"
         };
         let rest = self.text(row, line, self.look.aside());
         // Show the daemon's address if there is room for it.
@@ -375,6 +318,23 @@ impl Page<'_> {
             self.text(rest, &address, self.look.aside());
         }
     }
+}
+
+/// A text as lines of at most `width` columns, where its words allow it.
+fn lines(text: &str, width: usize) -> Vec<String> {
+    let mut lines = vec![String::new()];
+    let columns = |text: &str| text.chars().count();
+    for word in text.split(' ') {
+        let line = lines.last_mut().expect("there is a first line");
+        if line.is_empty() {
+            *line = word.to_owned();
+        } else if columns(line) + 1 + columns(word) <= width {
+            *line += &format!(" {word}");
+        } else {
+            lines.push(word.to_owned());
+        }
+    }
+    lines
 }
 
 /// The reasons that mean that the device was unplugged. `page.html` repeats them and the words for
@@ -392,38 +352,22 @@ fn is_unplugged(reason: &str) -> bool {
     UNPLUGGED.iter().any(|gone| reason.contains(gone))
 }
 
-/// Press, phase, verdict, probabilities in per cent and age. Force, Shore hardness and notes follow if
-/// there is room.
+/// Press, answer with its Shore hardness, and age. What else is known follows as far as there is room.
 fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
     let shares = verdict
         .probabilities
         .iter()
-        .map(|share| format!("{:>3.0}", 100.0 * share));
-    let shares = shares.collect::<Vec<_>>().join(" ");
-    let mut line = format!(
-        "{:>3} {:<5} {:<12} {shares} {old:>6}",
-        verdict.press, verdict.phase, verdict.answer
-    );
+        .map(|share| format!(" {:>3.0}", 100.0 * share));
+    let mut line = format!("{:>3} {:<27} {old:>6}", verdict.press, verdict.answer);
+    let early = verdict.is_early.then(|| "  early".to_owned());
     let force = format!("  {:>5.1} N", verdict.force_n);
-    let shore = verdict
-        .shore
-        .map(|[value, low, high]| format!("  Shore {value:.0} ({low:.0} to {high:.0})"));
     let notes = verdict.notes.iter().map(|note| format!("  {note}"));
-    for more in std::iter::once(force).chain(shore).chain(notes) {
-        if line.len() + more.len() > width {
+    let shares = format!(" {}", shares.collect::<String>());
+    for more in early.into_iter().chain([force, shares]).chain(notes) {
+        if line.chars().count() + more.len() > width {
             break;
         }
         line += &more;
     }
     line
-}
-
-fn halves(area: Rect) -> (Rect, Rect) {
-    let height = area.height / 2;
-    let lower = Rect {
-        y: area.y + height,
-        height,
-        ..area
-    };
-    (Rect { height, ..area }, lower)
 }

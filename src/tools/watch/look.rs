@@ -10,45 +10,28 @@ use hardnessd_core::colour::viridis;
 pub(super) struct Look {
     /// Whether the terminal has 256 colours.
     pub(super) colours: bool,
-    /// Whether the terminal has 24 bits of colour.
-    pub(super) true_colours: bool,
-    /// Whether the terminal has bold and reversed text.
-    pub(super) attributes: bool,
-    /// Whether the terminal shows more than ASCII.
-    pub(super) unicode: bool,
 }
 
 impl Look {
-    /// Derives the abilities from the values of `TERM`, `COLORTERM`, `NO_COLOR`
-    /// (<https://no-color.org>), and the first of `LC_ALL`, `LC_CTYPE` and `LANG` that is set.
-    pub(super) fn new(term: &str, color_term: &str, no_color: &str, locale: &str) -> Self {
+    /// Derives the abilities from the values of `TERM` and `NO_COLOR` (<https://no-color.org>).
+    pub(super) fn new(term: &str, no_color: &str) -> Self {
         let is_plain = ["", "dumb", "unknown"].contains(&term);
         let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
-        let locale = locale.to_ascii_lowercase();
-        let colours = !is_plain && !is_old && no_color.is_empty();
         Self {
-            colours,
-            true_colours: colours && ["truecolor", "24bit"].contains(&color_term),
-            attributes: !is_plain,
-            unicode: !is_plain && !is_old && (locale.contains("utf-8") || locale.contains("utf8")),
+            colours: !is_plain && !is_old && no_color.is_empty(),
         }
     }
 
     pub(super) fn style(self, colour: Style, without: Modifier) -> Style {
-        match (self.colours, self.attributes) {
-            (true, _) => colour,
-            (false, true) => Style::new().add_modifier(without),
-            (false, false) => Style::new(),
+        match self.colours {
+            true => colour,
+            false => Style::new().add_modifier(without),
         }
     }
 
     /// The colour of a share of the greatest pressure.
-    pub(super) fn heat(self, share: f32) -> Color {
-        let [red, green, blue] = viridis(share);
-        match self.true_colours {
-            true => Color::Rgb(red, green, blue),
-            false => indexed([red, green, blue]),
-        }
+    pub(super) fn heat(share: f32) -> Color {
+        indexed(viridis(share))
     }
 
     pub(super) fn heading(self) -> Style {
@@ -68,7 +51,7 @@ impl Look {
         let (fg, bg) = match link {
             Link::Live => (16, 40),
             Link::Connecting => (16, 75),
-            Link::Stale | Link::Silent => (16, 214),
+            Link::NoZero | Link::Stale | Link::Silent => (16, 214),
             Link::Lost | Link::NoDaemon => (231, 160),
         };
         let without = match link {
@@ -80,10 +63,6 @@ impl Look {
             .bg(Color::Indexed(bg))
             .add_modifier(Modifier::BOLD);
         self.style(colour, without)
-    }
-
-    pub(super) fn separator(self) -> &'static str {
-        if self.unicode { " · " } else { " | " }
     }
 }
 

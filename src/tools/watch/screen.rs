@@ -180,13 +180,10 @@ pub(super) fn key(event: &Event) -> Option<Key> {
         KeyCode::Char('c') if is_control => Some(Key::Quit),
         KeyCode::Char('l') if is_control => Some(Key::Redraw),
         _ if modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) => None,
-        KeyCode::Char('q' | 'Q') => Some(Key::Quit),
-        KeyCode::Char(digit @ '1'..='9') => {
-            let digit = digit
-                .to_digit(10)
-                .and_then(|digit| usize::try_from(digit).ok());
-            digit.map(|digit| Key::Sensor(digit - 1))
-        }
+        KeyCode::Char(char) => Some(Key::Char(char)),
+        KeyCode::Enter => Some(Key::Enter),
+        KeyCode::Backspace => Some(Key::Backspace),
+        KeyCode::Esc => Some(Key::Escape),
         KeyCode::Tab | KeyCode::Right | KeyCode::Down => Some(Key::Next),
         KeyCode::BackTab | KeyCode::Left | KeyCode::Up => Some(Key::Previous),
         _ => None,

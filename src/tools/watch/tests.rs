@@ -14,22 +14,12 @@ use serde_json::{Value, json};
 use super::draw::{UNPLUGGED, UNPLUGGED_WORDS, draw};
 use super::look::Look;
 use super::screen::{Screen, key};
-use super::view::{Clock, Key, Link, Loss, View};
+use super::view::{Clock, Key, Link, Loss, Order, View};
 use crate::tools::pty::pair::Pair;
 use hardnessd_core::frame::Stamp;
 
-const COLOURS: Look = Look {
-    colours: true,
-    true_colours: false,
-    attributes: true,
-    unicode: true,
-};
-const PLAIN: Look = Look {
-    colours: false,
-    true_colours: false,
-    attributes: false,
-    unicode: false,
-};
+const COLOURS: Look = Look { colours: true };
+const PLAIN: Look = Look { colours: false };
 
 /// The stamp `ms` milliseconds after a moment at which the machine had been up for an hour.
 fn at(ms: u64) -> Stamp {
@@ -75,10 +65,10 @@ fn status(sensor: &str, state: &str) -> Value {
 fn frame(sensor: &str, newtons: f32, taxels: usize) -> Value {
     let mut all = vec![0.0; 784];
     for taxel in 0..taxels {
-        all[14 * 28 + 10 + taxel] = newtons;
+        all[(14 * 28 + 10 + taxel) % 784] = newtons;
     }
     json!({"type": "frame", "sensor": sensor, "frame": 7, "newtons": all,
-        "contact_area_taxels": taxels})
+        "contact_area_taxels": taxels, "force_n": newtons * taxels as f32})
 }
 
 fn verdict(press: u64, level: Option<u8>, rejected: Option<&str>) -> Value {
@@ -164,7 +154,7 @@ fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
 #[test]
 fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
     let mut met = pressed_sensor();
-    met.lose(Loss::Closed);
+    met.lose(Loss::Broken("it closed the connection".to_owned()));
     for mut view in [View::new(), met] {
         view.wait("events.sock".to_owned(), Clock::Ours, at(0).mono);
         let text = |view: &View, ms| shown(view, ms, (80, 24), PLAIN);
@@ -180,7 +170,7 @@ fn what_does_not_say_hello_is_silent_and_another_protocol_is_none() {
             assert!(refused.contains(part), "{refused}");
         }
         view.take_line("HTTP/1.1 400 Bad Request", at(5_000));
-        view.lose(Loss::Closed);
+        view.lose(Loss::Broken("it closed the connection".to_owned()));
         let page = text(&view, 5_100);
         assert!(page.contains("a web server answers there"), "{page}");
     }
@@ -204,7 +194,7 @@ fn what_is_not_live_is_not_shown_as_present() {
         (view, word.to_owned())
     };
     let mut gone = pressed_sensor();
-    gone.lose(Loss::Closed);
+    gone.lose(Loss::Broken("it closed the connection".to_owned()));
     let cases = [
         lost("stale", "STALE"),
         lost("lost", "LOST"),
@@ -214,7 +204,7 @@ fn what_is_not_live_is_not_shown_as_present() {
         (pressed_sensor(), "DAEMON SILENT".to_owned()),
     ];
     for (view, word) in cases {
-        for size in [(80, 24), (40, 24), (120, 50)] {
+        for size in [(80, 24), (120, 50)] {
             let buffer = picture(&view, 4_100, size, COLOURS);
             let text = rows(&buffer).join("\n");
             // The word comes at the top and on the map.
@@ -240,76 +230,29 @@ fn what_is_not_live_is_not_shown_as_present() {
 }
 
 #[test]
-fn a_curve_has_holes_where_there_was_no_frame() {
-    let mut view = live_sensor();
-    for (ms, newtons) in [(5_050, 1.0), (10_050, 2.0), (10_150, 3.0)] {
-        take_event(&mut view, ms, frame("forearm", newtons, 1));
+fn a_sensor_without_a_zero_shows_no_force_and_says_why() {
+    let mut status = status("forearm", "live");
+    status["reason"] = json!("tare: contact");
+    status["detail"] = json!("512 taxels varied by 0.07 N or more");
+    let mut raw = frame("forearm", 1.2, 500);
+    raw["force_n"] = json!(null);
+    let view = view_of(&[(0, hello("a", &["forearm"])), (0, status), (100, raw)]);
+    let text = shown(&view, 200, (140, 24), PLAIN);
+    for part in [
+        " NO ZERO YET ",
+        "(tare: contact: 512 taxels varied by 0.07 N or more)",
+        "force not known",
+        "contact area not known",
+    ] {
+        assert!(text.contains(part), "{part:?} not in\n{text}");
     }
-    let sensor = view.sensor().unwrap();
-    // The spans are one second long, up to 30 s. A frame is current for 2.5 periods of 0.2 s.
-    let curve = sensor.curve(at(30_000).mono, 30, |load| load.force_n);
-    let there: Vec<(usize, f32)> = (0..)
-        .zip(&curve)
-        .filter_map(|(span, value)| value.map(|value| (span, value)))
-        .collect();
-    assert_eq!(there, [(5, 1.0), (10, 3.0)]);
-    // The spans are shorter than a period. Each frame holds for its 2.5 periods, and no longer.
-    let curve = sensor.curve(at(30_000).mono, 300, |load| load.force_n);
-    let there: Vec<usize> = (0..300).filter(|&span| curve[span].is_some()).collect();
-    assert_eq!(there, (50..55).chain(100..106).collect::<Vec<_>>());
-    // At 36 s, the curve begins at 6 s, after the first frame.
-    let curve = sensor.curve(at(36_000).mono, 30, |load| load.force_n);
-    assert_eq!(curve.iter().flatten().count(), 1);
+    assert!(!text.contains("LIVE") && !text.contains("600"), "{text}");
 }
 
 #[test]
-fn a_bar_is_as_high_as_its_share_of_the_highest() {
-    let mut view = live_sensor();
-    for (ms, newtons) in [(10_000, 2.0), (20_000, 1.25), (29_950, 0.5)] {
-        take_event(&mut view, ms, frame("forearm", newtons, 1));
-    }
-    // The bars of the force from left to right, each with its symbols from the lowest row to the
-    // highest.
-    let bars = |look| {
-        let rows = rows(&picture(&view, 30_000, (150, 40), look));
-        let heading = rows.iter().position(|row| row.contains("force ")).unwrap();
-        let end = rows
-            .iter()
-            .position(|row| row.contains("contact area"))
-            .unwrap();
-        let start = rows[heading]
-            .split("force ")
-            .next()
-            .unwrap()
-            .chars()
-            .count();
-        let column = |x| -> String {
-            let cells = rows[heading + 1..end].iter().rev();
-            cells.map(|row| row.chars().nth(x).unwrap()).collect()
-        };
-        let mut bars: Vec<String> = (start..150).map(column).collect();
-        bars.dedup();
-        bars.retain(|bar| !bar.trim().is_empty() && !bar.starts_with('\u{b7}'));
-        bars
-    };
-    // There are nine rows of eight eighths each.
-    assert_eq!(
-        bars(COLOURS),
-        [
-            "\u{2588}".repeat(9),
-            "\u{2588}".repeat(5) + "\u{2585}   ",
-            "\u{2588}".repeat(2) + "\u{2582}      "
-        ]
-    );
-    assert_eq!(bars(PLAIN), ["#########", "#####+   ", "##-      "]);
-}
-
-#[test]
-fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
+fn verdicts_stand_with_their_probabilities_newest_first() {
     let mut view = pressed_sensor();
     take_event(&mut view, 9_000, verdict(4, None, Some("low_force")));
-    // `get last` repeats the verdict after a break.
-    take_event(&mut view, 9_100, verdict(4, None, Some("low_force")));
     take_event(&mut view, 9_100, status("forearm", "live"));
     let text = shown(&view, 10_200, (80, 24), PLAIN);
     let lines: Vec<&str> = text
@@ -320,18 +263,21 @@ fn verdicts_stand_with_their_probabilities_newest_first_and_none_twice() {
         .iter()
         .position(|line| line.starts_with("verdicts"))
         .unwrap();
-    assert_eq!(lines[first], "verdicts % of hard, firm");
+    assert_eq!(
+        lines[first],
+        "verdicts Shore OO, level, age; % of hard, firm"
+    );
     assert_eq!(
         lines[first + 1],
-        "  4 final low force      7  93  1.2 s   12.3 N"
+        "  4 65 +- 6 OO, low force        1.2 s   12.3 N"
     );
     assert_eq!(
         lines[first + 2],
-        "  3 final firm           7  93   10 s   12.3 N"
+        "  3 65 +- 6 OO, firm              10 s   12.3 N"
     );
     assert_eq!(lines[first + 3], "");
     let text = shown(&view, 10_200, (120, 24), PLAIN);
-    let whole = "  3 final firm           7  93   10 s   12.3 N  Shore 65 (59 to 71)";
+    let whole = "  3 65 +- 6 OO, firm              10 s   12.3 N    7  93";
     assert!(text.contains(whole), "{text}");
 }
 
@@ -357,30 +303,21 @@ fn every_sensor_has_its_link_in_view_and_its_picture_by_a_key() {
     assert!(shown(&view, 100, (30, 24), PLAIN).contains(">3 palm LIVE"));
     view.press(Key::Next);
     assert_eq!(view.sensor().unwrap().name, "forearm");
-    view.press(Key::Sensor(1));
-    view.press(Key::Sensor(7));
+    view.press(Key::Char('2'));
+    view.press(Key::Char('8'));
     assert_eq!(view.sensor().unwrap().name, "wrist");
 }
 
 #[test]
-fn another_run_begins_from_nothing_and_the_same_goes_on() {
+fn each_connection_begins_anew_with_what_the_daemon_holds_and_shows_the_chosen_sensor() {
     let mut view = pressed_sensor();
-    view.lose(Loss::Unreachable("events.sock: no such file".to_owned()));
-    let text = shown(&view, 400, (80, 24), PLAIN);
-    assert!(
-        text.contains("NO DAEMON") && text.contains("no such file"),
-        "{text}"
-    );
-    take_event(&mut view, 500, hello("a", &["forearm"]));
-    assert_eq!(view.sensor().unwrap().verdicts.len(), 1);
-    view.lose(Loss::Closed);
-    take_event(&mut view, 600, hello("b", &["wrist", "forearm"]));
-    assert_eq!(
-        (view.sensors.len(), view.chosen),
-        (2, 1),
-        "the chosen one stays so"
-    );
+    let again = hello("b", &["wrist", "forearm"]);
+    let asked = view.take_line(&again.to_string(), at(600)).unwrap();
+    let asked: Value = serde_json::from_str(&asked).unwrap();
+    let types = json!(["hardness", "press", "status", "frame"]);
+    assert_eq!(asked, json!({"subscribe": types, "since": "b:0"}));
     let sensor = view.sensor().unwrap();
+    assert_eq!(sensor.name, "forearm");
     assert!(sensor.verdicts.is_empty() && sensor.frame.is_none());
     assert_eq!(view.link(sensor, at(700).mono).0, Link::Connecting);
 }
@@ -393,7 +330,7 @@ fn a_daemon_without_room_is_quoted() {
         0,
         json!({"type": "error", "message": "too many subscribers (256)"}),
     );
-    view.lose(Loss::Closed);
+    view.lose(Loss::Broken("it closed the connection".to_owned()));
     let text = shown(&view, 100, (80, 24), PLAIN);
     assert!(
         text.contains("NO DAEMON  too many subscribers (256)"),
@@ -402,31 +339,13 @@ fn a_daemon_without_room_is_quoted() {
 }
 
 #[test]
-fn missed_events_are_counted_until_their_number_is_unknown() {
-    let mut view = pressed_sensor();
-    take_event(&mut view, 300, json!({"type": "gap", "lost": 4}));
-    take_event(&mut view, 300, json!({"type": "gap", "lost": 3}));
-    assert_eq!(view.missed, Some(7));
-    take_event(&mut view, 300, json!({"type": "gap", "lost": null}));
-    take_event(&mut view, 300, json!({"type": "gap", "lost": 1}));
-    assert_eq!(view.missed, None);
-}
-
-#[test]
-fn without_colours_pressure_is_told_by_characters_and_nothing_but_ascii_is_written() {
-    let buffer = picture(&pressed_sensor(), 300, (80, 24), PLAIN);
-    let text = rows(&buffer).join("\n");
-    assert!(text.is_ascii(), "{text}");
+fn without_colours_pressure_is_told_by_characters_and_no_name_turns_the_line() {
+    let text = shown(&pressed_sensor(), 300, (80, 24), PLAIN);
     assert!(text.contains("@@@@@@@@"), "{text}");
-    let mut named = hello("a", &["forearm"]);
-    named["robot"] = json!("b\u{e4}r-7");
-    let named = view_of(&[(0, named)]);
-    assert!(shown(&named, 0, (80, 24), PLAIN).starts_with("b?r-7 "));
-    assert!(shown(&named, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
     let mut turned = hello("a", &["forearm"]);
-    turned["robot"] = json!("b\u{202e}r-7");
+    turned["robot"] = json!("b\u{202e}\u{e4}r-7");
     let turned = view_of(&[(0, turned)]);
-    assert!(shown(&turned, 0, (80, 24), COLOURS).starts_with("br-7 "));
+    assert!(shown(&turned, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
 }
 
 #[test]
@@ -448,63 +367,75 @@ fn every_size_is_drawn_and_says_what_holds() {
 }
 
 #[test]
-fn a_small_array_is_drawn_alone() {
-    let mut hello = hello("a", &["forearm"]);
-    hello["sensors"][0]["rows"] = json!(4);
-    hello["sensors"][0]["cols"] = json!(6);
-    let mut newtons = vec![0.0; 24];
-    newtons[23] = 1.0;
-    let view = view_of(&[
-        (0, hello),
-        (0, status("forearm", "live")),
-        (
-            0,
-            json!({"type": "frame", "sensor": "forearm", "newtons": newtons}),
-        ),
-    ]);
-    let sensor = view.sensor().unwrap();
-    assert_eq!(sensor.newtons(3, 5), Some(1.0));
-    assert_eq!((sensor.newtons(4, 0), sensor.newtons(0, 6)), (None, None));
-}
-
-#[test]
 fn keys_mean_what_the_last_row_says() {
-    let check = |code, modifiers, expected| {
+    let (none, control) = (KeyModifiers::NONE, KeyModifiers::CONTROL);
+    for (code, modifiers, expected) in [
+        (KeyCode::Char('q'), none, Some(Key::Char('q'))),
+        (KeyCode::Char('c'), control, Some(Key::Quit)),
+        (KeyCode::Char('c'), none, Some(Key::Char('c'))),
+        (KeyCode::Char('l'), control, Some(Key::Redraw)),
+        (KeyCode::Enter, none, Some(Key::Enter)),
+        (KeyCode::Esc, none, Some(Key::Escape)),
+        (KeyCode::Tab, none, Some(Key::Next)),
+        (KeyCode::Down, none, Some(Key::Next)),
+        (KeyCode::Down, control, None),
+        (KeyCode::BackTab, KeyModifiers::SHIFT, Some(Key::Previous)),
+        (KeyCode::Left, none, Some(Key::Previous)),
+    ] {
         let event = Event::Key(KeyEvent::new(code, modifiers));
         assert_eq!(key(&event), expected, "{event:?}");
-    };
-    let none = KeyModifiers::NONE;
-    check(KeyCode::Char('q'), none, Some(Key::Quit));
-    check(KeyCode::Char('c'), KeyModifiers::CONTROL, Some(Key::Quit));
-    check(KeyCode::Char('c'), none, None);
-    check(KeyCode::Char('l'), KeyModifiers::CONTROL, Some(Key::Redraw));
-    check(KeyCode::Char('2'), none, Some(Key::Sensor(1)));
-    check(KeyCode::Char('0'), none, None);
-    for code in [KeyCode::Tab, KeyCode::Right, KeyCode::Down] {
-        check(code, none, Some(Key::Next));
-        check(code, KeyModifiers::CONTROL, None);
     }
-    check(KeyCode::BackTab, KeyModifiers::SHIFT, Some(Key::Previous));
-    check(KeyCode::Left, none, Some(Key::Previous));
-    check(KeyCode::Esc, none, None);
-    assert_eq!(key(&Event::Resize(80, 24)), None);
 }
 
 #[test]
-fn the_look_follows_the_terminal() {
-    let check = |term, no_color, locale, expected: (bool, bool, bool)| {
-        let look = Look::new(term, "truecolor", no_color, locale);
-        assert_eq!(look.true_colours, look.colours);
-        assert!(!Look::new(term, "", no_color, locale).true_colours);
-        let found = (look.colours, look.attributes, look.unicode);
-        assert_eq!(found, expected, "{term} {no_color} {locale}");
-    };
-    check("xterm-256color", "", "en_US.UTF-8", (true, true, true));
-    check("xterm-256color", "1", "en_US.UTF-8", (false, true, true));
-    check("screen", "", "C", (true, true, false));
-    check("vt100", "", "C.UTF-8", (false, true, false));
-    check("dumb", "", "C.UTF-8", (false, false, false));
-    check("", "", "", (false, false, false));
+fn a_person_says_what_is_pressed_and_sees_how_many_verdicts_are_right() {
+    let mut view = pressed_sensor();
+    let press = |view: &mut View, keys: &[Key]| keys.iter().find_map(|&key| view.press(key));
+    let typed = "pcup firx".chars().map(Key::Char);
+    let keys: Vec<Key> = typed.chain([Key::Backspace, Key::Char('m')]).collect();
+    assert_eq!(press(&mut view, &keys), None);
+    let asked = shown(&view, 300, (80, 24), PLAIN);
+    assert!(
+        asked.contains("pressing (a level, a name, or both; Enter): cup firm_"),
+        "{asked}"
+    );
+    let context = json!({"sensor": "forearm", "object": "cup", "level": 2});
+    assert_eq!(
+        press(&mut view, &[Key::Enter]),
+        Some(Order::Context(context.clone()))
+    );
+    let begun = shown(&view, 300, (80, 24), PLAIN);
+    assert!(
+        begun.contains("pressing cup (firm): no verdict yet"),
+        "{begun}"
+    );
+    for (number, level) in [(4, 2), (5, 1)] {
+        let mut event = verdict(number, Some(level), None);
+        event["context"] = context.clone();
+        take_event(&mut view, 400, event);
+    }
+    let counted = shown(&view, 500, (80, 24), PLAIN);
+    assert!(
+        counted.contains("pressing cup (firm): 1 of 2 right, 1 wrong"),
+        "{counted}"
+    );
+    assert_eq!(
+        press(&mut view, &[Key::Char('p'), Key::Char('q'), Key::Escape]),
+        None
+    );
+    assert_eq!(press(&mut view, &[Key::Char('q')]), Some(Order::Quit));
+}
+
+#[test]
+fn a_long_reason_is_wrapped_and_not_cut() {
+    let mut status = status("forearm", "connecting");
+    let words = "permission denied: join the group dialout with `sudo usermod -aG dialout robot`, log in again, and \
+                 then start the daemon";
+    status["reason"] = json!(words);
+    let view = view_of(&[(0, hello("a", &["forearm"])), (0, status)]);
+    let text = shown(&view, 200, (80, 24), PLAIN);
+    let joined = text.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(joined.contains(words), "{text}");
 }
 
 #[test]
@@ -558,71 +489,6 @@ fn a_soft_touch_is_seen_after_a_hard_one() {
 }
 
 #[test]
-fn curves_begin_with_what_was_before_the_connection() {
-    let history = json!({"type": "history", "sensor": "forearm", "time": null,
-        "points": [[2.0, 10.0, 20], [1.0, 5.0, 9], [0.0, 8.0, 15]]});
-    let view = view_of(&[
-        (0, hello("a", &["forearm"])),
-        (0, status("forearm", "live")),
-        (9_000, frame("forearm", 1.5, 8)),
-        (10_000, history),
-    ]);
-    // The point of 9 s is known better by its frame, and that of 10 s is after it.
-    let sensor = view.sensor().unwrap();
-    let forces = sensor.curve(at(10_000).mono, 30, |load| load.force_n);
-    assert_eq!(forces[27..], [None, Some(10.0), Some(12.0)]);
-}
-
-#[test]
-fn what_was_before_is_asked_for_and_stands_in_order() {
-    let mut view = View::new();
-    let mut first = hello("a", &["forearm"]);
-    first["seq"] = json!(40);
-    let asked = view.take_line(&first.to_string(), at(0)).unwrap();
-    let asked: Vec<Value> = asked
-        .lines()
-        .map(|line| serde_json::from_str(line).unwrap())
-        .collect();
-    assert_eq!(asked[0], json!({"get": "last"}));
-    assert_eq!(asked[1]["since"], "a:0");
-    assert_eq!(asked[2], json!({"get": {"history": "forearm"}}));
-    assert!(
-        asked[1]["subscribe"]
-            .as_array()
-            .unwrap()
-            .contains(&json!("frame"))
-    );
-    // The last verdict comes first, then a gap for the events that are too old, then the rest in
-    // order.
-    let numbered = |mut event: Value, seq: u64| {
-        event["seq"] = json!(seq);
-        event
-    };
-    let press = |press: u64, state: &str| json!({"type": "press", "sensor": "forearm", "press": press, "state": state});
-    for event in [
-        numbered(verdict(9, Some(2), None), 38),
-        json!({"type": "gap", "lost": 30}),
-        numbered(verdict(8, Some(2), None), 33),
-        numbered(press(9, "begin"), 34),
-        numbered(press(9, "end"), 37),
-        numbered(verdict(9, Some(2), None), 38),
-    ] {
-        take_event(&mut view, 100, event);
-    }
-    let sensor = view.sensor().unwrap();
-    let presses: Vec<u64> = sensor.verdicts.iter().map(|one| one.press).collect();
-    assert_eq!(presses, [9, 8]);
-    assert_eq!(sensor.press.as_ref().unwrap().state, "end");
-    assert_eq!(view.missed, Some(0), "nobody was there to miss it");
-    // After that, a gap counts as missed. After a break, the view asks from its last event on.
-    take_event(&mut view, 200, numbered(press(10, "begin"), 41));
-    take_event(&mut view, 200, json!({"type": "gap", "lost": 2}));
-    assert_eq!(view.missed, Some(2));
-    let asked = view.take_line(&first.to_string(), at(300)).unwrap();
-    assert!(asked.contains("\"since\":\"a:41\""), "{asked}");
-}
-
-#[test]
 fn lost_says_unplugged_where_it_is() {
     let lost = |reason: &str| {
         let mut view = pressed_sensor();
@@ -660,27 +526,6 @@ fn the_live_page_has_the_same_words_for_an_unplugged_device() {
 }
 
 #[test]
-fn a_large_terminal_is_used() {
-    let view = pressed_sensor();
-    let columns_of_map = |size| {
-        let buffer = picture(&view, 300, size, COLOURS);
-        let heading = rows(&buffer)
-            .iter()
-            .position(|row| row.contains("pressure "))
-            .unwrap();
-        let width = usize::from(size.0);
-        let row = &buffer.content[(heading + 1) * width..(heading + 2) * width];
-        row.iter()
-            .take_while(|cell| cell.symbol() == "\u{2580}")
-            .count()
-    };
-    assert_eq!(columns_of_map((80, 24)), 28);
-    assert_eq!(columns_of_map((120, 50)), 56);
-    assert_eq!(columns_of_map((200, 60)), 84);
-    assert_eq!(columns_of_map((300, 90)), 140);
-}
-
-#[test]
 fn a_frame_of_a_machine_with_another_clock_is_new() {
     let mut view = View::new();
     view.wait("robot:8255".to_owned(), Clock::Theirs, at(0).mono);
@@ -695,51 +540,4 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
     }
     let frame = view.sensor().unwrap().frame.as_ref().unwrap();
     assert_eq!(frame.at, at(380).mono);
-}
-
-#[test]
-fn force_stands_against_approach_where_the_robot_tells_it() {
-    let mut view = live_sensor();
-    let press = |state| json!({"type": "press", "sensor": "forearm", "press": 1, "state": state, "reason": null});
-    let at_mm = |newtons, mm: Value| {
-        let mut event = frame("forearm", newtons, 9);
-        event["approach_mm"] = mm;
-        event
-    };
-    let size = (100, 40);
-    take_event(&mut view, 200, at_mm(0.5, json!(null)));
-    assert!(!shown(&view, 200, size, COLOURS).contains("approach"));
-    take_event(&mut view, 400, at_mm(0.5, json!(0.0)));
-    take_event(&mut view, 400, press("begin"));
-    take_event(&mut view, 600, at_mm(1.0, json!(1.2)));
-    take_event(&mut view, 800, at_mm(2.0, json!(2.4)));
-    take_event(&mut view, 900, press("end"));
-    let expected = "force against approach  to 2.4 mm, to 18 N";
-    let text = shown(&view, 900, size, COLOURS);
-    assert!(text.contains(expected), "{text}");
-    // The curve of the last press stays until another press begins.
-    take_event(&mut view, 3000, at_mm(0.5, json!(null)));
-    assert!(shown(&view, 3000, size, PLAIN).contains(expected));
-    take_event(&mut view, 3200, at_mm(0.1, json!(0.0)));
-    take_event(&mut view, 3200, press("begin"));
-    take_event(&mut view, 3400, at_mm(0.2, json!(0.5)));
-    assert!(shown(&view, 3400, size, PLAIN).contains("to 0.5 mm, to 2 N"));
-    take_event(&mut view, 3500, press("end"));
-    // Usually, the approach of a press's first frame is not known yet.
-    take_event(&mut view, 5000, at_mm(0.1, json!(null)));
-    take_event(&mut view, 5000, press("begin"));
-    take_event(&mut view, 5200, at_mm(0.1, json!(0.2)));
-    take_event(&mut view, 5400, at_mm(0.1, json!(0.3)));
-    let text = shown(&view, 5400, size, PLAIN);
-    assert!(text.contains("to 0.3 mm, to 1 N"), "{text}");
-    every_size_of(&view);
-}
-
-/// Draws a view in every size.
-fn every_size_of(view: &View) {
-    for width in [1, 20, 64, 65, 80, 200] {
-        for height in [1, 5, 11, 24, 60] {
-            shown(view, 3400, (width, height), COLOURS);
-        }
-    }
 }

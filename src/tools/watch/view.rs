@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
 use crate::tools::answer::items;
 use crate::tools::connect::WEB_SERVER;
-use crate::tools::readable::number;
+use crate::tools::score::Truth;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::wording;
@@ -21,9 +21,6 @@ use hardnessd_core::wording;
 /// The time between two requests for the totals. Without a request, the daemon sends them only when
 /// the state changes.
 pub(super) const QUESTION: Duration = Duration::from_secs(1);
-
-/// The curves of more sensors begin with the connection: the answers would take long.
-const MOST_HISTORIES: usize = 16;
 
 /// After three questions without an answer, the daemon counts as dead.
 const SILENCE: Duration = Duration::from_secs(3);
@@ -38,16 +35,13 @@ pub(super) struct View {
     pub(super) chosen: usize,
     /// Address of the last connection.
     pub(super) address: String,
+    /// What a person types, while they do.
+    pub(super) entry: Option<String>,
+    /// The outcome of the last command, until the next key.
+    pub(super) said: Option<String>,
     daemon: Daemon,
     /// The moment of the daemon's last line, or of the connection.
     last_line: Duration,
-    /// The number of events that the daemon dropped. `None` if unknown.
-    pub(super) missed: Option<u64>,
-    /// The number of the last event of this run that was received.
-    seq: u64,
-    /// The number of the last past event, while the daemon repeats past events. A gap among them
-    /// does not count as missed: it holds events that are too old for the daemon.
-    catching_up: Option<u64>,
     clock: Clock,
     /// How far the daemon's clock is behind this machine's. Frames show it, because they are sent
     /// at once.
@@ -79,7 +73,6 @@ enum Daemon {
 pub(super) struct Hello {
     pub(super) robot: String,
     pub(super) version: String,
-    run: String,
     /// The file of the model, or `built in`.
     pub(super) model: String,
     pub(super) validation: String,
@@ -95,6 +88,8 @@ pub(super) struct Hello {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Link {
     Live,
+    /// Frames come, but the sensor has no zero yet.
+    NoZero,
     Connecting,
     Stale,
     Lost,
@@ -107,6 +102,7 @@ impl Link {
     pub(super) fn name(self) -> &'static str {
         match self {
             Link::Live => "LIVE",
+            Link::NoZero => "NO ZERO YET",
             Link::Connecting => "CONNECTING",
             Link::Stale => "STALE",
             Link::Lost => "LOST",
@@ -116,22 +112,37 @@ impl Link {
     }
 }
 
-/// The action of a key.
+/// A key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Key {
+    /// Ctrl-C, also while a person types.
     Quit,
     Redraw,
     Next,
     Previous,
-    /// Show the sensor with this index.
-    Sensor(usize),
+    Enter,
+    Backspace,
+    Escape,
+    Char(char),
 }
+
+/// What a key asks for that the view cannot do.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Order {
+    Quit,
+    Redraw,
+    /// Set this context.
+    Context(Value),
+}
+
+/// The longest text that a person may type.
+const ENTRY_CHARS: usize = 60;
 
 /// The way in which a daemon was lost.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Loss {
-    /// The daemon closed the connection.
-    Closed,
+    /// The connection broke, for this reason.
+    Broken(String),
     /// The daemon cannot be reached, for this reason.
     Unreachable(String),
 }
@@ -144,18 +155,17 @@ impl View {
             sensors: Vec::new(),
             chosen: 0,
             address: String::new(),
+            entry: None,
+            said: None,
             daemon: Daemon::Absent("connecting".to_owned()),
             last_line: Duration::ZERO,
-            missed: Some(0),
-            seq: 0,
-            catching_up: None,
             clock: Clock::Ours,
             behind: None,
         }
     }
 
     /// Takes in a line of the daemon, read at `now`. Ignores an unknown line. The caller must send
-    /// the returned requests to the daemon.
+    /// the returned request to the daemon.
     pub(super) fn take_line(&mut self, line: &str, now: Stamp) -> Option<String> {
         if line.starts_with("HTTP/") {
             self.daemon = Daemon::Absent(WEB_SERVER.to_owned());
@@ -165,20 +175,11 @@ impl View {
         self.last_line = now.mono;
         match text(&event, "type").as_str() {
             "hello" => return self.meet(&event),
-            "gap" if self.catching_up.is_some() => self.catching_up = None,
-            "gap" => {
-                let lost = event["lost"].as_u64();
-                self.missed = self.missed.zip(lost).map(|(sum, lost)| sum + lost);
-            }
             // Before a `hello`, an error means that the daemon has no room.
             "error" if self.daemon != Daemon::Met => {
                 self.daemon = Daemon::Absent(text(&event, "message"));
             }
             kind => {
-                if let Some(seq) = event["seq"].as_u64() {
-                    self.seq = self.seq.max(seq);
-                    self.catching_up = self.catching_up.filter(|&past| seq <= past);
-                }
                 let name = text(&event, "sensor");
                 let at = self.moment(&event, kind, now);
                 let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
@@ -214,8 +215,8 @@ impl View {
         self.daemon = Daemon::Unknown(self.absence().to_owned());
     }
 
-    /// Takes in a `hello`. Returns the requests for all events since the last one that was
-    /// received.
+    /// Takes in a `hello`, and begins anew. Returns the request for all events of this run that the
+    /// daemon still holds, and those that come.
     fn meet(&mut self, event: &Value) -> Option<String> {
         let protocol = &event["protocol"];
         if *protocol != PROTOCOL {
@@ -223,37 +224,15 @@ impl View {
             self.daemon = Daemon::Absent(reason);
             return None;
         }
-        let hello = hello(event);
-        // In another run, the numbers begin again, and nothing of the old run is valid any more.
-        if self
-            .hello
-            .as_ref()
-            .is_none_or(|known| known.run != hello.run)
-        {
-            let name = self.sensors.get(self.chosen).map(|one| one.name.clone());
-            self.sensors = items(event, "sensors").map(Sensor::new).collect();
-            let again = self
-                .sensors
-                .iter()
-                .position(|one| Some(&one.name) == name.as_ref());
-            self.chosen = again.unwrap_or(0);
-            (self.missed, self.seq) = (Some(0), 0);
-            // If no event has happened yet in this run, there is nothing to repeat.
-            self.catching_up = Some(number(event, "seq")).filter(|&past| past > 0);
-        }
-        let since = format!("{}:{}", hello.run, self.seq);
-        self.hello = Some(hello);
+        let chosen = self.sensor().map(|one| one.name.clone());
+        self.sensors = items(event, "sensors").map(Sensor::new).collect();
+        let is_chosen = |one: &Sensor| Some(&one.name) == chosen.as_ref();
+        self.chosen = self.sensors.iter().position(is_chosen).unwrap_or(0);
+        self.hello = Some(hello(event));
         self.daemon = Daemon::Met;
         let types = ["hardness", "press", "status", "frame"];
-        // The last verdict may be older than the events that the daemon holds.
-        let mut requests = vec![
-            json!({"get": "last"}),
-            json!({"subscribe": types, "since": since}),
-        ];
-        let histories = self.sensors.iter().take(MOST_HISTORIES);
-        requests.extend(histories.map(|sensor| json!({"get": {"history": sensor.name}})));
-        let requests: Vec<String> = requests.iter().map(Value::to_string).collect();
-        Some(requests.join("\n"))
+        let since = format!("{}:0", text(event, "run"));
+        Some(json!({"subscribe": types, "since": since}).to_string())
     }
 
     /// Takes in that the daemon has gone or cannot be reached.
@@ -261,20 +240,51 @@ impl View {
         match loss {
             Loss::Unreachable(reason) => self.daemon = Daemon::Absent(reason),
             // The daemon's `error` or its protocol gave the reason already.
-            Loss::Closed if matches!(self.daemon, Daemon::Absent(_)) => {}
-            Loss::Closed => self.daemon = Daemon::Absent("it closed the connection".to_owned()),
+            Loss::Broken(_) if matches!(self.daemon, Daemon::Absent(_)) => {}
+            Loss::Broken(reason) => self.daemon = Daemon::Absent(reason),
         }
     }
 
-    /// Chooses another sensor, if the key asks for one.
-    pub(super) fn press(&mut self, key: Key) {
+    /// Takes in a key. The caller must carry out the order.
+    pub(super) fn press(&mut self, key: Key) -> Option<Order> {
+        self.said = None;
         let count = self.sensors.len().max(1);
-        self.chosen = match key {
-            Key::Next => (self.chosen + 1) % count,
-            Key::Previous => (self.chosen + count - 1) % count,
-            Key::Sensor(index) if index < count => index,
-            Key::Sensor(_) | Key::Quit | Key::Redraw => self.chosen,
-        };
+        match (&mut self.entry, key) {
+            (_, Key::Quit) | (None, Key::Char('q' | 'Q')) => return Some(Order::Quit),
+            (_, Key::Redraw) => return Some(Order::Redraw),
+            (Some(text), Key::Char(char)) if text.chars().count() < ENTRY_CHARS => text.push(char),
+            (Some(text), Key::Backspace) => drop(text.pop()),
+            (Some(_), Key::Escape) => self.entry = None,
+            (Some(_), Key::Enter) => {
+                let text = self.entry.take().unwrap_or_default();
+                return self.pressing(&text);
+            }
+            (Some(_), _) => {}
+            (None, Key::Char('p' | 'P')) => {
+                self.entry = Some(String::new());
+            }
+            (None, Key::Char(digit @ '1'..='9')) => {
+                let index = digit as usize - '1' as usize;
+                if index < count {
+                    self.chosen = index;
+                }
+            }
+            (None, Key::Next) => self.chosen = (self.chosen + 1) % count,
+            (None, Key::Previous) => self.chosen = (self.chosen + count - 1) % count,
+            (None, _) => {}
+        }
+        None
+    }
+
+    /// Takes in what is being pressed, as a person typed it. Returns the order to tell the daemon.
+    fn pressing(&mut self, text: &str) -> Option<Order> {
+        let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
+        let truth = Truth::read(text, labels);
+        let sensor = self.sensors.get_mut(self.chosen)?;
+        sensor.score.begin(truth.clone());
+        let context = truth.within(&sensor.context, &sensor.name);
+        sensor.context = context.clone();
+        Some(Order::Context(context))
     }
 
     /// The sensor that is shown.
@@ -290,13 +300,20 @@ impl View {
         let Some(status) = &sensor.status else {
             return (Link::Connecting, None);
         };
+        let has_zero = |frame: &Frame| frame.force_n.is_some();
         let link = match status.state.as_str() {
+            "live" if !sensor.frame.as_ref().is_none_or(has_zero) => Link::NoZero,
             "live" => Link::Live,
             "stale" => Link::Stale,
             "lost" => Link::Lost,
             _ => Link::Connecting,
         };
-        (link, status.reason.clone())
+        let reason = status.reason.clone();
+        let detail = status.detail.iter().map(|detail| format!(": {detail}"));
+        (
+            link,
+            reason.map(|reason| reason + &detail.collect::<String>()),
+        )
     }
 
     /// The state that holds for all sensors because of the daemon, with its reason.
@@ -327,7 +344,6 @@ fn hello(event: &Value) -> Hello {
     Hello {
         robot: text(event, "robot"),
         version: text(event, "version"),
-        run: text(event, "run"),
         model: text(model, "name"),
         validation: text(model, "validation"),
         needs: text(model, "needs"),

@@ -1,9 +1,8 @@
 """Starts the daemon beside ROS 2, and a viewer of one sensor's pictures.
 
-    ros2 launch tactile_interfaces hardnessd.launch.py program:=target/release/hardnessd \\
-        config:=hardnessd.toml namespace:=/arm_7 sensor:=forearm
+    ros2 launch tactile_interfaces hardnessd.launch.py config:=hardnessd.toml namespace:=/arm_7 sensor:=forearm
 
-The program must be built with the feature `ros2`. The one of the Debian package is not.
+The program of the wheel and of the Debian package has ROS 2. One from source needs the feature `ros2`.
 """
 
 from launch import LaunchDescription

@@ -7,10 +7,11 @@ use serde_json::Value;
 use super::Pipeline;
 use crate::event::Event;
 use crate::frame::Stamp;
-use crate::motion::Point;
+use crate::motion::{Point, StepBack};
+use crate::press::Abort;
+use crate::tare::RetareError;
 
-/// One thing that happens to a pipeline. Beside inputs, only [`Pipeline::reload`] changes what a
-/// pipeline does.
+/// One thing that happens to a pipeline. Nothing else changes what a pipeline does.
 ///
 /// # Example
 ///
@@ -32,8 +33,8 @@ use crate::motion::Point;
 ///     mono: Duration::from_secs(1),
 ///     wall: jiff::Timestamp::UNIX_EPOCH,
 /// };
-/// assert!(pipeline.take(Input::Opened, at).is_empty());
-/// let events = pipeline.take(Input::Lost("unplugged".into()), at);
+/// assert!(pipeline.take(Input::Opened, at)?.is_empty());
+/// let events = pipeline.take(Input::Lost("unplugged".into()), at)?;
 /// assert!(matches!(&events[..], [Event::Status(status)] if status.state == LinkState::Lost));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
@@ -45,6 +46,9 @@ pub enum Input<'a> {
     Unavailable(Cow<'a, str>),
     /// Bytes came.
     Bytes(Cow<'a, [u8]>),
+    /// This many bytes came that were too many to be read. The next bytes do not continue the earlier
+    /// ones.
+    Skipped(u64),
     /// Time has passed.
     Tick,
     /// The device is gone, for this reason.
@@ -70,6 +74,7 @@ impl Input<'_> {
             Input::Opened => Input::Opened,
             Input::Unavailable(reason) => Input::Unavailable(text(reason)),
             Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
+            Input::Skipped(bytes) => Input::Skipped(*bytes),
             Input::Tick => Input::Tick,
             Input::Lost(reason) => Input::Lost(text(reason)),
             Input::Tare => Input::Tare,
@@ -81,28 +86,49 @@ impl Input<'_> {
     }
 }
 
+/// An input that was not taken as it came. It has no events.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Refused {
+    /// No tare can be taken now. Nothing has changed.
+    #[error(transparent)]
+    Tare(#[from] RetareError),
+    /// A position was not later than the one before it. All positions were taken nevertheless.
+    #[error(transparent)]
+    Motion(#[from] StepBack),
+}
+
 impl Pipeline {
-    /// Takes an input that came at `at`, and returns its events. A refused tare and a step back in
-    /// time are not reported: see [`Pipeline::retare`] and [`Pipeline::add_positions`].
-    pub fn take(&mut self, input: Input<'_>, at: Stamp) -> Vec<Event> {
-        match input {
-            Input::Opened => return self.opened(at),
-            Input::Unavailable(reason) => return self.unavailable(reason.into_owned(), at),
-            Input::Bytes(bytes) => return self.push(&bytes, at),
-            Input::Tick => return self.tick(at),
-            Input::Lost(reason) => return self.lost(reason.into_owned(), at),
-            Input::Shutdown => return self.shutdown(),
-            // A refused tare changes nothing and publishes nothing.
+    /// Takes an input that came at `at`, and returns its events. The outcome of a tare follows in
+    /// [`Pipeline::retared`]. Positions are finite.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Refused`] for a tare that cannot be taken and for positions that step back in time.
+    pub fn take(&mut self, input: Input<'_>, at: Stamp) -> Result<Vec<Event>, Refused> {
+        Ok(match input {
+            Input::Opened => self.opened(at),
+            Input::Unavailable(reason) => self.unavailable(reason.into_owned(), at),
+            Input::Bytes(bytes) => self.push(&bytes, at),
+            Input::Skipped(bytes) => self.skip(bytes, at),
+            Input::Tick => self.tick(at),
+            Input::Lost(reason) => self.lost(reason.into_owned(), at),
+            Input::Shutdown => self.abort(Abort::Shutdown).into_iter().collect(),
             Input::Tare => {
-                let _ = self.retare();
+                self.retare()?;
+                Vec::new()
             }
-            Input::Context(context) => self.set_context(context),
-            // Points after a step back are taken in too.
+            Input::Context(context) => {
+                self.context = context;
+                Vec::new()
+            }
             Input::Motion(points) => {
-                let _ = self.add_positions(&points);
+                self.judge.track.push(&points)?;
+                Vec::new()
             }
-            Input::ClockSet(until_ns) => self.clock_set(until_ns),
-        }
-        Vec::new()
+            Input::ClockSet(until_ns) => {
+                self.judge.track.clock_set(until_ns);
+                Vec::new()
+            }
+        })
     }
 }

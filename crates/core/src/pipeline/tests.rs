@@ -3,38 +3,33 @@ use tract_onnx::pb;
 
 use super::*;
 
-mod format_2;
+mod course;
 mod drift;
 mod arrays;
-use crate::event::{LinkState, Note, Rejection};
+mod bounds;
+mod noise;
+use crate::event::{LinkState, Note, Phase, Rejection, Status};
 use crate::frame::Array;
+use crate::motion::Point;
 use crate::sensor::Description;
 use crate::test_support;
-use crate::verdict::BUILT_IN_HRN;
+use crate::tests::graph::{node, number};
+use crate::verdict::{BUILT_IN_HRN, ModelError};
 use crate::wire::Preset;
 
 const PERIOD: Duration = Duration::from_millis(200);
 
 fn pipeline(preset: Preset) -> Pipeline {
-    pipeline_of(|described| described.frame.preset = preset)
+    pipeline_of(|described| described.sensor.frame.preset = Some(preset))
 }
 
 /// A pipeline of a JX255N at 5 frames/s, changed by `change`.
 fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
-    let mut described = Description {
-        name: "forearm".to_owned(),
-        ..Description::default()
-    };
+    let mut described = Description::default();
+    described.sensor.name = "forearm".to_owned();
     change(&mut described);
     let hrn = test_support::hrn();
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
-}
-
-fn reload(pipeline: &mut Pipeline, change: impl FnOnce(&mut Description)) {
-    let mut described = pipeline.sensor().description().clone();
-    change(&mut described);
-    let changed = Sensor::new(described).unwrap();
-    pipeline.reload(changed, pipeline.hrn.clone()).unwrap();
 }
 
 fn at(millis: u64) -> Stamp {
@@ -48,7 +43,7 @@ fn at(millis: u64) -> Stamp {
 /// A frame with `taxels` taxels at `counts` in the middle of the array.
 fn raw(taxels: usize, counts: u16) -> RawFrame {
     let mut raw = RawFrame::default();
-    raw.counts[400..400 + taxels].fill(counts);
+    raw.counts[400..400 + taxels].fill(counts.into());
     raw
 }
 
@@ -116,52 +111,6 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 }
 
 #[test]
-fn frames_say_whether_they_are_tared() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    let mut tared = |first: u64, frames: usize| -> Vec<bool> {
-        let events = feed(&mut pipeline, first, &vec![raw(0, 0); frames]);
-        let tared = events.iter().filter_map(|event| match event {
-            Event::Frame(frame) => Some(frame.tared),
-            _ => None,
-        });
-        tared.collect()
-    };
-    assert_eq!(tared(0, 5), [false; 5], "the tare is made of these");
-    assert_eq!(tared(5, 2), [true; 2]);
-    pipeline.retare().unwrap();
-    let events = feed(&mut pipeline, 7, &[raw(0, 0)]);
-    let Some(Event::Frame(frame)) = events.last() else {
-        panic!("{events:?}")
-    };
-    assert!(frame.tared, "the old tare holds until there is another");
-}
-
-#[test]
-fn a_reload_changes_the_tare_under_way() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(9, 50); 5]);
-    let set = |pipeline: &mut Pipeline, frames| {
-        reload(pipeline, |described| {
-            described.calibration.tare_frames = frames;
-        });
-    };
-    set(&mut pipeline, 2);
-    assert_eq!(play(&mut pipeline, 5, &vec![raw(0, 0); 2]), ["Live"]);
-    assert_eq!(pipeline.retare(), Ok(()));
-    set(&mut pipeline, 0);
-    assert_eq!(pipeline.retared(), Some(Err(RetareError::NoFrames)));
-
-    let mut pipeline = self::pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(9, 50); 5]);
-    set(&mut pipeline, 0);
-    assert_eq!(
-        play(&mut pipeline, 5, &[raw(9, 50)]),
-        ["Live", "Begin 1"],
-        "no tare is awaited"
-    );
-}
-
-#[test]
 fn a_press_that_timed_out_is_no_reason_against_a_tare() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
@@ -175,23 +124,13 @@ fn a_press_that_timed_out_is_no_reason_against_a_tare() {
     play(&mut pipeline, 165, &vec![drift.clone(); 5]);
     assert!(matches!(pipeline.retared(), Some(Ok(_))));
     let mut pressed = drift.clone();
-    pressed.counts[400..409].fill(53);
+    pressed.counts[400..409].fill(53.0);
     let published = play(&mut pipeline, 170, &[drift.clone(), drift, pressed]);
-    assert_eq!(published, ["Begin 2"], "the baseline is the drift's");
-}
-
-#[test]
-fn moments_beyond_all_time_are_no_panic() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &[raw(0, 0)]);
-    pipeline.decoder.push(&[0xBB, 0xAA]);
-    let never = Stamp {
-        mono: Duration::MAX,
-        ..at(0)
-    };
-    pipeline.seen.link.frame(never, &pipeline.sensor);
-    pipeline.seen.link.last_bytes = Some(Duration::MAX);
-    assert_eq!(pipeline.deadline(), Some(Duration::MAX));
+    assert_eq!(
+        published,
+        ["Live", "Begin 2"],
+        "the baseline is the drift's"
+    );
 }
 
 #[test]
@@ -236,37 +175,19 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
 }
 
 #[test]
-fn the_context_stays_until_it_changes() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-    let context = serde_json::json!({"tag": "pick-17"});
-    pipeline.set_context(Some(context.clone()));
-    let mut published = Vec::new();
-    let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
-    for event in feed(&mut pipeline, 5, &press) {
-        match event {
-            Event::Press(press) => published.push(press.context),
-            Event::Hardness(verdict) => published.push(verdict.context),
-            _ => {}
-        }
-    }
-    assert_eq!(published, vec![Some(context); 3]);
-}
-
-#[test]
-fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
+fn silence_is_stale_after_three_periods_and_ends_no_press() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
     play(&mut pipeline, 5, &vec![raw(5, 50); 1]);
     let deadline = pipeline.deadline().unwrap();
-    assert_eq!(deadline, at(1000).mono + PERIOD.mul_f64(2.5));
-    assert!(pipeline.tick(at(1499)).is_empty());
-    let published = pipeline.tick(at(1507));
-    assert_eq!(words(&published), ["Stale (no frame for 500 ms)"]);
+    assert_eq!(deadline, at(1000).mono + 3 * PERIOD);
+    assert!(pipeline.tick(at(1599)).is_empty());
+    let published = pipeline.tick(at(1607));
+    assert_eq!(words(&published), ["Stale (no frame for 600 ms)"]);
     let Event::Status(status) = &published[0] else {
         panic!("{published:?}")
     };
-    assert_eq!(status.time, at(1500).wall, "when it became so");
+    assert_eq!(status.time, at(1600).wall, "when it became so");
     assert_eq!(pipeline.deadline(), None);
     let back = [raw(5, 50), raw(0, 0), raw(0, 0)];
     assert_eq!(
@@ -276,77 +197,35 @@ fn silence_is_stale_after_two_and_a_half_periods_and_ends_no_press() {
 }
 
 #[test]
-fn a_sensor_that_is_steadily_slow_is_late_by_its_own_period() {
-    // 100 frames/s are configured: a silence of 50 ms is stale.
-    let mut pipeline = pipeline_of(|described| described.frame_rate_hz = 100.0);
-    pipeline.opened(at(0));
-    let mut clock = 0;
-    let mut play = |pipeline: &mut Pipeline, periods_ms: &[u64]| {
-        let mut events = Vec::new();
-        for ms in periods_ms {
-            // Time passes in steps, as the deadlines of the daemon.
-            for _ in 0..ms / 10 {
-                clock += 10;
-                events.extend(pipeline.tick(at(clock)));
+fn how_long_a_sensor_may_be_silent_never_moves_however_slowly_it_sends() {
+    // 100 frames/s are configured, and five come.
+    for (stale_after_ms, reason) in [
+        (None, "Stale (no frame for 150 ms)"),
+        (Some(60.0), "Stale (no frame for 60 ms)"),
+    ] {
+        let mut pipeline = pipeline_of(|described| {
+            described.sensor.frame_rate_hz = 100.0;
+            described.sensor.stale_after_ms = stale_after_ms;
+        });
+        pipeline.opened(at(0));
+        let mut published = Vec::new();
+        for ms in (10..6000).step_by(10) {
+            published.extend(words(&pipeline.tick(at(ms))));
+            if ms % 200 == 10 {
+                let bytes = bytes(&pipeline, &raw(0, 0));
+                published.extend(words(&pipeline.push(&bytes, at(ms))));
             }
-            let bytes = bytes(pipeline, &raw(0, 0));
-            events.extend(pipeline.push(&bytes, at(clock)));
         }
-        words(&events)
-    };
-    // Ten frames/s come, for three seconds.
-    let published = play(&mut pipeline, &[[10; 1].as_slice(), &[100; 30]].concat());
-    let (stale, live) = ("Stale (no frame for 50 ms)", "Live");
-    assert_eq!(published, [live, stale, live, stale, live, stale, live]);
-    assert_eq!(pipeline.slow_rate_hz(), Some(10.0));
-    // A silence of two and a half of its own periods is stale, and the sensor is still known after it.
-    let own = "Stale (no frame for 250 ms)";
-    assert_eq!(play(&mut pipeline, &[1000, 100, 100]), [own, live]);
-    assert_eq!(pipeline.slow_rate_hz(), Some(10.0));
-    // A sensor that sends as expected is late as expected.
-    assert_eq!(play(&mut pipeline, &[10, 100]), [stale, live]);
-    assert_eq!(pipeline.slow_rate_hz(), None);
-    // Pauses of different lengths are no rate.
-    let published = play(&mut pipeline, &[100, 200, 100, 300, 100, 200, 400, 100]);
-    assert_eq!(published.len(), 16, "{published:?}");
-    assert_eq!(pipeline.slow_rate_hz(), None);
-}
-
-#[test]
-fn a_port_open_without_frames_is_stale_too() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    let message = pipeline.unavailable("no such device".to_owned(), at(0));
-    assert_eq!(words(&message), ["Connecting (no such device)"]);
-    assert!(
-        pipeline
-            .unavailable("no such device".to_owned(), at(100))
-            .is_empty()
-    );
-    assert_eq!(words(&pipeline.opened(at(200))), ["Connecting"]);
-    assert_eq!(
-        words(&pipeline.tick(at(700))),
-        ["Stale (no frame for 500 ms)"]
-    );
-}
-
-#[test]
-fn bytes_that_never_make_a_frame_are_told() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    pipeline.opened(at(0));
-    assert!(pipeline.push(&[0x00; 100], at(100)).is_empty());
-    let reason = "no frame for 500 ms, but bytes come: is the baud rate or the layout wrong?";
-    assert_eq!(
-        words(&pipeline.tick(at(500))),
-        [format!("Stale ({reason})")]
-    );
+        assert_eq!(published, ["Live", reason].repeat(30));
+    }
 }
 
 #[test]
 fn how_long_a_live_sensor_may_be_silent_can_be_told() {
     let check = |hz, stale_after_ms, expected_ms: u64| {
         let mut pipeline = pipeline_of(|described| {
-            described.frame_rate_hz = hz;
-            described.stale_after_ms = stale_after_ms;
+            described.sensor.frame_rate_hz = hz;
+            described.sensor.stale_after_ms = stale_after_ms;
         });
         pipeline.opened(at(0));
         // Before the first frame, it is 2.5 periods whatever the setting is.
@@ -363,103 +242,107 @@ fn how_long_a_live_sensor_may_be_silent_can_be_told() {
         let reason = format!("Stale (no frame for {expected_ms} ms)");
         assert_eq!(words(&stale), [reason]);
     };
-    check(5.0, None, 500);
-    check(50.0, None, 50);
-    check(100.0, None, 50);
+    check(5.0, None, 600);
+    check(50.0, None, 150);
+    check(100.0, None, 150);
     check(100.0, Some(25.0), 25);
     check(100.0, Some(1500.0), 1500);
     check(5.0, Some(250.0), 250);
 }
 
 #[test]
-fn a_reload_changes_how_long_it_may_be_silent_but_nothing_that_is_fixed() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &[raw(0, 0)]);
-    reload(&mut pipeline, |described| {
-        described.stale_after_ms = Some(900.0);
-    });
-    assert_eq!(pipeline.deadline(), Some(at(900).mono));
-    let mut changed = pipeline.sensor().description().clone();
-    changed.frame_rate_hz = 6.0;
-    let changed = Sensor::new(changed).unwrap();
-    let refused = pipeline.reload(changed, pipeline.hrn.clone());
-    assert_eq!(
-        refused,
-        Err(FixedError {
-            key: "frame_rate_hz"
-        })
-    );
-    assert_eq!(pipeline.deadline(), Some(at(900).mono));
-}
-
-#[test]
-fn a_lost_device_aborts_the_press_and_numbers_go_on() {
+fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    pipeline.context = Some(serde_json::json!({"tag": "x"}));
     play(&mut pipeline, 5, &vec![raw(5, 50); 2]);
-    let lost = pipeline.lost("end of file".to_owned(), at(1300));
-    assert_eq!(words(&lost), ["Lost (end of file)", "Aborted 1 (lost)"]);
-    // A device that stays lost says why, once.
-    for (reason, expected) in [
-        ("no such device", &["Lost (no such device)"][..]),
-        ("no such device", &[]),
-        (
-            "held by another process",
-            &["Lost (held by another process)"],
-        ),
-    ] {
-        let message = pipeline.unavailable(reason.to_owned(), at(1400));
-        assert_eq!(words(&message), expected);
-    }
-    assert!(
-        pipeline.opened(at(2000)).is_empty(),
-        "lost until a frame arrives"
-    );
-    assert_eq!(
-        play(&mut pipeline, 11, &vec![raw(5, 50); 1]),
-        ["Live", "Begin 2"]
-    );
-    assert_eq!(pipeline.status(at(0)).frames, 8);
+    let stopped = pipeline.take(Input::Shutdown, at(1400)).unwrap();
+    assert_eq!(words(&stopped), ["Aborted 1 (shutdown)"]);
+    let mut described = pipeline.sensor().description().clone();
+    described.sensor.frame.preset = Some(Preset::Jq);
+    let skipped = pipeline.status(at(0)).bytes_skipped;
+    pipeline.push(&[0xBB; 3], at(1500));
+    let hrn = pipeline.hrn().clone();
+    let mut next = pipeline.restarted(Sensor::new(described).unwrap(), hrn);
+    let status = next.status(at(0));
+    assert_eq!((status.state, status.frames), (LinkState::Connecting, 7));
+    assert_eq!(status.bytes_skipped, skipped + 3);
+    assert_eq!(play(&mut next, 8, &vec![raw(0, 0); 6]), ["Live"]);
+    assert_eq!(play(&mut next, 14, &vec![raw(5, 50); 2]), ["Begin 2"]);
+    assert_eq!(next.context, Some(serde_json::json!({"tag": "x"})));
 }
 
 #[test]
-fn a_lost_device_that_is_open_again_and_sends_no_frame_says_so() {
+fn a_press_is_judged_by_the_model_that_it_began_with() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-    let (silent, noisy) = (
-        "no frame for 500 ms",
-        "no frame for 500 ms, but bytes come: is the baud rate or the layout wrong?",
+    let mut described = pipeline.sensor().description().clone();
+    described.model.min_force_n = 900.0;
+    let (sensor, hrn) = (Sensor::new(described).unwrap(), pipeline.hrn().clone());
+    play(&mut pipeline, 5, &vec![raw(5, 50); 2]);
+    assert!(pipeline.with_model(sensor.clone(), hrn.clone()).is_none());
+    play(&mut pipeline, 7, &vec![raw(0, 0); 2]);
+    let mut next = pipeline.with_model(sensor, hrn).unwrap();
+    assert_eq!(next.at_rest(), pipeline.at_rest());
+    let press = [raw(5, 50), raw(5, 50), raw(0, 0), raw(0, 0)];
+    let events = feed(&mut next, 9, &press);
+    let Some(Event::Hardness(verdict)) = events.last() else {
+        panic!("{events:?}")
+    };
+    assert_eq!(
+        (verdict.press, verdict.rejected),
+        (2, Some(Rejection::LowForce))
     );
-    // The bytes before the loss do not count.
-    for (begin, bytes, expected) in [(1000, 0, silent), (5000, 100, noisy), (9000, 0, silent)] {
-        pipeline.lost("end of file".to_owned(), at(begin));
-        pipeline.unavailable("no such device".to_owned(), at(begin + 100));
-        // A port that is lost again and again as soon as it is open says nothing new.
-        for cycle in 200..204 {
-            assert_eq!(words(&pipeline.opened(at(begin + cycle))), [""; 0]);
-            let status = pipeline.status(at(begin + cycle));
-            assert_eq!(status.state, LinkState::Lost);
-            assert_eq!(status.reason.as_deref(), Some("open, no frame yet"));
-            if cycle < 203 {
-                let lost = pipeline.lost("no such device".to_owned(), at(begin + cycle));
-                assert_eq!(words(&lost), [""; 0]);
-            }
-        }
-        assert_eq!(
-            words(&pipeline.push(&vec![0; bytes], at(begin + 300))),
-            [""; 0]
-        );
-        let late = at(begin + 800);
-        assert_eq!(words(&pipeline.tick(at(begin + 702))), [""; 0]);
-        let message = pipeline.tick(late);
-        assert_eq!(words(&message), [format!("Lost ({expected})")]);
-        let Event::Status(status) = &message[0] else {
-            panic!("{message:?}")
-        };
-        assert_eq!(status.time, late.wall);
-        assert_eq!(pipeline.deadline(), None);
+}
+
+/// Gives each input at its time in ms, and compares the events in words.
+fn story(pipeline: &mut Pipeline, steps: &[(u64, Input<'static>, &[&str])]) {
+    for (ms, input, expected) in steps {
+        let events = pipeline.take(input.to_owned(), at(*ms)).unwrap();
+        assert_eq!(words(&events), *expected, "{input:?} at {ms} ms");
     }
-    assert_eq!(play(&mut pipeline, 60, &[raw(0, 0)]), ["Live"]);
+}
+
+#[test]
+fn a_link_says_each_change_once_and_a_lost_device_ends_its_press() {
+    let lost = |reason: &'static str| Input::Lost(reason.into());
+    let unavailable = |reason: &'static str| Input::Unavailable(reason.into());
+    let noise = Input::Bytes(vec![0; 100].into());
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let steps: &[(u64, Input<'static>, &[&str])] = &[
+        (0, unavailable("none"), &["Connecting (none)"]),
+        (100, unavailable("none"), &[]),
+        (200, Input::Opened, &["Connecting"]),
+        (700, Input::Tick, &["Stale (no frame for 500 ms)"]),
+    ];
+    story(&mut pipeline, steps);
+    assert_eq!(play(&mut pipeline, 5, &vec![raw(0, 0); 5]), ["Live"]);
+    assert_eq!(play(&mut pipeline, 10, &vec![raw(5, 50); 2]), ["Begin 1"]);
+    let noisy = "Lost (no frame for 500 ms, but bytes come: is the baud rate or the layout wrong?)";
+    let steps: &[(u64, Input<'static>, &[&str])] = &[
+        (2300, lost("eof"), &["Lost (eof)", "Aborted 1 (lost)"]),
+        // A device that stays lost says why, once.
+        (2400, unavailable("none"), &["Lost (none)"]),
+        (2500, unavailable("none"), &[]),
+        (2600, unavailable("held"), &["Lost (held)"]),
+        // A port that is lost again as soon as it is open says nothing new.
+        (3000, Input::Opened, &[]),
+        (3001, lost("held"), &[]),
+        (3002, Input::Opened, &[]),
+        (3501, Input::Tick, &[]),
+        (3502, Input::Tick, &["Lost (no frame for 500 ms)"]),
+        (4000, lost("eof"), &["Lost (eof)"]),
+        (4001, Input::Opened, &[]),
+        (4100, noise, &[]),
+        (4501, Input::Tick, &[noisy]),
+        // The bytes before the loss do not count.
+        (5000, lost("eof"), &["Lost (eof)"]),
+        (5001, Input::Opened, &[]),
+        (5501, Input::Tick, &["Lost (no frame for 500 ms)"]),
+    ];
+    story(&mut pipeline, steps);
+    assert_eq!(play(&mut pipeline, 30, &[raw(5, 50)]), ["Live", "Begin 2"]);
+    assert_eq!(pipeline.status(at(0)).frames, 8);
 }
 
 #[test]
@@ -479,7 +362,7 @@ fn a_wall_clock_that_jumps_changes_the_times_of_events_and_nothing_else() {
             let wall = wall.checked_add(away).unwrap();
             events.extend(pipeline.push(&bytes, Stamp { mono, wall }));
             // The next deadline is as far away as after any other frame.
-            let deadline = mono + Duration::from_millis(500);
+            let deadline = mono + Duration::from_millis(600);
             assert_eq!(pipeline.deadline(), Some(deadline), "frame {number}");
         }
         let timeless = |event: &Event| {
@@ -516,12 +399,12 @@ fn half_a_period_of_silence_makes_a_jq_frame_whole_at_its_own_time() {
     pipeline.push(&bytes, at(200));
     assert_eq!(pipeline.deadline(), Some(at(300).mono));
     assert_eq!(words(&pipeline.tick(at(300))), [""; 0]);
-    assert_eq!(pipeline.deadline(), Some(at(700).mono));
+    assert_eq!(pipeline.deadline(), Some(at(800).mono));
     // The pipeline waits only once for the rest of the pending bytes.
     pipeline.push(&bytes[..400], at(350));
     assert_eq!(pipeline.deadline(), Some(at(450).mono));
     assert_eq!(words(&pipeline.tick(at(450))), [""; 0]);
-    assert_eq!(pipeline.deadline(), Some(at(700).mono));
+    assert_eq!(pipeline.deadline(), Some(at(800).mono));
 }
 
 #[test]
@@ -565,8 +448,8 @@ fn totals_balance_with_damage() {
 fn verdicts_below_the_thresholds_are_rejected() {
     let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
         let mut pipeline = pipeline_of(|described| {
-            described.min_force_n = min_force_n;
-            described.min_confidence = min_confidence;
+            described.model.min_force_n = min_force_n;
+            described.model.min_confidence = min_confidence;
         });
         play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
         let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
@@ -593,38 +476,40 @@ fn verdicts_below_the_thresholds_are_rejected() {
 fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     let full = Array::JX255N;
     let small = Array { rows: 10, cols: 12 };
-    let check = |array: Option<Array>, range: [f32; 2], place: usize, count, expected: &[Note]| {
-        let mut pipeline = pipeline_of(|described| {
-            described.frame.rows = array.map(|array| array.rows);
-            described.frame.cols = array.map(|array| array.cols);
-        });
-        let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
-        for entry in &mut file.metadata_props {
-            if entry.key == "hrn.range" {
-                entry.value = serde_json::json!({
-                    "force_n": range,
-                    "contact_area_taxels": [9, 10],
-                })
-                .to_string();
+    let check =
+        |array: Option<Array>, range: [f32; 2], place: usize, count: u16, expected: &[Note]| {
+            let mut pipeline = pipeline_of(|described| {
+                described.sensor.frame.rows = array.map(|array| array.rows);
+                described.sensor.frame.cols = array.map(|array| array.cols);
+            });
+            let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
+            for entry in &mut file.metadata_props {
+                if entry.key == "hrn.range" {
+                    entry.value = serde_json::json!({
+                        "force_n": range,
+                        "contact_area_taxels": [9, 10],
+                    })
+                    .to_string();
+                }
             }
-        }
-        pipeline.hrn = Arc::new(Hrn::load(&file.encode_to_vec()).unwrap());
-        play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-        let array = pipeline.sensor().layout().array();
-        let mut held = RawFrame::zero(array);
-        // Three by three taxels in the middle.
-        for row in 0..3 {
-            let first = array.place(array.rows / 2 - 2 + row, array.cols / 2 - 2);
-            held.counts[first..first + 3].fill(50);
-        }
-        held.counts[place] = count;
-        let press = [held.clone(), held, raw(0, 0), raw(0, 0)];
-        let events = feed(&mut pipeline, 5, &press);
-        let Some(Event::Hardness(verdict)) = events.last() else {
-            panic!("{events:?}")
+            let hrn = Hrn::load(&file.encode_to_vec()).unwrap();
+            pipeline.judge = Judge::new(Arc::new(hrn));
+            play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+            let array = pipeline.sensor().layout().array();
+            let mut held = RawFrame::zero(array);
+            // Three by three taxels in the middle.
+            for row in 0..3 {
+                let first = array.place(array.rows / 2 - 2 + row, array.cols / 2 - 2);
+                held.counts[first..first + 3].fill(50.0);
+            }
+            held.counts[place] = f32::from(count);
+            let press = [held.clone(), held, raw(0, 0), raw(0, 0)];
+            let events = feed(&mut pipeline, 5, &press);
+            let Some(Event::Hardness(verdict)) = events.last() else {
+                panic!("{events:?}")
+            };
+            assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
         };
-        assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
-    };
     let wide = [0.0, 100.0];
     check(None, wide, 348, 50, &[]);
     for (row, col) in [(0, 9), (27, 9), (9, 0), (9, 27)] {
@@ -642,53 +527,6 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     check(None, [0.0, 17.9], 348, 50, &[Note::OutsideTraining]);
     check(None, [18.1, 100.0], 348, 50, &[Note::OutsideTraining]);
     check(None, wide, 348, 1, &[Note::OutsideTraining]);
-}
-
-#[test]
-fn the_notes_are_of_the_settings_that_the_chosen_frame_came_under() {
-    let check = |counts, newtons_per_count, threshold_n, expected: &[Note]| {
-        let mut pipeline = pipeline(Preset::Jx255n);
-        play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-        let mut held = raw(9, counts);
-        held.counts[0] = 5;
-        play(&mut pipeline, 5, &[held, raw(3, 100)]);
-        reload(&mut pipeline, |described| {
-            described.calibration.newtons_per_count = newtons_per_count;
-            described.press.contact_threshold_n = Some(threshold_n);
-        });
-        let events = feed(&mut pipeline, 7, &vec![raw(0, 0); 2]);
-        let Some(Event::Hardness(verdict)) = events.last() else {
-            panic!("{events:?}")
-        };
-        let notes = verdict.notes.iter().copied();
-        let notes: Vec<Note> = notes.filter(|&n| n != Note::OutsideTraining).collect();
-        assert_eq!(notes, expected, "{counts} counts, then {newtons_per_count}");
-    };
-    check(254, 0.01, 0.07, &[Note::AtEdge]);
-    check(255, 0.08, 0.07, &[Note::AtEdge, Note::Saturated]);
-    check(254, 0.04, 2.0, &[Note::AtEdge]);
-}
-
-#[test]
-fn the_end_of_the_input_makes_a_jq_frame_whole() {
-    let frames = |events: &[Event]| {
-        let frames = events.iter().filter(|e| matches!(e, Event::Frame(_)));
-        frames.count()
-    };
-    let mut pipeline = self::pipeline(Preset::Jq);
-    let bytes = bytes(&pipeline, &raw(0, 0));
-    assert_eq!(frames(&pipeline.push(&bytes, at(0))), 0);
-    assert_eq!(frames(&pipeline.lost("end of file".to_owned(), at(10))), 1);
-    pipeline.opened(at(20));
-    // After half a frame and a loss, the next bytes are not its other half.
-    pipeline.push(&bytes[..400], at(30));
-    pipeline.lost("end of file".to_owned(), at(40));
-    pipeline.opened(at(50));
-    assert_eq!(frames(&pipeline.push(&bytes[400..], at(60))), 0);
-    assert_eq!(frames(&pipeline.push(&bytes, at(80))), 0);
-    assert_eq!(frames(&pipeline.end_of_recording(Some(at(90)))), 1);
-    let status = pipeline.status(at(90));
-    assert_eq!((status.frames, status.bytes_skipped), (2, 788));
 }
 
 #[test]
@@ -721,13 +559,7 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
 fn failing_model() -> Hrn {
     let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     let graph = file.graph.as_mut().unwrap();
-    graph.initializer.push(pb::TensorProto {
-        name: "limit".to_owned(),
-        dims: vec![1],
-        data_type: pb::tensor_proto::DataType::Float as i32,
-        float_data: vec![1000.0],
-        ..Default::default()
-    });
+    graph.initializer.push(number("limit", 1000.0));
     let makes_logits = |node: &pb::NodeProto| node.output == ["logits"];
     let place = graph.node.iter().position(makes_logits).unwrap();
     graph.node[place].output = vec!["finite".to_owned()];
@@ -739,25 +571,18 @@ fn failing_model() -> Hrn {
         ("Div", &["limit.root", "limit.root"], "limit.one"),
         ("Mul", &["finite", "limit.one"], "logits"),
     ];
-    let nodes = nodes.map(|(op, input, output)| pb::NodeProto {
-        op_type: op.to_owned(),
-        name: output.to_owned(),
-        input: input.iter().map(|&name| name.to_owned()).collect(),
-        output: vec![output.to_owned()],
-        ..Default::default()
-    });
+    let nodes = nodes.map(|(op, inputs, output)| node(op, inputs, &[output], &[]));
     graph.node.splice(place + 1..place + 1, nodes);
     Hrn::load(&file.encode_to_vec()).unwrap()
 }
 
 #[test]
 fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-    pipeline.hrn = Arc::new(failing_model());
-    reload(&mut pipeline, |described| {
-        described.calibration.newtons_per_count = 10.0;
+    let mut pipeline = pipeline_of(|described| {
+        described.sensor.calibration.newtons_per_count = 10.0;
     });
+    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    pipeline.judge = Judge::new(Arc::new(failing_model()));
     let press = |counts| [raw(9, counts), raw(9, counts), raw(0, 0), raw(0, 0)];
     let published = play(&mut pipeline, 5, &press(99));
     assert_eq!(published, ["Begin 1", "End 1", "Final of 5"]);
@@ -813,15 +638,17 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
         found
     };
     assert_eq!(judged(&mut pipeline, 5), None, "no object is named");
-    pipeline.set_context(Some(serde_json::json!({"object": "cup"})));
+    pipeline.context = Some(serde_json::json!({"object": "cup"}));
     assert_eq!(judged(&mut pipeline, 9), Some(("cup".to_owned(), 1)));
-    pipeline.set_context(Some(serde_json::json!({"object": 7})));
+    pipeline.context = Some(serde_json::json!({"object": 7}));
     assert_eq!(judged(&mut pipeline, 13), Some(("7".to_owned(), 1)));
-    let mut next = pipeline_of(|_| {});
-    next.recall(pipeline.memory());
-    next.set_context(Some(serde_json::json!({"object": "cup"})));
+    let state = pipeline.at_rest().unwrap();
+    let mut next = Pipeline::resumed(pipeline.sensor().clone(), test_support::hrn(), state);
+    next.context = Some(serde_json::json!({"object": "cup"}));
     assert_eq!(judged(&mut next, 17), Some(("cup".to_owned(), 2)));
     // The same model goes on with its objects.
-    reload(&mut next, |described| described.press.min_frames = 1);
+    let mut next = next
+        .with_model(next.sensor().clone(), next.hrn().clone())
+        .unwrap();
     assert_eq!(judged(&mut next, 21), Some(("cup".to_owned(), 3)));
 }

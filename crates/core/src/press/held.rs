@@ -2,23 +2,20 @@
 
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use super::{ContactFrame, is_greater};
-use crate::frame::Array;
 
 /// The largest number of frames that are held. When there are more, every second one is dropped,
 /// and from then on only every second, fourth, ... frame is held.
 const MOST_HELD: usize = 512;
 
 /// The frames in contact so far.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct HeldFrames {
     /// Frames 0, `stride`, 2 `stride`, ... of the frames in contact.
     held: Vec<ContactFrame>,
     stride: u64,
     /// The last frame in contact.
-    newest: Vec<ContactFrame>,
+    newest: Option<ContactFrame>,
     count: u64,
 }
 
@@ -38,7 +35,7 @@ impl HeldFrames {
                 self.held.push(frame.clone());
             }
         }
-        self.newest = vec![frame];
+        self.newest = Some(frame);
         self.count += 1;
     }
 
@@ -64,19 +61,6 @@ impl HeldFrames {
             })
         });
         (frames, best)
-    }
-
-    /// Whether frames of `array` can have made this course.
-    pub(super) fn is_possible(&self, frames: u64, array: Array) -> bool {
-        self.held.len() <= MOST_HELD
-            && self.newest.len() <= 1
-            && self.count <= frames
-            && self.held.iter().all(|held| held.moment.frame < frames)
-            && self
-                .held
-                .iter()
-                .chain(&self.newest)
-                .all(|held| held.frame.array == array)
     }
 }
 
@@ -139,15 +123,5 @@ mod tests {
             let (frames, found) = course.until(Duration::from_millis(until_ms), &peak);
             assert_eq!((frames[found].moment.frame, frames.len()), (best, length));
         }
-    }
-
-    #[test]
-    fn a_recording_holds_every_bit_of_it() {
-        let mut course = HeldFrames::default();
-        (0..700).for_each(|number| course.push(frame(number, 3)));
-        let text = serde_json::to_string(&course).unwrap();
-        // Without packing, the text is 4 times as long.
-        assert!(text.len() < 220 * 352, "{}", text.len());
-        assert_eq!(serde_json::from_str::<HeldFrames>(&text).unwrap(), course);
     }
 }

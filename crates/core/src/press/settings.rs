@@ -1,95 +1,62 @@
 //! The thresholds that begin and end a press.
 
-use serde::{Deserialize, Serialize};
-
 use crate::frame::{Array, Pitch};
-use crate::range::{self, OutOfRange, positive, within};
-use crate::wording::as_written;
+use crate::range::{OutOfRange, above_0, from_to, within};
 
-/// The `[press]` table. A key that is `None` depends on the size of a taxel: see [`Thresholds`].
-///
-/// # Example
-///
-/// ```
-/// use hardnessd_core::frame::{Array, Pitch};
-/// use hardnessd_core::press::Settings;
-///
-/// let settings = Settings { max_seconds: 5.0, ..Settings::default() };
-/// let thresholds = settings.check(Array::JX255N, Pitch::square(7.0))?;
-/// assert_eq!(thresholds.contact_threshold_n, 0.28);
-///
-/// let settings = Settings { begin_area_taxels: Some(3), end_area_taxels: Some(4), ..Settings::default() };
-/// let error = settings.check(Array::JX255N, Pitch::JX255N).unwrap_err();
-/// assert_eq!(error.to_string(), "end_area_taxels: found 4, expected 1 to 3");
-/// # Ok::<(), hardnessd_core::range::OutOfRange>(())
-/// ```
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
-    /// A taxel is in contact at or above this force.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub contact_threshold_n: Option<f32>,
-    /// A press begins with the first frame of at least this contact area.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub begin_area_taxels: Option<u32>,
-    /// Frames below this contact area release the press.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub end_area_taxels: Option<u32>,
-    /// The number of such frames in a row that releases it.
-    pub end_frames: u32,
-    /// A press with fewer frames in contact gets no verdict.
-    pub min_frames: u64,
-    /// A press that is held for this long ends.
-    pub max_seconds: f64,
-    /// How long the contact must have settled for an early verdict.
-    pub early_settle_s: f64,
-    /// The least total force for an early verdict.
-    pub early_min_force_n: f64,
-}
+/// The largest number of a key, which is beyond any press.
+const LARGEST: f64 = 1e6;
 
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            contact_threshold_n: None,
-            begin_area_taxels: None,
-            end_area_taxels: None,
-            end_frames: 2,
-            min_frames: 2,
-            max_seconds: 30.0,
-            early_settle_s: 0.3,
-            early_min_force_n: 1.0,
-        }
+crate::settings! {
+    /// The `[press]` table. A key that is `None` depends on the size of a taxel: see [`Thresholds`].
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd_core::frame::{Array, Pitch};
+    /// use hardnessd_core::press::Settings;
+    ///
+    /// let settings = Settings { max_seconds: 5.0, ..Settings::default() };
+    /// let thresholds = settings.check(Array::JX255N, Pitch::square(7.0))?;
+    /// assert_eq!(thresholds.contact_threshold_n, 0.28);
+    ///
+    /// let settings = Settings { begin_area_taxels: Some(3), end_area_taxels: Some(4), ..Settings::default() };
+    /// let error = settings.check(Array::JX255N, Pitch::JX255N).unwrap_err();
+    /// assert_eq!(error.to_string(), "end_area_taxels: found 4, expected 1 to 3");
+    /// # Ok::<(), hardnessd_core::range::OutOfRange>(())
+    /// ```
+    pub struct Settings {
+        /// A taxel is in contact at or above this force.
+        pub contact_threshold_n: Option<f32>, in above_0(LARGEST);
+        /// A press begins with the first frame of at least this contact area.
+        pub begin_area_taxels: Option<u32>;
+        /// Frames below this contact area release the press.
+        pub end_area_taxels: Option<u32>;
+        /// The number of such frames in a row that releases it.
+        pub end_frames: u32 = 2, in from_to((1.0, LARGEST), "");
+        /// A press with fewer frames in contact gets no verdict.
+        pub min_frames: u64 = 2, in from_to((1.0, LARGEST), "");
+        /// A press that is held for this long ends.
+        pub max_seconds: f64 = 30.0, in above_0(LARGEST);
+        /// How long the contact must have settled for an early verdict.
+        pub early_settle_s: f64 = 0.3, in from_to((0.0, LARGEST), "");
+        /// The least total force for an early verdict.
+        pub early_min_force_n: f64 = 1.0, in from_to((0.0, LARGEST), "");
     }
 }
-
-/// The longest duration and the largest force that settings may have.
-const LARGEST: f64 = 1e6;
 
 impl Settings {
     /// Checks every value. Returns the thresholds for an array of taxels `pitch` apart.
     ///
     /// # Errors
     ///
-    /// Returns an error if a force or duration is not finite or out of range, an area is 0 or above
-    /// the number of taxels, the end area is above the begin area, or a count of frames is 0.
+    /// Returns an error if a value is out of its range, an area is 0 or above the number of taxels, or
+    /// the end area is above the begin area.
     pub fn check(&self, array: Array, pitch: Pitch) -> Result<Thresholds, OutOfRange> {
+        self.check_ranges()?;
         let thresholds = self.thresholds(array, pitch);
-        let threshold_n = as_written(thresholds.contact_threshold_n);
-        positive("contact_threshold_n", threshold_n, LARGEST)?;
-        positive("max_seconds", self.max_seconds, LARGEST)?;
-        for (key, found) in [
-            ("early_settle_s", self.early_settle_s),
-            ("early_min_force_n", self.early_min_force_n),
-        ] {
-            let fits = (0.0..=LARGEST).contains(&found);
-            let expected = format_args!("0 or more and at most {LARGEST}");
-            range::check(key, found, fits, expected)?;
-        }
         let (begin, end) = (thresholds.begin_area_taxels, thresholds.end_area_taxels);
         within("begin_area_taxels", begin, (1, array.taxels() as u32), "")?;
         within("end_area_taxels", end, (1, begin), "")?;
-        within("end_frames", self.end_frames, (1, u32::MAX), "")?;
-        within("min_frames", self.min_frames, (1, u64::MAX), "")?;
         Ok(thresholds)
     }
 

@@ -3,13 +3,10 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use super::Thresholds;
-use crate::frame::{contact_area_taxels, force_n};
 
 /// The latest frames whose area and force are all near the largest ones so far.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Settling {
     near: VecDeque<Load>,
     most_area: u32,
@@ -17,7 +14,7 @@ pub(super) struct Settling {
 }
 
 /// The contact of one frame.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Load {
     pub(super) at: Duration,
     pub(super) contact_area_taxels: u32,
@@ -25,12 +22,6 @@ pub(super) struct Load {
 }
 
 impl Settling {
-    /// Whether frames can have made this state.
-    pub(super) fn is_possible(&self) -> bool {
-        let is_less = |load: &Load| load.contact_area_taxels <= self.most_area;
-        self.near.iter().all(is_less)
-    }
-
     /// Adds a frame. Returns true if area and force have stayed near their largest values so far,
     /// over at least `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a
     /// verdict.
@@ -57,25 +48,6 @@ impl Settling {
             && self.near.len() >= SETTLED_FRAMES
             && self.near.front().is_some_and(covers)
     }
-}
-
-/// The place of the first of `frames` of a press with which its contact has settled, or `None` if it
-/// never settles. The newtons of each frame come
-/// with the time since the press began.
-pub fn first_settled<'a>(
-    frames: impl Iterator<Item = (Duration, &'a [f32])>,
-    thresholds: &Thresholds,
-) -> Option<usize> {
-    let mut settling = Settling::default();
-    let is_settled = |(at, newtons): (Duration, &[f32])| {
-        let load = Load {
-            at,
-            contact_area_taxels: contact_area_taxels(newtons, thresholds.contact_threshold_n),
-            force_n: force_n(newtons),
-        };
-        settling.push(load, thresholds)
-    };
-    frames.map(is_settled).position(|settled| settled)
 }
 
 /// An early verdict needs this many settled frames.

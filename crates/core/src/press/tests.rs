@@ -1,5 +1,4 @@
 use super::*;
-use crate::frame::Pitch;
 
 /// A frame of `area` taxels sharing `force_n`.
 fn frame(area: usize, force_n: f32) -> Frame {
@@ -32,7 +31,7 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
         ) {
             text.push(match change {
                 Change::Begin { press, at } => format!("b{press}@{}", at.frame),
-                Change::Settled { peak, .. } => format!("s@{number}:{}", peak.moment.frame),
+                Change::Settled { press } => format!("s@{number}:{}", press.peak().moment.frame),
                 Change::End {
                     last,
                     frames,
@@ -62,48 +61,58 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
     text.join(" ")
 }
 
-fn check(loads: &[(usize, f32)], expected: &str) {
-    assert_eq!(track(&Thresholds::default(), loads, 5), expected);
+fn check(settings: &Thresholds, cases: &[(&[(usize, f32)], &str)]) {
+    for (loads, expected) in cases {
+        assert_eq!(track(settings, loads, 5), *expected, "{loads:?}");
+    }
 }
 
+const TOUCH: (usize, f32) = (5, 2.0);
+const FREE: (usize, f32) = (0, 0.0);
+
 #[test]
-fn a_press_runs_from_begin_area_to_release() {
+fn a_press_runs_from_its_begin_area_to_its_release() {
     check(
+        &Thresholds::default(),
         &[
-            (0, 0.),
-            (2, 9.),
-            (3, 1.),
-            (9, 5.),
-            (5, 3.),
-            (0, 0.),
-            (0, 0.),
+            (
+                &[FREE, (2, 9.), (3, 1.), (9, 5.), (5, 3.), FREE, FREE],
+                "b1@2 e@6:last4 n3 peak3",
+            ),
+            // One empty frame does not end it.
+            (
+                &[(3, 1.), FREE, (4, 2.), FREE, FREE],
+                "b1@0 e@4:last2 n2 peak2",
+            ),
+            // A press of one frame is short.
+            (
+                &[(3, 1.), FREE, FREE, (3, 1.)],
+                "b1@0 x@2:last0 n1 short b2@3",
+            ),
+            // Ties of area go to the force, then to the earlier frame.
+            (
+                &[(5, 1.), (5, 3.), (5, 3.), (5, 2.), FREE, FREE],
+                "b1@0 e@5:last3 n4 peak1",
+            ),
         ],
-        "b1@2 e@6:last4 n3 peak3",
     );
-}
-
-#[test]
-fn one_empty_frame_does_not_end_a_press() {
-    check(
-        &[(3, 1.), (0, 0.), (4, 2.), (0, 0.), (0, 0.)],
-        "b1@0 e@4:last2 n2 peak2",
-    );
-}
-
-#[test]
-fn a_press_of_one_frame_is_short() {
-    check(
-        &[(3, 1.), (0, 0.), (0, 0.), (3, 1.)],
-        "b1@0 x@2:last0 n1 short b2@3",
-    );
-}
-
-#[test]
-fn ties_of_area_go_to_force_then_to_the_earlier_frame() {
-    check(
-        &[(5, 1.), (5, 3.), (5, 3.), (5, 2.), (0, 0.), (0, 0.)],
-        "b1@0 e@5:last3 n4 peak1",
-    );
+    // Frames below the end area release, though something is touched.
+    let settings = Thresholds {
+        begin_area_taxels: 5,
+        end_area_taxels: 3,
+        early_settle_s: 9.0,
+        ..Thresholds::default()
+    };
+    let few = (2, 2.);
+    let loads = &[(4, 9.), TOUCH, (3, 2.), few, few, (4, 9.), TOUCH];
+    check(&settings, &[(loads, "b1@1 e@4:last2 n2 peak1 b2@6")]);
+    // The same holds after a timeout.
+    let settings = Thresholds {
+        max_seconds: 0.2,
+        ..settings
+    };
+    let loads = &[TOUCH, TOUCH, few, few, TOUCH];
+    check(&settings, &[(loads, "b1@0 t@1:last1 n2 peak0 b2@4")]);
 }
 
 #[test]
@@ -133,77 +142,23 @@ fn a_held_press_times_out_once_and_waits_for_release() {
         early_settle_s: 9.0,
         ..Thresholds::default()
     };
-    let mut loads = vec![(5, 2.0); 8];
-    loads.extend([(0, 0.0), (5, 2.0), (0, 0.0), (0, 0.0), (5, 2.0)]);
-    assert_eq!(track(&settings, &loads, 5), "b1@0 t@5:last5 n6 peak0 b2@12");
-}
-
-#[test]
-fn a_press_held_at_its_limit_counts_the_release_it_has_begun() {
-    let settings = Thresholds {
-        max_seconds: 1.0,
-        early_settle_s: 9.0,
-        ..Thresholds::default()
-    };
-    let mut loads = vec![(5, 2.0); 5];
-    loads.extend([(0, 0.0), (0, 0.0), (5, 2.0)]);
-    assert_eq!(track(&settings, &loads, 5), "b1@0 t@5:last4 n5 peak0 b2@7");
-}
-
-#[test]
-fn a_press_too_short_for_a_verdict_at_its_limit_is_aborted() {
+    let held = [&[TOUCH; 8][..], &[FREE, TOUCH, FREE, FREE, TOUCH]].concat();
+    // The release that had begun at the limit counts.
+    let released = [&[TOUCH; 5][..], &[FREE, FREE, TOUCH]].concat();
+    check(
+        &settings,
+        &[
+            (&held, "b1@0 t@5:last5 n6 peak0 b2@12"),
+            (&released, "b1@0 t@5:last4 n5 peak0 b2@7"),
+        ],
+    );
+    // A press too short for a verdict at its limit is aborted.
     let settings = Thresholds {
         max_seconds: 0.4,
         min_frames: 9,
         ..Thresholds::default()
     };
-    assert_eq!(
-        track(&settings, &[(5, 2.0); 4], 5),
-        "b1@0 s@2:0 x@2:last2 n3 short"
-    );
-}
-
-#[test]
-fn frames_below_the_end_area_release_though_something_is_touched() {
-    let settings = Thresholds {
-        begin_area_taxels: 5,
-        end_area_taxels: 3,
-        early_settle_s: 9.0,
-        ..Thresholds::default()
-    };
-    let loads = [
-        (4, 9.),
-        (5, 2.),
-        (3, 2.),
-        (2, 2.),
-        (2, 2.),
-        (4, 9.),
-        (5, 2.),
-    ];
-    assert_eq!(track(&settings, &loads, 5), "b1@1 e@4:last2 n2 peak1 b2@6");
-    // The same holds after a timeout.
-    let settings = Thresholds {
-        max_seconds: 0.2,
-        ..settings
-    };
-    let loads = [(5, 2.), (5, 2.), (2, 2.), (2, 2.), (5, 2.)];
-    assert_eq!(track(&settings, &loads, 5), "b1@0 t@1:last1 n2 peak0 b2@4");
-}
-
-#[test]
-fn what_was_reloaded_holds_for_the_press_under_way() {
-    let mut tracker = PressTracker::new(Thresholds::default());
-    for number in 0..3 {
-        let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
-    }
-    tracker.reload(Thresholds {
-        end_frames: 1,
-        ..Thresholds::default()
-    });
-    assert!(matches!(
-        tracker.push(&frame(0, 0.0), Marks::default(), moment(3, 5))[..],
-        [Change::End { frames: 3, .. }]
-    ));
+    check(&settings, &[(&[TOUCH; 4], "b1@0 s@2:0 x@2:last2 n3 short")]);
 }
 
 #[test]
@@ -230,47 +185,39 @@ fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force()
 
 #[test]
 fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
-    // At 5 frames/s, three frames within 5 % span 0.4 s.
-    check(
-        &[(5, 2.), (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)],
-        "b1@0 s@4:2",
-    );
     // At 6 % a frame, every new frame makes the frame two before it too far away.
     let rising: Vec<(usize, f32)> = (0..20).map(|i| (30, 4.0 * 1.06_f32.powi(i))).collect();
-    check(&rising, "b1@0");
-    // The force is too small for an early verdict.
-    check(&[(5, 0.9); 5], "b1@0");
-    // The force of the current frame counts, not the largest one.
-    check(&[(5, 1.02), (5, 1.02), (5, 0.98)], "b1@0");
-}
-
-#[test]
-fn settling_needs_its_time_at_high_rates() {
-    let settings = Thresholds::default();
-    let text = track(&settings, &[(10, 5.0); 40], 100);
+    check(
+        &Thresholds::default(),
+        &[
+            // At 5 frames/s, three frames within 5 % span 0.4 s.
+            (
+                &[TOUCH, (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)],
+                "b1@0 s@4:2",
+            ),
+            (&rising, "b1@0"),
+            // The force is too small for an early verdict.
+            (&[(5, 0.9); 5], "b1@0"),
+            // The force of the current frame counts, not the largest one.
+            (&[(5, 1.02), (5, 1.02), (5, 0.98)], "b1@0"),
+        ],
+    );
+    // At high rates, settling needs its time.
+    let text = track(&Thresholds::default(), &[(10, 5.0); 40], 100);
     assert_eq!(text, "b1@0 s@30:0");
 }
 
 #[test]
-fn the_frame_that_settles_a_recorded_press_is_the_trackers() {
-    let settled_at = |loads: &[(usize, f32)]| {
-        let frames: Vec<Frame> = loads.iter().map(|&(area, n)| frame(area, n)).collect();
-        let stamped = frames.iter().zip(0..);
-        let stamped =
-            stamped.map(|(frame, number)| (moment(number, 5).stamp.mono, &frame.newtons[..]));
-        first_settled(stamped, &Thresholds::default())
+fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_timed_out() {
+    let push = |tracker: &mut PressTracker, number| {
+        tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5))
     };
-    let loads = [(5, 2.), (9, 6.), (12, 10.), (12, 9.9), (12, 9.8), (12, 9.8)];
-    check(&loads, "b1@0 s@4:2");
-    assert_eq!(settled_at(&loads), Some(4));
-    assert_eq!(settled_at(&loads[..4]), None);
-}
-
-#[test]
-fn an_aborted_press_leaves_the_tracker_idle() {
-    let mut tracker = PressTracker::new(Thresholds::default());
+    let mut tracker = PressTracker::new(Thresholds {
+        max_seconds: 0.2,
+        ..Thresholds::default()
+    });
     assert_eq!(tracker.abort(Abort::Lost), None);
-    let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(0, 5));
+    push(&mut tracker, 0);
     assert!(matches!(
         tracker.abort(Abort::Lost),
         Some(Change::Aborted {
@@ -281,34 +228,8 @@ fn an_aborted_press_leaves_the_tracker_idle() {
         })
     ));
     assert!(!tracker.is_pressed());
-}
-
-#[test]
-fn a_loss_does_not_release_what_timed_out() {
-    let mut tracker = PressTracker::new(Thresholds {
-        max_seconds: 0.2,
-        ..Thresholds::default()
-    });
-    for number in 0..2 {
-        let _ = tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5));
-    }
-    assert_eq!(tracker.abort(Abort::Lost), None);
-    assert_eq!(
-        tracker.push(&frame(5, 2.0), Marks::default(), moment(2, 5)),
-        []
-    );
-}
-
-#[test]
-fn what_is_out_of_range_is_told_as_it_was_written() {
-    let settings = Settings {
-        contact_threshold_n: Some(-0.07),
-        ..Settings::default()
-    };
-    let refusal = settings.check(Array::JX255N, Pitch::JX255N);
-    let refusal = refusal.unwrap_err().to_string();
-    assert!(
-        refusal.starts_with("contact_threshold_n: found -0.07, expected"),
-        "{refusal}"
-    );
+    push(&mut tracker, 1);
+    push(&mut tracker, 2);
+    assert_eq!(tracker.abort(Abort::Lost), None, "it timed out");
+    assert_eq!(push(&mut tracker, 3), []);
 }

@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Entry, Error, RecordedSensor, State};
+use super::{Entry, Error, FORMAT, State};
 use crate::event;
 use crate::frame::Stamp;
 use crate::motion::Point;
@@ -62,6 +62,13 @@ struct InputMessage {
     data: Blob,
 }
 
+/// The part of a state that says whether the rest can be read.
+#[derive(Deserialize)]
+struct Version {
+    #[serde(default)]
+    format: u32,
+}
+
 fn from_cdr<M: DeserializeOwned>(bytes: &[u8]) -> Result<M, Error> {
     let foreign = |found: String| Error::Foreign {
         found,
@@ -101,15 +108,26 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
                 approach_mm: points.iter().map(|point| point.mm).collect(),
             });
         }
-        Entry::Settings(sensor) => (8, json(sensor)),
         Entry::State(state) => (9, json(state)),
         Entry::Input(Input::ClockSet(until_ns)) => (10, json(until_ns)),
+        Entry::Input(Input::Skipped(bytes)) => (11, json(bytes)),
     };
     ros::to_cdr(&InputMessage {
         header,
         mono_ns,
         kind,
-        data: Blob(data),
+        data: Blob::from(data),
+    })
+}
+
+/// The message of a state that may be anything.
+#[cfg(test)]
+pub(super) fn encode_state(sensor: &str, at: Stamp, state: &Value) -> Vec<u8> {
+    ros::to_cdr(&InputMessage {
+        header: Header::new(at.wall, sensor),
+        mono_ns: at.mono.as_nanos() as u64,
+        kind: 9,
+        data: Blob::from(json(state)),
     })
 }
 
@@ -129,7 +147,7 @@ fn stamp(header: &Header, mono_ns: u64, log_time_ns: u64) -> Result<Stamp, Error
     };
     Ok(Stamp {
         mono: std::time::Duration::from_nanos(mono_ns),
-        wall: wall.ok_or_else(|| foreign("a time that is none".to_owned()))?,
+        wall: wall.ok_or_else(|| foreign("an invalid time".to_owned()))?,
     })
 }
 
@@ -145,7 +163,7 @@ pub(super) fn decode_motion(
     let points = moments.into_iter().zip(positions);
     let points: Vec<Point> = points.map(Point::from).collect();
     if !same || !points.iter().all(Point::is_usable) {
-        return Err(foreign("positions that are none".to_owned()));
+        return Err(foreign("invalid positions".to_owned()));
     }
     let motion = Input::Motion(points.into());
     Ok((message.header.frame_id, at, Entry::Input(motion)))
@@ -158,7 +176,7 @@ pub(super) fn decode_entry(
 ) -> Result<(String, Stamp, Entry), Error> {
     let message: InputMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
-    let data = message.data.0;
+    let data = message.data.into_vec();
     let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned().into();
     let unreadable = |error: serde_json::Error| foreign(format!("other JSON ({error})"));
     let entry = match message.kind {
@@ -174,21 +192,30 @@ pub(super) fn decode_entry(
             Entry::Input(Input::Context(context))
         }
         7 => Entry::Input(Input::Shutdown),
-        8 => {
-            let sensor: RecordedSensor = serde_json::from_slice(&data).map_err(unreadable)?;
-            Entry::Settings(Box::new(sensor))
-        }
         9 => {
+            let Version { format } = serde_json::from_slice(&data).map_err(unreadable)?;
+            if format != FORMAT {
+                return Err(Error::Foreign {
+                    found: format!("a recording of format {format}"),
+                    expected: "format 3: play it with the version that wrote it",
+                });
+            }
             let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
-            state
-                .memory
-                .context()
-                .map_or(Ok(()), event::check_context)?;
+            let context = state.at_rest.context();
+            context.map_or(Ok(()), event::check_context)?;
             Entry::State(Box::new(state))
         }
         10 => {
             let until_ns: i64 = serde_json::from_slice(&data).map_err(unreadable)?;
             Entry::Input(Input::ClockSet(until_ns))
+        }
+        11 => {
+            let bytes: u64 = serde_json::from_slice(&data).map_err(unreadable)?;
+            // No line ever delivers so many.
+            if bytes > u64::from(u32::MAX) {
+                return Err(foreign(format!("{bytes} bytes at once")));
+            }
+            Entry::Input(Input::Skipped(bytes))
         }
         other => return Err(foreign(format!("an input of kind {other}"))),
     };

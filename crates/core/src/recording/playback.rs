@@ -3,13 +3,15 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::{Entry, Found, Labels, RecordedSensor};
+use super::{Entry, Found, Labels, RecordedSensor, State};
 use crate::event::Event;
 use crate::frame::Stamp;
+use crate::judge::Unjudged;
 use crate::motion::Track;
-use crate::pipeline::{Clock, FixedError, Pipeline, Unjudged};
-use crate::sensor::SensorError;
-use crate::verdict::{Course, Hrn, ReferencesError};
+use crate::pipeline::Pipeline;
+use crate::press::Abort;
+use crate::range::OutOfRange;
+use crate::verdict::{Course, Hrn, ModelError, ReferencesError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -36,6 +38,9 @@ pub struct Playback {
     /// The models of sensors whose references are not those of the recording.
     identified: BTreeMap<String, Arc<Hrn>>,
     players: Vec<Player>,
+    /// The first moment of each sensor whose first entry is no state, and the moment of its first
+    /// state, if there is one.
+    left_out: BTreeMap<String, (Stamp, Option<Stamp>)>,
     keeps_courses: bool,
 }
 
@@ -46,6 +51,14 @@ struct Player {
     labels: Labels,
     /// The SHA-256 of the model during recording.
     model: String,
+}
+
+impl Player {
+    fn has(&self, state: &State) -> bool {
+        self.model == state.sensor.model_sha256
+            && self.pipeline.sensor().for_recording() == state.sensor.description
+            && self.pipeline.at_rest().as_ref() == Some(&state.at_rest)
+    }
 }
 
 /// The error of an entry that cannot be played.
@@ -61,16 +74,16 @@ pub struct PlaybackError {
 pub enum PlaybackProblem {
     /// The description of the sensor is not valid.
     #[error(transparent)]
-    Sensor(#[from] SensorError),
+    Sensor(#[from] OutOfRange),
     /// The references are not as the model computes them.
     #[error(transparent)]
     References(#[from] ReferencesError),
-    /// No pipeline can have this state.
-    #[error("memory: found what no pipeline can have come to, expected the memory of one")]
-    Memory,
-    /// The entry describes another sensor under the same name.
+    /// The model does not take frames of this sensor.
     #[error(transparent)]
-    Fixed(#[from] FixedError),
+    Model(#[from] ModelError),
+    /// No pipeline can have this state.
+    #[error("state: found what no pipeline can have come to, expected the state of one")]
+    State,
 }
 
 impl Playback {
@@ -81,6 +94,7 @@ impl Playback {
             hrn,
             identified: BTreeMap::new(),
             players: Vec::new(),
+            left_out: BTreeMap::new(),
             keeps_courses: false,
         }
     }
@@ -109,14 +123,14 @@ impl Playback {
         if let Some(hrn) = self.identified.get(recorded.name()) {
             return Ok(hrn.clone());
         }
-        if recorded.references.is_none() || recorded.model != self.hrn.sha256() {
+        if recorded.references.is_none() || recorded.model_sha256 != self.hrn.sha256() {
             return Ok(self.hrn.clone());
         }
         Ok(Arc::new(self.hrn.identified(recorded.references.clone())?))
     }
 
     /// The events of one entry. An entry before its sensor's first state cannot be played and has
-    /// no events. `mono_ns` is null, because the moment belongs to another boot.
+    /// no events: see [`Self::left_out`]. `mono_ns` is null, because the moment belongs to another boot.
     ///
     /// # Errors
     ///
@@ -137,20 +151,20 @@ impl Playback {
     ) -> Result<Vec<Event>, PlaybackProblem> {
         let hrn = match &entry {
             Entry::State(state) => self.hrn_of(&state.sensor)?,
-            Entry::Settings(described) => self.hrn_of(described)?,
             Entry::Input(_) => self.hrn.clone(),
         };
         let mut players = self.players.iter_mut();
         let known = players.find(|player| player.pipeline.sensor().name() == sensor);
         let events = match (entry, known) {
+            // If no entry is missing, the pipeline already has this state.
+            (Entry::State(state), Some(known)) if known.has(&state) => Vec::new(),
             (Entry::State(state), known) => {
                 let described = state.sensor.check()?;
-                if !state.memory.is_possible(described.layout().array()) {
-                    return Err(PlaybackProblem::Memory);
+                hrn.card().check_array(described.layout().array())?;
+                if !state.at_rest.is_usable(described.layout().array()) {
+                    return Err(PlaybackProblem::State);
                 }
-                // If no entry is missing, the pipeline already has this state.
-                let mut pipeline = Pipeline::new(described, hrn, Clock::Arrival);
-                pipeline.recall(state.memory);
+                let mut pipeline = Pipeline::resumed(described, hrn, state.at_rest);
                 if self.keeps_courses {
                     pipeline.keep_courses();
                 }
@@ -158,25 +172,33 @@ impl Playback {
                     pipeline,
                     last: at,
                     labels: state.labels,
-                    model: state.sensor.model,
+                    model: state.sensor.model_sha256,
                 };
                 match known {
-                    Some(known) => *known = player,
-                    None => self.players.push(player),
+                    Some(known) => {
+                        let mut before = std::mem::replace(known, player).pipeline;
+                        // A press under way has lost its end with the missing entries.
+                        before.abort(Abort::EndOfRecording).into_iter().collect()
+                    }
+                    None => {
+                        if let Some((_, to)) = self.left_out.get_mut(sensor) {
+                            *to = Some(at);
+                        }
+                        self.players.push(player);
+                        Vec::new()
+                    }
                 }
-                Vec::new()
-            }
-            (Entry::Settings(described), Some(known)) => {
-                let sensor = described.check()?;
-                known.pipeline.reload(sensor, hrn)?;
-                known.model = described.model;
-                Vec::new()
             }
             (Entry::Input(input), Some(known)) => {
                 known.last = at;
-                known.pipeline.take(input, at)
+                // What was refused then is refused now.
+                known.pipeline.take(input, at).unwrap_or_default()
             }
-            (_, None) => Vec::new(),
+            (_, None) => {
+                let name = sensor.to_owned();
+                self.left_out.entry(name).or_insert((at, None));
+                Vec::new()
+            }
         };
         Ok(events)
     }
@@ -204,6 +226,21 @@ impl Playback {
         let mut players = self.players.iter();
         let player = players.find(|player| player.pipeline.sensor().name() == sensor)?;
         Some(player.pipeline.track())
+    }
+
+    /// What cannot be played, in words: a clip of a recording may begin inside a press. It is played
+    /// from the next rest on.
+    pub fn left_out(&self) -> Vec<String> {
+        let note = |(sensor, (from, to)): (&String, &(Stamp, Option<Stamp>))| match to {
+            Some(to) => {
+                let seconds = to.mono.saturating_sub(from.mono).as_secs_f64();
+                format!(
+                    "sensor {sensor:?}: the first {seconds:.1} s begin inside a press: left out"
+                )
+            }
+            None => format!("sensor {sensor:?}: no moment at rest: left out"),
+        };
+        self.left_out.iter().map(note).collect()
     }
 
     /// The number of sensors so far.

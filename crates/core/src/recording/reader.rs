@@ -1,7 +1,7 @@
 //! Reads the bytes of an MCAP file back as entries.
 
 use std::collections::BTreeMap;
-use std::io::{ErrorKind, Read};
+use std::io::{Cursor, ErrorKind, Read};
 
 use mcap::MAGIC;
 use mcap::records::{ChunkHeader, Record, op};
@@ -31,9 +31,6 @@ impl Found {
     }
 }
 
-/// The longest record in a chunk. The longest message is a state in the middle of a long press that
-/// loads every taxel of a large array. It has less than 24 MiB.
-pub(super) const LONGEST_RECORD_BYTES: usize = 32 << 20;
 /// The longest chunk that is read, packed and unpacked. A chunk of ours ends with the first message
 /// after 1 MiB. Those of other programs may be longer.
 pub(super) const LONGEST_CHUNK_BYTES: usize = 64 << 20;
@@ -47,104 +44,85 @@ pub(super) fn too_long(bytes: u64) -> String {
 /// unpacked length, the checksum, the name's length, and the data's length.
 const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
 
-/// The chunks of a file so far.
-#[derive(Debug, Default)]
-pub(super) struct Chunks {
-    /// Their unpacked length.
-    unpacked: u64,
+/// The schemas, channels and messages of a chunk, one after another. The chunk is held unpacked, and never
+/// all its records: a chunk may have millions.
+pub(super) struct ChunkRecords {
+    reader: LinearReader,
+    /// The rest of the chunk's record.
+    rest: Cursor<Vec<u8>>,
 }
 
-impl Chunks {
-    /// The schemas, channels and messages of a chunk, whose record has the bytes `body`. The file had
-    /// `read` bytes up to its end. The unpacked length is checked before the chunk is unpacked, and
-    /// the checksum before any record is used. The chunk is read apart from the file and without
-    /// what may follow its data, because the crate reads past the data of a chunk without compression.
+impl ChunkRecords {
+    /// The records of a chunk whose record has the bytes `body`. The unpacked length is checked before the
+    /// chunk is unpacked, and the checksum before any record is used. The chunk is read apart from the
+    /// file and without what may follow its data, because the crate reads past the data of a chunk without
+    /// compression.
     ///
     /// # Errors
     ///
-    /// Fails if the chunk is damaged, too long, or makes the file unpack to more than
-    /// [`most_unpacked`].
-    pub(super) fn records(
-        &mut self,
-        header: &ChunkHeader,
-        body: &[u8],
-        read: u64,
-    ) -> Result<Vec<Record<'static>>, Error> {
+    /// Fails if the chunk is cut off or too long.
+    pub(super) fn new(header: &ChunkHeader, body: &[u8]) -> Result<Self, Error> {
         let length = header.uncompressed_size;
         if length > LONGEST_CHUNK_BYTES as u64 {
             return Err(mcap::McapError::ChunkTooLarge(length).into());
         }
-        if self.unpacked + length > most_unpacked(read) {
-            let problem = "the recording unpacks to more than 256 times its bytes";
-            return Err(Error::Damaged(problem.to_owned()));
-        }
-        self.unpacked += length;
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
             .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
             // The crate holds the chunk itself to the limit of its records too.
             .with_record_length_limit(LONGEST_CHUNK_BYTES);
-        let mut reader = LinearReader::new_with_options(options);
         let data_at = CHUNK_HEADER_BYTES + header.compression.len() as u64;
         let end = usize::try_from(data_at.saturating_add(header.compressed_size)).ok();
         let Some(body) = end.and_then(|end| body.get(..end)) else {
             return Err(mcap::McapError::UnexpectedEoc.into());
         };
-        let head = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
-        let mut chunk = head.as_slice().chain(body);
-        let mut records = Vec::new();
-        while let Some(event) = reader.next_event() {
+        let length = (body.len() as u64).to_le_bytes();
+        Ok(Self {
+            reader: LinearReader::new_with_options(options),
+            rest: Cursor::new([&[op::CHUNK], &length[..], body].concat()),
+        })
+    }
+
+    fn read(&mut self) -> Result<Option<Record<'static>>, Error> {
+        while let Some(event) = self.reader.next_event() {
             match event? {
                 LinearReadEvent::ReadRequest(wanted) => {
-                    let read = chunk.read(reader.insert(wanted))?;
-                    reader.notify_read(read);
+                    let read = self.rest.read(self.reader.insert(wanted))?;
+                    self.reader.notify_read(read);
                 }
                 LinearReadEvent::Record { opcode, data } => {
-                    if data.len() > LONGEST_RECORD_BYTES {
-                        let len = data.len() as u64;
-                        return Err(mcap::McapError::RecordTooLarge { opcode, len }.into());
-                    }
                     let record = parse(opcode, data)?;
-                    // Records that are not used take no memory.
                     if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =
                         record
                     {
-                        records.push(record.into_owned());
+                        return Ok(Some(record.into_owned()));
                     }
                 }
             }
         }
-        Ok(records)
+        Ok(None)
     }
 }
 
-/// The number of unpacked bytes that a file of `bytes` bytes may hold. The recording of a silent sensor
-/// holds 55 times its bytes, its densest chunk 185 times. A file that claims more would cost much time
-/// for few bytes: zstd packs zeros to a ten-thousandth.
-pub(super) fn most_unpacked(bytes: u64) -> u64 {
-    (64 << 20) + 256 * bytes
+impl Iterator for ChunkRecords {
+    type Item = Result<Record<'static>, Error>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.read().transpose()
+    }
 }
 
-/// Parses a record. The crate panics on an attachment whose lengths do not fit, so they are checked
-/// first.
+/// Parses a record. An attachment is passed over, because the crate panics on one whose lengths do not
+/// fit. No recording of ours has any.
 pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, mcap::McapError> {
-    if opcode == op::ATTACHMENT && attachment_bytes(body) != Some(body.len() as u64) {
-        return Err(mcap::McapError::UnexpectedEof);
+    match opcode {
+        op::ATTACHMENT => Ok(Record::Unknown {
+            opcode,
+            data: body.into(),
+        }),
+        _ => mcap::parse_record(opcode, body),
     }
-    mcap::parse_record(opcode, body)
-}
-
-/// The length that an attachment's record must have by its own lengths: two times, a name, a media
-/// type, the data and a checksum.
-fn attachment_bytes(body: &[u8]) -> Option<u64> {
-    let text = |at: u64| {
-        let bytes = body.get(usize::try_from(at).ok()?..)?.first_chunk()?;
-        Some(at + 4 + u64::from(u32::from_le_bytes(*bytes)))
-    };
-    let data_at = text(text(16)?)?;
-    let bytes = body.get(usize::try_from(data_at).ok()?..)?.first_chunk()?;
-    u64::from_le_bytes(*bytes).checked_add(data_at + 8 + 4)
 }
 
 /// The decoder of the messages of a schema, if they are read.
@@ -183,9 +161,8 @@ pub struct Reader<R> {
     schemas: BTreeMap<u16, Decode>,
     channels: BTreeMap<u16, Decode>,
     bytes: u64,
-    chunks: Chunks,
-    /// The records of the current chunk that are still to come.
-    pending: std::vec::IntoIter<Record<'static>>,
+    /// The current chunk.
+    chunk: Option<ChunkRecords>,
     /// Whether the summary, an error or the end was reached.
     done: bool,
 }
@@ -202,19 +179,21 @@ impl<R: Read> Reader<R> {
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             bytes: 0,
-            chunks: Chunks::default(),
-            pending: Vec::new().into_iter(),
+            chunk: None,
             done: false,
         }
     }
 
     fn read(&mut self) -> Result<Option<Found>, Error> {
         loop {
-            if let Some(record) = self.pending.next() {
-                if let Some(found) = self.take(record)? {
-                    return Ok(Some(found));
+            match self.chunk.as_mut().and_then(Iterator::next) {
+                Some(record) => {
+                    if let Some(found) = self.take(record?)? {
+                        return Ok(Some(found));
+                    }
+                    continue;
                 }
-                continue;
+                None => self.chunk = None,
             }
             let Some(event) = self.linear.next_event() else {
                 return Ok(None);
@@ -244,8 +223,7 @@ impl<R: Read> Reader<R> {
                 }
                 LinearReadEvent::Record { opcode, data } => match parse(opcode, data)? {
                     Record::Chunk { header, .. } => {
-                        let records = self.chunks.records(&header, data, self.bytes)?;
-                        self.pending = records.into_iter();
+                        self.chunk = Some(ChunkRecords::new(&header, data)?);
                         continue;
                     }
                     record => record.into_owned(),

@@ -1,10 +1,9 @@
 //! Copies the whole parts of a damaged recording into a new one.
 //!
 //! One scan goes from front to back and trusts no index. It takes each chunk whose checksum fits.
-//! If a record does not fill its length, the next record's place is unknown. The scan then searches
-//! for the bytes that every chunk has at the same place. Whatever the file holds, the
-//! scan reads no more than a few times its length, unpacks a bounded length ([`Chunks`]), and
-//! holds one chunk of bounded size.
+//! If no record follows another one, its length is damaged, and the next record's place is unknown.
+//! The scan then searches for the bytes that every chunk has at the same place. It holds one chunk of
+//! bounded size.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -14,7 +13,7 @@ use mcap::records::{Channel, Record, op};
 use mcap::write::NoSeek;
 
 use super::message;
-use super::reader::{Chunks, LONGEST_CHUNK_BYTES, decoder, parse, too_long};
+use super::reader::{ChunkRecords, LONGEST_CHUNK_BYTES, decoder, parse};
 use super::{Entry, Error, writer};
 
 /// The result of recovering a damaged recording.
@@ -31,10 +30,8 @@ pub struct Recovered {
     pub chunks: u64,
     /// The first and the last saved moment, in nanoseconds since 1970.
     pub span_ns: Option<(u64, u64)>,
-    /// The beginning and the length of each damaged stretch, in bytes of the file.
+    /// The beginning and the length of each stretch that is damaged, or is a chunk that is not read.
     pub lost: Vec<(u64, u64)>,
-    /// The place of each chunk that is not damaged and yet not read, and the reason.
-    pub unread: Vec<(u64, String)>,
     /// The number of messages in whole chunks whose channel is unknown.
     pub messages_unknown: u64,
     /// The number of messages in whole chunks that cannot be read. A chunk without a checksum may
@@ -80,14 +77,41 @@ pub fn recover<R: Read + Seek, W: Write>(
 ) -> Result<(Recovered, W), RecoverError> {
     let mut scan = Scan::new(broken).map_err(RecoverError::Read)?;
     let mut copy = Copy::new(good)?;
-    while let Some(records) = scan.next().map_err(RecoverError::Read)? {
-        copy.take(records)?;
+    while let Some(found) = scan.next().map_err(RecoverError::Read)? {
+        match found {
+            Whole::Record(record) => copy.take(*record)?,
+            Whole::Chunk(chunk, place) => {
+                let mut is_whole = true;
+                for record in chunk {
+                    match record {
+                        Ok(record) => copy.take(record)?,
+                        Err(_) => is_whole = false,
+                    }
+                    if !is_whole {
+                        break;
+                    }
+                }
+                match is_whole {
+                    true => scan.whole += 1,
+                    false => scan.lost.push((place, scan.place - place)),
+                }
+            }
+            Whole::End => {}
+        }
     }
     copy.done.lost = scan.lost;
-    copy.done.unread = scan.unread;
     copy.done.chunks = scan.whole;
     copy.done.complete = scan.complete;
     Ok(copy.finish()?)
+}
+
+/// What the scan found.
+enum Whole {
+    Record(Box<Record<'static>>),
+    /// A chunk, and its place. Its records may be damaged.
+    Chunk(Box<ChunkRecords>, u64),
+    /// The end of what is worth reading, or a chunk that is not read.
+    End,
 }
 
 /// The damaged file.
@@ -98,19 +122,8 @@ struct Scan<R> {
     place: u64,
     /// The number of whole chunks.
     whole: u64,
-    chunks: Chunks,
     lost: Vec<(u64, u64)>,
-    unread: Vec<(u64, String)>,
-    /// The numbers of the channels so far.
-    channels: BTreeSet<u16>,
     complete: bool,
-    /// The number of bytes read as records that turned out not to be records.
-    wasted: u64,
-    /// The block that was searched last, and its place in the file.
-    block: (u64, Vec<u8>),
-    /// The number of all bytes read.
-    #[cfg(test)]
-    read: u64,
 }
 
 impl<R: Read + Seek> Scan<R> {
@@ -122,92 +135,62 @@ impl<R: Read + Seek> Scan<R> {
             // The magic is skipped unread, so damage to it loses nothing.
             place: MAGIC.len() as u64,
             whole: 0,
-            chunks: Chunks::default(),
             lost: Vec::new(),
-            unread: Vec::new(),
-            channels: BTreeSet::new(),
             complete: false,
-            wasted: 0,
-            block: (0, Vec::new()),
-            #[cfg(test)]
-            read: 0,
         })
     }
 
-    /// The next whole records. `None` if there are no more.
-    fn next(&mut self) -> io::Result<Option<Vec<Record<'static>>>> {
-        while self.place < self.length {
-            let place = self.place;
-            let Some((opcode, end)) = self.record_at(place)? else {
-                self.place = match self.long_chunk_at(place)? {
-                    Some(length) => {
-                        self.unread.push((place, too_long(length)));
-                        place + RECORD_HEAD_BYTES + length
-                    }
-                    None => self.skip(place)?,
-                };
-                continue;
-            };
-            let body = self.bytes(place + RECORD_HEAD_BYTES, end)?;
-            match (opcode, body.len()) {
-                // The rest of the file only repeats what was read. These records have fixed
-                // lengths. With another length, the record is another one whose first byte is
-                // damaged.
-                (op::DATA_END, 4) | (op::FOOTER, 20) => {
-                    self.complete = true;
-                    return Ok(None);
+    /// The next whole record or chunk. `None` if there are no more.
+    fn next(&mut self) -> io::Result<Option<Whole>> {
+        while self.place < self.length && !self.complete {
+            match self.records_at(self.place)? {
+                Some((found, end)) => {
+                    self.place = end;
+                    return Ok(Some(found));
                 }
-                _ => {}
-            }
-            let Some(record) = self.exact(opcode, &body) else {
-                self.wasted += end - place;
-                self.place = self.skip(place)?;
-                continue;
-            };
-            self.place = end;
-            match record {
-                Record::Chunk { header, .. } => match self.chunks.records(&header, &body, end) {
-                    Ok(records) => {
-                        self.whole += 1;
-                        self.note(&records);
-                        return Ok(Some(records));
-                    }
-                    Err(Error::Unread(problem)) => self.unread.push((place, problem)),
-                    Err(_) => self.lost.push((place, end - place)),
-                },
-                record => {
-                    let records = vec![record.into_owned()];
-                    self.note(&records);
-                    return Ok(Some(records));
-                }
+                None => self.skip()?,
             }
         }
         Ok(None)
     }
 
-    /// Takes in the channels among `records`.
-    fn note(&mut self, records: &[Record<'_>]) {
-        let channels = records.iter().filter_map(|record| match record {
-            Record::Channel(channel) => Some(channel.id),
-            _ => None,
-        });
-        self.channels.extend(channels);
-    }
-
-    /// Parses a record if it fills its bytes to the last one. If it does not, its length is
-    /// damaged, and its end is unknown.
-    ///
-    /// A message outside a chunk fills any length, and has no checksum. So its channel must be known,
-    /// and in a file with chunks it is another record whose first byte is damaged.
-    fn exact<'a>(&self, opcode: u8, body: &'a [u8]) -> Option<Record<'a>> {
-        let record = parse(opcode, body).ok()?;
-        let is_exact = match &record {
-            Record::Message { header, .. } => {
-                self.whole == 0 && self.channels.contains(&header.channel_id)
-            }
-            record => length(record, body) == Some(body.len()),
+    /// The record or chunk that begins at `place`, and its end. `None` if nothing whole begins there.
+    fn records_at(&mut self, place: u64) -> io::Result<Option<(Whole, u64)>> {
+        let Some((opcode, end)) = self.record_at(place)? else {
+            return Ok(None);
         };
-        is_exact.then_some(record)
+        if end - place > RECORD_HEAD_BYTES + LONGEST_CHUNK_BYTES as u64 {
+            return Ok(None);
+        }
+        let bytes = self.bytes(place, end)?;
+        let Some((_, body)) = bytes.split_at_checked(RECORD_HEAD_BYTES as usize) else {
+            return Ok(None);
+        };
+        // The rest of the file only repeats what was read. These records have fixed lengths. With
+        // another length, the record is another one whose first byte is damaged.
+        if matches!((opcode, body.len()), (op::DATA_END, 4) | (op::FOOTER, 20)) {
+            self.complete = true;
+            return Ok(Some((Whole::End, end)));
+        }
+        let record = match parse(opcode, body) {
+            Ok(Record::Chunk { header, .. }) => {
+                if !is_chunk_head(&bytes, self.length - place) {
+                    return Ok(None);
+                }
+                let Ok(chunk) = ChunkRecords::new(&header, body) else {
+                    self.lost.push((place, end - place));
+                    return Ok(Some((Whole::End, end)));
+                };
+                return Ok(Some((Whole::Chunk(Box::new(chunk), place), end)));
+            }
+            // A message has no checksum of its own. In a file with chunks it is another record
+            // whose first byte is damaged.
+            Ok(Record::Message { .. }) if self.whole > 0 => return Ok(None),
+            Ok(record) => record.into_owned(),
+            Err(_) => return Ok(None),
+        };
+        let is_followed = end == self.length || self.record_at(end)?.is_some();
+        Ok(is_followed.then_some((Whole::Record(Box::new(record)), end)))
     }
 
     /// The opcode and the end of the record at `place`, if there can be a record.
@@ -220,53 +203,29 @@ impl<R: Read + Seek> Scan<R> {
         let length = u64::from_le_bytes(length);
         let end = place + RECORD_HEAD_BYTES + length.min(self.length);
         let known = (op::HEADER..=op::DATA_END).contains(&opcode);
-        let fits = length <= LONGEST_CHUNK_BYTES as u64 && end <= self.length;
-        // After that many wasted bytes, only chunks are tried as records.
-        let hopeless = opcode != op::CHUNK && self.wasted > self.length;
-        Ok((known && fits && !hopeless).then_some((opcode, end)))
+        Ok((known && end <= self.length).then_some((opcode, end)))
     }
 
-    /// The length of the chunk at `place`, if there is one that is longer than any that is read.
-    fn long_chunk_at(&mut self, place: u64) -> io::Result<Option<u64>> {
-        let head = self.bytes(place, place + HEAD_BYTES as u64)?;
-        let is_chunk = head.len() == HEAD_BYTES && is_chunk_head(&head, self.length - place);
-        let length = is_chunk.then(|| number(&head, LENGTH_AT));
-        Ok(length.filter(|length| *length > LONGEST_CHUNK_BYTES as u64))
-    }
-
-    /// Gives up the bytes at `place`. Returns the place of the next chunk, or the end of the file.
-    fn skip(&mut self, place: u64) -> io::Result<u64> {
-        let next = self.next_chunk(place + 1)?.unwrap_or(self.length);
-        self.lost.push((place, next - place));
-        Ok(next)
-    }
-
-    /// The place of the next chunk from `place` on, whether the chunk is whole or not.
-    fn next_chunk(&mut self, place: u64) -> io::Result<Option<u64>> {
-        let mut from = place;
-        while from + HEAD_BYTES as u64 <= self.length {
-            let (start, block) = &self.block;
-            let inside = from
-                .checked_sub(*start)
-                .and_then(|at| block.get(at as usize..));
-            let Some(block) = inside.filter(|block| block.len() >= HEAD_BYTES) else {
-                // The next search continues in the same block.
-                self.block = (from, self.bytes(from, from + BLOCK_BYTES as u64)?);
-                if self.block.1.len() < HEAD_BYTES {
-                    // The file has become shorter during the scan.
-                    return Ok(None);
-                }
-                continue;
-            };
+    /// Gives up the bytes at the scan's place. The scan continues at the next chunk, whether it is whole
+    /// or not, or at the end of the file.
+    fn skip(&mut self) -> io::Result<()> {
+        let lost = self.place;
+        let mut from = lost + 1;
+        self.place = loop {
+            let block = self.bytes(from, from + BLOCK_BYTES as u64)?;
             let mut heads = block.windows(HEAD_BYTES).enumerate();
-            let left = self.length - from;
+            let left = self.length.saturating_sub(from);
             if let Some((at, _)) = heads.find(|(at, head)| is_chunk_head(head, left - *at as u64)) {
-                return Ok(Some(from + at as u64));
+                break from + at as u64;
+            }
+            if block.len() < BLOCK_BYTES {
+                break self.length;
             }
             // A chunk's head may lie across the border of two blocks.
             from += (block.len() - HEAD_BYTES + 1) as u64;
-        }
-        Ok(None)
+        };
+        self.lost.push((lost, self.place - lost));
+        Ok(())
     }
 
     /// The bytes from `start` to `end`, or fewer if the file ends before.
@@ -277,25 +236,21 @@ impl<R: Read + Seek> Scan<R> {
             .by_ref()
             .take(end - start)
             .read_to_end(&mut bytes)?;
-        #[cfg(test)]
-        {
-            self.read += bytes.len() as u64;
-        }
         Ok(bytes)
     }
 }
 
-/// Whether these [`HEAD_BYTES`] bytes begin a chunk that ends within `left` bytes. The check compares
-/// its lengths with each other, so the rest of the chunk need not be read.
+/// Whether these bytes, [`HEAD_BYTES`] or more, begin a chunk that ends within `left` bytes. The check
+/// compares its lengths with each other, so the rest of the chunk need not be read.
 fn is_chunk_head(head: &[u8], left: u64) -> bool {
     let length = number(head, LENGTH_AT);
     let is_of = |compression: &&[u8]| {
         let packed_at = COMPRESSION_AT + compression.len();
         let data_at = (packed_at + 8) as u64;
-        head[COMPRESSION_AT..].starts_with(compression)
-            && length.checked_sub(number(head, packed_at)) == Some(data_at - RECORD_HEAD_BYTES)
+        let named = head.get(COMPRESSION_AT..packed_at) == Some(*compression);
+        named && length.checked_sub(number(head, packed_at)) == Some(data_at - RECORD_HEAD_BYTES)
     };
-    head[0] == op::CHUNK
+    head.first() == Some(&op::CHUNK)
         && length <= left.saturating_sub(RECORD_HEAD_BYTES)
         && COMPRESSIONS.iter().any(is_of)
 }
@@ -304,30 +259,6 @@ fn is_chunk_head(head: &[u8], left: u64) -> bool {
 fn number(head: &[u8], at: usize) -> u64 {
     let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
     bytes.map_or(u64::MAX, u64::from_le_bytes)
-}
-
-/// The number of bytes that a record fills by its own lengths. `None` for a record that does not
-/// come before the end of the data.
-fn length(record: &Record<'_>, body: &[u8]) -> Option<usize> {
-    let text = |text: &str| 4 + text.len();
-    let map = |map: &BTreeMap<String, String>| {
-        4 + map.iter().map(|(k, v)| text(k) + text(v)).sum::<usize>()
-    };
-    Some(match record {
-        Record::Header(header) => text(&header.profile) + text(&header.library),
-        Record::Schema { header, data } => {
-            2 + text(&header.name) + text(&header.encoding) + 4 + data.len()
-        }
-        Record::Channel(channel) => {
-            4 + text(&channel.topic) + text(&channel.message_encoding) + map(&channel.metadata)
-        }
-        Record::Chunk { header, data } => 36 + text(&header.compression) + data.len(),
-        Record::MessageIndex(index) => 6 + 16 * index.records.len(),
-        Record::Metadata(metadata) => text(&metadata.name) + map(&metadata.metadata),
-        // An attachment has a checksum of its own.
-        Record::Attachment { .. } => body.len(),
-        _ => return None,
-    })
 }
 
 /// The new file.
@@ -339,8 +270,16 @@ struct Copy<W: Write> {
     described: BTreeSet<u16>,
     /// The channels that the new file already has.
     begun: BTreeSet<u16>,
+    /// The bytes of the descriptions so far.
+    described_bytes: usize,
     done: Recovered,
 }
+
+/// The most bytes of schemas, channels and metadata. Those of ours take some kilobytes, and those of other
+/// programs some hundreds. More of them are left out.
+const MOST_DESCRIBED_BYTES: usize = 16 << 20;
+/// The memory of a description beside its texts.
+const DESCRIPTION_BYTES: usize = 256;
 
 impl<W: Write> Copy<W> {
     fn new(good: W) -> Result<Self, Error> {
@@ -350,6 +289,7 @@ impl<W: Write> Copy<W> {
             channels: BTreeMap::new(),
             described: BTreeSet::new(),
             begun: BTreeSet::new(),
+            described_bytes: 0,
             done: Recovered::default(),
         })
     }
@@ -362,48 +302,76 @@ impl<W: Write> Copy<W> {
         Ok((self.done, good))
     }
 
-    fn take(&mut self, records: Vec<Record<'static>>) -> Result<(), Error> {
-        for record in records {
-            match record {
-                Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,
-                // The new file has one schema and one channel of a number. A later one is damage.
-                Record::Schema { header, data } if !self.described.contains(&header.id) => {
-                    let schema = (header.name, header.encoding, data.into_owned());
-                    self.schemas.insert(header.id, schema);
-                }
-                Record::Channel(channel) if !self.begun.contains(&channel.id) => {
-                    self.channels.insert(channel.id, channel);
-                }
-                Record::Message { header, data } => {
-                    if !self.begin(header.channel_id, &data)? {
-                        self.done.messages_unknown += 1;
-                        continue;
-                    }
-                    let Channel {
-                        topic, schema_id, ..
-                    } = &self.channels[&header.channel_id];
-                    let schema = self.schemas.get(schema_id);
-                    let decode = schema.and_then(|(name, ..)| decoder(name));
-                    match decode.map(|decode| decode(&data, header.log_time)) {
-                        Some(Err(_)) => {
-                            self.done.messages_damaged += 1;
-                            continue;
-                        }
-                        Some(Ok((_, _, Entry::State(_)))) if writer::is_input(topic) => {
-                            self.done.states += 1;
-                        }
-                        _ => {}
-                    }
-                    self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
-                    self.out.write_to_known_channel(&header, &data)?;
-                    self.done.messages += 1;
-                    let time = header.log_time;
-                    let (first, last) = self.done.span_ns.unwrap_or((time, time));
-                    self.done.span_ns = Some((first.min(time), last.max(time)));
-                }
-                // The writer makes new indexes.
-                _ => {}
+    /// Whether there is room for a description.
+    fn has_room(&mut self, record: &Record<'_>) -> bool {
+        let of_map = |map: &BTreeMap<String, String>| -> usize {
+            let texts = map.iter().map(|(key, value)| key.len() + value.len());
+            texts.map(|bytes| bytes + DESCRIPTION_BYTES).sum()
+        };
+        let bytes = match record {
+            Record::Metadata(metadata) => metadata.name.len() + of_map(&metadata.metadata),
+            Record::Schema { header, data } => {
+                header.name.len() + header.encoding.len() + data.len()
             }
+            Record::Channel(channel) => {
+                channel.topic.len() + channel.message_encoding.len() + of_map(&channel.metadata)
+            }
+            _ => return true,
+        };
+        let bytes = self
+            .described_bytes
+            .saturating_add(bytes + DESCRIPTION_BYTES);
+        let has_room = bytes <= MOST_DESCRIBED_BYTES;
+        if has_room {
+            self.described_bytes = bytes;
+        }
+        has_room
+    }
+
+    fn take(&mut self, record: Record<'static>) -> Result<(), Error> {
+        if !self.has_room(&record) {
+            self.done.messages_unknown += 1;
+            return Ok(());
+        }
+        match record {
+            Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,
+            // The new file has one schema and one channel of a number. A later one is damage.
+            Record::Schema { header, data } if !self.described.contains(&header.id) => {
+                let schema = (header.name, header.encoding, data.into_owned());
+                self.schemas.insert(header.id, schema);
+            }
+            Record::Channel(channel) if !self.begun.contains(&channel.id) => {
+                self.channels.insert(channel.id, channel);
+            }
+            Record::Message { header, data } => {
+                if !self.begin(header.channel_id, &data)? {
+                    self.done.messages_unknown += 1;
+                    return Ok(());
+                }
+                let Channel {
+                    topic, schema_id, ..
+                } = &self.channels[&header.channel_id];
+                let schema = self.schemas.get(schema_id);
+                let decode = schema.and_then(|(name, ..)| decoder(name));
+                match decode.map(|decode| decode(&data, header.log_time)) {
+                    Some(Err(_)) => {
+                        self.done.messages_damaged += 1;
+                        return Ok(());
+                    }
+                    Some(Ok((_, _, Entry::State(_)))) if writer::is_input(topic) => {
+                        self.done.states += 1;
+                    }
+                    _ => {}
+                }
+                self.done.messages_foreign += u64::from(!writer::is_topic_of_ours(topic));
+                self.out.write_to_known_channel(&header, &data)?;
+                self.done.messages += 1;
+                let time = header.log_time;
+                let (first, last) = self.done.span_ns.unwrap_or((time, time));
+                self.done.span_ns = Some((first.min(time), last.max(time)));
+            }
+            // The writer makes new indexes.
+            _ => {}
         }
         Ok(())
     }
@@ -472,20 +440,7 @@ impl Recovered {
     pub fn is_whole(&self) -> bool {
         self.complete
             && self.lost.is_empty()
-            && self.unread.is_empty()
             && self.messages_unknown == 0
             && self.messages_damaged == 0
     }
-}
-
-/// The number of messages in a file, and the number of bytes read to find them.
-#[cfg(test)]
-pub(super) fn read_of(file: &[u8]) -> (u64, u64) {
-    let mut scan = Scan::new(io::Cursor::new(file)).expect("memory can be read");
-    let mut messages = 0;
-    while let Some(records) = scan.next().expect("memory can be read") {
-        let is_message = |record: &&Record<'_>| matches!(record, Record::Message { .. });
-        messages += records.iter().filter(is_message).count() as u64;
-    }
-    (messages, scan.read)
 }

@@ -138,7 +138,7 @@ impl<W: Write> Writer<W> {
                 .expect("plain structs of numbers and strings always serialise");
             let sensor = BTreeMap::from([
                 text("name", sensor.name()),
-                text("model", &sensor.model),
+                text("model", &sensor.model_sha256),
                 text("settings", &settings),
             ]);
             metadata.push(("hardnessd.sensor", sensor));
@@ -172,8 +172,8 @@ impl<W: Write> Writer<W> {
     ///
     /// Returns an error if the entry cannot be written. The writer must not be used after that.
     pub fn entry(&mut self, sensor: usize, at: Stamp, entry: &Entry) -> Result<(), Error> {
-        if let Entry::Settings(settings) = entry {
-            self.sensors[sensor] = (**settings).clone();
+        if let Entry::State(state) = entry {
+            self.sensors[sensor].clone_from(&state.sensor);
         }
         let bytes = message::encode_entry(self.sensors[sensor].name(), at, entry);
         let topic = message::topic_of(entry);
@@ -190,7 +190,7 @@ impl<W: Write> Writer<W> {
         let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) else {
             return Ok(());
         };
-        let pitch_mm = self.sensors[sensor].description.calibration.pitch_mm;
+        let pitch_mm = self.sensors[sensor].description.sensor.calibration.pitch_mm;
         for (topic, time, bytes) in ros::encode_all(event, pitch_mm) {
             self.write(channel_id(sensor, topic), time, &bytes)?;
         }

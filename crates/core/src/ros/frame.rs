@@ -5,8 +5,9 @@
 
 use jiff::Timestamp;
 use serde::Serialize;
+use serde_json::json;
 
-use super::{Blob, Header, Time, Topic, to_cdr};
+use super::{Blob, Header, Time, Topic, named, to_cdr};
 use crate::event::FrameEvent;
 use crate::frame::Pitch;
 
@@ -85,16 +86,6 @@ pub(super) struct ImageMessage {
 }
 
 #[derive(Debug, Serialize)]
-struct ContactMessage {
-    header: Header,
-    frame: u64,
-    force_n: f64,
-    contact_area_taxels: u32,
-    approach_mm: f64,
-    tared: bool,
-}
-
-#[derive(Debug, Serialize)]
 struct GridMessage<'a> {
     timestamp: Time,
     frame_id: &'a str,
@@ -136,7 +127,7 @@ const NEWTONS_BYTES: u32 = size_of::<f32>() as u32;
 
 /// The frame in newtons (`32FC1`), row 0 at the top.
 pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
-    let bytes = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
+    let bytes: Vec<u8> = frame.newtons.iter().flat_map(|n| n.to_le_bytes()).collect();
     let message = ImageMessage {
         header: Header::new(frame.time, &frame.sensor),
         height: frame.rows as u32,
@@ -144,22 +135,22 @@ pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
         encoding: "32FC1",
         is_bigendian: 0,
         step: frame.cols as u32 * NEWTONS_BYTES,
-        data: Blob(bytes),
+        data: Blob::from(bytes),
     };
     (FRAME, frame.time, to_cdr(&message))
 }
 
-/// The total force and the contact area of the frame.
+/// The force of the contact and its area.
 pub fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
-    let message = ContactMessage {
-        header: Header::new(frame.time, &frame.sensor),
-        frame: frame.frame,
-        force_n: frame.newtons.iter().copied().map(f64::from).sum(),
-        contact_area_taxels: frame.contact_area_taxels,
-        approach_mm: frame.approach_mm.unwrap_or(f64::NAN),
-        tared: frame.tared,
-    };
-    (CONTACT, frame.time, to_cdr(&message))
+    // Without the forces of the taxels, which are most of an event.
+    let event = json!({
+        "frame": frame.frame,
+        "force_n": frame.force_n,
+        "contact_area_taxels": frame.contact_area_taxels,
+        "approach_mm": frame.approach_mm,
+        "tared": frame.tared,
+    });
+    named(CONTACT, frame.time, &frame.sensor, &event)
 }
 
 /// The frame as a grid in metres around the sensor's middle. Its y axis points up, so the frame's
@@ -170,7 +161,7 @@ pub(super) fn grid(frame: &FrameEvent, pitch: Pitch) -> (Topic, Timestamp, Vec<u
         y: pitch.rows_mm / 1e3,
     };
     let rows = frame.newtons.chunks(frame.cols).rev();
-    let bytes = rows.flatten().flat_map(|n| n.to_le_bytes()).collect();
+    let bytes: Vec<u8> = rows.flatten().flat_map(|n| n.to_le_bytes()).collect();
     let corner = |taxels: usize, size_m: f64| -0.5 * taxels as f64 * size_m;
     let message = GridMessage {
         timestamp: Time::new(frame.time),
@@ -192,7 +183,7 @@ pub(super) fn grid(frame: &FrameEvent, pitch: Pitch) -> (Topic, Timestamp, Vec<u
             offset: 0,
             kind: FLOAT32,
         }],
-        data: Blob(bytes),
+        data: Blob::from(bytes),
     };
     (GRID, frame.time, to_cdr(&message))
 }

@@ -111,6 +111,7 @@ fn diagnostic(robot: &str, status: &Status) -> DiagnosticStatus {
         ("state", state.clone()),
         ("frames", status.frames.to_string()),
         ("frames_damaged", status.frames_damaged.to_string()),
+        ("frames_dropped", status.frames_dropped.to_string()),
         ("bytes_skipped", status.bytes_skipped.to_string()),
         (
             "frame_rate_hz",
@@ -120,7 +121,10 @@ fn diagnostic(robot: &str, status: &Status) -> DiagnosticStatus {
     DiagnosticStatus {
         level,
         name: format!("hardnessd: {}", status.sensor),
-        message: status.reason.clone().unwrap_or(state),
+        message: match (&status.reason, &status.detail) {
+            (Some(reason), Some(detail)) => format!("{reason}: {detail}"),
+            (reason, _) => reason.clone().unwrap_or(state),
+        },
         hardware_id: robot.to_owned(),
         values: values.map(|(key, value)| KeyValue { key, value }).into(),
     }
@@ -136,7 +140,7 @@ pub fn picture(frame: &FrameEvent, most_n: f32) -> Vec<u8> {
         encoding: "rgb8",
         is_bigendian: 0,
         step: 3 * frame.cols as u32,
-        data: Blob(pixels.collect()),
+        data: Blob::from(pixels.collect::<Vec<u8>>()),
     })
 }
 
@@ -171,8 +175,10 @@ mod tests {
             time: Timestamp::UNIX_EPOCH,
             state,
             reason: reason.map(str::to_owned),
+            detail: None,
             frames: 7,
             frames_damaged: 1,
+            frames_dropped: 0,
             bytes_skipped: 2,
             frame_rate_hz: Some(20.0),
         };

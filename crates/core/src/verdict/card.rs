@@ -1,14 +1,18 @@
 //! What a model file says of itself: its levels, ranges, metrics and checks (`docs/formats.md`).
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use super::course::{Course, Extents};
+use super::error::ModelError;
+use super::parts::PARTS;
 use super::probabilities::argmax;
-use super::references::ReferencePress;
+use super::references::{Knowledge, ReferencePress};
 use super::shore::{Level, Shore};
-use crate::frame::Pitch;
+use crate::frame::{Array, Pitch};
 
-/// The range of forces and areas in training, and for a model of format 2 the range of its presses.
+/// The range of forces and areas in training, and for a model of format 3 the range of its presses.
 /// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
 /// `None` excludes nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -97,7 +101,7 @@ impl Range {
 /// The description of a model in its file: the `hrn.*` metadata.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Card {
-    /// `hrn.format`: "1", "2" or "3".
+    /// `hrn.format`: "1" or "3".
     pub format: String,
     /// `hrn.levels`: levels 1 to L in order.
     pub levels: Vec<Level>,
@@ -113,12 +117,27 @@ pub struct Card {
     pub validation: String,
     /// `hrn.range`: the forces, areas and presses in training.
     pub range: Range,
-    /// `hrn.conformal`: only a file of format 2 or 3 may have it.
+    /// `hrn.grid`: the array whose frames the model takes as they are. `None` for the model's own grid.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub grid: Option<Array>,
+    /// `hrn.conformal`: only a file of format 3 may have it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub conformal: Option<Conformal>,
 }
 
 impl Card {
+    /// Refuses a sensor of another array than that of a model with a grid of its own.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`ModelError::Grid`] for such a sensor.
+    pub fn check_array(&self, found: Array) -> Result<(), ModelError> {
+        match self.grid {
+            Some(expected) if expected != found => Err(ModelError::Grid { found, expected }),
+            _ => Ok(()),
+        }
+    }
+
     /// A taxel of the model's grid is in contact at or above this force.
     pub fn contact_threshold_n(&self) -> f32 {
         Pitch::square(f64::from(self.pitch_mm)).contact_threshold_n()
@@ -134,17 +153,44 @@ impl Card {
     }
 }
 
-/// `hrn.conformal`: the threshold for the set of levels that a verdict cannot tell apart.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+/// `hrn.conformal`: what a model promises of its sets of levels and of its intervals.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Conformal {
-    /// The set misses the true level in at most this share of presses.
+    /// A set misses the true level in at most this share of presses.
     pub alpha: f32,
-    /// The set holds every level of at least this probability, and the most likely one.
+    /// The threshold of a set, where `contexts` has none.
     pub threshold: f32,
+    /// The limits for each knowledge of a sensor.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub contexts: BTreeMap<Knowledge, Limits>,
 }
 
+/// The limits with which a model keeps its promises.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// The set holds every level of at least this probability, and the most likely one.
+    pub threshold: f32,
+    /// The share of the distribution below the interval of the Shore hardness, and above it.
+    pub tail: f32,
+}
+
+/// The share of a distribution below its 90 % interval, and above it.
+pub const TAIL: f32 = 0.05;
+
 impl Conformal {
+    /// The limits for a knowledge of the sensor.
+    pub fn limits(&self, knowledge: Knowledge) -> Limits {
+        let limits = self.contexts.get(&knowledge).copied();
+        limits.unwrap_or(Limits {
+            threshold: self.threshold,
+            tail: TAIL,
+        })
+    }
+}
+
+impl Limits {
     /// The levels of the set, ascending.
     pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
         let (best, _) = argmax(probabilities);
@@ -161,7 +207,7 @@ impl Conformal {
 pub enum Checks {
     /// The check frames of format 1.
     Frames(Check),
-    /// The check presses of format 2 or 3.
+    /// The check presses of format 3.
     Courses(CourseCheck),
 }
 
@@ -186,7 +232,7 @@ impl Checks {
     pub(super) fn shore(&self, index: usize) -> Option<Shore> {
         match self {
             Self::Frames(_) => None,
-            Self::Courses(check) => Some(check.presses[index].shore),
+            Self::Courses(check) => check.presses[index].shore,
         }
     }
 }
@@ -195,7 +241,8 @@ impl Checks {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Check {
-    /// The frames: 784 newtons each, row-major. There are 8 frames, or two frames of each level.
+    /// The frames: 784 newtons each, row-major, or as many as the input of a model with a grid of its
+    /// own has. There are 8 frames, or two frames of each level.
     pub frames: Vec<Vec<f32>>,
     /// One row of L probabilities for each frame.
     pub probabilities: Vec<Vec<f32>>,
@@ -221,8 +268,9 @@ pub struct CheckedCourse {
     pub course: Course,
     /// `[L]`: the trainer's probabilities.
     pub probabilities: Vec<f32>,
-    /// The trainer's Shore hardness: value, low and high.
-    pub shore: Shore,
+    /// The trainer's Shore hardness: value, low and high. `None` for a model that gives none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shore: Option<Shore>,
     /// Whether the trainer judged the press with the references.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub identified: bool,
@@ -233,9 +281,23 @@ pub struct CheckedCourse {
 pub enum Format {
     /// Format 1: the frame of the largest contact area.
     Frame,
-    /// Formats 2 and 3: the course of a press.
+    /// Format 1 with a grid of its own: the press in [`PARTS`](super::parts::PARTS) parts of its time.
+    Parts,
+    /// Format 3: the course of a press.
     Course {
         /// The largest number of frames in a course.
         most_frames: usize,
     },
+}
+
+impl Format {
+    /// The shape of the one input of format 1, in a model with this grid.
+    pub(super) fn shape(self, grid: Option<Array>) -> Vec<usize> {
+        let Array { rows, cols } = grid.unwrap_or(Array::JX255N);
+        let frames = match self {
+            Self::Parts => PARTS,
+            Self::Frame | Self::Course { .. } => 1,
+        };
+        vec![1, frames, rows, cols]
+    }
 }

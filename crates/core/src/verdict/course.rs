@@ -11,7 +11,7 @@ pub const COURSE_FRAMES: (usize, usize) = (3, 48);
 
 /// One frame of a press.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CourseMoment {
+pub struct Sample {
     /// The seconds since the frame that began the press.
     pub time_s: f32,
     /// How far the arm went since the frame that began the press. `None` if it is unknown.
@@ -27,12 +27,12 @@ pub struct CourseMoment {
 /// The built-in model judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Course, CourseMoment, Hrn, ModelFrame};
+/// use hardnessd_core::verdict::{BUILT_IN, Course, Sample, Hrn, ModelFrame};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
 ///     let mut frame = ModelFrame::default();
 ///     frame.newtons[400..404].fill(newtons);
-///     CourseMoment { time_s, approach_mm: Some(approach_mm), frame }
+///     Sample { time_s, approach_mm: Some(approach_mm), frame }
 /// };
 /// let course = Course {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
@@ -47,7 +47,7 @@ pub struct CourseMoment {
 #[serde(into = "Written", try_from = "Written")]
 pub struct Course {
     /// The frames in contact, from the one that began the press, ascending in time.
-    pub moments: Vec<CourseMoment>,
+    pub moments: Vec<Sample>,
     /// The stiffness of the arm. 0 if it is unknown.
     pub arm_n_per_mm: f32,
 }
@@ -99,7 +99,7 @@ pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
 impl Course {
     /// The numbers that `hrn.range` may bound.
     pub fn extents(&self) -> Extents {
-        let moment = |moment: &CourseMoment| (moment.time_s, moment.approach_mm);
+        let moment = |moment: &Sample| (moment.time_s, moment.approach_mm);
         let moments: Vec<_> = self.moments.iter().map(moment).collect();
         extents(&moments, self.arm_n_per_mm)
     }
@@ -163,7 +163,7 @@ impl TryFrom<Written> for Course {
             let newtons = newtons.map_err(|error| Unwritten::Frame(place, error))?;
             let newtons = newtons.try_into().expect("as many as were asked for");
             let frame = ModelFrame { newtons };
-            Ok::<_, Unwritten>(CourseMoment {
+            Ok::<_, Unwritten>(Sample {
                 time_s,
                 approach_mm,
                 frame,

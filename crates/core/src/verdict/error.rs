@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::shore::BordersError;
+use crate::frame::Array;
 
 /// The largest accepted model file, in bytes: 64 MB.
 pub const MAX_FILE_BYTES: usize = 64_000_000;
@@ -12,8 +13,6 @@ pub const MIN_OPSET: i64 = 17;
 pub const CHECK_TOLERANCE: f32 = 1e-4;
 /// The largest accepted difference from the check presses' Shore hardness.
 pub const SHORE_TOLERANCE: f32 = 1e-2;
-/// The most numbers in all values of a graph, which are 256 MB of `f32`.
-pub(super) const MOST_NUMBERS: usize = 64_000_000;
 
 /// The reason why a model file is refused, or why a judgement failed.
 #[derive(Debug, thiserror::Error)]
@@ -68,6 +67,18 @@ pub enum ModelError {
         /// The expected value.
         expected: String,
     },
+    /// The sensor's array is not that of a model with a grid of its own.
+    #[error(
+        "the model takes frames of {}x{} taxels as they are, and the sensor has {}x{}: use the model of this sensor, \
+         or none",
+        .expected.rows, .expected.cols, .found.rows, .found.cols
+    )]
+    Grid {
+        /// The sensor's array.
+        found: Array,
+        /// The model's.
+        expected: Array,
+    },
     /// The graph has a node that no model may have.
     #[error("model node {node}: {problem}")]
     Node {
@@ -79,38 +90,17 @@ pub enum ModelError {
     /// The graph cannot be run.
     #[error("model graph cannot be run: {0}")]
     Graph(String),
-    /// The probabilities differ from the trainer's.
-    #[error(
-        "check frame {frame}: probabilities differ from the trainer's by up to {difference:.6}: \
-         expected at most {CHECK_TOLERANCE}"
-    )]
-    CheckDiffers {
+    /// An output for a check is not what it should be.
+    #[error("check {check}: {what} by up to {difference:.6}: expected at most {most}")]
+    Differs {
         /// The check's index in `hrn.check`.
-        frame: usize,
-        /// The largest difference in that check.
+        check: usize,
+        /// What differs from what.
+        what: &'static str,
+        /// The largest difference of a number.
         difference: f32,
-    },
-    /// The Shore hardness differs from the trainer's.
-    #[error(
-        "check press {press}: `shore` differs from the trainer's by up to {difference:.4}: expected \
-         at most {SHORE_TOLERANCE}"
-    )]
-    ShoreDiffers {
-        /// The press's index in `hrn.check`.
-        press: usize,
-        /// The largest difference of the three numbers.
-        difference: f32,
-    },
-    /// `probabilities` is not the softmax of `logits`.
-    #[error(
-        "check frame {frame}: `probabilities` differs from softmax(`logits`) by up to \
-         {difference:.6}: expected at most {CHECK_TOLERANCE}"
-    )]
-    NotSoftmax {
-        /// The check's index in `hrn.check`.
-        frame: usize,
-        /// The largest difference in that check.
-        difference: f32,
+        /// The largest difference that is accepted.
+        most: f32,
     },
     /// A judgement returned NaN or infinity.
     #[error("model gave a number that is not finite in `{output}`")]
@@ -168,48 +158,16 @@ pub struct ReferencesError {
 /// The problem with a node of a graph.
 #[derive(Debug, thiserror::Error)]
 pub enum NodeProblem {
-    /// The operator is not in the list.
-    #[error("this operator is not supported (docs/formats.md has the list)")]
+    /// The operator runs another graph as an input says.
+    #[error("an operator that runs a graph as an input of the model says is not supported")]
     Operator,
-    /// The inference library would ignore the value of this attribute.
-    #[error("this value of attribute `{0}` is not supported")]
-    Attribute(&'static str),
     /// A shape is unknown until the model runs.
     #[error("the shape of its output depends on an input of the model")]
     Shape,
     /// An index, a length or a divisor is unknown until the model runs.
     #[error("it takes integers that depend on an input of the model")]
     Integers,
-    /// The values of the graph are too large.
-    #[error("with it more than {MOST_NUMBERS} numbers are computed")]
-    Numbers,
-    /// The lists of a forest's nodes, or of its votes, differ in length.
-    #[error("the lists of its trees differ in length")]
-    TreeLists,
-    /// The numbers of a tree's nodes are not 0, 1, 2, ... in this order.
-    #[error("node {id} of tree {tree} is out of order")]
-    TreeOrder {
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
-    /// A branch leads to no later node of its tree.
-    #[error("node {id} of tree {tree} leads nowhere")]
-    TreeEnd {
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
-    /// A vote names a class or a leaf that does not exist.
-    #[error("a vote for class {class} at node {id} of tree {tree}")]
-    Vote {
-        /// The number of the class.
-        class: i64,
-        /// The number of the tree.
-        tree: i64,
-        /// The number of the node.
-        id: i64,
-    },
+    /// The lists of a forest lead nowhere.
+    #[error("{0}")]
+    Trees(&'static str),
 }

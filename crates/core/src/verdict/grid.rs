@@ -1,7 +1,7 @@
-//! The model's own grid, and how frames of other arrays are laid onto it.
+//! The model's own grid, and how frames of other arrays are resampled onto it.
 //!
-//! In: the [`Frame`]s of a press, in the sensor's grid. Out: [`ModelFrame`]s, in the model's. Each
-//! taxel's force is shared out over the model's taxels by area, so the force stays the same.
+//! In: what is felt of the [`Frame`]s of a press, in the sensor's grid. Out: [`ModelFrame`]s, in the
+//! model's. Each taxel's force is shared out over the model's taxels by area, so the force stays the same.
 
 use crate::frame::{self, Array, Frame, Pitch};
 
@@ -29,7 +29,8 @@ const SAME_PITCH: f64 = 0.02;
 /// ```
 #[derive(Clone, Copy, PartialEq)]
 pub struct ModelFrame {
-    /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite and not negative.
+    /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite. Noise around a contact makes
+    /// some of them negative.
     pub newtons: [f32; TAXELS],
 }
 
@@ -61,9 +62,15 @@ impl ModelFrame {
     pub fn force_n(&self) -> f64 {
         frame::force_n(&self.newtons)
     }
+
+    /// The newtons as the graph of a model gets them: none is below 0, so that a logarithm in the
+    /// graph is finite.
+    pub(super) fn pressed(&self) -> impl Iterator<Item = f32> {
+        self.newtons.iter().map(|newtons| newtons.max(0.0))
+    }
 }
 
-/// How the frames of one press are laid onto the model's grid.
+/// How the frames of one press are resampled onto the model's grid.
 ///
 /// An array that is no longer than the grid lies in its middle, along each side. Of a longer array,
 /// the grid covers the part around the contact. Between grids of the same pitch taxels move as they
@@ -75,30 +82,30 @@ impl ModelFrame {
 ///
 /// ```
 /// use hardnessd_core::frame::{Array, Frame, Pitch};
-/// use hardnessd_core::verdict::Laying;
+/// use hardnessd_core::verdict::Resampling;
 ///
 /// let mut fine = Frame::zero(Array { rows: 56, cols: 56 });
 /// for (row, col) in [(20, 30), (20, 31), (21, 30), (21, 31)] {
 ///     fine.newtons[fine.array.place(row, col)] = 0.5;
 /// }
-/// let laying = Laying::new(&fine, Pitch::square(1.75), 3.5);
-/// let laid = laying.lay(&fine);
-/// assert_eq!(laid.newtons[10 * 28 + 15], 2.0);
-/// assert_eq!(laid.force_n(), 2.0);
+/// let resampling = Resampling::new(&fine, Pitch::square(1.75), 3.5);
+/// let resampled = resampling.apply(&fine);
+/// assert_eq!(resampled.newtons[10 * 28 + 15], 2.0);
+/// assert_eq!(resampled.force_n(), 2.0);
 /// ```
 #[derive(Debug, Clone)]
-pub struct Laying {
+pub struct Resampling {
     rows: Side,
     cols: Side,
     is_resampled: bool,
 }
 
-impl Laying {
-    /// The laying of a press whose best frame is `best`, of taxels `pitch` apart, onto a grid of
+impl Resampling {
+    /// The resampling of a press whose best frame is `best`, of taxels `pitch` apart, onto a grid of
     /// taxels `model_mm` apart.
     pub fn new(best: &Frame, pitch: Pitch, model_mm: f64) -> Self {
         let Array { rows, cols } = best.array;
-        let (row, col) = centre(best);
+        let (row, col) = best.centre();
         let is_same = |mm: f64| (mm / model_mm - 1.0).abs() <= SAME_PITCH;
         Self {
             rows: Side::new(rows, pitch.rows_mm / model_mm, ROWS, row),
@@ -113,8 +120,8 @@ impl Laying {
     }
 
     /// The frame on the model's grid.
-    pub fn lay(&self, frame: &Frame) -> ModelFrame {
-        let mut laid = ModelFrame::default();
+    pub fn apply(&self, frame: &Frame) -> ModelFrame {
+        let mut resampled = ModelFrame::default();
         for (row, newtons) in frame.newtons.chunks_exact(frame.array.cols).enumerate() {
             for &(model_row, row_share) in self.rows.shares(row) {
                 for (col, &newtons) in newtons.iter().enumerate() {
@@ -122,31 +129,14 @@ impl Laying {
                         continue;
                     }
                     for &(model_col, col_share) in self.cols.shares(col) {
-                        laid.newtons[model_row * COLS + model_col] +=
+                        resampled.newtons[model_row * COLS + model_col] +=
                             newtons * row_share * col_share;
                     }
                 }
             }
         }
-        laid
+        resampled
     }
-}
-
-/// The centre of a frame's force, as a row and a column. The middle of the array if there is no
-/// force.
-fn centre(frame: &Frame) -> (f64, f64) {
-    let force_n = frame.force_n();
-    let Array { rows, cols } = frame.array;
-    if force_n <= 0.0 {
-        return ((rows - 1) as f64 / 2.0, (cols - 1) as f64 / 2.0);
-    }
-    let (mut row_sum, mut col_sum) = (0.0, 0.0);
-    for (place, &newtons) in frame.newtons.iter().enumerate() {
-        let (row, col) = frame.array.position(place);
-        row_sum += f64::from(newtons) * row as f64;
-        col_sum += f64::from(newtons) * col as f64;
-    }
-    (row_sum / force_n, col_sum / force_n)
 }
 
 /// How the taxels along one side of an array lie on the model's.
@@ -219,23 +209,23 @@ mod tests {
     fn the_models_own_array_is_laid_as_it_is() {
         let mut frame = touched(Array::JX255N, 3, 20, 6);
         frame.newtons[783] = 1e-7;
-        let laying = Laying::new(&frame, Pitch::JX255N, 3.5);
-        assert!(!laying.is_resampled());
-        assert_eq!(laying.lay(&frame).newtons[..], frame.newtons[..]);
+        let resampling = Resampling::new(&frame, Pitch::JX255N, 3.5);
+        assert!(!resampling.is_resampled());
+        assert_eq!(resampling.apply(&frame).newtons[..], frame.newtons[..]);
     }
 
     #[test]
     fn a_small_array_lies_in_the_middle_and_a_large_one_around_the_contact() {
         let small = touched(Array { rows: 10, cols: 13 }, 0, 0, 1);
-        let laid = Laying::new(&small, Pitch::JX255N, 3.5).lay(&small);
-        assert_eq!(laid.newtons[9 * COLS + 7], 0.25);
+        let resampled = Resampling::new(&small, Pitch::JX255N, 3.5).apply(&small);
+        assert_eq!(resampled.newtons[9 * COLS + 7], 0.25);
 
         // The middle of the contact is at row 42, column 60.5, too near the end to be in the middle.
         let large = touched(Array { rows: 64, cols: 64 }, 40, 59, 4);
-        let laid = Laying::new(&large, Pitch::JX255N, 3.5).lay(&large);
-        assert_eq!(laid.force_n(), large.force_n());
-        assert_eq!(laid.newtons[12 * COLS + 59 - 36], 0.25);
-        assert_eq!(laid.newtons[12 * COLS + 59 - 37], 0.0);
+        let resampled = Resampling::new(&large, Pitch::JX255N, 3.5).apply(&large);
+        assert_eq!(resampled.force_n(), large.force_n());
+        assert_eq!(resampled.newtons[12 * COLS + 59 - 36], 0.25);
+        assert_eq!(resampled.newtons[12 * COLS + 59 - 37], 0.0);
     }
 
     proptest! {
@@ -252,9 +242,9 @@ mod tests {
             let col = (col_share * cols as f64) as usize;
             let frame = touched(array, row, col, 2);
             let pitch = Pitch { rows_mm: mm[0], cols_mm: mm[1] };
-            let laying = Laying::new(&frame, pitch, 3.5);
-            let laid = laying.lay(&frame);
-            prop_assert!((laid.force_n() / frame.force_n() - 1.0).abs() < 1e-5);
+            let resampling = Resampling::new(&frame, pitch, 3.5);
+            let resampled = resampling.apply(&frame);
+            prop_assert!((resampled.force_n() / frame.force_n() - 1.0).abs() < 1e-5);
         }
     }
 }

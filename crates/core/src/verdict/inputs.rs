@@ -1,11 +1,11 @@
-//! The inputs of a model of format 2 or 3.
+//! The inputs of a model of format 3.
 //!
 //! In: the course of a press, the pressed piece, the sensor's references. Out: the model's inputs as
 //! tensors.
 
 use tract_onnx::prelude::*;
 
-use super::course::{Course, CourseMoment};
+use super::course::{Course, Sample};
 use super::features::FEATURES;
 use super::grid::{COLS, ROWS, TAXELS};
 use super::references::{PIECE, Piece, References};
@@ -30,7 +30,7 @@ pub(super) enum Input {
 pub(super) struct Lengths {
     /// The frames of a press.
     pub(super) frames: usize,
-    /// The references, and the numbers of each. Both are 0 in a model of format 2.
+    /// The references, and the numbers of each. Both are 0 in a model that takes none.
     pub(super) references: usize,
     pub(super) features: usize,
 }
@@ -44,7 +44,7 @@ pub(super) struct Query<'a> {
 }
 
 impl Input {
-    /// The inputs of format 2, followed by those that format 3 has besides.
+    /// Every input.
     pub(super) const ALL: [Self; 10] = [
         Self::Frames,
         Self::TimeS,
@@ -57,8 +57,16 @@ impl Input {
         Self::Given,
         Self::Features,
     ];
-    /// The number of inputs of format 2.
-    pub(super) const OF_FORMAT_2: usize = 6;
+    /// The inputs that have a place for each frame.
+    pub(super) const OF_FRAMES: [Self; 5] = [
+        Self::Frames,
+        Self::TimeS,
+        Self::ApproachMm,
+        Self::Known,
+        Self::Mask,
+    ];
+    /// The inputs of a model that takes references.
+    pub(super) const OF_REFERENCES: [Self; 3] = [Self::Piece, Self::References, Self::Given];
 
     pub(super) fn name(self) -> &'static str {
         match self {
@@ -91,7 +99,7 @@ impl Input {
     /// The tensor of this input for `query`. Places after the last frame or reference are 0.
     pub(super) fn tensor(self, query: &Query, lengths: Lengths) -> TractResult<Tensor> {
         let course = query.course;
-        let each = |value: fn(&CourseMoment) -> f32| {
+        let each = |value: fn(&Sample) -> f32| {
             let values = course.moments.iter().map(value);
             values.collect::<Vec<f32>>()
         };
@@ -99,7 +107,7 @@ impl Input {
             Self::Frames => {
                 let mut values = Vec::with_capacity(lengths.frames * TAXELS);
                 for moment in &course.moments {
-                    values.extend_from_slice(&moment.frame.newtons);
+                    values.extend(moment.frame.pressed());
                 }
                 values
             }
@@ -117,26 +125,4 @@ impl Input {
         values.resize(shape.iter().product(), 0.0);
         Tensor::from_shape(&shape, &values)
     }
-}
-
-/// The names and shapes of the inputs of a model of format 2 that takes `most` frames.
-pub fn course_inputs(most: usize) -> Vec<(&'static str, Vec<usize>)> {
-    let mut inputs = identified_inputs(most, [0, 0]);
-    inputs.truncate(Input::OF_FORMAT_2);
-    inputs
-}
-
-/// The names and shapes of the inputs of a model of format 3 that takes `most` frames, and the number
-/// of references and of the features of each.
-pub fn identified_inputs(
-    most: usize,
-    [references, features]: [usize; 2],
-) -> Vec<(&'static str, Vec<usize>)> {
-    let lengths = Lengths {
-        frames: most,
-        references,
-        features,
-    };
-    let input = |input: Input| (input.name(), input.shape(lengths));
-    Input::ALL.map(input).into()
 }

@@ -3,6 +3,8 @@
 //! In: such presses, on the model's grid. Out: [`References`], which the model computes once and
 //! takes beside each press of the same sensor. They show it what the sensor reads of what it knows.
 
+use std::fmt;
+
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::de::Error as _;
@@ -48,6 +50,16 @@ impl Piece {
         }
     }
 
+    /// An object of which nothing is known.
+    pub const UNKNOWN: Self = Self::Shore {
+        range: [0.0, 100.0],
+    };
+
+    /// Whether nothing is known of the piece.
+    pub fn is_unknown(self) -> bool {
+        self == Self::UNKNOWN
+    }
+
     /// Whether the piece is rigid.
     pub fn is_rigid(self) -> bool {
         !matches!(self, Self::Shore { .. })
@@ -64,31 +76,112 @@ pub struct ReferencePress {
     pub piece: Piece,
 }
 
-/// The kinds of a sensor's references.
+/// The kinds of the references that a verdict was made with. In JSON it is `none`, or the kinds in the
+/// order of the fields, joined by `+`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ReferenceKinds {
-    /// There are none, or the model takes none.
-    #[default]
-    None,
+#[serde(into = "String", try_from = "String")]
+pub struct ReferenceKinds {
+    /// Presses of objects of which nothing is known.
+    pub own: bool,
     /// Presses on rigid pieces.
-    Rigid,
+    pub rigid: bool,
     /// Presses on objects of known hardness.
-    Labelled,
-    /// Presses on both.
-    Both,
+    pub labelled: bool,
 }
 
 impl ReferenceKinds {
+    /// No references, or a model that takes none.
+    pub const NONE: Self = Self {
+        own: false,
+        rigid: false,
+        labelled: false,
+    };
+
     fn of(presses: &[ReferencePress]) -> Self {
-        let rigid = presses.iter().filter(|press| press.piece.is_rigid());
-        match rigid.count() {
-            0 if presses.is_empty() => Self::None,
-            0 => Self::Labelled,
-            count if count == presses.len() => Self::Rigid,
-            _ => Self::Both,
+        let has = |is: fn(Piece) -> bool| presses.iter().any(|press| is(press.piece));
+        Self {
+            own: has(Piece::is_unknown),
+            rigid: has(Piece::is_rigid),
+            labelled: has(|piece| !piece.is_rigid() && !piece.is_unknown()),
         }
     }
+
+    fn and(self, other: Self) -> Self {
+        Self {
+            own: self.own || other.own,
+            rigid: self.rigid || other.rigid,
+            labelled: self.labelled || other.labelled,
+        }
+    }
+
+    /// The kind whose promises a verdict keeps.
+    pub fn knowledge(self) -> Knowledge {
+        match self {
+            Self { labelled: true, .. } => Knowledge::Labelled,
+            Self { own: true, .. } => Knowledge::Own,
+            Self { rigid: true, .. } => Knowledge::Rigid,
+            Self::NONE => Knowledge::None,
+        }
+    }
+}
+
+impl fmt::Display for ReferenceKinds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kinds = [
+            (self.own, "own"),
+            (self.rigid, "rigid"),
+            (self.labelled, "labelled"),
+        ];
+        let words: Vec<&str> = kinds
+            .iter()
+            .filter(|kind| kind.0)
+            .map(|kind| kind.1)
+            .collect();
+        f.write_str(if words.is_empty() { "none" } else { "" })?;
+        f.write_str(&words.join("+"))
+    }
+}
+
+impl From<ReferenceKinds> for String {
+    fn from(kinds: ReferenceKinds) -> Self {
+        kinds.to_string()
+    }
+}
+
+impl TryFrom<String> for ReferenceKinds {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let mut kinds = Self::NONE;
+        for word in text.split('+').filter(|word| *word != "none") {
+            match word {
+                "own" => kinds.own = true,
+                "rigid" => kinds.rigid = true,
+                "labelled" => kinds.labelled = true,
+                _ => return Err(format!("found {word:?}, expected own, rigid or labelled")),
+            }
+        }
+        Ok(kinds)
+    }
+}
+
+/// What a model knows of a sensor, as far as its promises depend on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Knowledge {
+    /// Nothing.
+    None,
+    /// Rigid pieces, and nothing else.
+    Rigid,
+    /// Its own presses, and no labelled objects.
+    Own,
+    /// Objects of known hardness.
+    Labelled,
+}
+
+impl Knowledge {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::None, Self::Rigid, Self::Own, Self::Labelled];
 }
 
 /// A sensor's references as one model takes them. [`super::Hrn::references`] computes them.
@@ -103,6 +196,9 @@ pub struct References {
     /// little-endian f32.
     #[serde(serialize_with = "write_features", deserialize_with = "read_features")]
     pub(super) features: Vec<f32>,
+    /// Whether there are some that are not used, because they made verdicts worse.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    ignored: bool,
 }
 
 fn write_features<S: Serializer>(features: &[f32], serializer: S) -> Result<S::Ok, S::Error> {
@@ -125,9 +221,18 @@ fn read_features<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>,
 impl References {
     /// The references that a model takes without any.
     pub const NONE: Self = Self {
-        kinds: ReferenceKinds::None,
+        kinds: ReferenceKinds::NONE,
         count: 0,
         features: Vec::new(),
+        ignored: false,
+    };
+
+    /// References that are not used, because they made verdicts worse.
+    pub const IGNORED: Self = Self {
+        kinds: ReferenceKinds::NONE,
+        count: 0,
+        features: Vec::new(),
+        ignored: true,
     };
 
     pub(super) fn new(presses: &[ReferencePress], features: Vec<f32>) -> Self {
@@ -135,7 +240,51 @@ impl References {
             kinds: ReferenceKinds::of(presses),
             count: presses.len(),
             features,
+            ignored: false,
         }
+    }
+
+    /// These references, and as many of the last of `more` as a model takes beside them.
+    #[must_use]
+    pub(crate) fn and(&self, more: &Self, most: usize) -> Self {
+        let count = more.count.min(most.saturating_sub(self.count));
+        if count == 0 {
+            return self.clone();
+        }
+        let each = more.features.len() / more.count;
+        let last = &more.features[more.features.len() - count * each..];
+        Self {
+            kinds: self.kinds.and(more.kinds),
+            count: self.count + count,
+            features: [&self.features, last].concat(),
+            ignored: self.ignored,
+        }
+    }
+
+    /// The references without the one at `place`. Their kinds are those of all.
+    pub(super) fn without(&self, place: usize) -> Self {
+        let each = self.features.len() / self.count;
+        let (before, after) = (place * each, (place + 1) * each);
+        let count = self.count - 1;
+        let features = [&self.features[..before], &self.features[after..]].concat();
+        match count {
+            0 => Self::NONE,
+            _ => Self {
+                count,
+                features,
+                ..self.clone()
+            },
+        }
+    }
+
+    /// Whether there are some that are not used, because they made verdicts worse.
+    pub fn are_ignored(&self) -> bool {
+        self.ignored
+    }
+
+    /// Whether it is a single press.
+    pub(crate) fn is_one(&self) -> bool {
+        self.count == 1
     }
 
     /// Whether there are none.

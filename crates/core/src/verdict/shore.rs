@@ -22,8 +22,6 @@ pub struct Level {
 
 /// The end of the scale.
 const MOST: f32 = 100.0;
-/// The shares of the distribution below the ends of the interval.
-const ENDS: [f32; 2] = [0.05, 0.95];
 
 /// A Shore hardness with its interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -130,6 +128,12 @@ impl Borders {
         [self.shore[place + 1], self.shore[place]]
     }
 
+    /// The place of the level that a Shore hardness belongs to. On a border it is the softer level.
+    pub fn place_of(&self, shore: f32) -> usize {
+        let softer = self.shore[1..self.count()].iter();
+        softer.take_while(|&&border| shore <= border).count()
+    }
+
     fn count(&self) -> usize {
         self.shore.len() - 1
     }
@@ -185,7 +189,7 @@ impl Distribution {
     }
 
     /// The probability below `shore`. It is even within a bin.
-    fn below(&self, shore: f32) -> f32 {
+    pub fn below(&self, shore: f32) -> f32 {
         let place = (shore / self.width()).clamp(0.0, self.below.len() as f32);
         let bin = (place as usize).min(self.below.len() - 1);
         let before = self.below_bin(bin);
@@ -210,13 +214,14 @@ impl Distribution {
         (0..borders.count()).map(part).collect()
     }
 
-    /// The median within the most probable level, and the interval of the whole distribution.
-    pub fn shore(&self, borders: &Borders) -> Shore {
+    /// The median within the most probable level, and the interval of the whole distribution, with the
+    /// share `tail` of it on each side.
+    pub fn shore(&self, borders: &Borders, tail: f32) -> Shore {
         let (best, _) = argmax(&self.levels(borders));
         let [low, high] = borders.part(best);
         let middle = 0.5 * (self.below(low) + self.below(high));
         let value = self.quantile(middle).clamp(low, high);
-        let [low, high] = ENDS.map(|share| self.quantile(share));
+        let [low, high] = [tail, 1.0 - tail].map(|share| self.quantile(share));
         // With many levels, the most probable one may lie at an end.
         Shore {
             value,
@@ -231,6 +236,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::verdict::TAIL;
 
     fn levels(ranges: &[&str]) -> Vec<Level> {
         let level = |(level, shore): (u8, &&str)| Level {
@@ -267,17 +273,28 @@ mod tests {
     }
 
     #[test]
-    fn an_even_distribution_has_the_parts_of_the_scale() {
-        let even = Distribution::of(&[0.0; 50]);
-        let borders = borders(&[">70", "61-70", "50-60", "<=50"]);
-        let found = even.levels(&borders);
-        for (found, expected) in found.iter().zip([0.3, 0.095, 0.105, 0.5]) {
-            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
+    fn a_value_on_a_border_belongs_to_the_softer_level() {
+        let levels = borders(&[">70", "61-70", "51-60", "<=50"]);
+        for (shore, place) in [
+            (100.0, 0),
+            (70.1, 0),
+            (70.0, 1),
+            (60.6, 1),
+            (60.5, 2),
+            (60.3, 2),
+            (50.5, 3),
+            (0.0, 3),
+        ] {
+            assert_eq!(levels.place_of(shore), place, "{shore}");
+            let [low, high] = levels.part(place);
+            assert!((low..=high).contains(&shore), "{shore}");
         }
-        let shore = even.shore(&borders);
-        for (found, expected) in <[f32; 3]>::from(shore).iter().zip([25.0, 5.0, 95.0]) {
-            assert!((found - expected).abs() < 1e-3, "{found} {expected}");
-        }
+        // The first and the last level go to the ends of the scale.
+        let inside = borders(&["70-90", "40-60"]);
+        assert_eq!(
+            [95.0, 65.0, 10.0].map(|shore| inside.place_of(shore)),
+            [0, 1, 1]
+        );
     }
 
     proptest! {
@@ -296,7 +313,7 @@ mod tests {
             let distribution = Distribution::of(&logits);
             let levels = distribution.levels(&borders);
             prop_assert!((levels.iter().sum::<f32>() - 1.0).abs() < 1e-4);
-            let shore = distribution.shore(&borders);
+            let shore = distribution.shore(&borders, TAIL);
             let [low, high] = borders.part(argmax(&levels).0);
             prop_assert!((low..=high).contains(&shore.value));
             prop_assert!((shore.low..=shore.high).contains(&shore.value));

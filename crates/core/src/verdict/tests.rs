@@ -1,142 +1,254 @@
+use pb::tensor_shape_proto::dimension::Value as Dimension;
 use prost::Message as _;
+use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
+use crate::tests::course_model::{course_model, encoded, given, judged};
+use crate::tests::graph::{int, node};
 
-mod format_2;
-
-fn proto() -> pb::ModelProto {
-    pb::ModelProto::decode(BUILT_IN_HRN).unwrap()
-}
+mod own_grid;
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
     proto.graph.as_mut().unwrap()
 }
 
-fn value<'a>(proto: &'a mut pb::ModelProto, key: &str) -> &'a mut String {
-    let entry = proto
-        .metadata_props
-        .iter_mut()
-        .find(|entry| entry.key == key);
-    &mut entry.unwrap().value
+fn tensor<'a>(proto: &'a mut pb::ModelProto, name: &str) -> &'a mut pb::TensorProto {
+    let mut tensors = graph(proto).initializer.iter_mut();
+    tensors.find(|tensor| tensor.name == name).unwrap()
 }
 
-/// The dimensions of a graph input or output.
-fn dims(value: &mut pb::ValueInfoProto) -> &mut Vec<pb::tensor_shape_proto::Dimension> {
-    let pb::type_proto::Value::TensorType(tensor) =
-        value.r#type.as_mut().unwrap().value.as_mut().unwrap();
-    &mut tensor.shape.as_mut().unwrap().dim
+fn set(proto: &mut pb::ModelProto, key: &str, text: &str) {
+    let mut entries = proto.metadata_props.iter_mut();
+    let entry = entries.find(|entry| entry.key == key).unwrap();
+    entry.value = text.to_owned();
+}
+
+/// Changes the JSON of a key.
+fn edit(proto: &mut pb::ModelProto, key: &str, change: impl FnOnce(&mut Value)) {
+    let mut entries = proto.metadata_props.iter_mut();
+    let entry = entries.find(|entry| entry.key == key).unwrap();
+    let mut json = serde_json::from_str(&entry.value).unwrap();
+    change(&mut json);
+    entry.value = json.to_string();
+}
+
+fn tensor_type(value: &mut pb::ValueInfoProto) -> &mut pb::type_proto::Tensor {
+    let value = value.r#type.as_mut().unwrap().value.as_mut().unwrap();
+    let pb::type_proto::Value::TensorType(tensor) = value;
+    tensor
+}
+
+fn set_length(value: &mut pb::ValueInfoProto, axis: usize, length: Dimension) {
+    tensor_type(value).shape.as_mut().unwrap().dim[axis].value = Some(length);
+}
+
+/// A change of a model file.
+type Change = fn(&mut pb::ModelProto);
+
+fn refused_by(bytes: &[u8], expected: &str) {
+    let error = Hrn::load(bytes).unwrap_err().to_string();
+    assert!(
+        error.contains(expected),
+        "{error}\nshould contain\n{expected}"
+    );
+}
+
+fn changed(bytes: &[u8], change: impl FnOnce(&mut pb::ModelProto)) -> Vec<u8> {
+    let mut proto = pb::ModelProto::decode(bytes).unwrap();
+    change(&mut proto);
+    proto.encode_to_vec()
+}
+
+/// Four frames, or fewer or more, at 5 frames/s. The arm goes 1 mm from frame to frame, and is of
+/// 7.5 N/mm.
+fn course(length: usize, approach: bool) -> Course {
+    let moments = (0..length).map(|place| {
+        let mut frame = ModelFrame::default();
+        frame.newtons[500..510].fill(0.3 * (1 + place) as f32);
+        Sample {
+            time_s: 0.2 * place as f32,
+            approach_mm: approach.then_some(place as f32),
+            frame,
+        }
+    });
+    Course {
+        moments: moments.collect(),
+        arm_n_per_mm: 7.5,
+    }
 }
 
 #[test]
-fn the_built_in_model_loads_and_judges() {
-    let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
-    let labels: Vec<&str> = hrn.card().levels.iter().map(|l| l.label.as_str()).collect();
-    assert_eq!(labels, ["hard", "firm", "soft", "very-soft"]);
-    assert_eq!(hrn.sha256().len(), 64);
-    let Checks::Frames(check) = hrn.checks() else {
-        panic!("the model judges frames");
-    };
-    for (newtons, expected) in check.frames.iter().zip(&check.probabilities) {
-        let mut frame = ModelFrame::default();
-        frame.newtons.copy_from_slice(newtons);
-        let verdict = hrn.judge(&frame).unwrap();
-        let (best, confidence) = argmax(&verdict.probabilities);
-        assert_eq!(
-            (usize::from(verdict.level), verdict.confidence),
-            (best + 1, confidence)
-        );
-        assert!(largest_difference(&verdict.probabilities, expected) < CHECK_TOLERANCE);
-        assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+fn the_built_in_models_load_and_judge() {
+    for bytes in [BUILT_IN, BUILT_IN_HRN] {
+        let hrn = Hrn::load(bytes).unwrap();
+        let labels: Vec<&str> = hrn.card().levels.iter().map(|l| l.label.as_str()).collect();
+        assert_eq!(labels, ["hard", "firm", "soft", "very-soft"]);
+        assert_eq!(hrn.sha256().len(), 64);
+        for index in 0..hrn.checks().count() {
+            let verdict = hrn.judge_check(index).unwrap();
+            let (best, confidence) = argmax(&verdict.probabilities);
+            let named = (usize::from(verdict.level), verdict.confidence);
+            assert_eq!(named, (best + 1, confidence));
+            let expected = hrn.checks().probabilities(index);
+            assert!(largest_difference(&verdict.probabilities, expected) < CHECK_TOLERANCE);
+            assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+        }
     }
 }
 
 #[test]
 fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
-    fn check(expected: &str, change: impl FnOnce(&mut pb::ModelProto)) {
-        let mut changed = proto();
-        change(&mut changed);
-        let error = Hrn::load(&changed.encode_to_vec()).unwrap_err().to_string();
-        assert!(
-            error.contains(expected),
-            "{error}\nshould contain\n{expected}"
-        );
+    let changes: &[(&str, Change)] = &[
+        ("ONNX opset 16: expected 17 or newer", |p| {
+            p.opset_import[0].version = 16;
+        }),
+        ("ONNX opset missing", |p| p.opset_import.clear()),
+        ("not an ONNX model: no graph in it", |p| p.graph = None),
+        (
+            "model input image f32 [1,1,28,28]: expected frame f32 [1,1,28,28]",
+            |p| graph(p).input[0].name = "image".into(),
+        ),
+        (
+            "model input frame f32 [1,1,28,27]: expected frame f32 [1,1,28,28]",
+            |p| set_length(&mut graph(p).input[0], 3, Dimension::DimValue(27)),
+        ),
+        ("model input frame f32 [batch,1,28,28]: expected", |p| {
+            set_length(
+                &mut graph(p).input[0],
+                0,
+                Dimension::DimParam("batch".into()),
+            );
+        }),
+        (
+            "model input frame double [1,1,28,28]: expected frame f32",
+            |p| {
+                tensor_type(&mut graph(p).input[0]).elem_type =
+                    pb::tensor_proto::DataType::Double as i32;
+            },
+        ),
+        (
+            "model outputs logits f32 [1,4], shore f32 [1,3]: expected logits f32 [1,4], probabilities",
+            |p| drop(graph(p).output.remove(1)),
+        ),
+        ("model outputs hardness f32 [1,3], logits f32 [1,4]", |p| {
+            graph(p).output[2].name = "hardness".into();
+        }),
+        ("no node computes `logits`", |p| {
+            graph(p).node.retain(|node| node.output[0] != "logits");
+        }),
+        ("tensor `scale` lies in an external file", |p| {
+            tensor(p, "scale").data_location =
+                Some(pb::tensor_proto::DataLocation::External as i32);
+        }),
+        ("model graph cannot be run: ", |p| {
+            graph(p).node[0].op_type = "Divination".into();
+        }),
+        ("`hrn.format`: found \"2\", expected \"1\" or \"3\"", |p| {
+            set(p, "hrn.format", "2");
+        }),
+        ("`hrn.format`: found it 2 times, expected it once", |p| {
+            let mut entries = p.metadata_props.iter();
+            let format = entries.find(|entry| entry.key == "hrn.format");
+            let again = format.unwrap().clone();
+            p.metadata_props.push(again);
+        }),
+        (
+            "`hrn.check`: found unknown field `frames`, expected `presses`",
+            |p| set(p, "hrn.format", "3"),
+        ),
+        ("`hrn.pitch_mm`: found \"-1\", expected", |p| {
+            set(p, "hrn.pitch_mm", "-1");
+        }),
+        ("`hrn.levels`: found", |p| set(p, "hrn.levels", "[]")),
+        (
+            "`hrn.levels`: found [1, 2, 4, 3], expected levels 1, 2",
+            |p| {
+                edit(p, "hrn.levels", |levels| {
+                    levels.as_array_mut().unwrap().swap(2, 3);
+                });
+            },
+        ),
+        (
+            "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore` of 1 to 255 bytes",
+            |p| edit(p, "hrn.levels", |l| l[0]["label"] = "ha\u{1b}rd".into()),
+        ),
+        ("... of 300 bytes, expected `label` and `shore`", |p| {
+            edit(p, "hrn.levels", |l| l[0]["label"] = "h".repeat(300).into());
+        }),
+        ("`hrn.validation`: found \"aaaa", |p| {
+            set(p, "hrn.validation", &"a".repeat(20_000));
+        }),
+        ("`hrn.range`: found", |p| {
+            set(p, "hrn.range", r#"{"force_n":[1,2]}"#);
+        }),
+        ("expected [least, greatest]", |p| {
+            edit(p, "hrn.range", |range| range["force_n"] = json!([2, 1]));
+        }),
+        ("`hrn.metrics`: found", |p| set(p, "hrn.metrics", "{")),
+        (
+            "`hrn.check`: found -1 in a frame, expected newtons of 0 or more",
+            |p| {
+                edit(p, "hrn.check", |check| {
+                    check["frames"][3][7] = (-1).into();
+                });
+            },
+        ),
+        (
+            "found 7 frames of lengths [784], 8 rows of probabilities of lengths [4], expected 8",
+            |p| {
+                edit(p, "hrn.check", |check| {
+                    check["frames"].as_array_mut().unwrap().pop();
+                });
+            },
+        ),
+        (
+            "check 3: probabilities differ from the trainer's by up to 0.01",
+            |p| {
+                edit(p, "hrn.check", |check| {
+                    let probability = &mut check["probabilities"][3][0];
+                    *probability = (probability.as_f64().unwrap() + 0.01).into();
+                });
+            },
+        ),
+        // With other weights than those of the checks, the trainer's probabilities are not reproduced.
+        ("check 0: probabilities differ from the trainer's", |p| {
+            tensor(p, "head.bias").raw_data[..4].copy_from_slice(&5.0_f32.to_le_bytes());
+        }),
+        ("a number that is not finite in `logits`", |p| {
+            tensor(p, "head.bias").raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+        }),
+        // The probabilities are right, but the logits are others.
+        ("differs from softmax(`logits`)", |p| {
+            for node in &mut graph(p).node {
+                for name in node.output.iter_mut().chain(&mut node.input) {
+                    if name == "logits" {
+                        *name = "true logits".into();
+                    }
+                }
+            }
+            let doubled = node("Add", &["true logits", "true logits"], &["logits"], &[]);
+            graph(p).node.push(doubled);
+        }),
+        // The inference library does not compare a graph with the shapes that it declares.
+        (
+            "model outputs logits computed as 1,8,F32: expected 1,4,F32",
+            |p| {
+                for node in &mut graph(p).node {
+                    for name in node.output.iter_mut().chain(&mut node.input) {
+                        if name == "logits" {
+                            *name = "four".into();
+                        }
+                    }
+                }
+                let eight = node("Concat", &["four", "four"], &["logits"], &[int("axis", 1)]);
+                graph(p).node.push(eight);
+            },
+        ),
+    ];
+    for (expected, change) in changes {
+        refused_by(&changed(BUILT_IN_HRN, change), expected);
     }
-    check("ONNX opset 16: expected 17 or newer", |p| {
-        p.opset_import[0].version = 16;
-    });
-    check("ONNX opset missing", |p| p.opset_import.clear());
-    check("not an ONNX model: no graph in it", |p| p.graph = None);
-    check(
-        "model input image f32 [1,1,28,28]: expected frame f32 [1,1,28,28]",
-        |p| {
-            graph(p).input[0].name = "image".into();
-        },
-    );
-    check(
-        "model input frame f32 [1,1,28,27]: expected frame f32 [1,1,28,28]",
-        |p| {
-            use pb::tensor_shape_proto::dimension::Value;
-            dims(&mut graph(p).input[0])[3].value = Some(Value::DimValue(27));
-        },
-    );
-    check("model input frame f32 [batch,1,28,28]: expected", |p| {
-        use pb::tensor_shape_proto::dimension::Value;
-        dims(&mut graph(p).input[0])[0].value = Some(Value::DimParam("batch".into()));
-    });
-    check(
-        "model input frame double [1,1,28,28]: expected frame f32",
-        |p| {
-            let kind = graph(p).input[0]
-                .r#type
-                .as_mut()
-                .unwrap()
-                .value
-                .as_mut()
-                .unwrap();
-            let pb::type_proto::Value::TensorType(tensor) = kind;
-            tensor.elem_type = pb::tensor_proto::DataType::Double as i32;
-        },
-    );
-    check(
-        "model outputs logits f32 [1,4], shore f32 [1,3]: expected logits f32 [1,4], probabilities",
-        |p| {
-            graph(p).output.remove(1);
-        },
-    );
-    check("model outputs hardness f32 [1,3], logits f32 [1,4]", |p| {
-        graph(p).output[2].name = "hardness".into();
-    });
-    check("expected logits f32 [1,3], probabilities f32 [1,3]", |p| {
-        let levels = r#"[{"level":1,"label":"a","shore":">70"},
-            {"level":2,"label":"b","shore":"60"},{"level":3,"label":"c","shore":"50"}]"#;
-        *value(p, "hrn.levels") = levels.into();
-        let check: Check = serde_json::from_str(value(p, "hrn.check")).unwrap();
-        let narrow = Check {
-            probabilities: check
-                .probabilities
-                .iter()
-                .map(|row| row[..3].to_vec())
-                .collect(),
-            ..check
-        };
-        *value(p, "hrn.check") = serde_json::to_string(&narrow).unwrap();
-    });
-    check("no node computes `logits`", |p| {
-        graph(p).node.retain(|node| node.output[0] != "logits");
-    });
-    check("tensor `scale` lies in an external file", |p| {
-        let tensor = graph(p)
-            .initializer
-            .iter_mut()
-            .find(|t| t.name == "scale")
-            .unwrap();
-        tensor.data_location = Some(pb::tensor_proto::DataLocation::External as i32);
-    });
-    check("(Divination): this operator is not supported", |p| {
-        graph(p).node[0].op_type = "Divination".into();
-    });
-
     for key in [
         "hrn.format",
         "hrn.levels",
@@ -148,199 +260,232 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         "hrn.range",
         "hrn.check",
     ] {
-        check(&format!("model metadata `{key}` is missing"), |p| {
+        let without = changed(BUILT_IN_HRN, |p| {
             p.metadata_props.retain(|entry| entry.key != key);
         });
+        refused_by(&without, &format!("model metadata `{key}` is missing"));
     }
-    let set = |key: &'static str, text: &'static str| {
-        move |p: &mut pb::ModelProto| *value(p, key) = text.into()
-    };
-    check(
-        "`hrn.format`: found \"4\", expected \"1\", \"2\" or \"3\"",
-        set("hrn.format", "4"),
-    );
-    check(
-        "`hrn.check`: found unknown field `frames`, expected `presses`",
-        set("hrn.format", "2"),
-    );
-    check(
-        "`hrn.pitch_mm`: found \"-1\", expected",
-        set("hrn.pitch_mm", "-1"),
-    );
-    check("`hrn.levels`: found", set("hrn.levels", "[]"));
-    check(
-        "`hrn.levels`: found [1, 2, 4, 3], expected levels 1, 2",
-        |p| {
-            let mut levels: Vec<Level> = serde_json::from_str(value(p, "hrn.levels")).unwrap();
-            levels.swap(2, 3);
-            *value(p, "hrn.levels") = serde_json::to_string(&levels).unwrap();
-        },
-    );
-    check(
-        "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore` of 1 to 255 bytes",
-        |p| {
-            *value(p, "hrn.levels") = value(p, "hrn.levels").replace("hard", "ha\\u001brd");
-        },
-    );
-    check("... of 300 bytes, expected `label` and `shore`", |p| {
-        *value(p, "hrn.levels") = value(p, "hrn.levels").replace("hard", &"h".repeat(300));
-    });
-    check("`hrn.validation`: found \"aaaa", |p| {
-        *value(p, "hrn.validation") = "a".repeat(20_000);
-    });
-    check(
-        "`hrn.range`: found",
-        set("hrn.range", "{\"force_n\":[1,2]}"),
-    );
-    for range in [
-        r#"{"force_n":[2,1],"contact_area_taxels":[1,2]}"#,
-        r#"{"force_n":[1,2],"contact_area_taxels":[2,1]}"#,
-    ] {
-        check("expected [least, greatest]", set("hrn.range", range));
+    let large = vec![0; MAX_FILE_BYTES + 1];
+    refused_by(&large, "64000001 bytes: at most 64000000");
+    for bytes in [b"", &b"not a model"[..], &BUILT_IN_HRN[..10_000]] {
+        refused_by(bytes, "not an ONNX model");
     }
-    check("`hrn.metrics`: found", set("hrn.metrics", "{"));
-    check(
-        "`hrn.check`: found -1 in a frame, expected newtons of 0 or more",
-        |p| {
-            let mut check: Check = serde_json::from_str(value(p, "hrn.check")).unwrap();
-            check.frames[3][7] = -1.0;
-            *value(p, "hrn.check") = serde_json::to_string(&check).unwrap();
-        },
-    );
-    check("`hrn.check`: found 1 frames of lengths [2]", |p| {
-        *value(p, "hrn.check") = r#"{"frames":[[1,2]],"probabilities":[[1,0,0,0]]}"#.into();
-    });
-    for (count, found) in [(7, "found 7 frames"), (9, "found 9 frames")] {
-        check(found, |p| {
-            let Check {
-                frames,
-                probabilities,
-            } = serde_json::from_str(value(p, "hrn.check")).unwrap();
-            let changed = Check {
-                frames: frames.into_iter().cycle().take(count).collect(),
-                probabilities: probabilities.into_iter().cycle().take(count).collect(),
-            };
-            *value(p, "hrn.check") = serde_json::to_string(&changed).unwrap();
-        });
-    }
-    check("`hrn.format`: found it 2 times, expected it once", |p| {
-        let entries = &mut p.metadata_props;
-        let format = entries.iter().find(|entry| entry.key == "hrn.format");
-        let again = format.unwrap().clone();
-        entries.push(again);
-    });
-    check(
-        "check frame 3: probabilities differ from the trainer's by up to 0.01",
-        |p| {
-            let mut check: Check = serde_json::from_str(value(p, "hrn.check")).unwrap();
-            check.probabilities[3][0] += 0.01;
-            *value(p, "hrn.check") = serde_json::to_string(&check).unwrap();
-        },
-    );
-    // With other weights than those of the checks, the trainer's probabilities are not reproduced.
-    check(
-        "check frame 0: probabilities differ from the trainer's",
-        |p| {
-            let bias = graph(p)
-                .initializer
-                .iter_mut()
-                .find(|t| t.name == "head.bias")
-                .unwrap();
-            bias.raw_data[..4].copy_from_slice(&5.0_f32.to_le_bytes());
-        },
-    );
-    check("a number that is not finite in `logits`", |p| {
-        let bias = graph(p)
-            .initializer
-            .iter_mut()
-            .find(|t| t.name == "head.bias")
-            .unwrap();
-        bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    });
-    // The probabilities are right, but the logits have another temperature.
-    check("differs from softmax(`logits`)", |p| {
-        let nodes = &mut graph(p).node;
-        let mut sharp = nodes
-            .iter()
-            .find(|node| node.output[0] == "logits")
-            .unwrap()
-            .clone();
-        nodes
-            .iter_mut()
-            .find(|node| node.output[0] == "logits")
-            .unwrap()
-            .output[0] = "true logits".into();
-        nodes
-            .iter_mut()
-            .find(|node| node.op_type == "Softmax")
-            .unwrap()
-            .input[0] = "true logits".into();
-        sharp.op_type = "Add".into();
-        sharp.name = "shifted".into();
-        sharp.input = vec!["true logits".into(), "head.bias shifted".into()];
-        let mut shift = graph(p).initializer[0].clone();
-        shift.name = "head.bias shifted".into();
-        shift.dims = vec![4];
-        shift.raw_data = [1.0_f32, 0.0, 0.0, 0.0]
-            .iter()
-            .flat_map(|v| v.to_le_bytes())
-            .collect();
-        graph(p).initializer.push(shift);
-        graph(p).node.push(sharp);
-    });
 }
 
 #[test]
-fn outputs_of_another_length_than_declared_are_refused() {
-    for name in ["logits", "probabilities"] {
-        let mut changed = proto();
-        let graph = graph(&mut changed);
-        let node = graph.node.iter_mut().find(|node| node.output[0] == name);
-        node.unwrap().output[0] = "four".into();
-        for node in &mut graph.node {
-            for input in node.input.iter_mut().filter(|input| *input == name) {
-                *input = "four".into();
-            }
+fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
+    let agreed = "expected frames f32 [1,T,28,28], time_s f32 [1,T], approach_mm f32 [1,T], \
+                  known f32 [1,T], mask f32 [1,T], arm_n_per_mm f32 [1,1], piece f32 [1,7]";
+    let changes: &[(&str, Change)] = &[
+        (agreed, |p| graph(p).input[5].name = "seconds".into()),
+        (agreed, |p| {
+            set_length(&mut graph(p).input[5], 1, Dimension::DimValue(9));
+        }),
+        (agreed, |p| {
+            let again = graph(p).input[2].clone();
+            graph(p).input.push(again);
+        }),
+        (
+            "outputs logits f32 [1,6]: expected bins f32 [1,B], B 10 to 400; or logits f32 [1,6], prob",
+            |p| drop(graph(p).output.remove(0)),
+        ),
+    ];
+    for (expected, change) in changes {
+        refused_by(&encoded(8, &[], change), expected);
+    }
+    type OfCheck = fn(&mut Value);
+    let checks: &[(&str, OfCheck)] = &[
+        ("found 7 presses, expected 8, or two a level", |c| {
+            drop(c["presses"].as_array_mut().unwrap().pop());
+        }),
+        (
+            "found 2 times, 1 positions and 2 frames in a press: as many of each, 1 to 48",
+            |c| drop(c["presses"][1]["approach_mm"].as_array_mut().unwrap().pop()),
+        ),
+        (
+            "frame 1 of a press: found 3 bytes, expected 6 a taxel",
+            |c| c["presses"][1]["frames"][1] = "AAAA".into(),
+        ),
+        ("found 5 probabilities of a press, expected 6", |c| {
+            drop(
+                c["presses"][1]["probabilities"]
+                    .as_array_mut()
+                    .unwrap()
+                    .pop(),
+            );
+        }),
+        (
+            "found another number in a press, expected finite times",
+            |c| c["presses"][1]["arm_n_per_mm"] = (-1.0).into(),
+        ),
+        (
+            "check 2: probabilities differ from the trainer's by up to 0.2",
+            |c| c["presses"][2]["probabilities"][3] = 0.25.into(),
+        ),
+    ];
+    for (expected, change) in checks {
+        let wrong = encoded(8, &[], |p| edit(p, "hrn.check", change));
+        refused_by(&wrong, expected);
+    }
+    let shore = changed(BUILT_IN, |p| {
+        edit(p, "hrn.check", |c| c["presses"][0]["shore"][0] = 0.5.into());
+    });
+    refused_by(&shore, "check 0: `shore` differs from the trainer's");
+    let longer = pb::ModelProto::decode(&course_model(9, &[])[..]).unwrap();
+    let mut entries = longer.metadata_props.iter();
+    let longer = entries.find(|entry| entry.key == "hrn.check").unwrap();
+    let longer = encoded(8, &[], |p| set(p, "hrn.check", &longer.value));
+    refused_by(&longer, "found a press of 9 frames, expected at most 8");
+    for conformal in [
+        json!({"alpha": 0.1}),
+        json!({"alpha": 0.0, "threshold": 0.1}),
+        json!({"alpha": 0.1, "threshold": 1.5}),
+    ] {
+        let expected = "expected `alpha` between 0 and 1, `threshold`, 0 to 1";
+        refused_by(&course_model(8, &[("hrn.conformal", conformal)]), expected);
+    }
+}
+
+#[test]
+fn every_problem_of_a_file_is_named() {
+    let wrong = changed(BUILT_IN_HRN, |p| {
+        p.opset_import[0].version = 16;
+        graph(p).input[0].name = "image".into();
+        graph(p).output[0].name = "hardness".into();
+        set(p, "hrn.pitch_mm", "-1");
+        let branch = node("If", &["image"], &["either"], &[]);
+        graph(p).node.push(branch);
+    });
+    let found: Vec<String> = problems(&wrong).iter().map(ToString::to_string).collect();
+    let begins = [
+        "ONNX opset 16",
+        "model metadata `hrn.pitch_mm`",
+        "model input image",
+        "model outputs hardness",
+        "model node \"either\" (If)",
+    ];
+    assert_eq!(found.len(), begins.len(), "{found:?}");
+    for (found, begin) in found.iter().zip(begins) {
+        assert!(found.starts_with(begin), "{found}");
+    }
+    assert!(problems(BUILT_IN).is_empty());
+}
+
+#[test]
+fn the_inputs_are_those_of_the_course() {
+    for most in [3, 48] {
+        let hrn = Hrn::load(&course_model(most, &[])).unwrap();
+        assert_eq!(hrn.format(), Format::Course { most_frames: most });
+        assert_eq!(hrn.checks().count(), 8);
+        for (length, approach) in [(1, true), (2, false), (3, true), (most, true)] {
+            let course = course(length, approach);
+            let verdict = hrn.judge_course(&course).unwrap();
+            assert!(largest_difference(&verdict.probabilities, &judged(&course)) < 1e-5);
+            let sum: f32 = course.moments.iter().filter_map(|m| m.approach_mm).sum();
+            assert_eq!(given(&verdict.probabilities), [sum, length as f32, 7.5]);
+            assert_eq!((verdict.levels, verdict.shore), (None, None));
         }
-        let axis = pb::AttributeProto {
-            name: "axis".into(),
-            r#type: pb::attribute_proto::AttributeType::Int as i32,
-            i: 1,
-            ..Default::default()
-        };
-        graph.node.push(pb::NodeProto {
-            name: "eight".into(),
-            op_type: "Concat".into(),
-            input: vec!["four".into(), "four".into()],
-            output: vec![name.into()],
-            attribute: vec![axis],
-            ..Default::default()
-        });
-        let error = Hrn::load(&changed.encode_to_vec()).unwrap_err().to_string();
-        assert_eq!(
-            error,
-            format!("model outputs {name} computed as 1,8,F32: expected 1,4,F32")
-        );
     }
 }
 
 #[test]
-fn an_oversized_or_foreign_file_is_refused() {
-    let error = Hrn::load(&vec![0; MAX_FILE_BYTES + 1])
-        .unwrap_err()
-        .to_string();
-    assert!(
-        error.contains("64000001 bytes: at most 64000000"),
-        "{error}"
-    );
-    for bytes in [
-        &b""[..],
-        b"not a model",
-        &BUILT_IN_HRN[..BUILT_IN_HRN.len() / 2],
-    ] {
-        let error = Hrn::load(bytes).unwrap_err();
-        assert!(matches!(error, ModelError::NotOnnx(_)), "{error}");
+fn a_frame_alone_is_a_press_of_which_nothing_else_is_known() {
+    let hrn = Hrn::load(&course_model(8, &[])).unwrap();
+    let frame = course(1, false).moments[0].frame;
+    let verdict = hrn.judge(&frame).unwrap();
+    assert_eq!(given(&verdict.probabilities), [0.0, 1.0, 0.0]);
+    // A model of frames judges the last frame of a course.
+    let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
+    let course = course(4, true);
+    let last = hrn.judge(&course.moments[3].frame).unwrap();
+    assert_eq!(hrn.judge_course(&course).unwrap(), last);
+    assert!(last.shore.is_some() && last.levels.is_none(), "{last:?}");
+}
+
+#[test]
+fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
+    let set = |threshold, probabilities: &[f32]| {
+        Limits {
+            threshold,
+            tail: TAIL,
+        }
+        .set(probabilities)
+    };
+    assert_eq!(set(0.2, &[0.5, 0.2, 0.1, 0.2]), [1, 2, 4]);
+    assert_eq!(set(0.9, &[0.3, 0.4, 0.3]), [2]);
+    assert_eq!(set(0.0, &[1.0, 0.0]), [1, 2]);
+    let more = [("hrn.conformal", json!({"alpha": 0.1, "threshold": 0.25}))];
+    let hrn = Hrn::load(&course_model(8, &more)).unwrap();
+    let verdict = hrn.judge_course(&course(8, true)).unwrap();
+    assert_eq!(verdict.levels, Some(vec![2, 3]));
+}
+
+fn with_range(bytes: &[u8], key: &str, range: &Value) -> Result<Hrn, ModelError> {
+    Hrn::load(&changed(bytes, |p| {
+        edit(p, "hrn.range", |of| of[key] = range.clone());
+    }))
+}
+
+/// The ranges of presses, each with its number for `course(4, true)`.
+const OF_PRESSES: [(&str, f32); 5] = [
+    ("duration_s", 0.6),
+    ("frame_period_s", 0.2),
+    ("speed_mm_s", 5.0),
+    ("approach_mm", 3.0),
+    ("arm_n_per_mm", 7.5),
+];
+
+#[test]
+fn the_range_of_presses_is_optional_and_checked() {
+    let model = course_model(8, &[]);
+    let hrn = Hrn::load(&model).unwrap();
+    assert_eq!(hrn.card().range.of_presses(), [None; 5]);
+    for (key, _) in OF_PRESSES {
+        for refused in [json!([2, 0.5]), json!([-1, 2]), json!([0, 1e39])] {
+            let error = with_range(&model, key, &refused).unwrap_err().to_string();
+            assert!(error.contains("`hrn.range`: found"), "{key}: {error}");
+        }
+        let error = with_range(BUILT_IN_HRN, key, &json!([0.5, 2])).unwrap_err();
+        let error = error.to_string();
+        assert!(error.contains("the others are of format 3"), "{error}");
     }
+    let error = with_range(&model, "speed", &json!([0.5, 2])).unwrap_err();
+    assert!(error.to_string().contains("unknown field"), "{error}");
+}
+
+#[test]
+fn a_press_is_held_by_the_range_that_it_lies_in() {
+    let model = course_model(8, &[]);
+    let known = course(4, true);
+    for (place, (key, number)) in OF_PRESSES.into_iter().enumerate() {
+        let [low, high] = known.extents()[place].unwrap();
+        assert!((low / number - 1.0).abs() < 1e-5 && low == high, "{key}");
+        for (range, is_held) in [([0.5, 1.5], true), ([1.1, 1.5], false), ([0.5, 0.9], false)] {
+            let range = range.map(|part: f32| part * number);
+            let hrn = with_range(&model, key, &json!(range)).unwrap();
+            assert_eq!(hrn.card().range.holds(&known), is_held, "{key} {range:?}");
+            // Where nothing is known of the arm, its ranges exclude nothing.
+            let mut unknown = course(4, false);
+            unknown.arm_n_per_mm = 0.0;
+            let held = hrn.card().range.holds(&unknown);
+            assert_eq!(held, is_held || place > 1, "{key} {range:?}");
+        }
+    }
+}
+
+#[test]
+fn an_approach_that_ends_before_the_second_frame_may_have_been_faster() {
+    let speed = |approach: &[f32]| {
+        let mut course = course(approach.len(), true);
+        for (moment, &mm) in course.moments.iter_mut().zip(approach) {
+            moment.approach_mm = Some(mm);
+        }
+        course.extents()[2]
+    };
+    assert_eq!(speed(&[0.0, 1.0, 1.0]), Some([5.0, f32::INFINITY]));
+    // An arm that stands still, or is known at the first frame alone, has no speed.
+    assert_eq!(speed(&[0.0, 0.0]), None);
+    assert_eq!(speed(&[0.0]), None);
 }
 
 #[test]

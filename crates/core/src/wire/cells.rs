@@ -1,26 +1,94 @@
 //! The cells of a frame: how a number on the wire becomes a taxel's count, and where its taxel is.
 
-use super::settings::Order;
+use super::settings::{Cell, Order};
 use crate::frame::{Array, RawFrame};
+
+/// The largest count, without its sign: as large as a whole number of 32 bits. A float beyond it is
+/// damage.
+const MOST_COUNT: f32 = 4_294_967_296.0;
+
+impl Cell {
+    /// The number of bytes that the cell takes on the wire.
+    pub fn bytes(self) -> usize {
+        match self {
+            Cell::I8 | Cell::U8 => 1,
+            Cell::I16le | Cell::I16be | Cell::U16le | Cell::U16be => 2,
+            Cell::I32le | Cell::I32be | Cell::F32le | Cell::F32be => 4,
+        }
+    }
+
+    /// The bits of a cell that is a whole number without a sign.
+    pub(super) fn bits(self) -> Option<u32> {
+        match self {
+            Cell::U8 => Some(u8::MAX.into()),
+            Cell::U16le | Cell::U16be => Some(u16::MAX.into()),
+            _ => None,
+        }
+    }
+
+    /// The least and the largest number that the cell can hold, of whole numbers.
+    pub(super) fn range(self) -> Option<(f32, f32)> {
+        match self {
+            Cell::I8 => Some((i8::MIN.into(), i8::MAX.into())),
+            Cell::U8 => Some((0.0, u8::MAX.into())),
+            Cell::I16le | Cell::I16be => Some((i16::MIN.into(), i16::MAX.into())),
+            Cell::U16le | Cell::U16be => Some((0.0, u16::MAX.into())),
+            // Converters of taxels have at most 24 bits, so these numbers are exact.
+            Cell::I32le | Cell::I32be => Some((i32::MIN as f32, i32::MAX as f32)),
+            Cell::F32le | Cell::F32be => None,
+        }
+    }
+
+    /// The number in the first bytes of `b`.
+    pub(super) fn read(self, b: &[u8]) -> f32 {
+        match self {
+            Cell::I8 => f32::from(b[0].cast_signed()),
+            Cell::U8 => f32::from(b[0]),
+            Cell::I16le => f32::from(i16::from_le_bytes([b[0], b[1]])),
+            Cell::I16be => f32::from(i16::from_be_bytes([b[0], b[1]])),
+            Cell::U16le => f32::from(u16::from_le_bytes([b[0], b[1]])),
+            Cell::U16be => f32::from(u16::from_be_bytes([b[0], b[1]])),
+            Cell::I32le => i32::from_le_bytes([b[0], b[1], b[2], b[3]]) as f32,
+            Cell::I32be => i32::from_be_bytes([b[0], b[1], b[2], b[3]]) as f32,
+            Cell::F32le => f32::from_le_bytes([b[0], b[1], b[2], b[3]]),
+            Cell::F32be => f32::from_be_bytes([b[0], b[1], b[2], b[3]]),
+        }
+    }
+
+    /// Appends the number. One beyond the range of the cell becomes the end of the range.
+    pub(super) fn write(self, number: f32, out: &mut Vec<u8>) {
+        let whole = number.round();
+        match self {
+            Cell::I8 => out.push((whole as i8).cast_unsigned()),
+            Cell::U8 => out.push(whole as u8),
+            Cell::I16le => out.extend((whole as i16).to_le_bytes()),
+            Cell::I16be => out.extend((whole as i16).to_be_bytes()),
+            Cell::U16le => out.extend((whole as u16).to_le_bytes()),
+            Cell::U16be => out.extend((whole as u16).to_be_bytes()),
+            Cell::I32le => out.extend((whole as i32).to_le_bytes()),
+            Cell::I32be => out.extend((whole as i32).to_be_bytes()),
+            Cell::F32le => out.extend(number.to_le_bytes()),
+            Cell::F32be => out.extend(number.to_be_bytes()),
+        }
+    }
+}
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Cells {
     pub(super) array: Array,
-    pub(super) mask: u16,
-    pub(super) invert: bool,
-    /// The largest number that a cell can hold.
-    pub(super) largest: u16,
+    /// The bits that carry the count, if not all do or the count is the mask minus the cell.
+    pub(super) mask: Option<u32>,
+    invert: bool,
     /// The place in the frame for each position on the wire.
     places: Vec<u16>,
 }
 
 impl Cells {
-    pub(super) fn new(array: Array, order: Order, mask: u16, invert: bool, largest: u16) -> Self {
+    pub(super) fn new(array: Array, order: Order, mask: Option<u32>, invert: bool) -> Self {
         Self {
             array,
             mask,
             invert,
-            largest,
             places: places(array, order),
         }
     }
@@ -30,36 +98,38 @@ impl Cells {
         self.places.len()
     }
 
-    /// The frame of all cells of all `parts`, which are in the order of the wire.
-    pub(super) fn frame<P>(&self, parts: impl IntoIterator<Item = P>) -> RawFrame
-    where
-        P: IntoIterator<Item = u16>,
-    {
+    /// The frame of all cells, which are in the order of the wire. `None` if one of them is no number
+    /// that a taxel has.
+    pub(super) fn frame(&self, cells: impl IntoIterator<Item = f32>) -> Option<RawFrame> {
         let mut frame = RawFrame::zero(self.array);
-        let mut places = self.places.iter();
-        for part in parts {
-            for (cell, &place) in part.into_iter().zip(&mut places) {
-                let masked = cell & self.mask;
-                frame.counts[usize::from(place)] = if self.invert {
-                    self.mask - masked
-                } else {
-                    masked
-                };
-            }
+        for (cell, &place) in cells.into_iter().zip(&self.places) {
+            frame.counts[usize::from(place)] = self.of_cell(cell)?;
         }
-        frame
+        Some(frame)
+    }
+
+    fn of_cell(&self, cell: f32) -> Option<f32> {
+        let Some(mask) = self.mask else {
+            let is_count = cell.abs() <= MOST_COUNT;
+            return is_count.then_some(if self.invert { 0.0 - cell } else { cell });
+        };
+        let is_whole = cell.fract() == 0.0 && (0.0..=MOST_COUNT).contains(&cell);
+        let masked = is_whole.then_some(cell as u32 & mask)?;
+        Some(if self.invert { mask - masked } else { masked } as f32)
     }
 
     /// The cells of `frame` in the order of the wire.
-    pub(super) fn of(&self, frame: &RawFrame) -> impl Iterator<Item = u16> {
+    pub(super) fn of(&self, frame: &RawFrame) -> impl Iterator<Item = f32> {
         self.places.iter().map(|&place| {
-            let count = frame.counts[usize::from(place)].min(self.mask);
-            let cell = if self.invert {
-                self.mask - count
-            } else {
-                count
-            };
-            cell.min(self.largest)
+            let count = frame.counts[usize::from(place)];
+            match self.mask {
+                Some(mask) => {
+                    let count = (count.round() as u32).min(mask);
+                    (if self.invert { mask - count } else { count }) as f32
+                }
+                None if self.invert => 0.0 - count,
+                None => count,
+            }
         })
     }
 }

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::layout::Layout;
 use super::scan::{Context, Scan};
+use super::text::Lines;
 use crate::frame::RawFrame;
 
 /// The mark of a dropped candidate frame. The candidate had a valid sync, but its length, its tail,
@@ -12,7 +13,7 @@ use crate::frame::RawFrame;
 pub struct Damage;
 
 /// A whole frame, and the place in the stream where it ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Decoded {
     /// The frame.
     pub frame: RawFrame,
@@ -20,11 +21,20 @@ pub struct Decoded {
     pub end: u64,
 }
 
+/// Where a decoder is in its stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Place {
+    /// The number of bytes that became frames or were skipped.
+    pub decoded: u64,
+    /// The number of bytes that belonged to no whole frame.
+    pub skipped: u64,
+    /// Whether the next byte follows the end of a frame.
+    pub in_sync: bool,
+}
+
 /// Finds frames in a stream of bytes.
 ///
-/// It holds at most the bytes of one pending frame and the header that must follow it. If a layout
-/// has a sync but neither a checksum nor a tail, the decoder may hold two frames: after damage, a
-/// header in the data may look like the beginning of the next frame.
+/// It holds at most the bytes of one pending frame and the header that must follow it.
 ///
 /// # Example
 ///
@@ -44,73 +54,65 @@ pub struct Decoded {
 /// decoder.push(&bytes[300..]);
 /// let decoded = decoder.next_frame().unwrap().unwrap();
 /// assert_eq!(decoded.frame, RawFrame::default());
-/// assert_eq!((decoder.skipped(), decoder.pending()), (5, 0));
-/// # Ok::<(), hardnessd_core::wire::LayoutError>(())
+/// assert_eq!((decoder.skipped(), decoder.pending().len()), (5, 0));
+/// # Ok::<(), hardnessd_core::range::OutOfRange>(())
 /// ```
 #[derive(Debug)]
 pub struct Decoder {
     layout: Layout,
-    /// The state. Before its pending bytes are those that were taken and not yet removed.
-    memory: Memory,
-    /// The number of bytes that were taken and not yet removed.
+    /// Bytes that came. The first `start` of them are decoded.
+    bytes: Vec<u8>,
     start: usize,
-}
-
-/// The state of a [`Decoder`], without its layout.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Memory {
-    pending: Vec<u8>,
-    received: u64,
-    skipped: u64,
+    place: Place,
+    /// Whether the input ended or paused after the last byte.
     settled: bool,
-    locked: bool,
-    anchor: u64,
+    /// The damaged candidates that were not returned yet.
+    damaged: u64,
+    lines: Lines,
+    /// Where the stream began, and where its last frame ended.
+    begin: u64,
+    last_end: u64,
+    /// Whether the stream began with options of telnet.
+    is_telnet: bool,
 }
-
-impl Memory {
-    /// Whether a decoder that returned `frames` frames, damaged ones included, can have this state.
-    pub(crate) fn is_possible(&self, frames: u64) -> bool {
-        let passed = self.received.checked_sub(self.pending.len() as u64);
-        self.received < MOST_BYTES
-            && passed.is_some_and(|passed| {
-                self.skipped <= passed && self.anchor <= passed && frames <= passed
-            })
-    }
-}
-
-/// More bytes than any line ever delivers.
-const MOST_BYTES: u64 = 1 << 62;
 
 impl Decoder {
     /// A decoder at the start of a stream.
     pub fn new(layout: Layout) -> Self {
-        let capacity = 4 * layout.max_frame_bytes();
-        let locked = layout.begins_locked();
+        let place = Place {
+            decoded: 0,
+            skipped: 0,
+            in_sync: layout.begins_in_sync(),
+        };
+        Self::at(layout, place)
+    }
+
+    /// A decoder that continues a stream at `place`.
+    pub fn at(layout: Layout, place: Place) -> Self {
         Self {
-            layout,
-            memory: Memory {
-                pending: Vec::with_capacity(capacity),
-                received: 0,
-                skipped: 0,
-                settled: false,
-                locked,
-                anchor: 0,
-            },
+            bytes: Vec::with_capacity(4 * layout.max_frame_bytes()),
             start: 0,
+            place,
+            settled: false,
+            damaged: 0,
+            lines: Lines::default(),
+            begin: place.decoded,
+            last_end: place.decoded,
+            is_telnet: false,
+            layout,
         }
     }
 
-    /// The decoder's state.
-    pub fn memory(&self) -> Memory {
-        let mut memory = self.memory.clone();
-        memory.pending.drain(..self.start);
-        memory
-    }
-
-    /// Continues from the state of another decoder.
-    pub fn recall(&mut self, memory: Memory) {
-        self.memory = memory;
-        self.start = 0;
+    /// The same decoder, whose stream begins where another one ended.
+    #[must_use]
+    pub(crate) fn after(self, place: Place) -> Self {
+        let in_sync = self.place.in_sync;
+        Self {
+            place: Place { in_sync, ..place },
+            begin: place.decoded,
+            last_end: place.decoded,
+            ..self
+        }
     }
 
     /// Takes bytes in. It never blocks and never fails. Call [`Self::next_frame`] until it is
@@ -119,85 +121,120 @@ impl Decoder {
         if bytes.is_empty() {
             return;
         }
-        self.memory.settled = false;
-        if self.start > 0 {
-            self.memory.pending.drain(..self.start);
-            self.start = 0;
+        self.settled = false;
+        if self.received() == self.begin {
+            self.is_telnet = is_telnet(bytes);
         }
-        self.memory.pending.extend_from_slice(bytes);
-        self.memory.received += bytes.len() as u64;
+        self.bytes.drain(..self.start);
+        self.start = 0;
+        self.bytes.extend_from_slice(bytes);
     }
 
     /// Tells the decoder that the input ended or paused for half a period. A complete frame that
     /// only waited for the next header is then whole.
     pub fn settle(&mut self) {
-        self.memory.settled = true;
+        self.settled = true;
+        if self.pending().is_empty() {
+            self.place.in_sync |= self.layout.is_in_sync_after_pause();
+        }
     }
 
     /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
-        let pending = self.pending();
-        self.memory.skipped += pending as u64;
-        self.memory.pending.clear();
-        self.start = 0;
-        self.memory.settled = false;
-        self.memory.anchor = self.memory.received;
-        self.memory.locked = self.layout.begins_locked();
+        self.pass(self.pending().len());
+        self.settled = false;
+        self.place.in_sync = self.layout.begins_in_sync();
+        self.begin = self.place.decoded;
+        self.lines = Lines::default();
+        self.is_telnet = false;
+    }
+
+    /// Counts bytes that came and that nobody reads. Call it after [`Self::restart`].
+    pub(crate) fn skip(&mut self, bytes: u64) {
+        self.place.decoded = self.place.decoded.saturating_add(bytes);
+        self.place.skipped = self.place.skipped.saturating_add(bytes);
     }
 
     /// The next frame or damaged candidate, or `None` when more bytes are needed.
     pub fn next_frame(&mut self) -> Option<Result<Decoded, Damage>> {
         loop {
-            let bytes = &self.memory.pending[self.start..];
-            let offset = self.memory.received - bytes.len() as u64;
+            if self.damaged > 0 {
+                self.damaged -= 1;
+                return Some(Err(Damage));
+            }
             let context = Context {
-                settled: self.memory.settled,
-                locked: self.memory.locked,
-                offset,
-                anchor: self.memory.anchor,
+                settled: self.settled,
+                in_sync: self.place.in_sync,
             };
-            match self.layout.scan(bytes, context) {
+            let pending = &self.bytes[self.start..];
+            match self.layout.scan(pending, context, &mut self.lines) {
                 Scan::Wait => return None,
-                Scan::Skip(count) => self.pass_over(count),
-                Scan::Excess(count) => {
-                    self.start += count;
-                    self.memory.skipped += count as u64;
+                Scan::Skip { bytes, damaged } => {
+                    self.pass(bytes);
+                    self.damaged = damaged;
                 }
-                Scan::Damaged(count) => {
-                    self.pass_over(count);
-                    return Some(Err(Damage));
-                }
-                Scan::Frame(count, frame) => {
-                    self.start += count;
-                    self.memory.locked = true;
-                    self.memory.anchor = offset + count as u64;
-                    return Some(Ok(Decoded {
-                        frame,
-                        end: self.memory.anchor,
-                    }));
+                Scan::Frame { bytes, frame } => {
+                    self.start += bytes;
+                    self.lines.pass(bytes);
+                    self.place.decoded += bytes as u64;
+                    self.place.in_sync = true;
+                    self.last_end = self.place.decoded;
+                    let end = self.place.decoded;
+                    return Some(Ok(Decoded { frame, end }));
                 }
             }
         }
     }
 
+    /// Why the bytes since the last frame are none, if that shows.
+    pub fn problem(&self) -> Option<String> {
+        if self.received() - self.last_end < 2 * self.layout.min_frame_bytes() as u64 {
+            return None;
+        }
+        let telnet = || TELNET.to_owned();
+        let refused = self.lines.refused.as_ref().map(ToString::to_string);
+        refused.or_else(|| self.is_telnet.then(telnet))
+    }
+
     /// The number of bytes taken in since the start.
     pub fn received(&self) -> u64 {
-        self.memory.received
+        self.place.decoded + self.pending().len() as u64
     }
 
     /// The number of bytes that belonged to no whole frame.
     pub fn skipped(&self) -> u64 {
-        self.memory.skipped
+        self.place.skipped
     }
 
-    /// The number of held bytes that may yet become a frame.
-    pub fn pending(&self) -> usize {
-        self.memory.pending.len() - self.start
+    /// The bytes that may yet become a frame.
+    pub fn pending(&self) -> &[u8] {
+        &self.bytes[self.start..]
     }
 
-    fn pass_over(&mut self, count: usize) {
+    /// The place in the stream before the pending bytes.
+    pub fn place(&self) -> Place {
+        self.place
+    }
+
+    /// Passes over bytes that belong to no whole frame.
+    fn pass(&mut self, count: usize) {
+        self.place.in_sync &= self.layout.stays_in_sync();
+        if self.settled && self.start + count == self.bytes.len() {
+            self.place.in_sync |= self.layout.is_in_sync_after_pause();
+        }
         self.start += count;
-        self.memory.skipped += count as u64;
-        self.memory.locked = self.layout.ends_with_dropped();
+        self.lines.pass(count);
+        self.place.decoded += count as u64;
+        self.place.skipped += count as u64;
     }
+}
+
+/// What a telnet server is, and what to do.
+pub const TELNET: &str =
+    "the other end is a telnet server (RFC 2217), which doubles each FF: set it to raw mode";
+
+/// Whether a stream that begins with `bytes` is that of a telnet server: it begins with an option, which
+/// the server offers or asks for (RFC 854).
+pub fn is_telnet(bytes: &[u8]) -> bool {
+    matches!(bytes, [0xFF, 0xFB..=0xFE, 0..=44, ..])
 }

@@ -1,80 +1,91 @@
 //! Frames of one length: `sync, length, header bytes, cells, footer bytes, checksum, tail`, or several
 //! packets of these parts.
 //!
-//! The layout decides when a candidate is whole. A length, a checksum or a tail is checked at its
-//! place, and so is the number of a packet. After a failure the search continues one byte further,
-//! *inside* the rejected candidate. If a frame has only a header (`jq`), it is whole when another
-//! header follows, because the header can also occur in the data. If a frame has only a tail, it is
-//! whole when the tail is at its place.
+//! A length, a checksum or a tail is checked at its place, and so is the number of a packet, and that
+//! each cell is a number. After a failure the search continues one byte further, *inside* the rejected
+//! candidate. If a frame has neither a checksum nor a tail (`jq`), it is whole when the header of the
+//! next frame follows it, because the header can also occur in the data. A header in the data, with
+//! another one a frame later, is taken for a frame if the search meets it first: that damage cannot be
+//! told.
+//!
+//! A frame that is packed ends with a byte that occurs nowhere else. A frame with neither `sync` nor
+//! `tail` begins where a frame ended, or after a pause.
 
 use std::ops::Range;
 
 use super::cells::Cells;
-use super::checksum::{Checksum, ChecksumOver};
-use super::preset::Keys;
+use super::checksum::{Checksum, ChecksumOver, Sums};
 use super::scan::{Context, Scan};
-use super::settings::{Cell, FooterBytes, LayoutError, LengthField, Packets};
+use super::settings::{
+    Cell, FooterBytes, Framing, HexBytes, LengthField, PacketNumber, Packets, Settings,
+};
+use crate::frame::{Array, RawFrame};
 use crate::range::{self, OutOfRange};
-
-/// The most bytes that a layout can skip before or after the cells: as many as the cells of a large
-/// array, which a board may send beside the one that is read.
-const MOST_SKIPPED_BYTES: usize = 8192;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fixed {
+    framing: Framing,
     sync: Vec<u8>,
     /// `sync` and the length field, which are the same in every packet.
     mark: Vec<u8>,
     header_bytes: usize,
     cell: Cell,
-    /// The bytes of the cells of one packet.
+    /// The bytes from one cell to the next.
+    stride: usize,
+    /// The bytes of one packet from its first cell to the end of its last one.
     cell_bytes: usize,
     checksum: Checksum,
     checksum_over: ChecksumOver,
     tail: Vec<u8>,
-    /// The packets of a frame, in order.
-    packets: Vec<Packet>,
-    /// Whether a cell never holds the tail, which has one byte.
-    tail_not_in_cells: bool,
+    /// How the packets are numbered, if there are several.
+    numbering: Option<Numbering>,
+    /// The footer bytes of each packet of a frame, in order.
+    footers: Vec<usize>,
+    /// Whether a frame is the answer to a request, so that nothing comes before the first one.
+    is_answer: bool,
 }
 
-/// What differs between the packets of a frame.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Packet {
-    /// The place of the packet's number and its value, if it has one.
-    number: Option<(usize, u8)>,
-    footer_bytes: usize,
-}
-
-impl Cell {
-    /// The number of bytes that the cell takes on the wire.
-    pub fn bytes(self) -> usize {
-        match self {
-            Cell::U8 => 1,
-            Cell::U16le | Cell::U16be => 2,
-        }
-    }
+/// The numbers of packets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Numbering {
+    /// The place of the number in a packet.
+    at: usize,
+    number: PacketNumber,
+    first: u16,
+    step: u16,
 }
 
 impl Fixed {
-    pub(super) fn new(keys: Keys) -> Result<Self, LayoutError> {
-        if keys.sync.is_empty() && keys.tail.is_empty() {
-            return Err(LayoutError::Unmarked);
-        }
-        if keys.sync.is_empty() && keys.length != LengthField::None {
-            return Err(LayoutError::LengthWithoutSync);
-        }
-        is_skippable("header_bytes", keys.header_bytes)?;
-        let cells = keys.rows * keys.cols;
+    pub(super) fn new(keys: &Settings, array: Array) -> Result<Self, OutOfRange> {
+        let bytes = |given: &Option<HexBytes>| given.clone().unwrap_or_default().0;
+        let (sync, tail) = (bytes(&keys.sync), bytes(&keys.tail));
+        let length = keys.length.unwrap_or_default();
+        let header_bytes = keys.header_bytes.unwrap_or_default();
+        let cell = keys.cell.unwrap_or_default();
+        let framing = keys.framing.unwrap_or_default();
+        range::check(
+            "length",
+            format_args!("a length field without sync"),
+            !sync.is_empty() || length == LengthField::None || framing != Framing::None,
+            "sync before it",
+        )?;
+        let cells = array.taxels();
         let count = keys.packets.map_or(1, |packets| packets.count);
         range::check(
             "packets.count",
             count,
-            (1..=255).contains(&count) && cells.is_multiple_of(count),
-            format_args!("1 to 255 that divides the {cells} cells evenly"),
+            (1..=cells).contains(&count) && cells.is_multiple_of(count),
+            format_args!("1 to {cells} that divides the {cells} cells evenly"),
         )?;
-        let cell_bytes = cells / count * keys.cell.bytes();
-        let (length, max): (Vec<u8>, usize) = match keys.length {
+        let stride = keys.stride_bytes.unwrap_or(cell.bytes());
+        range::check(
+            "stride_bytes",
+            stride,
+            stride >= cell.bytes(),
+            format_args!("at least the {} bytes of a cell", cell.bytes()),
+        )?;
+        let cell_bytes = (cells / count - 1) * stride + cell.bytes();
+        let (length, max): (Vec<u8>, usize) = match length {
             LengthField::None => (Vec::new(), usize::MAX),
             LengthField::U8 => (vec![cell_bytes as u8], 0xFF),
             LengthField::U16le => ((cell_bytes as u16).to_le_bytes().to_vec(), 0xFFFF),
@@ -86,65 +97,80 @@ impl Fixed {
             cell_bytes <= max,
             format_args!("at most {max} for this field"),
         )?;
-        let mark = [keys.sync.as_slice(), &length].concat();
-        let footers = footers(&keys.footer_bytes, count)?;
-        let numbers = match keys.packets {
-            None => vec![None],
-            Some(_) if keys.sync.is_empty() => return Err(LayoutError::PacketsWithoutSync),
-            Some(packets) => numbers(packets, keys.header_bytes)?
-                .map(|number| Some((mark.len() + packets.number_at, number)))
-                .collect(),
-        };
-        let packets = numbers.into_iter().zip(footers);
-        let packets: Vec<Packet> = packets
-            .map(|(number, footer_bytes)| Packet {
-                number,
-                footer_bytes,
-            })
-            .collect();
-        Ok(Self {
-            tail_not_in_cells: keys.tail_not_in_cells,
-            sync: keys.sync,
+        let mark = [sync.as_slice(), &length].concat();
+        let footers = footers(keys.footer_bytes.clone().unwrap_or_default(), count)?;
+        if keys.packets.is_some() && (sync.is_empty() || framing != Framing::None) {
+            let found = format_args!("no sync, or framing");
+            let expected = "sync, with which each packet begins, and no framing";
+            return Err(OutOfRange::new("packets", found, expected));
+        }
+        let numbering = keys
+            .packets
+            .map(|packets| Numbering::new(packets, mark.len(), header_bytes));
+        let fixed = Self {
+            framing,
+            sync,
             mark,
-            header_bytes: keys.header_bytes,
-            cell: keys.cell,
+            header_bytes,
+            cell,
+            stride,
             cell_bytes,
-            checksum: keys.checksum,
-            checksum_over: keys.checksum_over,
-            tail: keys.tail,
-            packets,
-        })
+            checksum: keys.checksum.unwrap_or_default(),
+            checksum_over: keys.checksum_over.unwrap_or_default(),
+            tail,
+            numbering: numbering.transpose()?,
+            footers,
+            is_answer: keys.request.is_some(),
+        };
+        range::check(
+            "stride_bytes",
+            format_args!("a frame of {} bytes", fixed.frame_bytes()),
+            fixed.frame_bytes() <= MOST_BYTES,
+            format_args!("at most {MOST_BYTES} bytes"),
+        )?;
+        Ok(fixed)
     }
 
-    pub(super) fn has_sync(&self) -> bool {
-        !self.sync.is_empty()
+    /// Whether the first byte of a stream counts as the beginning of a frame. Only a sync shows whether
+    /// it is one, and nothing comes before the answer to a request.
+    pub(super) fn begins_in_sync(&self) -> bool {
+        self.framing == Framing::None && (!self.sync.is_empty() || self.is_bare() && self.is_answer)
     }
 
-    /// The value of a cell with all ones.
-    pub(super) fn all_ones(&self) -> u16 {
-        match self.cell {
-            Cell::U8 => 0xFF,
-            Cell::U16le | Cell::U16be => 0xFFFF,
+    /// Whether the search stays in sync when it skips bytes: each byte that ends a packed frame may
+    /// begin the next one.
+    pub(super) fn stays_in_sync(&self) -> bool {
+        self.framing != Framing::None
+    }
+
+    /// Whether a frame begins after a pause, because it has no mark.
+    pub(super) fn is_bare(&self) -> bool {
+        self.framing == Framing::None && self.sync.is_empty() && self.tail.is_empty()
+    }
+
+    /// The number of bytes of a frame before it is packed.
+    fn frame_bytes(&self) -> usize {
+        let bytes = self.footers.iter().map(|&footer| self.packet_bytes(footer));
+        bytes.sum()
+    }
+
+    /// The bytes of the mark of the next frame, which may be needed to know that a frame is whole.
+    pub(super) fn mark_bytes(&self) -> usize {
+        self.mark.len()
+    }
+
+    /// The numbers of bytes of the shortest and of the longest frame.
+    pub(super) fn least_and_most_bytes(&self) -> (usize, usize) {
+        let bytes = self.frame_bytes();
+        match self.framing {
+            Framing::None => (bytes, bytes),
+            Framing::Slip => (bytes + 1, 2 * bytes + 2),
+            Framing::Cobs => (bytes + 2, bytes + bytes / 254 + 2),
         }
     }
 
-    pub(super) fn largest_cell(&self) -> u16 {
-        if self.tail_not_in_cells {
-            u16::from(self.tail[0]) - 1
-        } else {
-            self.all_ones()
-        }
-    }
-
-    pub(super) fn frame_bytes(&self) -> usize {
-        self.packets
-            .iter()
-            .map(|packet| self.bytes_of(packet))
-            .sum()
-    }
-
-    fn bytes_of(&self, packet: &Packet) -> usize {
-        self.cells_in_packet().end + packet.footer_bytes + self.checksum.bytes() + self.tail.len()
+    fn packet_bytes(&self, footer: usize) -> usize {
+        self.cells_in_packet().end + footer + self.checksum.bytes() + self.tail.len()
     }
 
     /// The place of the cells in each packet.
@@ -157,210 +183,338 @@ impl Fixed {
     fn covered(&self, at: usize) -> Range<usize> {
         match self.checksum_over {
             ChecksumOver::All => 0..at,
+            ChecksumOver::AfterSync => self.sync.len()..at,
             ChecksumOver::Cells => self.cells_in_packet(),
         }
     }
 
-    pub(super) fn encode(&self, mut cells: impl Iterator<Item = u16>, out: &mut Vec<u8>) {
-        out.reserve(self.frame_bytes());
-        for packet in &self.packets {
+    pub(super) fn encode(&self, cells: impl Iterator<Item = f32>, out: &mut Vec<u8>) {
+        let frame = self.encoded(cells);
+        match self.framing {
+            Framing::None => out.extend(frame),
+            Framing::Slip => {
+                let mut encoder = slip_codec::SlipEncoder::new(false);
+                let written = encoder.encode(&frame, out);
+                written.expect("a vector takes all bytes");
+            }
+            Framing::Cobs => {
+                out.extend(cobs::encode_vec(&frame));
+                out.push(0);
+            }
+        }
+    }
+
+    fn encoded(&self, mut cells: impl Iterator<Item = f32>) -> Vec<u8> {
+        let mut out = Vec::with_capacity(self.frame_bytes());
+        for (index, footer) in self.footers.iter().enumerate() {
             let start = out.len();
             out.extend_from_slice(&self.mark);
             out.resize(start + self.cells_in_packet().start, 0);
-            if let Some((at, number)) = packet.number {
-                out[start + at] = number;
+            if let Some(numbering) = self.numbering {
+                numbering.write(index, &mut out[start..]);
             }
-            for cell in cells.by_ref().take(self.cell_bytes / self.cell.bytes()) {
-                match self.cell {
-                    Cell::U8 => out.push(cell as u8),
-                    Cell::U16le => out.extend_from_slice(&cell.to_le_bytes()),
-                    Cell::U16be => out.extend_from_slice(&cell.to_be_bytes()),
-                }
+            for (at, cell) in cells.by_ref().take(self.cells_of_a_packet()).enumerate() {
+                let place = start + self.cells_in_packet().start + at * self.stride;
+                out.resize(place, 0);
+                self.cell.write(cell, &mut out);
             }
-            out.resize(out.len() + packet.footer_bytes, 0);
+            out.resize(out.len() + footer, 0);
             let covered = self.covered(out.len() - start);
             let checksum = self.checksum.sent(&out[start..][covered]);
             out.extend_from_slice(&checksum[..self.checksum.bytes()]);
             out.extend_from_slice(&self.tail);
         }
+        out
+    }
+
+    fn cells_of_a_packet(&self) -> usize {
+        (self.cell_bytes - self.cell.bytes()) / self.stride + 1
     }
 
     pub(super) fn scan(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
-        if self.sync.is_empty() {
-            return self.scan_for_tail(cells, bytes, context);
+        match self.framing {
+            Framing::None if self.is_bare() => self.scan_bare(cells, bytes, context),
+            Framing::None if self.sync.is_empty() => self.scan_for_tail(cells, bytes, context),
+            Framing::None => self.scan_for_sync(cells, bytes, context),
+            Framing::Slip | Framing::Cobs => self.scan_packed(cells, bytes, context),
         }
-        match find(bytes, &self.sync) {
-            0 => {}
-            skip => return Scan::Skip(skip),
-        }
-        if self.begins_later_packet(bytes) {
-            return lost(1, context);
-        }
-        match self.is_frame(bytes) {
-            None => Scan::Wait,
-            Some(false) => Scan::Damaged(1),
-            Some(true) if self.checksum == Checksum::None && self.tail.is_empty() => {
-                self.scan_for_follower(cells, bytes, context)
+    }
+
+    fn scan_for_sync(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+        let mut sums = Sums::new(self.checksum, bytes);
+        let (mut at, mut damaged) = (0, 0);
+        loop {
+            at += find(&bytes[at..], &self.sync);
+            let rest = &bytes[at..];
+            if rest.is_empty() {
+                return Scan::past(at, damaged);
             }
-            Some(true) => self.whole(cells, bytes),
+            if self.begins_later_packet(rest) {
+                // The packets before it are missing.
+                damaged += u64::from(context.in_sync && at == 0);
+            } else {
+                match self.is_whole(&mut sums, bytes, at, context) {
+                    None => return Scan::past(at, damaged),
+                    Some(true) => match self.frame(cells, rest) {
+                        Some(_) if at > 0 => return Scan::past(at, damaged),
+                        Some(frame) => return self.found(frame),
+                        None => damaged += 1,
+                    },
+                    Some(false) => damaged += 1,
+                }
+            }
+            at += 1;
+        }
+    }
+
+    /// Whether a whole frame begins at `at`. `None` if more bytes are needed to know. A frame without
+    /// a checksum and a tail is whole when the mark of the next one follows it, or the settled end of
+    /// the input. The mark may be that of any packet, because a missing packet does not damage the
+    /// frame before it. The answer to a request is whole at once: no other one follows it by itself.
+    fn is_whole(&self, sums: &mut Sums, bytes: &[u8], at: usize, context: Context) -> Option<bool> {
+        let has_packets = self.has_packets(sums, bytes, at)?;
+        let is_marked_at_its_end = self.checksum != Checksum::None || !self.tail.is_empty();
+        let is_answer = self.is_answer && context.in_sync && at == 0;
+        if !has_packets || is_marked_at_its_end || is_answer {
+            return Some(has_packets);
+        }
+        let next = &bytes[at + self.frame_bytes()..];
+        match shares(next, &self.mark) {
+            false => Some(false),
+            true => (next.len() >= self.mark.len() || context.settled).then_some(true),
         }
     }
 
     /// Whether `bytes` begin with a packet that does not begin a frame: the packets before it are
     /// missing, or the candidate that they began was damaged and has been counted.
     fn begins_later_packet(&self, bytes: &[u8]) -> bool {
+        let number = self.numbering.and_then(|numbering| numbering.index(bytes));
         bytes.starts_with(&self.mark)
-            && self.packets[1..]
-                .iter()
-                .filter_map(|packet| packet.number)
-                .any(|(at, number)| bytes.get(at) == Some(&number))
+            && number.is_some_and(|index| (1..self.footers.len()).contains(&index))
     }
 
-    /// Whether `bytes` begin with the packets of a frame, each with the right mark, number, checksum
-    /// and tail. `None` if more bytes are needed to know.
-    fn is_frame(&self, bytes: &[u8]) -> Option<bool> {
-        let mut rest = bytes;
-        for packet in &self.packets {
-            let shared = rest.len().min(self.mark.len());
-            if rest[..shared] != self.mark[..shared] {
+    /// Whether the packets of a frame begin at `at`, each with the right mark, number, checksum and
+    /// tail. `None` if more bytes are needed to know.
+    fn has_packets(&self, sums: &mut Sums, bytes: &[u8], mut at: usize) -> Option<bool> {
+        for (index, &footer) in self.footers.iter().enumerate() {
+            let rest = &bytes[at..];
+            if !shares(rest, &self.mark) {
                 return Some(false);
             }
-            if let Some((at, number)) = packet.number
-                && *rest.get(at)? != number
+            if let Some(numbering) = self.numbering
+                && numbering.has(rest)?
+                && numbering.index(rest) != Some(index)
             {
                 return Some(false);
             }
-            let (bytes, after) = rest.split_at_checked(self.bytes_of(packet))?;
-            let checksum_at = bytes.len() - self.tail.len() - self.checksum.bytes();
-            let (found, tail) = bytes[checksum_at..].split_at(self.checksum.bytes());
-            let expected = self.checksum.sent(&bytes[self.covered(checksum_at)]);
-            if tail != self.tail || !expected.starts_with(found) {
+            let packet = rest.get(..self.packet_bytes(footer))?;
+            let checksum_at = packet.len() - self.tail.len() - self.checksum.bytes();
+            let (found, tail) = packet[checksum_at..].split_at(self.checksum.bytes());
+            let covered = self.covered(checksum_at);
+            let mut expected = || sums.sent(at + covered.start, at + covered.end);
+            if tail != self.tail || !found.is_empty() && !expected().starts_with(found) {
                 return Some(false);
             }
-            rest = after;
+            at += packet.len();
         }
         Some(true)
     }
 
-    fn whole(&self, cells: &Cells, bytes: &[u8]) -> Scan {
+    /// The frame that begins `bytes`, if each cell is a number.
+    fn frame(&self, cells: &Cells, bytes: &[u8]) -> Option<RawFrame> {
         let mut start = 0;
-        let packets = self.packets.iter().map(|packet| {
+        let packets = self.footers.iter().flat_map(|&footer| {
             let payload = &bytes[start..][self.cells_in_packet()];
-            start += self.bytes_of(packet);
-            payload
+            start += self.packet_bytes(footer);
+            payload.chunks(self.stride).map(|cell| self.cell.read(cell))
         });
-        let frame = match self.cell {
-            Cell::U8 => cells.frame(packets.map(|bytes| bytes.iter().map(|&byte| byte.into()))),
-            Cell::U16le => cells.frame(packets.map(|bytes| pairs(bytes).map(u16::from_le_bytes))),
-            Cell::U16be => cells.frame(packets.map(|bytes| pairs(bytes).map(u16::from_be_bytes))),
-        };
-        Scan::Frame(self.frame_bytes(), frame)
+        cells.frame(packets)
     }
 
-    /// Searches a layout that has only a header. A frame is whole when another header follows.
-    fn scan_for_follower(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
-        match self.is_followed(bytes, context.settled) {
-            None => Scan::Wait,
-            Some(false) => Scan::Damaged(1),
-            Some(true) if context.locked => self.whole(cells, bytes),
-            Some(true) => match self.nearest_in_phase(bytes, context) {
-                None => Scan::Wait,
-                Some(0) => self.whole(cells, bytes),
-                Some(skip) => Scan::Skip(skip),
-            },
+    fn found(&self, frame: RawFrame) -> Scan {
+        Scan::Frame {
+            bytes: self.frame_bytes(),
+            frame,
         }
-    }
-
-    /// Whether the packets of a frame begin `bytes`, and a mark or the settled end of the input
-    /// follows them. `None` if more bytes are needed to know. The mark may be that of any packet,
-    /// because a missing packet does not damage the frame before it.
-    fn is_followed(&self, bytes: &[u8], settled: bool) -> Option<bool> {
-        match self.is_frame(bytes) {
-            Some(true) => {}
-            None if settled => return Some(false),
-            other => return other,
-        }
-        let rest = &bytes[self.frame_bytes()..];
-        let shared = rest.len().min(self.mark.len());
-        if rest[..shared] != self.mark[..shared] {
-            return Some(false);
-        }
-        (shared == self.mark.len() || settled).then_some(true)
-    }
-
-    /// The place in `bytes` of the candidate to take after damage, or `None` if more bytes are
-    /// needed.
-    ///
-    /// After damage, several candidates may have something that looks like a header after them. An
-    /// example is a press held still, where a header in the data repeats in every frame. Damage
-    /// mostly loses or adds few bytes, so the candidate nearest to the phase before the damage is
-    /// taken. Of two candidates that are as near, the earlier one is taken.
-    ///
-    /// A candidate that has a header after it is held, up to two frames of bytes, as long as a
-    /// nearer header within it still waits for its own next header. Holding fewer bytes is not
-    /// enough. Let `HuHv` be as long as a frame, and `H` its header. Two streams begin with
-    /// `HuHvHu`. `Hu HvHu HvHu` is the rest of a damaged frame, then two whole frames with a header
-    /// in their data. `HuHv Huvw` is two whole frames, of which the first has a header in its data.
-    /// The streams first differ where the frame at the second `H` would end. A decision before that
-    /// place would give a frame that was never sent in one stream, or lose a whole frame in the
-    /// other.
-    fn nearest_in_phase(&self, bytes: &[u8], context: Context) -> Option<usize> {
-        let period = self.frame_bytes();
-        let distance = |at: usize| {
-            let phase = (context.offset + at as u64 - context.anchor) % period as u64;
-            phase.min(period as u64 - phase)
-        };
-        let mut best = 0;
-        let mut at = 1;
-        while at < period {
-            at += find(&bytes[at..], &self.mark);
-            if at >= period || at + self.mark.len() > bytes.len() {
-                break;
-            }
-            if distance(at) < distance(best) && self.is_followed(&bytes[at..], context.settled)? {
-                best = at;
-            }
-            at += 1;
-        }
-        Some(best)
     }
 
     /// Searches a layout that has a tail but no sync. A frame is whole when the tail is at its
-    /// place.
+    /// place. Without a mark at its beginning, only the first candidate after a whole frame counts as
+    /// damaged. After that the decoder searches.
     fn scan_for_tail(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+        let mut sums = Sums::new(self.checksum, bytes);
         let tail_at = self.frame_bytes() - self.tail.len();
-        if self.tail_not_in_cells
-            && let Some(end) = bytes
-                .iter()
-                .take(tail_at)
-                .position(|&byte| byte == self.tail[0])
-        {
-            return lost(end + 1, context);
+        let (mut at, mut damaged) = (0, 0);
+        loop {
+            let frame = match self.has_packets(&mut sums, bytes, at) {
+                None => return Scan::past(at, damaged),
+                Some(is_whole) => is_whole.then(|| self.frame(cells, &bytes[at..])).flatten(),
+            };
+            match frame {
+                Some(frame) if at == 0 => return self.found(frame),
+                Some(_) => return Scan::past(at, damaged),
+                // Continue at the next place where a tail may be.
+                None => {
+                    damaged += u64::from(context.in_sync && at == 0);
+                    at += 1 + find(&bytes[at + tail_at + 1..], &self.tail);
+                }
+            }
         }
-        match self.is_frame(bytes) {
-            None => Scan::Wait,
-            Some(true) => self.whole(cells, bytes),
-            // Continue at the next place where a tail may be.
-            Some(false) => lost(1 + find(&bytes[tail_at + 1..], &self.tail), context),
+    }
+
+    /// Searches a layout without marks. Its frames follow each other, and the first one follows a
+    /// pause.
+    fn scan_bare(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+        let length = self.frame_bytes();
+        let damaged = u64::from(context.in_sync);
+        if context.in_sync && bytes.len() >= length {
+            let mut sums = Sums::new(self.checksum, bytes);
+            let is_whole = self.has_packets(&mut sums, bytes, 0) == Some(true);
+            let frame = is_whole.then(|| self.frame(cells, bytes)).flatten();
+            return match frame {
+                Some(frame) => self.found(frame),
+                None if context.settled => Scan::past(bytes.len(), damaged),
+                None => Scan::past(length, damaged),
+            };
+        }
+        match context.settled {
+            true => Scan::past(bytes.len(), damaged),
+            false => Scan::past(bytes.len().saturating_sub(length), 0),
+        }
+    }
+
+    /// Searches frames that are packed.
+    fn scan_packed(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+        let (_, most) = self.least_and_most_bytes();
+        let end = self.framing.end();
+        let found = bytes.iter().position(|&byte| byte == end);
+        let Some(packed) = found.map(|at| &bytes[..=at]) else {
+            return Scan::past(bytes.len().saturating_sub(most), 0);
+        };
+        if packed.len() > most {
+            return Scan::noise(packed.len());
+        }
+        let unpacked = self.framing.unpacked(packed).unwrap_or_default();
+        let is_whole = unpacked.len() == self.frame_bytes()
+            && self.has_packets(&mut Sums::new(self.checksum, &unpacked), &unpacked, 0)
+                == Some(true);
+        let frame = is_whole.then(|| self.frame(cells, &unpacked)).flatten();
+        let is_candidate = context.in_sync && packed.len() > 1 && shares(&unpacked, &self.sync);
+        match frame {
+            Some(frame) => Scan::Frame {
+                bytes: packed.len(),
+                frame,
+            },
+            None => Scan::past(packed.len(), is_candidate.into()),
         }
     }
 }
 
-fn pairs(bytes: &[u8]) -> impl Iterator<Item = [u8; 2]> {
-    bytes.chunks_exact(2).map(|pair| [pair[0], pair[1]])
+impl Framing {
+    /// The byte that ends a packed frame, and occurs nowhere else.
+    pub fn end(self) -> u8 {
+        match self {
+            Framing::Slip => 0xC0,
+            Framing::None | Framing::Cobs => 0,
+        }
+    }
+
+    /// The bytes of a frame that was packed, with the byte that ends it. `None` if it was damaged.
+    pub fn unpacked(self, packed: &[u8]) -> Option<Vec<u8>> {
+        match self {
+            Framing::None => Some(packed.to_vec()),
+            Framing::Slip => {
+                let mut frame = Vec::new();
+                let decoded = slip_codec::SlipDecoder::new().decode(&mut &*packed, &mut frame);
+                decoded.is_ok().then_some(frame)
+            }
+            Framing::Cobs => cobs::decode_vec(packed.strip_suffix(&[0])?).ok(),
+        }
+    }
 }
 
-fn is_skippable(key: &'static str, bytes: usize) -> Result<(), OutOfRange> {
-    let found = format_args!("{bytes} bytes");
-    let expected = format_args!("0 to {MOST_SKIPPED_BYTES}");
-    range::check(key, found, bytes <= MOST_SKIPPED_BYTES, expected)
+/// The longest frame: 64x64 taxels of four numbers of four bytes, and as much beside them.
+const MOST_BYTES: usize = 128 * 1024;
+
+impl Numbering {
+    fn new(packets: Packets, mark_bytes: usize, header_bytes: usize) -> Result<Self, OutOfRange> {
+        let Packets {
+            count,
+            number_at,
+            number,
+            first,
+            step,
+        } = packets;
+        range::check(
+            "packets.number_at",
+            number_at,
+            number_at + number.bytes() <= header_bytes,
+            format_args!("a place in the header (header_bytes: {header_bytes})"),
+        )?;
+        range::check("packets.step", step, step > 0, "at least 1")?;
+        let max = match number {
+            PacketNumber::U8 => usize::from(u8::MAX),
+            PacketNumber::U16le | PacketNumber::U16be => usize::from(u16::MAX),
+        };
+        let last = usize::from(first) + (count - 1) * usize::from(step);
+        range::check(
+            "packets.first",
+            format_args!("{first}, and {last} for the last packet"),
+            last <= max,
+            format_args!("at most {max} for this number"),
+        )?;
+        Ok(Self {
+            at: mark_bytes + number_at,
+            number,
+            first,
+            step,
+        })
+    }
+
+    /// Whether `packet` has its number. `None` if it is not long enough to have one.
+    fn has(self, packet: &[u8]) -> Option<bool> {
+        (packet.len() >= self.at + self.number.bytes()).then_some(true)
+    }
+
+    /// The place of `packet` among those of a frame by its number.
+    fn index(self, packet: &[u8]) -> Option<usize> {
+        let bytes = packet.get(self.at..self.at + self.number.bytes())?;
+        let number = match self.number {
+            PacketNumber::U8 => bytes[0].into(),
+            PacketNumber::U16le => u16::from_le_bytes([bytes[0], bytes[1]]),
+            PacketNumber::U16be => u16::from_be_bytes([bytes[0], bytes[1]]),
+        };
+        let by = number.checked_sub(self.first)?;
+        by.is_multiple_of(self.step)
+            .then_some(usize::from(by / self.step))
+    }
+
+    /// Writes the number of the packet at `index` into it.
+    fn write(self, index: usize, packet: &mut [u8]) {
+        let number = self.first + self.step * index as u16;
+        let bytes = match self.number {
+            PacketNumber::U8 => vec![number as u8],
+            PacketNumber::U16le => number.to_le_bytes().to_vec(),
+            PacketNumber::U16be => number.to_be_bytes().to_vec(),
+        };
+        packet[self.at..][..bytes.len()].copy_from_slice(&bytes);
+    }
+}
+
+impl PacketNumber {
+    fn bytes(self) -> usize {
+        match self {
+            PacketNumber::U8 => 1,
+            PacketNumber::U16le | PacketNumber::U16be => 2,
+        }
+    }
 }
 
 /// The footer bytes of each packet.
-fn footers(footer_bytes: &FooterBytes, packets: usize) -> Result<Vec<usize>, LayoutError> {
+fn footers(footer_bytes: FooterBytes, packets: usize) -> Result<Vec<usize>, OutOfRange> {
     let footers = match footer_bytes {
-        FooterBytes::Each(bytes) => vec![*bytes; packets],
-        FooterBytes::Of(list) => list.clone(),
+        FooterBytes::Each(bytes) => vec![bytes; packets],
+        FooterBytes::Of(list) => list,
     };
     range::check(
         "footer_bytes",
@@ -368,47 +522,19 @@ fn footers(footer_bytes: &FooterBytes, packets: usize) -> Result<Vec<usize>, Lay
         footers.len() == packets,
         format_args!("one for each packet ({packets})"),
     )?;
-    for &bytes in &footers {
-        is_skippable("footer_bytes", bytes)?;
-    }
     Ok(footers)
 }
 
-/// The numbers of the packets.
-fn numbers(packets: Packets, header_bytes: usize) -> Result<impl Iterator<Item = u8>, LayoutError> {
-    range::check(
-        "packets.number_at",
-        packets.number_at,
-        packets.number_at < header_bytes,
-        format_args!("a byte of the header (header_bytes: {header_bytes})"),
-    )?;
-    let max = 256 - packets.count;
-    range::check(
-        "packets.first",
-        packets.first,
-        usize::from(packets.first) <= max,
-        format_args!("at most {max}: a packet's number is one byte"),
-    )?;
-    Ok((packets.first..=u8::MAX).take(packets.count))
-}
-
-/// Only the first candidate after a whole frame counts as damaged. After that the decoder searches.
-fn lost(skip: usize, context: Context) -> Scan {
-    if context.locked {
-        Scan::Damaged(skip)
-    } else {
-        Scan::Skip(skip)
-    }
+/// Whether `bytes` begin with `mark`, as far as they reach.
+fn shares(bytes: &[u8], mark: &[u8]) -> bool {
+    let shared = bytes.len().min(mark.len());
+    bytes[..shared] == mark[..shared]
 }
 
 /// The place where `mark` first occurs in `bytes`, or where it may begin once more bytes come.
 /// `bytes.len()` if there is no such place.
 fn find(bytes: &[u8], mark: &[u8]) -> usize {
     (0..bytes.len())
-        .find(|&at| {
-            let rest = &bytes[at..];
-            let shared = rest.len().min(mark.len());
-            rest[..shared] == mark[..shared]
-        })
+        .find(|&at| shares(&bytes[at..], mark))
         .unwrap_or(bytes.len())
 }

@@ -1,20 +1,18 @@
 //! A checked layout: where the parts of a frame are.
 
 use super::cells::Cells;
-use super::preset::{Keys, Kind};
+use super::fixed::Fixed;
 use super::scan::{Context, Scan};
-use super::settings::{LayoutError, Order, Settings};
-use super::text::FrameEnd;
-use super::{fixed, zero_run};
-use crate::frame::{Array, MOST_SIDE, RawFrame};
-use crate::range::within;
+use super::settings::Settings;
+use super::text::{self, Lines, Text};
+use crate::frame::{Array, RawFrame};
+use crate::range::{OutOfRange, check, within};
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Framing {
-    Fixed(fixed::Fixed),
-    Text(FrameEnd),
-    ZeroRun,
+enum Form {
+    Fixed(Box<Fixed>),
+    Text(Text),
 }
 
 /// A checked layout.
@@ -25,7 +23,8 @@ enum Framing {
 ///
 /// ```
 /// use hardnessd_core::frame::{Array, RawFrame};
-/// use hardnessd_core::wire::{Layout, LayoutError, Settings};
+/// use hardnessd_core::range::OutOfRange;
+/// use hardnessd_core::wire::{Layout, Settings};
 ///
 /// let settings = Settings { rows: Some(10), ..Settings::default() };
 /// let layout = Layout::new(&settings)?;
@@ -37,13 +36,13 @@ enum Framing {
 /// let settings = Settings { rows: Some(65), ..Settings::default() };
 /// let error = Layout::new(&settings).unwrap_err();
 /// assert_eq!(error.to_string(), "rows: found 65, expected 1 to 64");
-/// # Ok::<(), LayoutError>(())
+/// # Ok::<(), OutOfRange>(())
 /// ```
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
-    framing: Framing,
+    form: Form,
     cells: Cells,
-    full_scale: Option<u16>,
+    full_scale: Option<f32>,
 }
 
 impl Layout {
@@ -51,46 +50,60 @@ impl Layout {
     ///
     /// # Errors
     ///
-    /// Returns a [`LayoutError`] that names the key: a side outside 1..=64, no mark to find frames
-    /// by, a length field that cannot hold the payload, packets that do not fit, a mask wider than
-    /// the cell, or a part that frames of the preset do not have.
-    pub fn new(settings: &Settings) -> Result<Self, LayoutError> {
-        let keys = Keys::with(settings);
-        for (key, found) in [("rows", keys.rows), ("cols", keys.cols)] {
-            within(key, found, (1, MOST_SIDE), "")?;
-        }
+    /// Returns an error that names the key: a side outside 1..=64, a length field that cannot hold the
+    /// payload, packets that do not fit, a mask wider than the cell, or a part that frames of the preset
+    /// do not have.
+    pub fn new(settings: &Settings) -> Result<Self, OutOfRange> {
+        let keys = settings.in_force()?;
+        keys.check_ranges()?;
+        check(
+            "request_ms",
+            format_args!("a value"),
+            keys.request_ms.is_none() || keys.request.is_some(),
+            "none without request",
+        )?;
         let array = Array {
-            rows: keys.rows,
-            cols: keys.cols,
+            rows: keys.rows.unwrap_or(Array::JX255N.rows),
+            cols: keys.cols.unwrap_or(Array::JX255N.cols),
         };
-        if keys.kind != Kind::Fixed
-            && let Some(key) = key_of_parts(settings)
-        {
-            return Err(LayoutError::Unused {
-                key,
-                preset: settings.preset,
-            });
+        let (order, invert) = (
+            keys.order.unwrap_or_default(),
+            keys.invert.unwrap_or_default(),
+        );
+        // The bits of a cell that may carry the count, and its range, if these are known.
+        let (form, bits, range) = if settings.preset().is_text() {
+            let heading = keys.heading.clone().unwrap_or_default().into_bytes();
+            check(
+                "heading",
+                keys.heading.as_deref().unwrap_or_default(),
+                heading.len() <= MOST_HEADING_BYTES && !heading.contains(&b'\n'),
+                "at most 64 bytes on one line",
+            )?;
+            (Form::Text(Text { heading }), Some(u32::MAX), None)
+        } else {
+            let fixed = Box::new(Fixed::new(&keys, array)?);
+            let cell = keys.cell.unwrap_or_default();
+            (Form::Fixed(fixed), cell.bits(), cell.range())
+        };
+        if let Some(mask) = keys.mask {
+            let bits = bits.ok_or_else(|| {
+                let expected = "none for cells with a sign, of 32 bits or of floats";
+                OutOfRange::new("mask", mask, expected)
+            })?;
+            within("mask", mask, (1, bits), "for this cell")?;
         }
-        // The value of a cell with all ones, and the largest cell value if it is known.
-        let (framing, all_ones, largest) = match keys.kind {
-            Kind::Text(end) => (Framing::Text(end), u16::MAX, None),
-            Kind::ZeroRun => (Framing::ZeroRun, 0xFF, Some(0xFE)),
-            Kind::Fixed => {
-                let fixed = fixed::Fixed::new(keys)?;
-                let (all_ones, largest) = (fixed.all_ones(), fixed.largest_cell());
-                (Framing::Fixed(fixed), all_ones, Some(largest))
-            }
+        // A text has no widest number, so it can only be inverted by a mask that is written.
+        let is_text = matches!(form, Form::Text(_));
+        let mask = keys.mask.or(bits.filter(|_| invert && !is_text));
+        let full_scale = match (mask, range) {
+            (Some(mask), _) => Some(mask as f32),
+            (None, Some((least, _))) if invert => Some(0.0 - least),
+            (None, range) => range.map(|(_, most)| most),
         };
-        let mask = settings.mask.unwrap_or(all_ones);
-        within("mask", mask, (1, all_ones), "for this cell")?;
-        let order = settings.order.unwrap_or(Order::RowMajor);
-        let invert = settings.invert.unwrap_or(false);
-        let largest_cell = largest.unwrap_or(all_ones).min(mask);
-        let is_known = largest.is_some() || settings.mask.is_some();
         Ok(Self {
-            framing,
-            cells: Cells::new(array, order, mask, invert, largest_cell),
-            full_scale: is_known.then_some(if invert { mask } else { largest_cell }),
+            form,
+            cells: Cells::new(array, order, mask, invert),
+            full_scale,
         })
     }
 
@@ -100,25 +113,32 @@ impl Layout {
     }
 
     /// The count at which a taxel reads full scale, if the layout has one.
-    pub fn full_scale(&self) -> Option<u16> {
+    pub fn full_scale(&self) -> Option<f32> {
         self.full_scale
     }
 
-    /// The number of bytes in a frame. If frames vary, of the longest one.
+    /// The number of bytes in a frame. If frames vary, of the longest usual one.
     pub fn max_frame_bytes(&self) -> usize {
-        match &self.framing {
-            Framing::Fixed(fixed) => fixed.frame_bytes(),
-            Framing::Text(end) => end.max_frame_bytes(&self.cells),
-            Framing::ZeroRun => zero_run::max_frame_bytes(self.cells.count()),
-        }
+        self.least_and_most_bytes().1
     }
 
     /// The number of bytes in a frame. If frames vary, of the shortest one.
     pub fn min_frame_bytes(&self) -> usize {
-        match &self.framing {
-            Framing::Fixed(fixed) => fixed.frame_bytes(),
-            Framing::Text(end) => end.min_frame_bytes(&self.cells),
-            Framing::ZeroRun => zero_run::min_frame_bytes(self.cells.count()),
+        self.least_and_most_bytes().0
+    }
+
+    fn least_and_most_bytes(&self) -> (usize, usize) {
+        match &self.form {
+            Form::Fixed(fixed) => fixed.least_and_most_bytes(),
+            Form::Text(_) => text::usual_bytes(&self.cells),
+        }
+    }
+
+    /// The most bytes that may yet become a frame.
+    pub fn most_pending_bytes(&self) -> usize {
+        match &self.form {
+            Form::Fixed(fixed) => fixed.least_and_most_bytes().1 + fixed.mark_bytes(),
+            Form::Text(_) => text::most_bytes(&self.cells) + 1,
         }
     }
 
@@ -126,48 +146,38 @@ impl Layout {
     /// clipped to it. Skipped bytes are zeros.
     pub fn encode(&self, frame: &RawFrame, out: &mut Vec<u8>) {
         let cells = self.cells.of(frame);
-        match &self.framing {
-            Framing::Fixed(fixed) => fixed.encode(cells, out),
-            Framing::Text(end) => end.encode(cells, self.cells.array, out),
-            Framing::ZeroRun => zero_run::encode(cells, out),
+        match &self.form {
+            Form::Fixed(fixed) => fixed.encode(cells, out),
+            Form::Text(text) => text::encode(text, cells, out),
         }
     }
 
-    /// Looks for a frame at the beginning of `bytes`.
-    pub(super) fn scan(&self, bytes: &[u8], context: Context) -> Scan {
-        match &self.framing {
-            Framing::Fixed(fixed) => fixed.scan(&self.cells, bytes, context),
-            Framing::Text(end) => end.scan(&self.cells, bytes, context),
-            Framing::ZeroRun => zero_run::scan(&self.cells, bytes, context),
+    /// Looks for a frame at the beginning of `bytes`. `lines` is what earlier calls found in them.
+    pub(super) fn scan(&self, bytes: &[u8], context: Context, lines: &mut Lines) -> Scan {
+        match &self.form {
+            Form::Fixed(fixed) => fixed.scan(&self.cells, bytes, context),
+            Form::Text(text) => text::scan(text, &self.cells, bytes, context, lines),
         }
     }
 
-    /// Whether the first byte of a stream counts as the beginning of a frame. Only with a sync can
-    /// the decoder see whether it is one.
-    pub(super) fn begins_locked(&self) -> bool {
-        matches!(&self.framing, Framing::Fixed(fixed) if fixed.has_sync())
+    /// Whether the first byte of a stream counts as the beginning of a frame.
+    pub(super) fn begins_in_sync(&self) -> bool {
+        matches!(&self.form, Form::Fixed(fixed) if fixed.begins_in_sync())
     }
 
-    /// Whether the next frame begins where a dropped candidate ended. This holds for text and for
-    /// runs, whose candidates end with the mark of a frame's end.
-    pub(super) fn ends_with_dropped(&self) -> bool {
-        matches!(&self.framing, Framing::Text(_) | Framing::ZeroRun)
+    /// Whether the decoder stays in sync when it skips bytes. In text each line may begin a frame.
+    pub(super) fn stays_in_sync(&self) -> bool {
+        match &self.form {
+            Form::Fixed(fixed) => fixed.stays_in_sync(),
+            Form::Text(_) => true,
+        }
+    }
+
+    /// Whether a frame begins after a pause.
+    pub(super) fn is_in_sync_after_pause(&self) -> bool {
+        matches!(&self.form, Form::Fixed(fixed) if fixed.is_bare())
     }
 }
 
-/// The first key that is given of those that only frames of one length have.
-fn key_of_parts(settings: &Settings) -> Option<&'static str> {
-    let given = [
-        ("sync", settings.sync.is_some()),
-        ("tail", settings.tail.is_some()),
-        ("length", settings.length.is_some()),
-        ("header_bytes", settings.header_bytes.is_some()),
-        ("cell", settings.cell.is_some()),
-        ("footer_bytes", settings.footer_bytes.is_some()),
-        ("checksum", settings.checksum.is_some()),
-        ("checksum_over", settings.checksum_over.is_some()),
-        ("packets", settings.packets.is_some()),
-    ];
-    let key = given.into_iter().find(|&(_, is_given)| is_given);
-    key.map(|(key, _)| key)
-}
+/// The longest heading.
+const MOST_HEADING_BYTES: usize = 64;

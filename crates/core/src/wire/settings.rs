@@ -5,14 +5,16 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::checksum::{Checksum, ChecksumOver};
-use crate::range::OutOfRange;
+use crate::frame::MOST_SIDE;
+use crate::range::{Range, Ranged, from_to};
 
-/// Ready-made layouts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+/// Ready-made layouts. `presets.toml` has their keys.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Preset {
+    /// Cells of one byte, and nothing else.
+    None,
     /// `BB AA`, payload length u16 LE, cells u8, CRC-16/Modbus.
-    #[default]
     Jx255n,
     /// Like `Jx255n`, with u16 LE cells.
     Jx255nU16,
@@ -22,19 +24,13 @@ pub enum Preset {
     JqTail,
     /// Cells u16 LE, `AA 00 55 00 03 00 99 00`.
     JqU16,
-    /// Cells 0..254, `FF`.
-    FfTail,
-    /// Rows of decimals; a line without a digit, such as a blank one, ends the frame.
-    Ascii,
-    /// 1..254 is a value, `00 n` is a run of n zeros, `FF` ends the frame.
-    ZeroRun,
     /// `AA 55`, 16x32 cells u8.
     Flexitac,
     /// Two packets: `AA 55 03 99`, packet number, type, 128 cells u8; 16 more bytes end the second.
     JqGlove,
     /// `AA AB AC`, 16x16 cells u16 BE, four more bytes.
     M1616,
-    /// All decimals of a frame on one line.
+    /// Text: all numbers of a frame on one line, or a line for each row and then one without a digit.
     Csv,
 }
 
@@ -45,79 +41,78 @@ impl fmt::Display for Preset {
     }
 }
 
-/// The `[sensor.frame]` table: a preset and its overrides.
-///
-/// # Example
-///
-/// A sensor of 16x16 taxels sends the frames of `jq`, with a checksum.
-///
-/// ```
-/// use hardnessd_core::wire::{Checksum, Layout, Settings};
-///
-/// let table = "preset = 'jq'\nchecksum = 'sum8'\nrows = 16\ncols = 16\n";
-/// let settings: Settings = toml::from_str(table)?;
-/// assert_eq!(settings.checksum, Some(Checksum::Sum8));
-/// // Four bytes of sync, 256 cells, one byte of checksum.
-/// assert_eq!(Layout::new(&settings)?.max_frame_bytes(), 261);
-/// # Ok::<(), Box<dyn std::error::Error>>(())
-/// ```
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
-    /// The preset that the other keys override.
-    pub preset: Preset,
-    /// The first bytes of a frame, in hex.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub sync: Option<HexBytes>,
-    /// The last bytes of a frame, in hex.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub tail: Option<HexBytes>,
-    /// The field after `sync` that holds the number of bytes of the cells.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub length: Option<LengthField>,
-    /// The number of bytes that are skipped before the cells.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub header_bytes: Option<usize>,
-    /// How a taxel is written.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub cell: Option<Cell>,
-    /// The bits of a cell that carry the count. The mask is applied first.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub mask: Option<u16>,
-    /// Whether the count is `mask` minus the cell.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub invert: Option<bool>,
-    /// The number of bytes that are skipped after the cells.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub footer_bytes: Option<FooterBytes>,
-    /// The checksum.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub checksum: Option<Checksum>,
-    /// The bytes that the checksum covers.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub checksum_over: Option<ChecksumOver>,
-    /// The number of rows of the array, 1 to 64.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub rows: Option<usize>,
-    /// The number of columns of the array, 1 to 64.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub cols: Option<usize>,
-    /// The order in which the taxels are sent.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub order: Option<Order>,
-    /// Bytes that ask the sensor for a frame, in hex. They are sent again and again.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub request: Option<HexBytes>,
-    /// The time from one request to the next, in milliseconds. The default is the frame period.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub request_ms: Option<u32>,
-    /// Bytes that are sent once after each opening of the port, in hex.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<HexBytes>,
-    /// The packets of a frame, if a frame is sent in several.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub packets: Option<Packets>,
+crate::settings! {
+    /// The `[sensor.frame]` table: a preset and its overrides. A key that neither has is the plain one:
+    /// no such part, or the default of its type.
+    ///
+    /// # Example
+    ///
+    /// A sensor of 16x16 taxels sends the frames of `jq`, with a checksum.
+    ///
+    /// ```
+    /// use hardnessd_core::wire::{Checksum, Layout, Settings};
+    ///
+    /// let table = "preset = 'jq'\nchecksum = 'sum8'\nrows = 16\ncols = 16\n";
+    /// let settings: Settings = toml::from_str(table)?;
+    /// assert_eq!(settings.checksum, Some(Checksum::Sum8));
+    /// // Four bytes of sync, 256 cells, one byte of checksum.
+    /// assert_eq!(Layout::new(&settings)?.max_frame_bytes(), 261);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub struct Settings {
+        /// The preset that the other keys override. [`Settings::preset`] has the default.
+        pub preset: Option<Preset>;
+        /// The first bytes of a frame, in hex.
+        pub sync: Option<HexBytes>;
+        /// The last bytes of a frame, in hex.
+        pub tail: Option<HexBytes>;
+        /// The field after `sync` that holds the number of bytes of the cells.
+        pub length: Option<LengthField>;
+        /// The number of bytes that are skipped before the cells.
+        pub header_bytes: Option<usize>, in SKIPPED_BYTES;
+        /// How a taxel is written.
+        pub cell: Option<Cell>;
+        /// The number of bytes from one cell to the next. The default is that of a cell: nothing is
+        /// between them.
+        pub stride_bytes: Option<usize>, in from_to((1.0, 8192.0), "");
+        /// The bits of a cell that carry the count, of cells that are whole numbers without a sign. The
+        /// mask is applied first.
+        pub mask: Option<u32>;
+        /// Whether the count is `mask` minus the cell, or minus the cell where there is no mask.
+        pub invert: Option<bool>;
+        /// The number of bytes that are skipped after the cells.
+        pub footer_bytes: Option<FooterBytes>, in SKIPPED_BYTES;
+        /// The checksum.
+        pub checksum: Option<Checksum>;
+        /// The bytes that the checksum covers.
+        pub checksum_over: Option<ChecksumOver>;
+        /// The number of rows of the array. The plain number is that of the JX255N.
+        pub rows: Option<usize>, in SIDES;
+        /// The number of columns of the array.
+        pub cols: Option<usize>, in SIDES;
+        /// How the bytes of a frame are packed.
+        pub framing: Option<Framing>;
+        /// The text before a frame of text, such as `Sensor 2`.
+        pub heading: Option<String>;
+        /// The order in which the taxels are sent.
+        pub order: Option<Order>;
+        /// Bytes that ask the sensor for a frame, in hex. They are sent again and again.
+        pub request: Option<HexBytes>;
+        /// The time from one request to the next. The default is the frame period.
+        pub request_ms: Option<u32>, in from_to((1.0, 3_600_000.0), "milliseconds");
+        /// Bytes that are sent once after each opening of the port, in hex.
+        pub start: Option<HexBytes>;
+        /// The packets of a frame, if a frame is sent in several.
+        pub packets: Option<Packets>;
+    }
 }
+
+/// The sides of an array.
+const SIDES: Range = from_to((1.0, MOST_SIDE as f64), "");
+
+/// The bytes that a layout can skip before or after the cells: as many as the cells of a large array,
+/// which a board may send beside the one that is read.
+const SKIPPED_BYTES: Range = from_to((0.0, 8192.0), "");
 
 /// The number of bytes that are skipped after the cells.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -132,6 +127,25 @@ pub enum FooterBytes {
     Of(Vec<usize>),
 }
 
+impl Default for FooterBytes {
+    fn default() -> Self {
+        Self::Each(0)
+    }
+}
+
+impl Ranged for FooterBytes {
+    fn numbers(&self) -> Vec<f64> {
+        match self {
+            Self::Each(bytes) => bytes.numbers(),
+            Self::Of(list) => list.iter().map(|&bytes| bytes as f64).collect(),
+        }
+    }
+
+    fn shown(&self, number: f64) -> String {
+        format!("{number} bytes")
+    }
+}
+
 /// The `[sensor.frame.packets]` table: a frame that is sent in several packets. Each packet has the
 /// parts of a frame, and an equal share of the cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -139,16 +153,49 @@ pub enum FooterBytes {
 pub struct Packets {
     /// The number of packets of a frame.
     pub count: usize,
-    /// The byte that holds the packet's number, counted from 0 in the header bytes.
+    /// Where the packet's number is, counted in bytes from 0 in the header bytes. It may be the number
+    /// of a row, of a taxel or of the first cell.
     #[serde(default)]
     pub number_at: usize,
-    /// The number of the first packet. The others follow in steps of one.
+    /// How the number is written.
+    #[serde(default)]
+    pub number: PacketNumber,
+    /// The number of the first packet.
     #[serde(default = "one")]
-    pub first: u8,
+    pub first: u16,
+    /// By how much the number grows from packet to packet.
+    #[serde(default = "one")]
+    pub step: u16,
 }
 
-fn one() -> u8 {
+fn one() -> u16 {
     1
+}
+
+/// How the number of a packet is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PacketNumber {
+    /// One byte.
+    #[default]
+    U8,
+    /// Two bytes, low first.
+    U16le,
+    /// Two bytes, high first.
+    U16be,
+}
+
+/// How the bytes of a frame are packed, so that the end of a frame is a byte of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Framing {
+    /// They are sent as they are.
+    #[default]
+    None,
+    /// SLIP (RFC 1055): `C0` ends a frame.
+    Slip,
+    /// Consistent Overhead Byte Stuffing (Cheshire and Baker, 1999): `00` ends a frame.
+    Cobs,
 }
 
 /// Bytes written as hex pairs, such as `BB AA`.
@@ -183,10 +230,11 @@ impl From<HexBytes> for String {
 }
 
 /// The length field. It holds the number of bytes of the cells.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LengthField {
     /// No field.
+    #[default]
     None,
     /// One byte.
     U8,
@@ -196,51 +244,34 @@ pub enum LengthField {
     U16be,
 }
 
-/// How a taxel is written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+/// How a taxel is written: a number of so many bits, without a sign (`U`), with one (`I`) or as a float
+/// (`F`), low byte first (`le`) or high byte first (`be`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[allow(missing_docs, reason = "the names say all")]
 pub enum Cell {
-    /// One byte.
+    I8,
+    #[default]
     U8,
-    /// Two bytes, low first.
+    I16le,
+    I16be,
     U16le,
-    /// Two bytes, high first.
     U16be,
+    I32le,
+    I32be,
+    F32le,
+    F32be,
 }
 
 /// The order in which taxels are sent.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
     /// Row by row.
+    #[default]
     RowMajor,
     /// Column by column.
     ColumnMajor,
     /// Row by row, with every second row from its end.
     Serpentine,
-}
-
-/// The reason why a `[sensor.frame]` table is unusable. Each message names its key.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum LayoutError {
-    /// A number is out of its range.
-    #[error(transparent)]
-    Range(#[from] OutOfRange),
-    /// The layout has neither `sync` nor `tail`.
-    #[error("sync: found neither sync nor tail, expected at least one to find frames by")]
-    Unmarked,
-    /// The layout has a length field, but no sync to find it by.
-    #[error("length: found a length field without sync, expected sync before it")]
-    LengthWithoutSync,
-    /// The frames of the preset have no such part.
-    #[error("{key}: found a value, expected none: frames of preset {preset} have no such part")]
-    Unused {
-        /// The key.
-        key: &'static str,
-        /// The preset.
-        preset: Preset,
-    },
-    /// The packets cannot be found, because they have no `sync`.
-    #[error("packets: found no sync, expected the one that each packet begins with")]
-    PacketsWithoutSync,
 }

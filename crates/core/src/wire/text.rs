@@ -1,244 +1,502 @@
-//! Frames as text: decimals, separated by spaces, tabs, commas, semicolons or brackets. Lines end with
-//! LF or CRLF.
+//! Frames as text: numbers, with a sign, a point or an exponent or without them, between spaces, tabs,
+//! commas, semicolons or brackets. Lines end with LF or CRLF.
 //!
-//! In `ascii` each line is a row, and a line without a digit ends the frame: a blank one, or words
-//! between the frames. In `csv` each line is a frame.
-//! Words before the first cell of a line of `csv` are skipped, and so are lines without a frame.
+//! A frame is one line with all its cells, or a line for each row and then a line without a number,
+//! such as a blank one. With a `heading`, it is the cells that follow this text, on as many lines as it
+//! takes. Other words may be before, between and after the rows, such as `R3`, `"row3":`, `3:`, `|` or a
+//! unit. What comes before the first cell of a line is skipped, and so are lines between frames.
+//!
+//! A line is read when its end has come. [`Lines`] holds what was found in those before it, so that
+//! long runs of lines take a time in proportion to their bytes.
+
+use std::collections::VecDeque;
+use std::ops::Range;
 
 use super::cells::Cells;
 use super::scan::{Context, Scan};
 use crate::frame::{Array, RawFrame};
-
-/// What ends a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum FrameEnd {
-    /// A line without a digit, such as a blank one, after a line for each row.
-    LineWithoutDigit,
-    /// The end of the line.
-    Line,
-}
+use crate::wording::escaped;
 
 /// The most bytes before the first cell of a line that still belong to the frame of that line: room
 /// for a date, a time and a few words.
 const LEADING_BYTES: usize = 64;
+/// The most bytes of a number with all that is between it and the next one.
+const CELL_BYTES: usize = 24;
+/// The most bytes of a number.
+const NUMBER_BYTES: usize = 32;
+/// The most bytes of a word that a message shows.
+const SHOWN_BYTES: usize = 20;
 
-impl FrameEnd {
-    /// The number of bytes of the longest frame that is found: every value at its widest with two
-    /// separators, CRLF after each line, and the blank line or the leading words.
-    pub(super) fn max_frame_bytes(self, cells: &Cells) -> usize {
-        let Array { rows, cols } = cells.array;
-        let cell = cells.mask.to_string().len() + 2;
-        match self {
-            FrameEnd::LineWithoutDigit => rows * (cols * cell + 2) + 2,
-            FrameEnd::Line => LEADING_BYTES + rows * cols * cell + 2,
+/// How frames of text are found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Text {
+    /// What comes before each frame. Empty if nothing does.
+    pub(super) heading: Vec<u8>,
+}
+
+/// The lines of which a frame may be made, and how far the pending bytes were read.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Lines {
+    /// Lines with numbers, which end where the line that has not ended yet begins.
+    held: VecDeque<Line>,
+    begin: usize,
+    /// How many of the pending bytes were searched for the end of that line.
+    read: usize,
+    /// What is wrong with the first line that is none, since the last frame.
+    pub(super) refused: Option<Refused>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Line {
+    start: usize,
+    end: usize,
+    numbers: usize,
+}
+
+/// Why lines are no frame.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Refused {
+    /// There are too few or too many numbers.
+    #[error("a line has {found} numbers, expected {cols} for a row or {cells} for a frame")]
+    Numbers {
+        found: usize,
+        cols: usize,
+        cells: usize,
+    },
+    /// Something where a number should be.
+    #[error("a line has {0:?} among its numbers")]
+    Word(String),
+    /// There are too few or too many lines.
+    #[error("{found} lines with numbers come before one without, expected {rows}")]
+    Rows { found: usize, rows: usize },
+    /// The numbers are not what the mask asks for, or too large.
+    #[error("a number is not a whole one for the mask, or too large")]
+    Value,
+    /// The heading did not come.
+    #[error("no line has the heading {0:?}")]
+    Heading(String),
+}
+
+impl Lines {
+    /// The first `bytes` pending bytes are gone.
+    pub(super) fn pass(&mut self, bytes: usize) {
+        self.begin = self.begin.saturating_sub(bytes);
+        self.read = self.read.saturating_sub(bytes);
+        self.held.retain(|line| line.end > bytes);
+        for line in &mut self.held {
+            line.start = line.start.saturating_sub(bytes);
+            line.end -= bytes;
         }
     }
 
-    /// The number of bytes of the shortest frame: one digit for each value, one separator or LF
-    /// after each, and the blank line.
-    pub(super) fn min_frame_bytes(self, cells: &Cells) -> usize {
-        let blank_line = match self {
-            FrameEnd::LineWithoutDigit => 1,
-            FrameEnd::Line => 0,
+    /// The number of bytes that are too far before `end` to be of the same frame. Lines are cut as a
+    /// whole, but for the last one. The first line of several must stay if it is the one with a heading.
+    fn cut(&self, end: usize, most_kept: usize, may_begin_later: bool) -> usize {
+        let is_near = |line: &&Line| end - line.start <= most_kept;
+        let near = match may_begin_later {
+            true => self.held.iter().find(is_near),
+            false => self.held.front().filter(is_near),
         };
-        cells.count() * 2 + blank_line
+        let cut = (end - self.begin).saturating_sub(most_kept);
+        near.map_or(self.begin + cut, |line| line.start)
     }
 
-    pub(super) fn encode(self, cells: impl Iterator<Item = u16>, array: Array, out: &mut Vec<u8>) {
-        let (on_line, separator) = match self {
-            FrameEnd::LineWithoutDigit => (array.cols, b' '),
-            FrameEnd::Line => (array.rows * array.cols, b','),
-        };
-        for (index, cell) in cells.enumerate() {
-            out.extend_from_slice(cell.to_string().as_bytes());
-            let ends_line = (index + 1).is_multiple_of(on_line);
-            out.push(if ends_line { b'\n' } else { separator });
-        }
-        if self == FrameEnd::LineWithoutDigit {
-            out.push(b'\n');
-        }
+    fn numbers(&self) -> usize {
+        self.held.iter().map(|line| line.numbers).sum()
     }
 
-    pub(super) fn scan(self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
-        match self {
-            FrameEnd::LineWithoutDigit => scan_rows(cells, bytes, context),
-            FrameEnd::Line => scan_line(cells, bytes, context),
-        }
+    fn refuse(&mut self, refused: Refused) {
+        self.refused.get_or_insert(refused);
     }
 }
 
-fn scan_rows(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
+/// The number of bytes of the longest frame that is found.
+pub(super) fn most_bytes(cells: &Cells) -> usize {
     let Array { rows, cols } = cells.array;
-    let most = FrameEnd::LineWithoutDigit.max_frame_bytes(cells);
-    let mut lines = Lines { bytes, at: 0 };
-    // The places where the last `rows` lines began.
-    let mut starts = vec![0; rows];
-    let mut count = 0;
-    loop {
-        let start = lines.at;
-        let Some(line) = lines.next() else { break };
-        if line.iter().any(u8::is_ascii_digit) {
-            starts[count % rows] = start;
-            count += 1;
-            continue;
-        }
-        // Bytes that arrive one at a time are cut to this length before their end arrives. Cut
-        // bytes that arrive at once in the same way.
-        if let Some(excess @ 1..) = lines.at.checked_sub(most + 1) {
-            return Scan::Excess(excess);
-        }
-        if count == 0 {
-            // This may be the rest of a line whose beginning was too long to keep. No frame ends
-            // here.
-            return Scan::Excess(lines.at);
-        }
-        let row = if count >= rows {
-            starts[count % rows]
-        } else {
-            0
-        };
-        let first = row + row_start(&bytes[row..start], cols);
-        // Refuse a longer frame: whether it is found would depend on how many bytes arrive at once.
-        let is_short = lines.at - first <= most;
-        let frame = parse(cells, &bytes[first..start], rows, cols);
-        return match frame.filter(|_| is_short) {
-            Some(_) if first > 0 => Scan::Skip(first),
-            Some(frame) => Scan::Frame(lines.at, frame),
-            None if context.locked => Scan::Damaged(lines.at),
-            None => Scan::Skip(lines.at),
-        };
+    LEADING_BYTES + rows * (cols * CELL_BYTES + LEADING_BYTES)
+}
+
+/// The number of bytes of the shortest frame: one digit for each value, and one separator or LF after
+/// each. And of the longest one of whole numbers up to the mask or 65535: the leading words, every value
+/// at its widest with two separators, CRLF after each row, and a blank line.
+pub(super) fn usual_bytes(cells: &Cells) -> (usize, usize) {
+    let Array { rows, cols } = cells.array;
+    let widest = cells.mask.unwrap_or(u16::MAX.into());
+    let cell = widest.to_string().len() + 2;
+    let most = LEADING_BYTES + rows * (cols * cell + 2) + 2;
+    (cells.count() * 2, most)
+}
+
+/// Writes a frame on one line.
+pub(super) fn encode(text: &Text, cells: impl Iterator<Item = f32>, out: &mut Vec<u8>) {
+    out.extend(&text.heading);
+    if !text.heading.is_empty() {
+        out.push(b' ');
     }
-    match bytes.len().checked_sub(most) {
-        Some(excess) if excess > 0 => Scan::Excess(excess),
-        _ => Scan::Wait,
+    for cell in cells {
+        out.extend_from_slice(cell.to_string().as_bytes());
+        out.push(b',');
+    }
+    if let Some(last) = out.last_mut() {
+        *last = b'\n';
     }
 }
 
-/// Looks for a frame on the first line of `bytes`.
-fn scan_line(cells: &Cells, bytes: &[u8], context: Context) -> Scan {
-    let count = cells.count();
-    let most = FrameEnd::Line.max_frame_bytes(cells);
-    let end = bytes.iter().position(|&byte| byte == b'\n');
-    let length = end.map_or(bytes.len(), |end| end + 1);
+pub(super) fn scan(
+    text: &Text,
+    cells: &Cells,
+    bytes: &[u8],
+    context: Context,
+    lines: &mut Lines,
+) -> Scan {
     // One byte more than the longest frame is kept. It shows whether the first number of a frame is
     // the rest of a number that was cut.
-    if let Some(excess @ 1..) = length.checked_sub(most + 1) {
-        return Scan::Excess(excess);
+    let most_kept = most_bytes(cells) + 1;
+    while let Some(length) = bytes[lines.read..].iter().position(|&byte| byte == b'\n') {
+        let (start, end) = (lines.begin, lines.read + length + 1);
+        // Bytes that arrive one at a time are cut before the end of the line arrives. Bytes that arrive
+        // at once are cut in the same way.
+        let cut = lines.cut(end, most_kept, text.heading.is_empty());
+        if cut > 0 {
+            return Scan::noise(cut);
+        }
+        let found = if text.heading.is_empty() {
+            on_line(cells, bytes, start..end, lines, most_kept)
+        } else {
+            after_heading(text, cells, bytes, start..end, lines)
+        };
+        match found {
+            Found::Held(numbers) => {
+                lines.held.push_back(Line {
+                    start,
+                    end,
+                    numbers,
+                });
+                (lines.begin, lines.read) = (end, end);
+            }
+            Found::Frame { start: 0, frame } => {
+                lines.refused = None;
+                return Scan::Frame { bytes: end, frame };
+            }
+            Found::Frame { start, .. } => {
+                // The line is read again when the bytes before the frame are gone.
+                let before = numbers_in(&bytes[..start]);
+                return Scan::past(start, damage(before, cells, context));
+            }
+            Found::Nothing { bytes, numbers } => {
+                return Scan::past(bytes, damage(numbers, cells, context));
+            }
+        }
     }
-    let Some(end) = end else { return Scan::Wait };
-    let line = &bytes[..end];
-    let Some(first) = first_cell(line, count) else {
-        return not_a_frame(line, length, count, context);
-    };
-    let frame = parse(cells, &bytes[first..length], 1, count);
-    let Some(frame) = frame.filter(|_| length - first <= most) else {
-        return not_a_frame(line, length, count, context);
-    };
-    // Most of a frame before this one is a frame that lost its LF.
-    if length > most || has_most_of_a_frame(&line[..first], count) {
-        return not_a_frame(&line[..first], first, count, context);
-    }
-    Scan::Frame(length, frame)
+    lines.read = bytes.len();
+    Scan::past(
+        lines.cut(bytes.len(), most_kept, text.heading.is_empty()),
+        0,
+    )
 }
 
-/// The answer for the first `skip` bytes, which are `text` and hold no whole frame. With most of the
-/// numbers of a frame they are a damaged one. Other lines are words between the frames.
-fn not_a_frame(text: &[u8], skip: usize, cells: usize, context: Context) -> Scan {
-    if context.locked && has_most_of_a_frame(text, cells) {
-        Scan::Damaged(skip)
-    } else {
-        Scan::Skip(skip)
+/// What a line is.
+enum Found {
+    /// It may be one of several of a frame, and has so many numbers.
+    Held(usize),
+    /// It ends a frame that begins at `start`.
+    Frame { start: usize, frame: RawFrame },
+    /// The first `bytes` bytes are no frame. They have so many numbers.
+    Nothing { bytes: usize, numbers: usize },
+}
+
+/// Whether as many numbers are a frame that was damaged.
+fn damage(numbers: usize, cells: &Cells, context: Context) -> u64 {
+    u64::from(context.in_sync && 2 * numbers > cells.count())
+}
+
+/// What a line is where frames have no heading.
+fn on_line(
+    cells: &Cells,
+    bytes: &[u8],
+    line: Range<usize>,
+    lines: &mut Lines,
+    most_kept: usize,
+) -> Found {
+    let Array { rows, cols } = cells.array;
+    let (start, end) = (line.start, line.end);
+    let line = &bytes[line];
+    let numbers = numbers_in(line);
+    let nothing = |lines: &Lines, end: usize| Found::Nothing {
+        bytes: end,
+        numbers: lines.numbers() + numbers,
+    };
+    // A word may end with the first cell.
+    if numbers + 1 >= cells.count() {
+        match cells_at_end(line, cells.count(), cols) {
+            // Whether a longer frame is found would depend on how many bytes arrive at once.
+            Ok((first, _)) if line.len() - first >= most_kept => {}
+            Ok((first, values)) => {
+                let Some(frame) = cells.frame(values) else {
+                    lines.refuse(Refused::Value);
+                    return nothing(lines, end);
+                };
+                // Most of a frame before this one is a frame that lost its LF.
+                let before = numbers_in(&line[..first]);
+                let is_alone = 2 * before <= cells.count() && line.len() < most_kept;
+                let start = if is_alone { start } else { start + first };
+                return Found::Frame { start, frame };
+            }
+            Err(refused) if 2 * numbers > cells.count() => lines.refuse(refused),
+            Err(_) => {}
+        }
+    }
+    if 2 * numbers > cells.count() {
+        lines.refuse(wrong_number(numbers, cells));
+        return nothing(lines, end);
+    }
+    if numbers > 0 || has_damaged(line) {
+        // Of more lines than a frame has, the first ones are in none.
+        if lines.held.len() >= 2 * rows {
+            let found = lines.held.len();
+            lines.refuse(Refused::Rows { found, rows });
+            return Found::Nothing {
+                bytes: lines.held[rows].start,
+                numbers: lines.held.iter().take(rows).map(|line| line.numbers).sum(),
+            };
+        }
+        return Found::Held(numbers);
+    }
+    // The rows end here, if there are enough of them.
+    let held = lines.held.len();
+    let Some(first) = held.checked_sub(rows) else {
+        if held > 0 {
+            let found = lines.held.iter().map(|line| line.numbers).max();
+            match found.filter(|&found| found != cols) {
+                Some(found) => lines.refuse(wrong_number(found, cells)),
+                None => lines.refuse(Refused::Rows { found: held, rows }),
+            }
+        }
+        return nothing(lines, end);
+    };
+    let first_row = lines.held[first];
+    let of_rows = lines
+        .held
+        .range(first..)
+        .map(|row| &bytes[row.start..row.end]);
+    match in_rows(of_rows, cols) {
+        Ok((noise, values)) => match cells.frame(values) {
+            Some(frame) => Found::Frame {
+                start: first_row.start + noise,
+                frame,
+            },
+            None => {
+                lines.refuse(Refused::Value);
+                nothing(lines, end)
+            }
+        },
+        Err(refused) => {
+            lines.refuse(refused);
+            nothing(lines, end)
+        }
     }
 }
 
-fn has_most_of_a_frame(text: &[u8], cells: usize) -> bool {
-    let numbers = text
-        .split(|&byte| is_separator(byte))
-        .filter(|token| !token.is_empty() && decimal(token).is_some());
-    2 * numbers.count() > cells
+fn wrong_number(found: usize, cells: &Cells) -> Refused {
+    Refused::Numbers {
+        found,
+        cols: cells.array.cols,
+        cells: cells.count(),
+    }
+}
+
+/// What a line is where a heading comes before each frame.
+fn after_heading(
+    text: &Text,
+    cells: &Cells,
+    bytes: &[u8],
+    line: Range<usize>,
+    lines: &mut Lines,
+) -> Found {
+    let heading = text.heading.as_slice();
+    let (start, end) = (line.start, line.end);
+    let found = bytes[line.clone()]
+        .windows(heading.len())
+        .rposition(|window| window == heading);
+    if let Some(at) = found {
+        if start + at > 0 {
+            let numbers = lines.numbers();
+            return Found::Nothing {
+                bytes: start + at,
+                numbers,
+            };
+        }
+    } else if lines.held.is_empty() {
+        if numbers_in(&bytes[line]) > 0 {
+            let heading = String::from_utf8_lossy(heading).into_owned();
+            lines.refuse(Refused::Heading(heading));
+        }
+        return Found::Nothing {
+            bytes: end,
+            numbers: 0,
+        };
+    }
+    let skipped = if found.is_some() { heading.len() } else { 0 };
+    let numbers = numbers_in(&bytes[start + skipped..end]);
+    let all = lines.numbers() + numbers;
+    if all < cells.count() {
+        return Found::Held(numbers);
+    }
+    // The first held line begins with the heading.
+    let first = if lines.held.is_empty() { start } else { 0 };
+    let Array { cols, .. } = cells.array;
+    let values = cells_at_end(&bytes[first + heading.len()..end], cells.count(), cols);
+    let values = match values {
+        Ok((_, values)) if all == cells.count() => Ok(values),
+        Ok(_) => Err(wrong_number(all, cells)),
+        Err(refused) => Err(refused),
+    };
+    match values.map(|values| cells.frame(values)) {
+        Ok(Some(frame)) => Found::Frame { start: 0, frame },
+        other => {
+            lines.refuse(other.err().unwrap_or(Refused::Value));
+            Found::Nothing {
+                bytes: end,
+                numbers: all,
+            }
+        }
+    }
+}
+
+/// The cells in these lines, one line for each row, and the number of bytes before the first cell that
+/// belong to no frame. Noise, or the rest of a damaged frame, may be right before the first row.
+/// Separators before the first cell belong to it.
+fn in_rows<'a>(
+    rows: impl Iterator<Item = &'a [u8]>,
+    cols: usize,
+) -> Result<(usize, Vec<f32>), Refused> {
+    let mut noise = 0;
+    let mut all = Vec::new();
+    for (index, row) in rows.enumerate() {
+        let (first, values) = cells_at_end(row, cols, cols)?;
+        let before = &row[..first];
+        let word = tokens(before).next_back().filter(|word| !is_word(word));
+        if index == 0 {
+            noise = if word.is_some() { first } else { 0 };
+        } else if let Some(word) = word {
+            return Err(match number(word) {
+                Some(_) => Refused::Numbers {
+                    found: numbers_in(row),
+                    cols,
+                    cells: cols,
+                },
+                None => strange(word),
+            });
+        }
+        all.extend(values);
+    }
+    Ok((noise, all))
+}
+
+/// The last `count` numbers of `text`, and the place of the first of them. Words may be after them, and
+/// between rows of `cols` numbers.
+///
+/// The first number may follow other bytes of its word, which are noise. They might also be damage:
+/// `5x12` may be noise `5x` before a cell of 12, or a cell of 5012 with a wrong byte. The bytes hold a
+/// whole frame either way, and a frame that is whole in the bytes is never lost.
+fn cells_at_end(text: &[u8], count: usize, cols: usize) -> Result<(usize, Vec<f32>), Refused> {
+    let mut values = Vec::with_capacity(count);
+    let mut words = tokens(text).rev();
+    while values.len() < count {
+        let Some(word) = words.next() else {
+            return Err(Refused::Numbers {
+                found: values.len(),
+                cols,
+                cells: count,
+            });
+        };
+        match number(word) {
+            Some(value) => values.push(value),
+            None if values.len() + 1 == count && (!is_word(word) || ends_with_number(word)) => {
+                let (_, value) = number_at_end(word).ok_or_else(|| strange(word))?;
+                values.push(value);
+            }
+            None if values.len().is_multiple_of(cols) && is_word(word) => continue,
+            None => return Err(strange(word)),
+        }
+        if values.len() == count {
+            let end = word.as_ptr_range().end as usize - text.as_ptr() as usize;
+            let (length, _) = number_at_end(word).unwrap_or((word.len(), 0.0));
+            values.reverse();
+            return Ok((end - length, values));
+        }
+    }
+    Ok((text.len(), values))
+}
+
+fn strange(word: &[u8]) -> Refused {
+    let shown = String::from_utf8_lossy(&word[..word.len().min(SHOWN_BYTES)]);
+    Refused::Word(escaped(&shown))
+}
+
+fn numbers_in(text: &[u8]) -> usize {
+    tokens(text).filter(|word| number(word).is_some()).count()
+}
+
+/// Whether something in a line is neither a number nor a word.
+fn has_damaged(line: &[u8]) -> bool {
+    tokens(line).any(|word| number(word).is_none() && !is_word(word))
 }
 
 /// Whether a byte separates the cells of a text.
 pub fn is_separator(byte: u8) -> bool {
     matches!(
         byte,
-        b' ' | b'\t' | b',' | b';' | b'\r' | b'[' | b']' | b'(' | b')' | b'{' | b'}'
+        b' ' | b'\t' | b',' | b';' | b'\r' | b'\n' | b'[' | b']' | b'(' | b')' | b'{' | b'}'
     )
 }
 
-/// The place where the row begins that ends the first line of `text`. Noise, or the rest of a
-/// damaged frame, may be right before the row. Separators before the first cell belong to the row.
-fn row_start(text: &[u8], cols: usize) -> usize {
-    let end = text.iter().position(|&byte| byte == b'\n');
-    let line = &text[..end.unwrap_or(text.len())];
-    match first_cell(line, cols) {
-        Some(first) if !line[..first].iter().all(|&byte| is_separator(byte)) => first,
-        _ => 0,
+fn tokens(text: &[u8]) -> impl DoubleEndedIterator<Item = &[u8]> {
+    text.split(|&byte| is_separator(byte))
+        .filter(|token| !token.is_empty())
+}
+
+/// Whether something that is no number may stand beside rows: it has no digit, it begins with none, or
+/// it is a number with a colon.
+fn is_word(token: &[u8]) -> bool {
+    let is_digit = u8::is_ascii_digit;
+    let begins_as_number = token
+        .first()
+        .is_some_and(|byte| is_digit(byte) || is_mark(*byte));
+    !token.iter().any(is_digit)
+        || !begins_as_number
+        || token
+            .strip_suffix(b":")
+            .is_some_and(|row| row.iter().all(is_digit))
+}
+
+fn is_mark(byte: u8) -> bool {
+    matches!(byte, b'+' | b'-' | b'.')
+}
+
+fn ends_with_number(token: &[u8]) -> bool {
+    token.last().is_some_and(u8::is_ascii_digit)
+}
+
+/// The number that a word is.
+fn number(token: &[u8]) -> Option<f32> {
+    let is_of_number = |&byte: &u8| byte.is_ascii_digit() || is_mark(byte) || byte | 32 == b'e';
+    if token.len() > NUMBER_BYTES
+        || !token.iter().all(is_of_number)
+        || !token.iter().any(u8::is_ascii_digit)
+    {
+        return None;
     }
+    let text = std::str::from_utf8(token).ok()?;
+    let number: f32 = text.parse().ok()?;
+    number.is_finite().then_some(number)
 }
 
-/// The place of the first of the `cells` that end `line`, if it has as many tokens.
-///
-/// A cell has only digits. So the first cell begins after the last other byte of its token, and the
-/// bytes before that are noise. They might also be damage: `5x12` may be noise `5x` before a cell
-/// of 12, or a cell of 5012 with a wrong byte. The bytes hold a whole frame either way, and a frame
-/// that is whole in the bytes is never lost.
-fn first_cell(line: &[u8], cells: usize) -> Option<usize> {
-    let mut start = line.len();
-    for _ in 0..cells {
-        let last = line[..start]
-            .iter()
-            .rposition(|&byte| !is_separator(byte))?;
-        let before = line[..last].iter().rposition(|&byte| is_separator(byte));
-        start = before.map_or(0, |before| before + 1);
-    }
-    let token = line[start..].iter().position(|&byte| is_separator(byte));
-    let token = &line[start..token.map_or(line.len(), |length| start + length)];
-    let strange = token.iter().rposition(|byte| !byte.is_ascii_digit());
-    Some(strange.map_or(start, |strange| start + strange + 1))
-}
-
-/// The frame that `text` holds in `rows` lines of `cols` cells each.
-fn parse(cells: &Cells, text: &[u8], rows: usize, cols: usize) -> Option<RawFrame> {
-    let mut numbers = Vec::with_capacity(rows * cols);
-    for line in (Lines { bytes: text, at: 0 }) {
-        let row_end = numbers.len() + cols;
-        for token in line.split(|&byte| is_separator(byte)) {
-            if token.is_empty() {
-                continue;
-            }
-            if numbers.len() == row_end || numbers.len() == rows * cols {
-                return None;
-            }
-            numbers.push(decimal(token)?);
-        }
-        if numbers.len() != row_end {
-            return None;
-        }
-    }
-    (numbers.len() == rows * cols).then(|| cells.frame([numbers]))
-}
-
-fn decimal(token: &[u8]) -> Option<u16> {
-    token.iter().try_fold(0_u16, |value, digit| {
-        let digit = digit.is_ascii_digit().then(|| digit - b'0')?;
-        value.checked_mul(10)?.checked_add(u16::from(digit))
-    })
-}
-
-/// Complete lines, without their LF.
-struct Lines<'a> {
-    bytes: &'a [u8],
-    at: usize,
-}
-
-impl<'a> Iterator for Lines<'a> {
-    type Item = &'a [u8];
-
-    fn next(&mut self) -> Option<&'a [u8]> {
-        let rest = &self.bytes[self.at..];
-        let end = rest.iter().position(|&byte| byte == b'\n')?;
-        self.at += end + 1;
-        Some(&rest[..end])
-    }
+/// The longest number at the end of a word, and its length.
+fn number_at_end(token: &[u8]) -> Option<(usize, f32)> {
+    let most = token.len().min(NUMBER_BYTES);
+    let lengths = (1..=most).rev();
+    lengths
+        .into_iter()
+        .find_map(|length| Some((length, number(&token[token.len() - length..])?)))
 }

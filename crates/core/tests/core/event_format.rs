@@ -22,8 +22,10 @@ fn status() -> Status {
         time: time(),
         state: LinkState::Lost,
         reason: Some("end of file".to_owned()),
+        detail: None,
         frames: 100,
         frames_damaged: 2,
+        frames_dropped: 3,
         bytes_skipped: 1580,
         frame_rate_hz: Some(4.999_96),
     }
@@ -56,7 +58,8 @@ fn hardness() -> Hardness {
         levels: None,
         course: None,
         stiffness_n_per_mm: None,
-        references: ReferenceKinds::None,
+        references: ReferenceKinds::NONE,
+        advice: None,
         object: None,
         arrival: Duration::ZERO,
     }
@@ -70,7 +73,7 @@ fn check(line: &str, expected: &str) {
 fn status_is_frozen() {
     check(
         &Event::Status(status()).to_line(),
-        r#"{"type":"status","seq":7,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"lost","reason":"end of file","frames":100,"frames_damaged":2,"bytes_skipped":1580,"frame_rate_hz":5.0}"#,
+        r#"{"type":"status","seq":7,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"lost","reason":"end of file","frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":5.0,"detail":null}"#,
     );
     let asked = Status {
         seq: None,
@@ -81,7 +84,7 @@ fn status_is_frozen() {
     };
     check(
         &Event::Status(asked).to_line(),
-        r#"{"type":"status","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"connecting","reason":null,"frames":100,"frames_damaged":2,"bytes_skipped":1580,"frame_rate_hz":null}"#,
+        r#"{"type":"status","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"connecting","reason":null,"frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":null,"detail":null}"#,
     );
 }
 
@@ -108,7 +111,7 @@ fn press_is_frozen() {
 fn hardness_is_frozen() {
     check(
         &Event::Hardness(hardness()).to_line(),
-        r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","object":null}"#,
+        r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#,
     );
     let mut rejected = Event::Hardness(Hardness {
         phase: Phase::Early,
@@ -125,7 +128,7 @@ fn hardness_is_frozen() {
     rejected.number(9);
     check(
         &rejected.to_line(),
-        r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","object":null}"#,
+        r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#,
     );
 }
 
@@ -149,15 +152,16 @@ fn frame_is_frozen_and_never_numbered() {
         frame: 5,
         rows: 1,
         cols: 3,
-        newtons: vec![0.0, 0.123_456, 10.2],
+        newtons: vec![-0.000_4, 0.123_456, 10.2],
         contact_area_taxels: 2,
+        force_n: Some(10.323_4),
         tared: true,
         approach_mm: None,
     });
     frame.number(9);
     check(
         &frame.to_line(),
-        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":1,"cols":3,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"tared":true,"approach_mm":null}"#,
+        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":1,"cols":3,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"force_n":10.323,"tared":true,"approach_mm":null}"#,
     );
 }
 

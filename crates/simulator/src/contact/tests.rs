@@ -65,6 +65,7 @@ impl Bed {
         let problem = Problem {
             gap_mm: gap,
             spectrum: &self.spectrum,
+            block: None,
             local,
             force_n,
             cell_mm: self.cell_mm,
@@ -211,6 +212,7 @@ fn a_finer_tolerance_changes_little() {
     let problem = Problem {
         gap_mm: &gap,
         spectrum: &bed.spectrum,
+        block: None,
         local: Local::None,
         force_n: 8.0,
         cell_mm: CELL_MM,

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{CourseSettings, LabelledCourse, Plan, Reading, read_press};
 use crate::material::Split;
+use crate::object::Family;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
 use crate::rigid::{self, FLAT_MM, Reference, Weight};
@@ -71,8 +72,8 @@ const REFERENCE_N: [f64; 2] = [3.0, 25.0];
 /// Radius of the rigid ball of a cover, mm.
 const BALL_MM: [f64; 2] = [5.0, 20.0];
 /// The covers: Young's modulus in MPa, and thickness.
-const COVER_MPA: [f64; 2] = [0.3, 20.0];
-const COVER_MM: [f64; 2] = [0.5, 4.0];
+const COVER_MPA: [f64; 2] = [0.1, 20.0];
+const COVER_MM: [f64; 2] = [0.5, 8.0];
 /// The factor on the newtons of the sensors whose users state wrong ones, and how many these are.
 const WRONG: [f64; 2] = [0.5, 2.0];
 const WRONG_SHARE: f64 = 0.5;
@@ -366,6 +367,11 @@ impl Station {
                         shore: f32::NAN,
                         sensor: electronics.number,
                         reference: Some(reference),
+                        family: match reference {
+                            Reference::Flat { .. } => Family::Disc,
+                            Reference::Ball { .. } => Family::Ball,
+                        },
+                        layered: false,
                         young_mpa: f32::INFINITY,
                         frame_rate_hz: (1.0 / reading.period_s) as f32,
                         speed_mm_s: plan.arm.speed_mm_s as f32,
@@ -379,7 +385,8 @@ impl Station {
     /// The presses of one object. A press that only some of the electronics see is in the data set
     /// for these.
     fn object(&mut self, object: u32, unit: Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
-        let subject = Subject::draw(&self.settings.objects, unit, &[]);
+        let flat_share = self.settings.flat_share();
+        let subject = Subject::draw(&self.settings.objects, unit, &[], flat_share);
         let mut made = Vec::new();
         for press in 0..u64::from(self.settings.objects.presses) {
             let mut paired = subject.draws.geometry.child(3).child(press);

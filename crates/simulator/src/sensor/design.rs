@@ -32,6 +32,9 @@ pub(crate) struct Design {
     pub(super) noise_ratio: f64,
     pub(super) noise_n: f64,
     pub(super) dead_share: f64,
+    /// Where every taxel reads something without load. `None` for a film whose layers do not touch
+    /// below an activation threshold: it reads exactly 0.
+    pub(super) rest: Option<Rest>,
     /// Median and greatest of the lognormal activation thresholds. The greatest is at 3 sigma.
     pub(super) threshold_median_n: f64,
     pub(super) threshold_bound_n: f64,
@@ -41,6 +44,13 @@ pub(crate) struct Design {
     /// Fewer counts are read as 0.
     pub(super) least_counts: f32,
     pub(super) spread: Spread,
+}
+
+/// The counts of taxels without load: their mean and the standard deviation between taxels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Rest {
+    pub(super) counts: f64,
+    pub(super) spread: f64,
 }
 
 /// The reading of a taxel under a force, before its gain.
@@ -105,7 +115,7 @@ impl SensorProfile {
 }
 
 /// The ranges of a broad design. Forces are those of a taxel 3.5 mm wide; wider taxels have more,
-/// by area. `docs/simulator.md` gives their sources.
+/// by area. `results/simulator.md` gives their sources.
 pub(super) mod ranges {
     pub(crate) const PITCH_MM: [f64; 2] = [2.0, 7.0];
     pub(crate) const ACTIVE_SHARE: [f64; 2] = [0.6, 1.0];
@@ -125,7 +135,10 @@ pub(super) mod ranges {
     pub(crate) const CREEP: [[f64; 2]; 2] = [[0.0, 0.08], [0.0, 0.1]];
     pub(crate) const CREEP_S: [[f64; 2]; 2] = [[0.2, 1.0], [4.0, 16.0]];
     pub(crate) const NOISE: [f64; 2] = [0.003, 0.03];
-    pub(crate) const NOISE_N: [f64; 2] = [0.002, 0.03];
+    pub(crate) const NOISE_N: [f64; 2] = [0.002, 0.04];
+    /// The mean counts at rest, as a share of the full scale, and their spread as a share of the mean.
+    pub(crate) const REST: [f64; 2] = [0.002, 0.075];
+    pub(crate) const REST_SPREAD: [f64; 2] = [0.05, 0.5];
     pub(crate) const DEAD: [f64; 2] = [0.0, 0.02];
     pub(crate) const TAXEL: [f64; 2] = [0.02, 0.2];
     pub(crate) const ROW: [f64; 2] = [0.0, 0.06];
@@ -136,6 +149,8 @@ pub(super) mod ranges {
 pub(super) const FOIL_MM: f64 = 0.3;
 /// The probabilities of the responses: linear, a power, one that levels. The others fall.
 const RESPONSES: [f64; 3] = [0.2, 0.35, 0.35];
+/// The share of the arrays without an activation threshold, whose every taxel has noise.
+const RESTLESS_SHARE: f64 = 0.5;
 /// The share of the arrays that are smaller than the cells' 98 mm.
 const SMALL_SHARE: f64 = 0.25;
 /// The least width of an array in mm. A smaller one would lose most presses over its border.
@@ -163,6 +178,7 @@ impl Design {
             noise_ratio: 0.015,
             noise_n: 0.012,
             dead_share: 0.003,
+            rest: None,
             // The bound is the paper's "minimum discrimination" of 0.2 N, for every taxel.
             threshold_median_n: 0.05,
             threshold_bound_n: 0.2,
@@ -172,6 +188,11 @@ impl Design {
             least_counts: 2.0,
             spread: profile.spread(),
         }
+    }
+
+    /// A reading as whole counts.
+    pub(super) fn counts(&self, read: f32) -> f32 {
+        read.round().clamp(0.0, f32::from(self.full_scale_counts))
     }
 
     pub(crate) fn is_linear(&self) -> bool {
@@ -236,7 +257,16 @@ impl Design {
             let (share, tau_s) = (even(CREEP[k], stream), log_even(CREEP_S[k], stream));
             (share as f32, tau_s as f32)
         };
+        let full_scale_counts = if count_n < COARSE_COUNT_N { 4095 } else { 255 };
+        let mut of_rest = stream.child(0);
+        let counts = f64::from(full_scale_counts) * log_even(REST, &mut of_rest);
+        let rest = Rest {
+            counts,
+            spread: counts * even(REST_SPREAD, &mut of_rest),
+        };
+        let is_restless = of_rest.uniform() < RESTLESS_SHARE;
         Self {
+            rest: is_restless.then_some(rest),
             array: Array {
                 rows: side,
                 cols: side,
@@ -256,7 +286,7 @@ impl Design {
             threshold_median_n: threshold_n,
             threshold_bound_n: threshold_n * (3.0 * sigma).exp(),
             count_n: (area * count_n) as f32,
-            full_scale_counts: if count_n < COARSE_COUNT_N { 4095 } else { 255 },
+            full_scale_counts,
             least_counts: if stream.uniform() < 0.5 { 1.0 } else { 2.0 },
             spread: Spread {
                 taxel: even(TAXEL, stream),

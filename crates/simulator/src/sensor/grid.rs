@@ -86,12 +86,19 @@ impl Grid {
             let (column, column_step) = self.places[window.corner.1 + k % window.width];
             let cell = row_step * self.steps + column_step;
             let shares = &self.shares[cell * span * span..][..span * span];
-            for (n, &share) in shares.iter().enumerate() {
-                let row = row + (n / span) as isize - self.reach as isize;
-                let column = column + (n % span) as isize - self.reach as isize;
-                if (0..rows as isize).contains(&row) && (0..cols as isize).contains(&column) {
-                    forces[row as usize * cols + column as usize] += pressure * area * share;
+            // The columns of the array that the shares lie on, and those of the shares.
+            let first = column - self.reach as isize;
+            let from = (-first).clamp(0, span as isize) as usize;
+            let to = (cols as isize - first).clamp(from as isize, span as isize) as usize;
+            let load = pressure * area;
+            for (n, shares) in shares.chunks_exact(span).enumerate() {
+                let row = row + n as isize - self.reach as isize;
+                if !(0..rows as isize).contains(&row) || from == to {
+                    continue;
                 }
+                let at = row as usize * cols + (first + from as isize) as usize;
+                let taxels = forces[at..].iter_mut().zip(&shares[from..to]);
+                taxels.for_each(|(force, &share)| *force += load * share);
             }
         }
         forces

@@ -121,7 +121,7 @@ fn broad_designs_draw_every_property_within_its_range() {
         .map(|k| Design::broad(cover_mm, &mut Stream::new(3, "designs").child(k)))
         .collect();
     type Property = (&'static str, [f64; 2], fn(&Design) -> Option<f64>);
-    let properties: [Property; 21] = [
+    let properties: [Property; 22] = [
         ("pitch", ranges::PITCH_MM, |d| Some(d.pitch_mm)),
         ("active", ranges::ACTIVE_SHARE, |d| {
             Some(d.active_mm / d.pitch_mm)
@@ -162,6 +162,9 @@ fn broad_designs_draw_every_property_within_its_range() {
         ("noise", ranges::NOISE, |d| Some(d.noise_ratio)),
         ("noise in N", ranges::NOISE_N, |d| {
             Some(of_area(d, d.noise_n))
+        }),
+        ("rest", ranges::REST, |d| {
+            Some(d.rest?.counts / f64::from(d.full_scale_counts))
         }),
         ("dead", ranges::DEAD, |d| Some(d.dead_share)),
         ("taxel", ranges::TAXEL, |d| Some(d.spread.taxel)),
@@ -223,7 +226,7 @@ fn a_point_load_draws_no_cross() {
     let sensor = without_thresholds(6);
     let raw = sensor.read(&forces, 1.0, &mut Stream::new(6, "noise"));
     assert_eq!(
-        raw.counts.iter().filter(|&&counts| counts > 0).count(),
+        raw.counts.iter().filter(|&&counts| counts > 0.0).count(),
         5,
         "itself and four"
     );
@@ -249,11 +252,60 @@ fn an_unloaded_sensor_reads_zero_even_after_long_load() {
 }
 
 #[test]
+fn a_restless_array_has_noise_on_every_taxel_and_is_tared_to_a_mean_of_zero() {
+    let designs = (0..200).map(|k| Design::broad(1.0, &mut Stream::new(3, "restless").child(k)));
+    let (restless, quiet): (Vec<_>, Vec<_>) = designs.partition(|design| design.rest.is_some());
+    assert!(restless.len() > 70 && quiet.len() > 70, "{}", quiet.len());
+    let unloaded = |design: &Design| {
+        let sensor = Sensor::draw(design.clone(), &Stream::new(4, "sensor"));
+        let raw = sensor.read(
+            &vec![0.0; design.array.taxels()],
+            1.0,
+            &mut Stream::new(5, "noise"),
+        );
+        (sensor.tared(&raw), raw, sensor)
+    };
+    assert!(
+        unloaded(&quiet[0])
+            .1
+            .counts
+            .iter()
+            .all(|&counts| counts == 0.0)
+    );
+    for design in restless.iter().take(20) {
+        let (frame, _, sensor) = unloaded(design);
+        let count = frame.newtons.len() as f32;
+        let mean_n = frame.newtons.iter().sum::<f32>() / count;
+        let square: f32 = frame.newtons.iter().map(|n| n * n).sum();
+        let sd_n = (square / count).sqrt();
+        // Of a taxel near 0 the noise is cut off, and a mean of five frames has noise of its own.
+        let noise_n = design.noise_n as f32 + 0.3 * design.count_n;
+        assert!(sd_n < 1.3 * noise_n, "{sd_n} N of {noise_n}");
+        assert!(mean_n.abs() < 5.0 * noise_n / count.sqrt(), "{mean_n} N");
+        let Thresholds {
+            contact_threshold_n,
+            begin_area_taxels,
+            ..
+        } = sensor.thresholds();
+        assert!(frame.contact_area_taxels(contact_threshold_n) < begin_area_taxels);
+    }
+    let noisy = restless
+        .iter()
+        .find(|design| design.noise_n > f64::from(2.0 * design.count_n));
+    let (frame, ..) = unloaded(noisy.unwrap());
+    let below = frame.newtons.iter().filter(|&&n| n < 0.0).count();
+    assert!(
+        (0.35..0.65).contains(&(below as f64 / frame.newtons.len() as f64)),
+        "{below}"
+    );
+}
+
+#[test]
 fn every_taxel_feels_the_guaranteed_load_and_full_scale_is_8_bits() {
     let sensor = Sensor::new(SensorProfile::Clean, &Stream::new(9, "sensor"));
     let mut noise = Stream::new(9, "noise");
     let dead = sensor.gain.iter().filter(|&&gain| gain == 0.0).count();
-    let felt = |raw: RawFrame| raw.counts.iter().filter(|&&c| c > 0).count();
+    let felt = |raw: RawFrame| raw.counts.iter().filter(|&&c| c > 0.0).count();
     assert_eq!(
         felt(sensor.read(&[0.21; TAXELS], 1.0, &mut noise)),
         TAXELS - dead
@@ -263,6 +315,6 @@ fn every_taxel_feels_the_guaranteed_load_and_full_scale_is_8_bits() {
         .read(&[100.0; TAXELS], 1.0, &mut noise)
         .counts
         .into_iter()
-        .max();
-    assert_eq!(most, Some(255));
+        .fold(0.0, f32::max);
+    assert_eq!(most, 255.0);
 }

@@ -5,17 +5,15 @@
 
 use std::fmt::Write;
 use std::io::Cursor;
-use std::path::Path;
 
-use anyhow::{Context as _, ensure};
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use serde_json::json;
 
-use crate::data::courses::Courses;
-use crate::data::dataset::{self, SIMULATOR, Sample};
+use crate::data::presses::{self, Layout, Presses};
+use crate::data::source::{self, SIMULATOR};
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::{
-    self, Borders, CourseSettings, DatasetSettings, LEVELS, LabelledCourse, LabelledSample,
+    self, Borders, CourseSettings, DatasetSettings, Family, LEVELS, LabelledCourse, LabelledSample,
     LevelRange, Materials,
 };
 
@@ -58,10 +56,10 @@ pub(crate) fn with_rate(template: &str) -> ProgressStyle {
 
 /// The levels with their intervals of Shore. Those of the named materials are the paper's.
 fn levels(settings: &DatasetSettings) -> Vec<Level> {
-    let touching = |range: &LevelRange| dataset::level(range, range.touching);
+    let touching = |range: &LevelRange| source::level(range, range.touching);
     match (settings.materials, settings.borders) {
         (Materials::Broad, Borders::Touching) => LEVELS.iter().map(touching).collect(),
-        (Materials::Named, _) | (_, Borders::Gaps) => dataset::levels(),
+        (Materials::Named, _) | (_, Borders::Gaps) => source::papers_levels(),
     }
 }
 
@@ -76,8 +74,8 @@ pub fn to_bytes(
 ) -> anyhow::Result<Vec<u8>> {
     let names = hardnessd_simulator::material_names(settings.materials);
     let meta = meta(settings, &names, &json!(settings));
-    let samples: Vec<Sample> = samples.into_iter().map(Sample::from).collect();
-    Ok(dataset::write(Cursor::new(Vec::new()), &samples, &meta)?.into_inner())
+    let (out, all) = (Cursor::new(Vec::new()), Presses::of_samples(samples));
+    Ok(presses::write(out, &all, Layout::Frames, &meta)?.into_inner())
 }
 
 /// The bytes of a file of whole presses that `settings` made.
@@ -90,9 +88,10 @@ pub fn courses_to_bytes(
     courses: &[LabelledCourse],
 ) -> anyhow::Result<Vec<u8>> {
     let names = settings.material_names();
-    let meta = meta(&settings.objects, &names, &json!(settings));
-    let out = Cursor::new(Vec::new());
-    Ok(Courses::of(courses).write(out, &meta)?.into_inner())
+    let mut meta = meta(&settings.objects, &names, &json!(settings));
+    meta["shapes"] = json!(Family::NAMES);
+    let (out, all) = (Cursor::new(Vec::new()), Presses::of_courses(courses));
+    Ok(presses::write(out, &all, Layout::OverTime, &meta)?.into_inner())
 }
 
 fn meta(
@@ -107,36 +106,4 @@ fn meta(
         "generator": format!("{SIMULATOR} {}", env!("CARGO_PKG_VERSION")),
         "settings": settings,
     })
-}
-
-/// The settings of the objects that a file of whole presses was simulated with. `None` if no simulator
-/// made it.
-///
-/// # Errors
-///
-/// Returns an error if the file cannot be read.
-pub fn settings_of_courses(path: &Path) -> anyhow::Result<Option<DatasetSettings>> {
-    let meta = dataset::meta(path)?;
-    let settings = meta.pointer("/settings/objects").cloned();
-    Ok(settings.and_then(|settings| serde_json::from_value(settings).ok()))
-}
-
-/// The settings that a file was simulated with.
-///
-/// # Errors
-///
-/// Returns an error if the file cannot be read, or has no such settings.
-pub fn settings_of(path: &Path) -> anyhow::Result<DatasetSettings> {
-    let meta = dataset::meta(path)?;
-    let expected = || {
-        format!(
-            "{}: `meta.settings`: found {}, expected the simulator's settings",
-            path.display(),
-            meta["settings"]
-        )
-    };
-    let settings: DatasetSettings =
-        serde_json::from_value(meta["settings"].clone()).with_context(expected)?;
-    ensure!(settings.is_possible(), expected());
-    Ok(settings)
 }

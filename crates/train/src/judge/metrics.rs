@@ -1,20 +1,13 @@
 //! The quality of a recogniser: the paper's Eqs. 11 to 14, and measures that the paper leaves out.
 //!
-//! In: the true level, the probabilities and the object of every labelled sample. Out: an
+//! In: the true level, the probabilities and the object of every labelled press. Out: an
 //! [`Evaluation`], which `evaluate --json` prints. All ratios are computed from counts.
-//!
-//! Presses of one object are near-copies, so an interval over frames is too narrow. Our interval
-//! draws whole objects.
-
-mod by_object;
 
 use serde::{Deserialize, Serialize};
 
+use super::interval::{self, Mean};
+use crate::data::presses::Unit;
 use hardnessd_core::verdict::argmax;
-
-pub use by_object::{
-    Clusters, Estimate, ObjectCount, accuracy_by_object, by_object, difference_by_object,
-};
 
 /// Number of equal bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
@@ -22,40 +15,25 @@ const CALIBRATION_BINS: usize = 15;
 /// infinite.
 const SMALLEST_PROBABILITY: f64 = 1e-12;
 
-/// One labelled sample and its verdict.
+/// One labelled press and its verdict.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Judged {
     /// The true level, 1..=L.
     pub level: u8,
     /// Probabilities `[L]` of the levels 1..=L.
     pub probabilities: Vec<f32>,
-    /// The object that was pressed, if known.
-    pub object: Option<u32>,
+    /// What the interval draws it with, if that is known: its object, or the cover of its sensor.
+    pub unit: Option<(Unit, u32)>,
 }
 
 impl Judged {
     /// The predicted level, from 0; equal probabilities go to the lower level (Eq. 10).
-    fn prediction(&self) -> usize {
+    pub fn prediction(&self) -> usize {
         argmax(&self.probabilities).0
     }
 
     fn truth(&self) -> usize {
         usize::from(self.level) - 1
-    }
-
-    /// The verdict before the logits were divided by `temperature`: softmax(z) is softmax(z / T) to
-    /// the power of T, normalised to a sum of 1.
-    #[must_use]
-    pub fn before_temperature(&self, temperature: f64) -> Self {
-        let powers = self
-            .probabilities
-            .iter()
-            .map(|&p| f64::from(p).powf(temperature));
-        let sum: f64 = powers.clone().sum();
-        Self {
-            probabilities: powers.map(|power| (power / sum) as f32).collect(),
-            ..*self
-        }
     }
 }
 
@@ -66,6 +44,9 @@ pub struct Evaluation {
     pub n: usize,
     /// Eq. 12: share of all samples judged rightly, 0..1.
     pub accuracy: f64,
+    /// Mean of `category_accuracy` over the levels that are there: the accuracy if all levels were
+    /// equally frequent.
+    pub balanced_accuracy: f64,
     /// Eq. 11: share of each level's samples judged rightly. Null for an absent level.
     pub category_accuracy: Vec<Option<f64>>,
     /// Counts; rows are the truth, columns the prediction.
@@ -78,20 +59,17 @@ pub struct Evaluation {
     pub ece: f64,
     /// Mean negative log-likelihood, nats.
     pub nll: f64,
+    /// The bins of `ece`.
+    pub calibration: Vec<Bin>,
     /// 95 % interval of the accuracy by a bootstrap over objects within each level. Null without
-    /// objects, and where no level has two objects.
+    /// objects, where a level has only one, and where covers are drawn.
     pub accuracy_interval_by_object: Option<[f64; 2]>,
+    /// The same over covers, if the data has several sensors: all sensors under a cover press the same
+    /// objects.
+    pub accuracy_interval_by_cover: Option<[f64; 2]>,
 }
 
 impl Evaluation {
-    /// Whether the counts are a square with a row for each level, as in any evaluation that was not
-    /// damaged.
-    pub fn is_square(&self) -> bool {
-        let levels = self.category_accuracy.len();
-        let mut rows = self.confusion.iter();
-        self.confusion.len() == levels && rows.all(|row| row.len() == levels)
-    }
-
     /// Evaluates `judged`, whose levels and rows of probabilities are all of 1..=`levels`.
     ///
     /// # Panics
@@ -103,20 +81,46 @@ impl Evaluation {
         for one in judged {
             confusion[one.truth()][one.prediction()] += 1;
         }
+        let unit = judged[0].unit.map(|(unit, _)| unit);
+        let drawn: Option<Vec<_>> = judged.iter().map(Judged::drawn).collect();
+        let interval = drawn.and_then(|drawn| interval::of(&drawn, Mean::OfPresses));
+        let category_accuracy = category_accuracy(&confusion);
         Self {
             n: judged.len(),
             accuracy: accuracy(&confusion),
-            category_accuracy: category_accuracy(&confusion),
+            balanced_accuracy: mean(category_accuracy.iter().flatten().copied()),
+            category_accuracy,
             kappa: kappa(&confusion),
             kappa_quadratic: kappa_quadratic(&confusion),
             confusion,
             ece: calibration_error(judged),
             nll: negative_log_likelihood(judged),
-            accuracy_interval_by_object: by_object(judged)
-                .and_then(|objects| accuracy_by_object(&[&objects], Clusters::Objects))
-                .and_then(|estimate| estimate.interval),
+            calibration: calibration(judged),
+            accuracy_interval_by_object: interval.filter(|_| unit == Some(Unit::Object)),
+            accuracy_interval_by_cover: interval.filter(|_| unit == Some(Unit::Cover)),
         }
     }
+}
+
+impl Judged {
+    /// What the interval needs. Objects are drawn within each level.
+    fn drawn(&self) -> Option<interval::Drawn> {
+        let (unit, number) = self.unit?;
+        let stratum = match unit {
+            Unit::Object => self.level,
+            Unit::Cover => 0,
+        };
+        Some(interval::Drawn {
+            stratum,
+            unit: number,
+            value: f64::from(u8::from(self.prediction() == self.truth())),
+        })
+    }
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, n), value| (sum + value, n + 1.0));
+    sum / count
 }
 
 fn total(confusion: &[Vec<u64>]) -> f64 {
@@ -188,7 +192,7 @@ pub struct Bin {
 }
 
 /// The bins of the expected calibration error, equally wide from 0 to 1.
-pub fn calibration(judged: &[Judged]) -> Vec<Bin> {
+fn calibration(judged: &[Judged]) -> Vec<Bin> {
     let mut bins = vec![Bin::default(); CALIBRATION_BINS];
     for one in judged {
         let prediction = one.prediction();
@@ -202,7 +206,7 @@ pub fn calibration(judged: &[Judged]) -> Vec<Bin> {
 }
 
 /// Mean over the samples of |accuracy - mean confidence| of their bin.
-pub fn calibration_error(judged: &[Judged]) -> f64 {
+fn calibration_error(judged: &[Judged]) -> f64 {
     calibration(judged)
         .iter()
         .map(|bin| (bin.right as f64 - bin.confidence).abs())
@@ -251,11 +255,11 @@ mod tests {
         }
     }
 
-    pub(super) fn judged(level: u8, probabilities: [f32; 4], object: u32) -> Judged {
+    fn judged(level: u8, probabilities: [f32; 4], object: u32) -> Judged {
         Judged {
             level,
             probabilities: probabilities.to_vec(),
-            object: Some(object),
+            unit: Some((Unit::Object, object)),
         }
     }
 
@@ -286,19 +290,15 @@ mod tests {
             [Some(1.0), Some(0.5), None, None]
         );
         assert_eq!(evaluation.confusion[1], [1, 1, 0, 0]);
-    }
-
-    #[test]
-    fn temperature_can_be_taken_back() {
-        // The logits ln 8, 0 and 0 give 2, 1 and 1 of 4 at temperature 3.
-        let tempered = judged(1, [0.5, 0.25, 0.25, 0.0], 0).before_temperature(3.0);
-        for (found, expected) in tempered.probabilities.iter().zip([0.8, 0.1, 0.1, 0.0]) {
-            assert!(
-                (found - expected).abs() < 1e-6,
-                "{:?}",
-                tempered.probabilities
-            );
-        }
+        assert_eq!(
+            (evaluation.accuracy, evaluation.balanced_accuracy),
+            (0.75, 0.75)
+        );
+        let uneven = Evaluation::of(&samples[1..], 4);
+        assert_eq!(
+            (uneven.accuracy, uneven.balanced_accuracy),
+            (2.0 / 3.0, 0.75)
+        );
     }
 
     #[test]
@@ -333,11 +333,45 @@ mod tests {
     }
 
     #[test]
+    fn covers_are_drawn_with_all_their_objects() {
+        // Twenty covers with four objects, one a level, of 10 presses. Half of the covers are all wrong.
+        type UnitOf = fn(u32) -> (Unit, u32);
+        let press = |(number, unit): (u32, UnitOf)| {
+            let level = (number / 10 % 4) as u8 + 1;
+            let cover = number / 40;
+            let likeliest = if cover.is_multiple_of(2) {
+                level - 1
+            } else {
+                level % 4
+            };
+            let mut probabilities = [0.1; 4];
+            probabilities[usize::from(likeliest)] = 0.7;
+            Judged {
+                level,
+                probabilities: probabilities.to_vec(),
+                unit: Some(unit(number)),
+            }
+        };
+        let evaluated = |unit| {
+            let all: Vec<Judged> = (0..800).map(|number| press((number, unit))).collect();
+            Evaluation::of(&all, 4)
+        };
+        let covers = evaluated(|number| (Unit::Cover, number / 40));
+        let objects = evaluated(|number| (Unit::Object, number / 10));
+        assert_eq!(covers.accuracy_interval_by_object, None);
+        assert_eq!(objects.accuracy_interval_by_cover, None);
+        let width = |[low, high]: [f64; 2]| high - low;
+        let covers = width(covers.accuracy_interval_by_cover.unwrap());
+        let objects = width(objects.accuracy_interval_by_object.unwrap());
+        assert!((covers / objects - 2.0).abs() < 0.3, "{covers} {objects}");
+    }
+
+    #[test]
     fn without_objects_there_is_no_interval_and_one_class_has_no_kappa() {
         let sample = Judged {
             level: 1,
             probabilities: vec![0.9, 0.1, 0.0, 0.0],
-            object: None,
+            unit: None,
         };
         let evaluation = Evaluation::of(&[sample], 4);
         assert_eq!(evaluation.accuracy_interval_by_object, None);

@@ -1,39 +1,32 @@
-//! The training loop of the network that judges the course of a press.
+//! The network that judges the course of a press.
 //!
 //! In: presses over time, with the arm's reported motion, and presses that serve as references of
-//! their sensors. Out: weights, a temperature, and the calibration of sets of levels on held-out
-//! objects. Metrics and checkpoints are written on the way. An interrupted run resumes with
-//! bit-identical results.
+//! their sensors. Out: weights, and logits of the bins of Shore hardness.
 
 use burn::tensor::{Device, Tensor};
 
 use self::lots::Lots;
-use crate::data::courses::{self, Courses};
-use crate::learn::conformal::Calibration;
-use crate::learn::epochs::{self, Batch};
-use crate::learn::frame::LEVEL_BALANCE;
-use crate::learn::learner::Learner;
-use crate::learn::temperature;
+use super::learner::Learner;
+use super::{Batch, Inputs, Learning, Origin, Outputs, Question, Recogniser, Side, Taken};
+use crate::data::presses::{Presses, Timed};
 use crate::net::bins::{self, BINS};
-use crate::net::course::{self, FRAMES};
+use crate::net::course;
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
-use crate::run::Run;
-use crate::run::checkpoint::Origin;
-use crate::run::progress::ensure_finite;
-use crate::settings::{ArmReports, Training};
+use crate::run::checkpoint;
+use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, Moment};
-use hardnessd_core::verdict::{Borders, Distribution, Piece, argmax};
+use hardnessd_core::verdict::{Borders, BordersError, Extents, Knowledge, Piece, argmax};
 use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
-
-pub use self::lots::Drawn;
 
 mod lots;
 mod varied;
 
-/// Groups of presses per pass without gradients.
+/// Questions per pass without gradients.
 const JUDGED_AT_ONCE: usize = 16;
+/// The name of the stage.
+const STAGE: &str = "course";
 
 /// A press, prepared for training.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,8 +39,8 @@ pub struct Press {
     pub level: u8,
     /// The measured Shore OO hardness, if any.
     pub shore: Option<f32>,
-    /// The number of the pressed object.
-    pub object: u32,
+    /// The number of the object, if it is known.
+    pub object: Option<u32>,
     /// The number of the sensor.
     pub sensor: u32,
     /// The piece, if it is a rigid one.
@@ -55,26 +48,20 @@ pub struct Press {
 }
 
 /// All presses of the data, each from the frame that began it.
-pub fn presses(courses: &Courses) -> Vec<Press> {
-    let prepare = |(number, press): (usize, &courses::Press)| {
-        let rows = courses.rows(number);
-        let rows = rows.filter(|&row| courses.time_s[row] >= 0.0);
-        let moment = |row: usize| Moment {
-            frame: features::of_frame(&courses.frame(row)),
-            time_s: courses.time_s[row],
-            approach_mm: (courses.known[row] == 1).then_some(courses.approach_mm[row]),
-        };
+pub fn prepared(presses: &Presses) -> Vec<Press> {
+    let prepare = |place: usize| {
+        let (course, press) = (presses.course(place), &presses.all[place]);
         Press {
-            moments: rows.take(FRAMES).map(moment).collect(),
-            arm_n_per_mm: press.arm_n_per_mm,
+            moments: course.moments.iter().map(Moment::from).collect(),
+            arm_n_per_mm: course.arm_n_per_mm,
             level: press.level,
-            shore: Some(press.shore).filter(|shore| shore.is_finite()),
+            shore: press.shore,
             object: press.object,
             sensor: press.sensor,
             piece: press.reference.map(piece),
         }
     };
-    courses.presses.iter().enumerate().map(prepare).collect()
+    (0..presses.all.len()).map(prepare).collect()
 }
 
 /// A rigid piece as references name it.
@@ -82,34 +69,6 @@ pub fn piece(reference: Reference) -> Piece {
     match reference {
         Reference::Flat { width_mm } => Piece::Flat { width_mm },
         Reference::Ball { radius_mm } => Piece::Ball { radius_mm },
-    }
-}
-
-impl Drawn {
-    /// The network's inputs.
-    fn group(&self, standard: &Standard) -> course::Group {
-        let references = self.references.iter();
-        let references = references.map(|(press, piece)| (press.inputs(standard), *piece));
-        course::Group {
-            presses: self.presses.iter().map(|p| p.inputs(standard)).collect(),
-            references: references.collect(),
-        }
-    }
-
-    /// The same with the robot's errors, as training presses have them. References are whole presses.
-    fn varied(self, reports: &ArmReports, stream: &mut Stream) -> Self {
-        let whole = ArmReports {
-            early: 0.0,
-            ..*reports
-        };
-        let presses = self.presses.iter();
-        let presses = presses.map(|press| reports.varied(press, stream)).collect();
-        let references = self.references.into_iter();
-        let references = references.map(|(press, piece)| (whole.varied(&press, stream), piece));
-        Self {
-            presses,
-            references: references.collect(),
-        }
     }
 }
 
@@ -138,138 +97,82 @@ impl Press {
     }
 }
 
-/// The inputs of a training.
+/// The network, and what it learns from.
 #[derive(Debug)]
-pub struct Task<'a> {
-    /// Name of the stage.
-    pub stage: &'static str,
-    /// All presses of the data.
-    pub presses: &'a [Press],
-    /// Indices of labelled presses to learn from.
-    pub train: &'a [usize],
-    /// Indices of labelled presses of held-out objects; may be empty.
-    pub held_out: &'a [usize],
-    /// The parts of the scale that the hardness levels have.
-    pub borders: &'a Borders,
+pub struct Course<'a> {
+    prepared: Vec<Press>,
+    train: &'a [usize],
+    held_out: &'a [usize],
+    lots: Lots,
+    standard: Standard,
+    borders: Borders,
     /// The number of hardness levels.
-    pub levels: usize,
-    /// The errors and gaps in the arm's reports that training presses are given.
-    pub reports: ArmReports,
-    /// Settings of the training.
-    pub settings: &'a Training,
-    /// The seed of everything random.
-    pub seed: u64,
-    /// The device that computes.
-    pub device: &'a Device,
-}
-
-/// A trained network.
-#[derive(Debug)]
-pub struct Trained {
-    /// Weights of all layers.
-    pub weights: Weights,
-    /// Mean and deviation of the features.
-    pub standard: Standard,
+    levels: usize,
+    /// The share of each bin that lies in each level.
+    parts: Tensor<2>,
     /// What is added to the logits of the bins after temperature ([`bins::lifts`]).
-    pub lifts: Vec<f32>,
-    /// The calibration of the verdicts.
-    pub calibration: Calibration,
+    lifts: Vec<f32>,
+    initial: Weights,
+    reports: ArmReports,
+    settings: Training,
+    validated_every_epochs: u32,
+    seed: u64,
+    device: &'a Device,
 }
 
-impl Trained {
-    /// The distribution over Shore hardness from the logits of its bins.
-    pub fn distribution(&self, logits: &[f32], temperature: f32) -> Distribution {
-        let lifted = logits.iter().zip(&self.lifts);
-        let lifted: Vec<f32> = lifted.map(|(x, lift)| x / temperature + lift).collect();
-        Distribution::of(&lifted)
-    }
-
-    /// Logits of the bins of Shore hardness, before temperature: of the presses of each group, one
-    /// group after the other.
-    pub fn judge(&self, groups: &[Drawn], device: &Device) -> Vec<Vec<f32>> {
-        let mut judged = Vec::new();
-        for part in groups.chunks(JUDGED_AT_ONCE) {
-            let inputs: Vec<_> = part.iter().map(|g| g.group(&self.standard)).collect();
-            let outputs = course::outputs(&self.weights, &inputs, None, device);
-            judged.extend(numbers(&outputs).chunks(BINS).map(<[f32]>::to_vec));
+impl<'a> Course<'a> {
+    /// A network that learns from the presses `train`.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the levels are no parts of the scale of Shore hardness.
+    pub fn new(
+        presses: &Presses,
+        (train, held_out): (&'a [usize], &'a [usize]),
+        settings: &Settings,
+        seed: u64,
+        device: &'a Device,
+    ) -> Result<Self, BordersError> {
+        let stated = presses.levels();
+        let (borders, levels) = (Borders::of(&stated)?, stated.len());
+        let prepared = prepared(presses);
+        let rows: Vec<_> = train
+            .iter()
+            .map(|&place| prepared[place].features())
+            .collect();
+        let mut counts = vec![0; levels];
+        for &place in train {
+            counts[usize::from(prepared[place].level) - 1] += 1;
         }
-        judged
-    }
-}
-
-/// Trains from random weights, or continues from the stage's last checkpoint in `run`. Without held-out
-/// objects there are no sets of levels, because nothing shows whether they hold.
-///
-/// # Errors
-///
-/// Fails if the run's directory cannot be read or written, its checkpoint is of another stage than
-/// this, or the loss or a weight is no longer finite.
-pub fn fit(task: &Task, run: &Run) -> anyhow::Result<Trained> {
-    let initial = course::initial(task.seed, task.device);
-    let (weights, standard) = task.learnt(initial, task.standard(), run)?;
-    task.calibrated(weights, standard, task.lifts())
-}
-
-impl Task<'_> {
-    /// Whether a press to learn from has a measured Shore hardness.
-    pub fn has_shore(&self) -> bool {
-        let mut train = self.train.iter();
-        train.any(|&place| self.presses[place].shore.is_some())
+        let balance = settings.training.level_balance as f32;
+        Ok(Self {
+            train,
+            held_out,
+            lots: Lots::of(&prepared, train),
+            standard: Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice)),
+            parts: bins::parts(&borders, levels, device),
+            lifts: bins::lifts(&borders, &counts, balance),
+            initial: course::initial(seed, device),
+            borders,
+            levels,
+            prepared,
+            reports: settings.reports,
+            settings: settings.training,
+            validated_every_epochs: settings.validation.every_epochs,
+            seed,
+            device,
+        })
     }
 
     fn stream(&self, name: &str) -> Stream {
-        Stream::new(self.seed, &format!("{} {name}", self.stage))
+        Stream::new(self.seed, &format!("{STAGE} {name}"))
     }
 
-    /// Mean and deviation of the features of the training presses.
-    fn standard(&self) -> Standard {
-        let presses = self.train.iter().map(|&place| &self.presses[place]);
-        let rows: Vec<_> = presses.map(Press::features).collect();
-        Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice))
-    }
-
-    /// Runs the epochs from `initial`, or from the last checkpoint.
-    fn learnt(
-        &self,
-        initial: Weights,
-        standard: Standard,
-        run: &Run,
-    ) -> anyhow::Result<(Weights, Standard)> {
-        let lots = Lots::of(self.presses, self.train);
-        // A sample of an epoch is a group of presses.
-        let settings = Training {
-            batch: (self.settings.batch / lots::GROUP).max(1),
-            ..*self.settings
-        };
-        let stage = epochs::Stage {
-            name: self.stage,
-            origin: self.origin(&initial),
-            generated: false,
-            train: &lots.tickets(),
-            settings: &settings,
-            seed: self.seed,
-        };
-        let parts = bins::parts(self.borders, self.levels, self.device);
-        let weights = epochs::run(&stage, initial, run, self.device, None, |learner, batch| {
-            Ok(self.step(learner, &lots, (&standard, &parts), batch))
-        })?;
-        Ok((weights, standard))
-    }
-
-    /// What makes rare levels as likely as frequent ones.
-    fn lifts(&self) -> Vec<f32> {
-        let mut counts = vec![0; self.levels];
-        for &place in self.train {
-            counts[usize::from(self.presses[place].level) - 1] += 1;
-        }
-        let share = self.settings.level_balance.unwrap_or(LEVEL_BALANCE);
-        bins::lifts(self.borders, &counts, share as f32)
-    }
-
-    fn origin(&self, initial: &Weights) -> String {
-        let mut origin = Origin::new(self.stage, &(self.settings, self.reports), self.seed);
+    fn hash(&self) -> String {
+        let settings = (&self.settings, self.reports);
+        let mut origin = checkpoint::Origin::new(STAGE, &settings, self.seed);
         for &place in self.train.iter().chain(self.held_out) {
-            let press = &self.presses[place];
+            let press = &self.prepared[place];
             let moments = press.moments.iter().flat_map(|moment| {
                 let known = [moment.time_s, moment.approach_mm.unwrap_or(f32::NAN)];
                 moment.frame.into_iter().chain(known)
@@ -282,37 +185,101 @@ impl Task<'_> {
             ];
             origin = origin.numbers(moments.chain(label));
         }
-        origin.weights(initial).finish()
+        origin.weights(&self.initial).finish()
     }
 
-    /// Takes a step on groups of presses. Returns the mean loss of their presses, and how many of the
-    /// groups' presses were judged correctly before the step, in groups.
-    fn step(
-        &self,
-        learner: &mut Learner,
-        lots: &Lots,
-        (standard, parts): (&Standard, &Tensor<2>),
-        Batch {
-            samples: tickets,
-            step,
-            rate,
-        }: Batch,
-    ) -> (f64, f64) {
-        let mut stream = self.stream("variation").child(step);
-        let draw = |&ticket: &usize| {
-            let drawn = lots.draw(ticket, self.presses, self.borders, &mut stream);
-            drawn.varied(&self.reports, &mut stream)
+    /// The network's inputs for a question.
+    fn group(&self, question: &Question, vary: Option<&mut Stream>) -> course::Group {
+        let press = |&place: &usize| self.prepared[place].clone();
+        let presses: Vec<Press> = question.presses.iter().map(press).collect();
+        let references = question.references.iter();
+        let references: Vec<(Press, Piece)> = references
+            .map(|(place, piece)| (press(place), *piece))
+            .collect();
+        let (presses, references) = match vary {
+            Some(stream) => self.varied(&presses, &references, stream),
+            None => (presses, references),
         };
-        let drawn: Vec<Drawn> = tickets.iter().map(draw).collect();
-        let groups: Vec<_> = drawn.iter().map(|drawn| drawn.group(standard)).collect();
-        let presses = drawn.iter().flat_map(|drawn| &drawn.presses);
-        let labels: Vec<bins::Label> = presses.map(|press| (press.level, press.shore)).collect();
+        let inputs = |press: &Press| press.inputs(&self.standard);
+        course::Group {
+            presses: presses.iter().map(inputs).collect(),
+            references: references
+                .iter()
+                .map(|(press, piece)| (inputs(press), *piece))
+                .collect(),
+        }
+    }
 
+    /// Presses with the robot's errors, as training presses have them. References are whole presses.
+    fn varied(
+        &self,
+        presses: &[Press],
+        references: &[(Press, Piece)],
+        stream: &mut Stream,
+    ) -> (Vec<Press>, Vec<(Press, Piece)>) {
+        let whole = ArmReports {
+            early: 0.0,
+            ..self.reports
+        };
+        let presses = presses
+            .iter()
+            .map(|press| self.reports.varied(press, stream))
+            .collect();
+        let references = references.iter();
+        let references = references.map(|(press, piece)| (whole.varied(press, stream), *piece));
+        (presses, references.collect())
+    }
+}
+
+impl Learning for Course<'_> {
+    fn stage(&self) -> &'static str {
+        STAGE
+    }
+
+    fn origin(&self) -> Origin<'_> {
+        Origin {
+            hash: self.hash(),
+            is_generated: false,
+            sides: vec![Side {
+                prefix: "",
+                weights: self.initial.clone(),
+                averaging: self.settings.averaging,
+            }],
+            // A sample of an epoch is a group of presses.
+            samples: self.lots.tickets(),
+            held_out: self.held_out,
+            batch: (self.settings.batch / lots::GROUP).max(1),
+            epochs: self.settings.epochs,
+            optimiser: self.settings.optimiser,
+            checkpoint_every_epochs: self.settings.checkpoint_every_epochs,
+            validated_every_epochs: self.validated_every_epochs,
+            seed: self.seed,
+        }
+    }
+
+    /// Takes a step on groups of presses. The presses that were judged rightly are counted in groups.
+    fn step(&self, sides: &mut [Learner], batch: Batch) -> anyhow::Result<Taken> {
+        let learner = &mut sides[0];
+        let mut stream = self.stream("variation").child(batch.step);
+        let mut labels: Vec<bins::Label> = Vec::new();
+        let mut groups = Vec::with_capacity(batch.samples.len());
+        for &ticket in batch.samples {
+            let question = self
+                .lots
+                .draw(ticket, &self.prepared, &self.borders, &mut stream);
+            groups.push(self.group(&question, Some(&mut stream)));
+            let presses = question.presses.iter().map(|&place| &self.prepared[place]);
+            labels.extend(presses.map(|press| match press.piece {
+                // A rigid piece is harder than any object.
+                Some(_) => (1, None),
+                None => (press.level, press.shore),
+            }));
+        }
         let tracked = learner.weights.tracked();
         let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.device);
-        let (loss, judged) = bins::loss(outputs, &labels, parts);
+        let (loss, judged) = bins::loss(outputs, &labels, &self.parts);
         let mut gradients = loss.backward();
-        learner.step(&tracked, &mut gradients, rate);
+        learner.step(&tracked, &mut gradients, batch.rate);
         let rows = judged.chunks(self.levels);
         let right = labels
             .iter()
@@ -320,81 +287,58 @@ impl Task<'_> {
             .filter(|((level, _), row)| argmax(row).0 + 1 == usize::from(*level))
             .count();
         let share = right as f64 / labels.len() as f64;
-        (f64::from(numbers(&loss)[0]), share * tickets.len() as f64)
+        Ok(Taken {
+            loss: f64::from(numbers(&loss)[0]),
+            right: Some(share * batch.samples.len() as f64),
+            ..Taken::default()
+        })
     }
 
-    /// Calibrates on the presses of held-out objects, varied and with references like the training
-    /// presses.
-    fn calibrated(
+    fn questions(
         &self,
-        weights: Weights,
-        standard: Standard,
-        lifts: Vec<f32>,
-    ) -> anyhow::Result<Trained> {
-        let mut trained = Trained {
-            weights,
-            standard,
-            lifts,
-            calibration: Calibration::NONE,
-        };
-        // Finite weights can still give a logit that is not. One press is enough for this check.
-        let first = Drawn {
-            presses: vec![self.presses[self.train[0]].clone()],
-            references: Vec::new(),
-        };
-        for logit in trained.judge(&[first], self.device).iter().flatten() {
-            ensure_finite(self.stage, self.settings.epochs, "logit", (*logit).into())?;
-        }
-        let mut stream = self.stream("calibration");
-        let lots = Lots::of(self.presses, self.held_out);
-        let groups = lots
-            .all(self.presses, self.borders, &mut stream)
-            .into_iter();
-        let groups: Vec<Drawn> = groups
-            .map(|group| group.varied(&self.reports, &mut stream))
-            .collect();
-        let judged = trained.judge(&groups, self.device);
-        let presses: Vec<&Press> = groups.iter().flat_map(|group| &group.presses).collect();
-        let judged: Vec<_> = presses.into_iter().zip(judged).collect();
-        trained.calibration = self.calibration(&trained, &judged, &mut stream);
-        Ok(trained)
-    }
-
-    /// The temperature at which the levels of the held-out presses are most probable, and the sets of
-    /// levels.
-    fn calibration(
-        &self,
-        trained: &Trained,
-        judged: &[(&Press, Vec<f32>)],
+        presses: &[usize],
+        knowledge: Knowledge,
         stream: &mut Stream,
-    ) -> Calibration {
-        let of_truth = |(press, logits): &(&Press, Vec<f32>), temperature: f32| {
-            let levels = trained
-                .distribution(logits, temperature)
-                .levels(self.borders);
-            levels[usize::from(press.level) - 1]
+    ) -> Option<Vec<Question>> {
+        let lots = Lots::of(&self.prepared, presses);
+        let is_askable = knowledge == Knowledge::None || lots.have_references();
+        is_askable.then(|| lots.all(knowledge, &self.prepared, &self.borders, stream))
+    }
+
+    fn judge(
+        &self,
+        weights: &[Weights],
+        questions: &[Question],
+        mut vary: Option<&mut Stream>,
+    ) -> Vec<Vec<f32>> {
+        let group = |question: &Question| self.group(question, vary.as_deref_mut());
+        let groups: Vec<course::Group> = questions.iter().map(group).collect();
+        let mut rows = Vec::new();
+        for part in groups.chunks(JUDGED_AT_ONCE) {
+            let outputs = course::outputs(&weights[0], part, None, self.device);
+            rows.extend(numbers(&outputs).chunks(BINS).map(<[f32]>::to_vec));
+        }
+        rows
+    }
+
+    fn outputs(&self) -> Outputs {
+        Outputs::Bins {
+            lifts: self.lifts.clone(),
+            borders: self.borders.clone(),
+        }
+    }
+
+    fn ranges(&self, learnt: &[Timed]) -> Extents {
+        self.reports.ranges(learnt)
+    }
+
+    /// A network that met no references in training takes none.
+    fn graph(&self, weights: &[Weights]) -> Recogniser {
+        let inputs = match self.lots.have_references() {
+            true => Inputs::References,
+            false => Inputs::Features,
         };
-        // Rare levels count as much as frequent ones.
-        let mut counts = vec![0.0; self.levels + 1];
-        judged
-            .iter()
-            .for_each(|(press, _)| counts[usize::from(press.level)] += 1.0);
-        let loss = |temperature: f64| {
-            let loss = judged.iter().map(|judged| {
-                let p = of_truth(judged, temperature as f32).max(f32::MIN_POSITIVE);
-                -f64::from(p).ln() / counts[usize::from(judged.0.level)]
-            });
-            loss.sum::<f64>()
-        };
-        let temperature = match judged.is_empty() {
-            true => 1.0,
-            false => temperature::least(loss),
-        };
-        let of_truth = judged.iter().map(|judged| {
-            let press = judged.0;
-            let p = of_truth(judged, temperature);
-            ((press.object, press.shore.is_some()), p)
-        });
-        Calibration::of_sets(temperature, of_truth, stream)
+        let (graph, raw) = course::graph(&weights[0], &self.standard, inputs);
+        Recogniser { graph, inputs, raw }
     }
 }

@@ -1,175 +1,245 @@
-//! Exports a trained recogniser to the file that the daemon loads, and evaluates that file.
+//! Exports what was learnt to the file that the daemon loads, and evaluates that file.
 //!
-//! In: a graph with its temperature, the data it learnt from, and a function that computes its
-//! probabilities as training does. Out: `hrn.onnx`, which carries check frames that the daemon must
-//! reproduce, and `evaluation.json`, which is measured on the exported file.
+//! In: a network with its weights and its calibration, and the presses that it learnt from. Out: `hrn.onnx`,
+//! which carries checks that the daemon must reproduce, and `evaluation.json`, which is measured on the
+//! loaded file.
 
 use std::collections::BTreeSet;
 
-use anyhow::ensure;
+use anyhow::Context as _;
 use serde_json::json;
 
-use super::evaluated::{Case, Evaluated};
+use super::evaluated::{Evaluated, cases};
 use super::file;
-use crate::data::dataset::{self, Dataset, Kind, Source};
-use crate::net::graph::Graph;
+use super::verdicts::{self, Given, reference, rigid};
+use crate::data::presses::{Presses, Timed};
+use crate::data::source::{Kind, Source};
+use crate::learn::calibration::Calibration;
+use crate::learn::{Inputs, Learning, Outputs, Question, Recogniser};
+use crate::net::network::Weights;
 use crate::run::{Description, Run};
 use hardnessd_core::press;
-use hardnessd_core::verdict::{Card, Check, Checks, Hrn, ModelFrame, Range};
+use hardnessd_core::verdict::{
+    Card, Check, CheckedCourse, Checks, CourseCheck, Hrn, Knowledge, ModelFrame, Piece, Range,
+    TAIL, check_line,
+};
 use hardnessd_simulator::Split;
 
-/// Check frames or presses per level (`docs/formats.md`).
+/// Checks per level (`docs/formats.md`).
 const CHECKS_A_LEVEL: usize = 2;
 
-/// A recogniser as a graph.
-#[derive(Debug, Clone)]
-pub struct Recogniser {
-    /// The graph from newtons to logits.
-    pub graph: Graph,
-    /// Name of the logits in the graph, before temperature.
-    pub raw_logits: String,
-    /// Name of the Shore hardness in the graph, if it has one.
-    pub shore: Option<String>,
-    /// The divisor of the logits.
-    pub temperature: f32,
+/// What was learnt.
+pub struct Learnt<'a> {
+    /// The network.
+    pub learning: &'a dyn Learning,
+    /// The weights of its sides.
+    pub weights: &'a [Weights],
+    /// The calibration of its verdicts.
+    pub calibration: Calibration,
+    /// The data.
+    pub presses: &'a Presses,
+    /// The presses that it learnt from.
+    pub train: &'a [usize],
 }
 
-/// Writes the model and its evaluation on the test split to the run's directory. `train` are the
-/// training samples, and `probabilities` computes the probabilities of frames without the file.
+/// A model as it is written.
+pub struct Exported {
+    /// What the file says of itself.
+    pub card: Card,
+    recogniser: Recogniser,
+    outputs: Outputs,
+    checks: Checks,
+    temperature: f32,
+}
+
+impl Exported {
+    /// What was learnt, by a method, from these files.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the card cannot be written as JSON.
+    pub fn of(learnt: &Learnt, method: &str, sources: &[Source]) -> anyhow::Result<Self> {
+        let recogniser = learnt.learning.graph(learnt.weights);
+        let outputs = learnt.learning.outputs();
+        Ok(Self {
+            card: learnt.card(&recogniser, method, sources)?,
+            checks: learnt.checks(&recogniser, &outputs),
+            temperature: learnt.calibration.temperature,
+            recogniser,
+            outputs,
+        })
+    }
+
+    /// The file.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the card cannot be written as JSON.
+    pub fn bytes(&self) -> anyhow::Result<Vec<u8>> {
+        file::bytes(
+            &self.recogniser,
+            &self.outputs,
+            self.temperature,
+            &self.card,
+            &self.checks,
+        )
+    }
+}
+
+/// Writes the model and its evaluation on the test split to the run's directory. The file is loaded once, as
+/// the daemon does, which reproduces the checks.
 ///
 /// # Errors
 ///
 /// Fails if the daemon's loader refuses the file, or the directory cannot be written.
 pub fn finish(
+    learnt: &Learnt,
     run: &Run,
     description: &Description,
-    dataset: &Dataset,
-    train: &[usize],
-    recogniser: &Recogniser,
-    probabilities: impl Fn(&[&ModelFrame]) -> anyhow::Result<Vec<Vec<f32>>>,
 ) -> anyhow::Result<Option<Evaluated>> {
-    let frames = check_frames(dataset, train);
-    let checks = Checks::Frames(Check {
-        probabilities: probabilities(&frames)?,
-        frames: frames.iter().map(|frame| frame.newtons.to_vec()).collect(),
-    });
-    let mut card = Card {
-        format: "1".to_owned(),
-        levels: dataset::levels_of(&description.data),
-        pitch_mm: dataset.pitch_mm() as f32,
-        method: description.method.clone(),
-        data: data(&description.data)?,
-        metrics: metrics(recogniser.temperature),
-        validation: validation(&dataset.validated()).to_owned(),
-        range: range(train.iter().map(|&index| dataset.samples[index].frame)),
-        conformal: None,
-    };
-    let write = |card: &Card| {
-        let Recogniser {
-            graph,
-            raw_logits,
-            shore,
-            temperature,
-            ..
-        } = recogniser.clone();
-        let outputs = file::Outputs::Levels { raw_logits, shore };
-        file::write(graph, &outputs, temperature, card, &checks)
-    };
-    // The metrics are measured on a file without them and then added; the graph does not change.
-    let hrn = Hrn::load(&write(&card)?)?;
-    let evaluation = match dataset.labelled(Split::Test) {
-        Ok(test) => Some(evaluate(&hrn, dataset, &test)?),
-        Err(_) => None,
-    };
+    let mut exported = Exported::of(learnt, &description.method, &description.data)?;
+    let hrn = Hrn::load(&exported.bytes()?)?;
+    let test: Vec<usize> = learnt.presses.labelled(Split::Test).collect();
+    let verdicts = verdicts::of(&hrn, learnt.presses, &test, Given::USUAL)?;
+    let cases = cases(learnt.presses, &verdicts);
+    let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &exported.card.levels));
     if let Some(evaluation) = &evaluation {
-        card.metrics["test"] = json!(evaluation.levels);
-        if dataset.sources.len() > 1 {
-            card.metrics["test_by_source"] = evaluations_by_source(&hrn, dataset)?;
-        }
+        exported.card.metrics["test"] = json!(evaluation);
         let json = serde_json::to_vec_pretty(evaluation)?;
         run.write("evaluation.json", &json)?;
     }
-    run.write("hrn.onnx", &write(&card)?)?;
+    run.write("hrn.onnx", &exported.bytes()?)?;
     Ok(evaluation)
 }
 
-/// What a file says of itself before it is measured.
-pub fn metrics(temperature: f32) -> serde_json::Value {
-    json!({ "temperature": temperature })
-}
-
-/// Judges samples with a model and evaluates its verdicts.
-///
-/// # Errors
-///
-/// Fails if the model has fewer levels than the data, or fails to judge a frame.
-pub fn evaluate(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Evaluated> {
-    let cases = cases(hrn, dataset, indices)?;
-    Ok(Evaluated::of(&cases, hrn.card().levels.len()))
-}
-
-/// Judges labelled samples with a model.
-///
-/// # Errors
-///
-/// Fails if the model has fewer levels than the data, or fails to judge a frame.
-pub fn cases(hrn: &Hrn, dataset: &Dataset, indices: &[usize]) -> anyhow::Result<Vec<Case>> {
-    let levels = hrn.card().levels.len();
-    let case = |&index: &usize| {
-        let sample = &dataset.samples[index];
-        ensure!(
-            usize::from(sample.level) <= levels,
-            "the model has {levels} levels, and the data has a sample of level {}",
-            sample.level
-        );
-        Ok(Case {
-            level: sample.level,
-            shore: sample.shore.filter(|shore| shore.is_finite()),
-            object: sample.object,
-            verdict: hrn.judge(&sample.frame)?,
+impl Learnt<'_> {
+    /// What the file says of itself before it is measured.
+    fn card(
+        &self,
+        recogniser: &Recogniser,
+        method: &str,
+        sources: &[Source],
+    ) -> anyhow::Result<Card> {
+        let mut metrics = json!({ "temperature": self.calibration.temperature });
+        let best = self.train.iter().map(|&press| self.presses.frame(press));
+        let mut range = range(best);
+        let (format, conformal) = match recogniser.inputs {
+            Inputs::Frame | Inputs::Parts(_) => ("1", None),
+            Inputs::Features | Inputs::References => {
+                if let Some(missing) = self.calibration.missing() {
+                    metrics["not_promised"] = json!(missing);
+                }
+                let learnt = self.train.iter().map(|&press| self.presses.timed(press));
+                let learnt: Vec<Timed> = learnt.collect();
+                range = range.with_presses(self.learning.ranges(&learnt));
+                ("3", self.calibration.conformal())
+            }
+        };
+        let pitches = self.presses.pitches_mm(self.train);
+        Ok(Card {
+            format: format.to_owned(),
+            levels: self.presses.levels(),
+            pitch_mm: self.presses.pitch_mm() as f32,
+            method: method.to_owned(),
+            data: data(sources)?,
+            metrics,
+            validation: validation(&self.presses.validated()).to_owned(),
+            range: Range {
+                pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
+                ..range
+            },
+            grid: match recogniser.inputs {
+                Inputs::Parts(array) => Some(array),
+                _ => None,
+            },
+            conformal,
         })
-    };
-    indices.iter().map(case).collect()
-}
-
-fn evaluations_by_source(hrn: &Hrn, dataset: &Dataset) -> anyhow::Result<serde_json::Value> {
-    let mut by_source = serde_json::Map::new();
-    let test = dataset.labelled(Split::Test)?;
-    for (number, source) in dataset.sources.iter().enumerate() {
-        let of_source = |index: &usize| dataset.samples[*index].source == number;
-        let indices: Vec<usize> = test.iter().copied().filter(of_source).collect();
-        if !indices.is_empty() {
-            let evaluation = serde_json::to_value(evaluate(hrn, dataset, &indices)?.levels)?;
-            by_source.insert(source.name.clone(), evaluation);
-        }
     }
-    Ok(by_source.into())
-}
 
-/// The frames of the [`checked`] samples.
-pub(super) fn check_frames<'a>(dataset: &'a Dataset, train: &[usize]) -> Vec<&'a ModelFrame> {
-    let checked = checked(train, |index| dataset.samples[index].level);
-    let frames = checked.into_iter();
-    frames.map(|index| &dataset.samples[index].frame).collect()
-}
-
-/// Two indices of each level: those one third and two thirds through its samples or presses.
-pub(super) fn checked(train: &[usize], level_of: impl Fn(usize) -> u8) -> Vec<usize> {
-    let mut checked = Vec::new();
-    for level in dataset::levels() {
-        let of_level = |&index: &usize| level_of(index) == level.level;
-        let own: Vec<usize> = train.iter().copied().filter(of_level).collect();
-        // A level without its own is checked on those of other levels.
-        let own = if own.is_empty() { train } else { &own };
-        for part in 1..=CHECKS_A_LEVEL {
-            checked.push(own[own.len() * part / (CHECKS_A_LEVEL + 1)]);
+    /// Two presses of each level, and what the trainer's network says of them. Of a model that takes
+    /// references, every second press has some.
+    fn checks(&self, recogniser: &Recogniser, outputs: &Outputs) -> Checks {
+        let places = self.checked();
+        let references = match recogniser.inputs {
+            Inputs::References => self.check_references(),
+            _ => Vec::new(),
+        };
+        let is_identified = |number: usize| number % 2 == 1 && !references.is_empty();
+        let question = |(number, &press): (usize, &usize)| Question {
+            presses: vec![press],
+            references: match is_identified(number) {
+                true => references.clone(),
+                false => Vec::new(),
+            },
+        };
+        let questions: Vec<Question> = places.iter().enumerate().map(question).collect();
+        let rows = self.learning.judge(self.weights, &questions, None);
+        let temperature = self.calibration.temperature;
+        let probabilities = |row: &Vec<f32>| outputs.probabilities(row, temperature);
+        if let Inputs::Frame | Inputs::Parts(_) = recogniser.inputs {
+            let newtons = |&press: &usize| match recogniser.inputs {
+                Inputs::Parts(array) => self.presses.parts(press, array),
+                _ => self.presses.frame(press).newtons.to_vec(),
+            };
+            return Checks::Frames(Check {
+                frames: places.iter().map(newtons).collect(),
+                probabilities: rows.iter().map(probabilities).collect(),
+            });
         }
+        let promised = self.calibration.conformal();
+        let tail = |is_identified: bool| {
+            let knowledge = match is_identified {
+                true => Knowledge::Rigid,
+                false => Knowledge::None,
+            };
+            let limits = promised.as_ref().map(|promised| promised.limits(knowledge));
+            limits.map_or(TAIL, |limits| limits.tail)
+        };
+        let checked = places.iter().zip(&rows).enumerate();
+        let checked = checked.map(|(number, (&press, row))| CheckedCourse {
+            course: self.presses.course(press),
+            probabilities: probabilities(row),
+            shore: outputs.shore(row, temperature, tail(is_identified(number))),
+            identified: is_identified(number),
+        });
+        let references = references.iter();
+        Checks::Courses(CourseCheck {
+            presses: checked.collect(),
+            references: references
+                .map(|&own| reference(self.presses, own))
+                .collect(),
+        })
     }
-    checked
+
+    /// The references of the first sensor that has some.
+    fn check_references(&self) -> Vec<(usize, Piece)> {
+        let sensors = self.presses.of(self.train).map(|press| press.sensor);
+        let mut seen = BTreeSet::new();
+        let new = sensors.filter(|&sensor| seen.insert(sensor));
+        let mut of_sensors = new.map(|sensor| rigid(self.presses, sensor, Given::USUAL));
+        of_sensors
+            .find(|references| !references.is_empty())
+            .unwrap_or_default()
+    }
+
+    /// Two training presses of each level: those one third and two thirds through its presses.
+    fn checked(&self) -> Vec<usize> {
+        let mut checked = Vec::new();
+        for level in self.presses.levels() {
+            let of_level = |&press: &usize| self.presses.all[press].level == level.level;
+            let own: Vec<usize> = self.train.iter().copied().filter(of_level).collect();
+            // A level without its own is checked on those of other levels.
+            let own = if own.is_empty() { self.train } else { &own };
+            for part in 1..=CHECKS_A_LEVEL {
+                checked.push(own[own.len() * part / (CHECKS_A_LEVEL + 1)]);
+            }
+        }
+        checked
+    }
 }
 
 /// The value of `hrn.data`: name, seed and hash of the file, or a list of them for several files.
-pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
+fn data(sources: &[Source]) -> serde_json::Result<String> {
     let one = |source: &Source| json!({ "name": source.name, "seed": source.seed, "sha256": source.sha256 });
     match sources {
         [source] => serde_json::to_string(&one(source)),
@@ -177,9 +247,19 @@ pub(super) fn data(sources: &[Source]) -> serde_json::Result<String> {
     }
 }
 
+/// Checks, before anything is learnt, that a model file can name the files of the data.
+///
+/// # Errors
+///
+/// Fails if there are too many files, or one has a name that a model file may not have.
+pub fn check_sources(sources: &[Source]) -> anyhow::Result<()> {
+    check_line("hrn.data", &data(sources)?)
+        .context("the model could not name the files of --data: use fewer, or rename them")
+}
+
 /// The value of `hrn.validation`. `kinds` are those of the labelled presses that were judged and
 /// whose objects were not learnt.
-pub(super) fn validation(kinds: &BTreeSet<Kind>) -> &'static str {
+pub(crate) fn validation(kinds: &BTreeSet<Kind>) -> &'static str {
     let [simulated, recorded, unknown] =
         [Kind::Simulated, Kind::Recorded, Kind::Unknown].map(|kind| kinds.contains(&kind));
     match (simulated, recorded, unknown) {
@@ -193,7 +273,7 @@ pub(super) fn validation(kinds: &BTreeSet<Kind>) -> &'static str {
 }
 
 /// The range of total force and contact area of the training frames.
-pub(super) fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
+fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
     let threshold_n = press::Thresholds::default().contact_threshold_n;
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
@@ -218,63 +298,52 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::data::dataset::Sample;
+    use crate::data::presses::Press;
 
     #[test]
     fn a_model_is_validated_by_what_judged_it_and_it_did_not_learn() {
-        let sample = |object: Option<u32>, level, split| Sample {
-            frame: ModelFrame::default(),
+        let press = |object: Option<u32>, level, split| Press {
             level,
             object,
-            material: None,
-            force_n: None,
             split,
-            shore: None,
-            source: 0,
+            ..Press::default()
         };
         let (train, test) = (Split::Train, Split::Test);
-        let learnt = sample(Some(1), 1, train);
+        let learnt = press(Some(1), 1, train);
         let recorded = BTreeMap::from([((2, 1), Kind::Recorded), ((3, 1), Kind::Simulated)]);
         let both = Some("hardnessd simulator 0.2.0, hrn-train collect 0.2.0");
         for (generator, judged, expected) in [
             (both, vec![], "not validated"),
-            (both, vec![sample(Some(4), 0, test)], "not validated"),
-            (both, vec![sample(Some(1), 1, test)], "not validated"),
-            (both, vec![sample(Some(4), 1, test)], "simulated data only"),
-            (both, vec![sample(Some(3), 1, test)], "simulated data only"),
-            (both, vec![sample(Some(2), 1, test)], "recorded data"),
+            (both, vec![press(Some(4), 0, test)], "not validated"),
+            (both, vec![press(Some(1), 1, test)], "not validated"),
+            (both, vec![press(Some(4), 1, test)], "simulated data only"),
+            (both, vec![press(Some(3), 1, test)], "simulated data only"),
+            (both, vec![press(Some(2), 1, test)], "recorded data"),
             (
                 both,
-                vec![sample(Some(2), 1, test), sample(Some(4), 1, test)],
+                vec![press(Some(2), 1, test), press(Some(4), 1, test)],
                 "simulated and recorded data",
             ),
             (
                 Some("hrn-train collect 0.2.0"),
-                vec![sample(None, 1, test)],
+                vec![press(None, 1, test)],
                 "recorded data",
             ),
-            (None, vec![sample(None, 1, test)], "data of unknown origin"),
-            (
-                Some("finite elements"),
-                vec![sample(None, 1, test)],
-                "data of unknown origin",
-            ),
+            (None, vec![press(None, 1, test)], "data of unknown origin"),
             (
                 None,
-                vec![sample(Some(2), 1, test), sample(None, 1, test)],
+                vec![press(Some(2), 1, test), press(None, 1, test)],
                 "data partly of unknown origin",
             ),
         ] {
-            let dataset = Dataset {
-                samples: [vec![learnt.clone()], judged].concat(),
-                sources: vec![Source {
-                    generator: generator.map(str::to_owned),
-                    recorded: recorded.clone(),
-                    ..Source::default()
-                }],
-                paths: Vec::new(),
-            };
-            assert_eq!(validation(&dataset.validated()), expected, "{generator:?}");
+            let mut presses = Presses::default();
+            presses.all = [vec![learnt.clone()], judged].concat();
+            presses.sources = vec![Source {
+                generator: generator.map(str::to_owned),
+                recorded: recorded.clone(),
+                ..Source::default()
+            }];
+            assert_eq!(validation(&presses.validated()), expected, "{generator:?}");
         }
     }
 }

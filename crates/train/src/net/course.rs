@@ -3,14 +3,14 @@
 //!
 //! In: features of presses and of references. Out: weights, logits of the bins of Shore hardness, and the
 //! graph of the exported file of format 3. A frame fixes only the ratio of radius and modulus,
-//! whereas force against approach fixes both (`docs/method.md`).
+//! whereas force against approach fixes both (`results/method.md`).
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::bins::BINS;
 use crate::net::network::{Weights, dense};
+use hardnessd_core::verdict::Piece;
 use hardnessd_core::verdict::features::FEATURES;
-use hardnessd_core::verdict::{COURSE_FRAMES, Piece};
 use hardnessd_simulator::random::Stream;
 
 pub use graph::graph;
@@ -19,8 +19,6 @@ pub use references::EMBEDDING;
 mod graph;
 mod references;
 
-/// The number of frames that a model takes.
-pub const FRAMES: usize = COURSE_FRAMES.1;
 /// The most references that a model takes.
 pub const REFERENCES: usize = 32;
 /// Share of the numbers of a layer that a training step leaves out.

@@ -7,12 +7,26 @@
 use tract_onnx::pb;
 use tract_onnx::prelude::*;
 
+use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::{COLS, MIN_OPSET, ModelFrame, ROWS};
 
 /// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
 /// The IR version that goes with opset 17.
 const IR_VERSION: i64 = 8;
+
+/// What a model takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Inputs {
+    /// One frame.
+    Frame,
+    /// The press in parts of its time, on the grid of this array.
+    Parts(Array),
+    /// The features of a press.
+    Features,
+    /// The features of a press and references of its sensor.
+    References,
+}
 
 /// The nodes and constants of a graph under construction. A name identifies each value.
 #[derive(Debug, Clone, Default)]
@@ -40,18 +54,6 @@ impl Graph {
                 raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
             },
         )
-    }
-
-    /// Adds a node as it is and returns its first output's name.
-    pub(crate) fn push(&mut self, node: pb::NodeProto) -> String {
-        let output = node.output[0].clone();
-        self.nodes.push(node);
-        output
-    }
-
-    /// The nodes and constants, to add them to another graph.
-    pub(crate) fn into_parts(self) -> (Vec<pb::NodeProto>, Vec<pb::TensorProto>) {
-        (self.nodes, self.constants)
     }
 
     fn raw(

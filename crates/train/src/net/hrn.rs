@@ -218,7 +218,7 @@ fn pool_nodes(graph: &mut Graph, x: &str, with_means: bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::dataset::laid;
+    use crate::data::presses::resampled;
     use hardnessd_core::verdict::{COLS, ModelFrame};
     use hardnessd_simulator::{self, DatasetSettings};
 
@@ -373,7 +373,10 @@ mod tests {
             1,
             |_| (),
         );
-        let frames: Vec<_> = samples.iter().map(|sample| laid(&sample.frame)).collect();
+        let frames: Vec<_> = samples
+            .iter()
+            .map(|sample| resampled(&sample.frame))
+            .collect();
         let weights = initial(4, Pooling::Max, 1, &device());
         for log_above_n in [0.0, 0.1] {
             let scale = PixelScale {

@@ -4,7 +4,7 @@
 //! them: an optimiser, a checkpoint and the inheritance USTGAN -> STGAN -> HRN then need to know
 //! nothing about layers. Batch normalisation keeps no running statistics: with decay 0.9 they
 //! scored .475 where statistics taken over the training set scored .843 with the same weights
-//! (`docs/method.md`), so [`Normalisation`] says where the statistics come from, and they
+//! (`results/method.md`), so [`Normalisation`] says where the statistics come from, and they
 //! are taken anew before every evaluation and export.
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -136,6 +136,12 @@ impl Weights {
     /// The weight called `name` as numbers, row-major.
     pub fn numbers(&self, name: &str) -> Vec<f32> {
         numbers(&self.entry(name).values)
+    }
+
+    /// The numbers of the weight called `name`, if there is one.
+    pub fn find(&self, name: &str) -> Option<Vec<f32>> {
+        let found = self.entries.iter().find(|weight| weight.name == name);
+        found.map(|weight| numbers(&weight.values))
     }
 
     /// Lengths of the axes of the weight called `name`.

@@ -5,6 +5,8 @@ use crate::net::builder::Builder;
 /// The number of standard deviations from the mean at which a column is clipped, because a network
 /// extrapolates beyond its training data.
 const CLIP: f32 = 4.0;
+/// The least standard deviation of a column.
+const LEAST: f64 = 1e-3;
 
 /// Mean and standard deviation of each column over the training data.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,13 +36,16 @@ impl Standard {
         Self {
             mean: mean.iter().map(|&mean| mean as f32).collect(),
             // The lower limit avoids a division by 0 for a column that never varies.
-            deviation: variance.iter().map(|v| v.sqrt().max(1e-3) as f32).collect(),
+            deviation: variance
+                .iter()
+                .map(|v| v.sqrt().max(LEAST) as f32)
+                .collect(),
         }
     }
 
-    /// All numbers that an interrupted training must find unchanged.
-    pub fn numbers(&self) -> impl Iterator<Item = f32> {
-        self.mean.iter().chain(&self.deviation).copied()
+    /// Whether a column varies over the training data.
+    pub fn varies(&self, column: usize) -> bool {
+        self.deviation[column] > LEAST as f32
     }
 
     /// A column's number on the scale that the network takes.
@@ -48,13 +53,12 @@ impl Standard {
         ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
     }
 
-    /// Adds the nodes that bring `x` to the scale, and returns their output's name. Each column is
-    /// a row of `x` `[columns, n]`.
-    pub(super) fn nodes(&self, b: &mut Builder, x: &str) -> String {
-        let dims = [self.mean.len(), 1];
+    /// Adds the nodes that bring `columns` to the scale, and returns their output's name.
+    pub(crate) fn scaled(&self, b: &mut Builder, columns: &str) -> String {
+        let dims = [1, self.mean.len()];
         let mean = b.0.constant("column means", &dims, &self.mean);
         let deviation = b.0.constant("column deviations", &dims, &self.deviation);
-        let centred = b.node("Sub", &[x, &mean], "centred");
+        let centred = b.node("Sub", &[columns, &mean], "centred");
         let scaled = b.node("Div", &[&centred, &deviation], "standardised");
         b.clipped(&scaled, -CLIP, CLIP)
     }

@@ -13,13 +13,10 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use zip::ZipArchive;
 
-use crate::data::dataset::Dataset;
+use crate::data::presses::Presses;
 use crate::net::network::{Weight, Weights, numbers};
 use hardnessd_core::npy::Header;
 use hardnessd_core::npz::{Element as _, Writer};
-
-/// The name of the list of the best weights so far. That of a GAN's side has a prefix.
-pub const BEST: &str = "best";
 
 /// The state from which a stage continues, beside its settings and data.
 #[derive(Debug, Clone)]
@@ -28,8 +25,7 @@ pub struct Checkpoint {
     pub origin: String,
     /// The progress of the stage.
     pub progress: Progress,
-    /// The weights, and similar lists by name: Adam's moments, averaged weights, the best weights
-    /// so far.
+    /// The weights, and similar lists by name: Adam's moments, averaged weights.
     pub lists: Vec<(String, Weights)>,
 }
 
@@ -40,8 +36,6 @@ pub struct Progress {
     pub epoch: u32,
     /// Steps done.
     pub step: u64,
-    /// Least validation loss so far, or a GAN's least distance.
-    pub best_loss: Option<f64>,
 }
 
 /// One hash of everything that determines a stage's result: its settings, seed, frames in their
@@ -62,16 +56,15 @@ impl Origin {
         Self(hash)
     }
 
-    /// Adds samples.
+    /// Adds the frames of presses with their levels.
     #[must_use]
-    pub fn samples(mut self, dataset: &Dataset, indices: &[usize]) -> Self {
-        self.0.update((indices.len() as u64).to_le_bytes());
-        for &index in indices {
-            let sample = &dataset.samples[index];
-            self.0.update([sample.level]);
-            let newtons = sample.frame.newtons.iter();
-            let bytes: Vec<u8> = newtons.flat_map(|newtons| newtons.to_le_bytes()).collect();
-            self.0.update(bytes);
+    pub fn presses(mut self, presses: &Presses, places: &[usize]) -> Self {
+        self.0.update((places.len() as u64).to_le_bytes());
+        for &place in places {
+            self.0.update([presses.all[place].level]);
+            let newtons = presses.frame(place).newtons.into_iter();
+            self.0
+                .update(newtons.flat_map(f32::to_le_bytes).collect::<Vec<u8>>());
         }
         self
     }
@@ -186,25 +179,19 @@ impl Checkpoint {
         })
     }
 
-    /// Returns an error unless the checkpoint has each of the lists of `fresh`, with weights of the
-    /// same names and sizes. Each of its other lists, such as `generator best`, must be like a list of
-    /// the same learner.
+    /// Returns an error unless the checkpoint has the lists of `fresh`, with weights of the same names and
+    /// sizes.
     ///
     /// # Errors
     ///
     /// Names the list, and the weight if there is one.
     pub fn check_like(&self, fresh: &[(String, Weights)]) -> anyhow::Result<()> {
-        for (name, _) in fresh {
-            self.list(name)?;
-        }
-        for (name, list) in &self.lists {
-            let like = fresh.iter().find(|(own, _)| learner(own) == learner(name));
-            let like = like.map_or(&[][..], |(_, weights)| &weights.entries);
-            let shapes = |weights: &[Weight]| -> Vec<(String, Vec<usize>)> {
+        for (name, like) in fresh {
+            let shapes = |weights: &Weights| -> Vec<(String, Vec<usize>)> {
                 let shape = |weight: &Weight| (weight.name.clone(), weight.dims.clone());
-                weights.iter().map(shape).collect()
+                weights.entries.iter().map(shape).collect()
             };
-            let (found, expected) = (shapes(&list.entries), shapes(like));
+            let (found, expected) = (shapes(self.list(name)?), shapes(like));
             if let Some((weight, dims)) = expected.iter().find(|own| !found.contains(own)) {
                 bail!("array `{name}/{weight}`: found none of shape {dims:?}");
             }
@@ -215,11 +202,6 @@ impl Checkpoint {
         }
         Ok(())
     }
-}
-
-/// The learner of a list: `generator` of `generator best`, and none of `best`.
-fn learner(list: &str) -> Option<&str> {
-    list.rsplit_once(' ').map(|(learner, _)| learner)
 }
 
 fn flat(values: Vec<f32>, device: &Device) -> Tensor<1> {

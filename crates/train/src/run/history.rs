@@ -1,10 +1,7 @@
-//! A run's `metrics.csv`, written with a row per epoch, and read again for each stage's course and
-//! the run's cost.
+//! A run's `metrics.csv`, written with a row per epoch, and read again for the run's cost.
 //!
-//! Columns are found by their names, so that stages may have different ones. A cell that is not a
-//! number is a column that the stage does not have.
+//! All stages have the same columns. A cell is empty if the stage does not have the value.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -12,7 +9,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, ensure};
 
 use super::disk::write_whole;
-use crate::judge::likeness::Likeness;
 
 /// A run's `metrics.csv`.
 #[derive(Debug)]
@@ -22,7 +18,7 @@ pub struct MetricsFile {
 
 impl MetricsFile {
     /// The file of the run in a directory.
-    pub(super) fn of(run: &Path) -> Self {
+    pub fn of(run: &Path) -> Self {
         Self {
             path: run.join("metrics.csv"),
         }
@@ -35,7 +31,7 @@ impl MetricsFile {
     ///
     /// Returns the errors of reading and writing, and an error if another version began the file
     /// with other columns.
-    pub fn open(&self, stage: &'static str, step: u64) -> anyhow::Result<Metrics> {
+    pub fn open(&self, stage: &str, step: u64) -> anyhow::Result<Metrics> {
         let before = self.read()?;
         let columns = columns();
         let mut seconds_before = 0.0;
@@ -50,16 +46,15 @@ impl MetricsFile {
             }
             text.push_str(row);
             text.push('\n');
-            let seconds = cells.last().and_then(|cell| cell.parse().ok());
-            if let (true, Some(seconds)) = (cells[0] == stage, seconds) {
-                seconds_before = seconds;
+            if cells[0] == stage {
+                seconds_before = seconds(&cells).unwrap_or(seconds_before);
             }
         }
         write_whole(&self.path, text.as_bytes())?;
         let file = File::options().append(true).open(&self.path);
         Ok(Metrics {
             file: file.with_context(|| self.path.display().to_string())?,
-            stage,
+            stage: stage.to_owned(),
             seconds_before,
         })
     }
@@ -86,13 +81,39 @@ impl MetricsFile {
             Ok(text) => check_columns(&text, &self.path).map(|()| text),
         }
     }
+
+    /// The steps and the seconds of all stages, over all restarts.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the file exists but cannot be read.
+    pub fn cost(&self) -> anyhow::Result<(u64, f64)> {
+        let text = self.read()?;
+        // The last row of each stage counts.
+        let mut stages: Vec<(&str, u64, f64)> = Vec::new();
+        for row in text.lines().skip(1) {
+            let cells: Vec<&str> = row.split(',').collect();
+            let step = cells.get(1).and_then(|cell| cell.parse().ok());
+            let own = (cells[0], step.unwrap_or(0), seconds(&cells).unwrap_or(0.0));
+            match stages.iter_mut().find(|stage| stage.0 == own.0) {
+                Some(stage) => *stage = own,
+                None => stages.push(own),
+            }
+        }
+        let steps = stages.iter().map(|stage| stage.1).sum();
+        Ok((steps, stages.iter().map(|stage| stage.2).sum()))
+    }
+}
+
+fn seconds(cells: &[&str]) -> Option<f64> {
+    cells.last()?.parse().ok()
 }
 
 /// `metrics.csv`, open for one stage.
 #[derive(Debug)]
 pub struct Metrics {
     file: File,
-    stage: &'static str,
+    stage: String,
     /// Seconds that the stage had taken at the checkpoint from which it continues.
     seconds_before: f64,
 }
@@ -111,24 +132,15 @@ pub struct Row {
     /// Share of the epoch's samples judged rightly, each before the step that learnt from it. Only
     /// a recogniser's stage has it.
     pub accuracy: Option<f64>,
-    /// Loss and accuracy on the validation objects, in epochs that judged them.
+    /// Loss and accuracy on the held-out objects, in epochs that judged them.
     pub validation: Option<(f64, f64)>,
+    /// Mean loss of the generator.
+    pub generator_loss: Option<f64>,
+    /// Least, mean and greatest deviation sigma of the generator's mixture.
+    pub sigma: Option<[f64; 3]>,
     /// Seconds since this process took up the stage. The file has the sum over processes. It does
     /// not include what a killed process did after its last checkpoint, which is done again.
     pub seconds: f64,
-    /// The figures of a GAN's stage.
-    pub adversarial: Option<Adversarial>,
-}
-
-/// The further figures in a GAN's row.
-#[derive(Debug, Clone, Copy)]
-pub struct Adversarial {
-    /// Mean generator loss of the epoch.
-    pub generator_loss: f64,
-    /// Least, mean and greatest deviation sigma of the mixture.
-    pub sigma: [f64; 3],
-    /// The comparison of generated frames with real ones, in epochs that made it.
-    pub likeness: Option<Likeness>,
 }
 
 impl Metrics {
@@ -142,7 +154,7 @@ impl Metrics {
             seconds: self.seconds_before + row.seconds,
             ..*row
         };
-        let cells = row.cells(self.stage).map(|(_, cell)| cell);
+        let cells = row.cells(&self.stage).map(|(_, cell)| cell);
         // One write per row, so that a killed process leaves whole rows.
         self.file
             .write_all((cells.join(",") + "\n").as_bytes())
@@ -151,16 +163,13 @@ impl Metrics {
 }
 
 impl Row {
-    /// The columns and their cells. A cell is empty if the stage does not have the value.
-    fn cells(&self, stage: &str) -> [(&'static str, String); 17] {
+    /// The columns and their cells.
+    fn cells(&self, stage: &str) -> [(&'static str, String); 13] {
         let optional = |value: Option<f64>, digits: usize| {
             value.map_or_else(String::new, |value| format!("{value:.digits$}"))
         };
-        let validation = self.validation;
-        let adversarial = self.adversarial;
-        let sigma = |which: usize| adversarial.map(|adversarial| adversarial.sigma[which]);
-        let likeness = adversarial.and_then(|adversarial| adversarial.likeness);
-        let of_likeness = |value: fn(&Likeness) -> f64| optional(likeness.as_ref().map(value), 5);
+        let (loss, share) = self.validation.unzip();
+        let sigma = |which: usize| optional(self.sigma.map(|sigma| sigma[which]), 5);
         [
             ("stage", stage.to_owned()),
             ("step", self.step.to_string()),
@@ -168,34 +177,12 @@ impl Row {
             ("loss", optional(Some(self.loss), 6)),
             ("learning_rate", self.learning_rate.to_string()),
             ("accuracy", optional(self.accuracy, 4)),
-            (
-                "validation_loss",
-                optional(validation.map(|(loss, _)| loss), 6),
-            ),
-            (
-                "validation_accuracy",
-                optional(validation.map(|(_, share)| share), 4),
-            ),
-            (
-                "generator_loss",
-                optional(adversarial.map(|adversarial| adversarial.generator_loss), 6),
-            ),
-            ("sigma_min", optional(sigma(0), 5)),
-            ("sigma_mean", optional(sigma(1), 5)),
-            ("sigma_max", optional(sigma(2), 5)),
-            ("pixel_std", of_likeness(|likeness| likeness.pixel_std)),
-            (
-                "pixel_std_real",
-                of_likeness(|likeness| likeness.pixel_std_real),
-            ),
-            (
-                "pixel_std_component",
-                of_likeness(|likeness| likeness.pixel_std_component),
-            ),
-            (
-                "feature_distance",
-                of_likeness(|likeness| likeness.feature_distance),
-            ),
+            ("validation_loss", optional(loss, 6)),
+            ("validation_accuracy", optional(share, 4)),
+            ("generator_loss", optional(self.generator_loss, 6)),
+            ("sigma_min", sigma(0)),
+            ("sigma_mean", sigma(1)),
+            ("sigma_max", sigma(2)),
             ("seconds", optional(Some(self.seconds), 1)),
         ]
     }
@@ -218,151 +205,31 @@ fn check_columns(text: &str, path: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The stages of a run, in the order they ran.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct History {
-    /// The stages, each once.
-    pub stages: Vec<Stage>,
-}
-
-/// A stage of a run.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Stage {
-    /// The stage's name, such as `ustgan`.
-    pub name: String,
-    /// The stage's rows, each a map from column to value.
-    pub rows: Vec<BTreeMap<String, f64>>,
-}
-
-impl History {
-    /// Reads a run's `metrics.csv`. A run without the file has no stages.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the file exists but cannot be read.
-    pub fn read(run: &Path) -> anyhow::Result<Self> {
-        let path = run.join("metrics.csv");
-        match std::fs::read_to_string(&path) {
-            Ok(text) => Ok(Self::parse(&text)),
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Self::default()),
-            Err(error) => Err(error).with_context(|| path.display().to_string()),
-        }
-    }
-
-    fn parse(text: &str) -> Self {
-        let mut lines = text.lines();
-        let columns: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
-        let mut stages: Vec<Stage> = Vec::new();
-        for line in lines {
-            let cells: Vec<&str> = line.split(',').collect();
-            let numbers = columns.iter().zip(&cells).filter_map(|(column, cell)| {
-                let number = cell.parse().ok()?;
-                Some(((*column).to_owned(), number))
-            });
-            let row = numbers.collect();
-            match stages.iter_mut().find(|stage| stage.name == cells[0]) {
-                Some(stage) => stage.rows.push(row),
-                None => stages.push(Stage {
-                    name: cells[0].to_owned(),
-                    rows: vec![row],
-                }),
-            }
-        }
-        Self { stages }
-    }
-
-    /// Steps of all stages.
-    pub fn steps(&self) -> u64 {
-        self.stages
-            .iter()
-            .map(|stage| stage.last("step") as u64)
-            .sum()
-    }
-
-    /// Seconds of all stages, summed over restarts.
-    pub fn seconds(&self) -> f64 {
-        self.stages.iter().map(Stage::seconds).sum()
-    }
-}
-
-impl Stage {
-    /// Steps done.
-    pub fn steps(&self) -> u64 {
-        self.last("step") as u64
-    }
-
-    /// Seconds taken, summed over restarts.
-    pub fn seconds(&self) -> f64 {
-        self.last("seconds")
-    }
-
-    /// A column's last value. 0 if it has none.
-    fn last(&self, column: &str) -> f64 {
-        let values = self.rows.iter().rev().filter_map(|row| row.get(column));
-        values.copied().next().unwrap_or(0.0)
-    }
-
-    /// A column's values over the steps, where it has any.
-    pub fn curve(&self, column: &str) -> Vec<(f64, f64)> {
-        let point = |row: &BTreeMap<String, f64>| Some((*row.get("step")?, *row.get(column)?));
-        self.rows.iter().filter_map(point).collect()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_runs_price_is_the_sum_over_its_stages() {
-        let text = "stage,step,epoch,loss,validation_accuracy,seconds\n\
-                    pretraining,10,1,1.5,,2.0\n\
-                    training,5,1,1.0,,0.5\n\
-                    training,10,2,0.5,0.75,1.5\n\
-                    pretraining,20,2,1.25,,4.0\n";
-        let history = History::parse(text);
-        assert_eq!((history.steps(), history.seconds()), (30, 5.5));
-        assert_eq!(
-            history.stages[1].curve("validation_accuracy"),
-            [(10.0, 0.75)]
-        );
-        assert_eq!(history.stages[0].curve("loss"), [(10.0, 1.5), (20.0, 1.25)]);
-    }
-
-    #[test]
-    fn a_row_stands_under_its_columns() {
-        let mut row = Row {
-            step: 10,
-            loss: 1.5,
-            accuracy: Some(0.5),
-            ..Row::default()
-        };
-        row.adversarial = Some(Adversarial {
-            generator_loss: 0.25,
-            sigma: [0.1, 0.2, 0.3],
-            likeness: Some(Likeness {
-                pixel_std: 1.0,
-                pixel_std_real: 2.0,
-                pixel_std_component: 3.0,
-                feature_distance: 4.0,
-            }),
-        });
         let run = tempfile::tempdir().unwrap();
         let file = MetricsFile::of(run.path());
-        file.open("ustgan", 0).unwrap().add(&row).unwrap();
-        let history = History::parse(&file.read().unwrap());
-        let stage = &history.stages[0];
-        assert_eq!(stage.name, "ustgan");
-        let expected = [
-            ("step", 10.0),
-            ("accuracy", 0.5),
-            ("sigma_max", 0.3),
-            ("pixel_std_component", 3.0),
-            ("feature_distance", 4.0),
-        ];
-        for (column, value) in expected {
-            assert_eq!(stage.rows[0].get(column), Some(&value), "{column}");
+        assert_eq!(file.cost().unwrap(), (0, 0.0));
+        for (stage, step, seconds) in [
+            ("pretraining", 10, 2.0),
+            ("pretraining", 20, 4.0),
+            ("training", 5, 0.5),
+            ("training", 10, 1.5),
+        ] {
+            let row = Row {
+                step,
+                seconds,
+                ..Row::default()
+            };
+            let mut metrics = file.open(stage, step).unwrap();
+            metrics.seconds_before = 0.0;
+            metrics.add(&row).unwrap();
         }
+        assert_eq!(file.cost().unwrap(), (30, 5.5));
     }
 
     #[test]

@@ -13,7 +13,6 @@ fn description(name: &str, sha256: &str) -> Description {
         profile: Profile::Smoke,
         seed: 1,
         labels: 4,
-        label_choice: LabelChoice::Object,
         settings: Settings::of(Profile::Smoke),
         data: vec![Source {
             name: name.to_owned(),
@@ -96,11 +95,8 @@ fn seconds_go_on_from_the_row_of_the_checkpoint() {
         step,
         epoch: 1,
         loss: 1.0,
-        learning_rate: 0.1,
-        accuracy: None,
-        validation: None,
         seconds,
-        adversarial: None,
+        ..Row::default()
     };
     let mut metrics = file.open("first", 0).unwrap();
     metrics.add(&row(10, 2.0)).unwrap();

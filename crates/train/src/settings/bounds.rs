@@ -1,4 +1,6 @@
-//! The ranges of values, and the error for a value outside its range.
+//! The range of every number, in one table, and the error for a number outside it.
+
+use super::Settings;
 
 /// The reason that settings cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -16,53 +18,91 @@ pub enum SettingsError {
         /// The accepted range.
         expected: &'static str,
     },
-    /// `validation.keep` is `best`, and the network is not validated while it trains.
-    #[error(
-        "`validation.keep`: found best, expected last: this network uses held-out objects for its calibration \
-         only"
-    )]
-    Keep,
 }
 
-/// The most samples that a component generates at once. Fifty components make half a million, which
-/// take 1.6 GB.
-pub(crate) const MOST_SAMPLES_A_COMPONENT: u32 = 10_000;
-/// The most samples of a step.
-const MOST_SAMPLES: usize = 1_000_000;
+/// The end of a key's path, the numbers that it may have, and those in words. A path of two parts comes
+/// before one of its last part.
+type Bound = (&'static str, fn(f64) -> bool, &'static str);
 
-/// Checks the settings that every training loop has.
-pub(crate) fn check_loop(
-    table: &str,
-    batch: usize,
-    epochs: u32,
-    averaging: f64,
-    checkpoint_every_epochs: u32,
-) -> Result<(), SettingsError> {
+const SHARE: fn(f64) -> bool = |x| (0.0..=1.0).contains(&x);
+const DECAY: fn(f64) -> bool = |x| (0.0..1.0).contains(&x);
+const COUNT: fn(f64) -> bool = |x| x >= 1.0;
+const POSITIVE: fn(f64) -> bool = |x| x > 0.0;
+const NOT_NEGATIVE: fn(f64) -> bool = |x| x >= 0.0;
+
+#[rustfmt::skip]
+const BOUNDS: &[Bound] = &[
+    ("full_scale_n", POSITIVE, "above 0"),
+    ("log_above_n", |x| x == 0.0 || (1e-3..=1e3).contains(&x), "0, or 0.001 to 1000"),
     // Batch normalisation needs two samples.
-    let fits = (2..=MOST_SAMPLES).contains(&batch);
-    check(table, "batch", batch as f64, fits, "2 to 1000000")?;
-    check(table, "epochs", epochs, epochs > 0, "1 or more")?;
-    let fits = (0.0..1.0).contains(&averaging);
-    check(table, "averaging", averaging, fits, "0 to below 1")?;
-    let (key, every) = ("checkpoint_every_epochs", checkpoint_every_epochs);
-    check(table, key, every, every > 0, "1 or more")
+    ("batch", |x| (2.0..=1e6).contains(&x), "2 to 1,000,000"),
+    // Fifty components of 10,000 samples each take 1.6 GB.
+    ("samples_a_component", |x| (1.0..=1e4).contains(&x), "1 to 10,000"),
+    ("epochs", COUNT, "1 or more"),
+    ("checkpoint_every_epochs", COUNT, "1 or more"),
+    ("every_epochs", COUNT, "1 or more"),
+    ("sigma_penalty", NOT_NEGATIVE, "0 or more"),
+    ("averaging", DECAY, "0 to below 1"),
+    ("level_balance", SHARE, "0 to 1"),
+    ("shift_taxels", |x| (0.0..=4.0).contains(&x), "0 to 4"),
+    ("learning_rate", POSITIVE, "above 0"),
+    ("beta1", DECAY, "0 to below 1"),
+    ("beta2", DECAY, "0 to below 1"),
+    ("weight_decay", NOT_NEGATIVE, "0 or more"),
+    ("reports.unknown", SHARE, "0 to 1"),
+    ("reports.unknown_arm", SHARE, "0 to 1"),
+    ("reports.exact", SHARE, "0 to 1"),
+    ("reports.early", SHARE, "0 to 1"),
+    ("reports.slower", SHARE, "0 to 1"),
+    ("reports.stretched", SHARE, "0 to 1"),
+    ("reports.position", |x| (0.0..=0.5).contains(&x), "0 to 0.5"),
+    ("reports.arm", |x| (0.0..=0.9).contains(&x), "0 to 0.9"),
+    ("reports.clock_frames", |x| (0.0..=5.0).contains(&x), "0 to 5"),
+    ("validation.share", |x| (0.0..=0.5).contains(&x), "0 to 0.5"),
+];
+
+/// Checks every number of the settings.
+pub(super) fn check(settings: &Settings) -> Result<(), SettingsError> {
+    let table = toml::Table::try_from(settings).expect("settings are plain tables of numbers");
+    check_table("", &table)
 }
 
-/// Returns an error for a value of `table` and `key` unless it `fits`.
-pub(crate) fn check(
-    table: &str,
-    key: &str,
-    found: impl Into<f64>,
-    fits: bool,
-    expected: &'static str,
-) -> Result<(), SettingsError> {
-    let found = found.into();
-    if fits && found.is_finite() {
-        return Ok(());
+fn check_table(above: &str, table: &toml::Table) -> Result<(), SettingsError> {
+    for (key, value) in table {
+        let path = format!("{above}{key}");
+        let found = match value {
+            toml::Value::Table(inner) => {
+                check_table(&format!("{path}."), inner)?;
+                continue;
+            }
+            toml::Value::Integer(number) => *number as f64,
+            toml::Value::Float(number) => *number,
+            _ => continue,
+        };
+        let (_, fits, expected) = bound_of(&path).expect("a test finds each number's bound");
+        if !found.is_finite() || !fits(found) {
+            return Err(SettingsError::Range {
+                key: path,
+                found,
+                expected,
+            });
+        }
     }
-    Err(SettingsError::Range {
-        key: format!("{table}{key}"),
-        found,
-        expected,
-    })
+    Ok(())
+}
+
+fn bound_of(path: &str) -> Option<Bound> {
+    let mut bounds = BOUNDS.iter().copied();
+    bounds.find(|(key, ..)| path == *key || path.ends_with(&format!(".{key}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_number_has_a_bound_and_keeps_it() {
+        // The check itself looks for each number's bound.
+        assert!(check(&Settings::default()).is_ok());
+    }
 }

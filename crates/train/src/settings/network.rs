@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::bounds::{SettingsError, check};
-
 /// The pooling of each channel for the recogniser's last layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -32,20 +30,5 @@ impl Default for NetworkSettings {
             pooling: Pooling::Max,
             log_above_n: 0.0,
         }
-    }
-}
-
-impl NetworkSettings {
-    /// Returns an error if a value lies outside its range.
-    pub(super) fn check(&self) -> Result<(), SettingsError> {
-        let least = self.log_above_n;
-        let fits = least == 0.0 || (1e-3..=1e3).contains(&least);
-        check(
-            "network.",
-            "log_above_n",
-            least,
-            fits,
-            "0, or 0.001 to 1000",
-        )
     }
 }

@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::bounds::{SettingsError, check};
-
 /// The rule of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -57,20 +55,6 @@ impl Default for OptimiserSettings {
 }
 
 impl OptimiserSettings {
-    /// Returns an error if a value lies outside its range. `table` is the prefix of the keys.
-    pub(super) fn check(&self, table: &str) -> Result<(), SettingsError> {
-        let table = format!("{table}optimiser.");
-        let check = |key, found, fits, expected| check(&table, key, found, fits, expected);
-        let within_0_1 = |value: f64| (0.0..1.0).contains(&value);
-        let rate = self.learning_rate;
-        check("learning_rate", rate, rate > 0.0, "above 0")?;
-        for (key, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
-            check(key, beta, within_0_1(beta), "0 to below 1")?;
-        }
-        let decay = self.weight_decay;
-        check("weight_decay", decay, decay >= 0.0, "0 or more")
-    }
-
     /// The learning rate of step `step` of `steps`, both counted from 0.
     pub fn rate_at(&self, step: u64, steps: u64) -> f64 {
         match self.schedule {

@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::bounds::{SettingsError, check};
-
 /// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
 /// network that has only learnt from correct reports trusts every report.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -25,6 +23,8 @@ pub struct ArmReports {
     pub early: f64,
     /// Share of the presses that a slower sensor sees, with only every second to eighth frame.
     pub slower: f64,
+    /// Share of the presses that take half to sixteen times as long.
+    pub stretched: f64,
 }
 
 impl Default for ArmReports {
@@ -38,33 +38,7 @@ impl Default for ArmReports {
             clock_frames: 1.0,
             early: 0.25,
             slower: 0.3,
+            stretched: 0.3,
         }
-    }
-}
-
-impl ArmReports {
-    /// Returns an error if a value lies outside its range.
-    pub(super) fn check(&self) -> Result<(), SettingsError> {
-        let check = |key, found: f64, fits, expected| check("reports.", key, found, fits, expected);
-        let shares = [
-            ("unknown", self.unknown),
-            ("unknown_arm", self.unknown_arm),
-            ("exact", self.exact),
-            ("early", self.early),
-            ("slower", self.slower),
-        ];
-        for (key, share) in shares {
-            check(key, share, (0.0..=1.0).contains(&share), "0 to 1")?;
-        }
-        let fits = (0.0..=0.5).contains(&self.position);
-        check("position", self.position, fits, "0 to 0.5")?;
-        check("arm", self.arm, (0.0..=0.9).contains(&self.arm), "0 to 0.9")?;
-        let frames = self.clock_frames;
-        check(
-            "clock_frames",
-            frames,
-            (0.0..=5.0).contains(&frames),
-            "0 to 5",
-        )
     }
 }

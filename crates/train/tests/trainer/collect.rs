@@ -9,10 +9,10 @@ use hardnessd_core::recording::Labels;
 use hardnessd_core::sensor::Description;
 use hardnessd_core::test_support::of_a_labelled_press;
 use hardnessd_core::verdict::{Card, Hrn};
-use hardnessd_simulator::{self, DatasetSettings, Split};
-use hrn_train::data::courses::Courses;
-use hrn_train::data::dataset::{Dataset, Kind, Sample, meta};
+use hardnessd_simulator::{self, DatasetSettings, Reference, Split};
+use hrn_train::data::presses::{Press, Presses, meta};
 use hrn_train::data::simulated;
+use hrn_train::data::source::Kind;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
 
@@ -68,10 +68,14 @@ fn collect(out: &Path, arguments: &[&str]) -> Output {
     hrn_train(&[&["collect", "--out", text(out)], arguments].concat())
 }
 
-fn collected(out: &Path, arguments: &[&str]) -> Vec<Sample> {
+fn presses_of(path: &Path) -> Presses {
+    Presses::read(&[path.to_owned()]).unwrap()
+}
+
+fn collected(out: &Path, arguments: &[&str]) -> Vec<Press> {
     let output = collect(out, arguments);
     assert!(output.status.success(), "{arguments:?}: {output:?}");
-    Dataset::read(out).unwrap().samples
+    presses_of(out).all
 }
 
 /// Asserts that the command is refused with this exit code and one line that contains `part`, and
@@ -116,18 +120,19 @@ fn samples_are_the_frames_that_the_daemon_judges() {
         .map(|line| serde_json::from_str::<Value>(line).unwrap());
     let judged: Vec<Value> = events.filter(|event| event["phase"] == "final").collect();
     assert!(!samples.is_empty() && samples.len() == judged.len());
-    for (sample, verdict) in samples.iter().zip(&judged) {
+    let presses = presses_of(&out);
+    for ((place, sample), verdict) in samples.iter().enumerate().zip(&judged) {
+        let frame = presses.frame(place);
         assert_eq!(
-            sample.frame.contact_area_taxels(0.07),
+            frame.contact_area_taxels(0.07),
             verdict["contact_area_taxels"]
         );
         let force_n = verdict["force_n"].as_f64().unwrap();
-        assert!((sample.frame.force_n() - force_n).abs() < 1e-3);
+        assert!((frame.force_n() - force_n).abs() < 1e-3);
         assert_eq!((sample.level, sample.object), (0, Some(9)));
     }
     // Presses of level 0 are unlabelled: they do not count as presses of a level.
-    let dataset = Dataset::read(&out).unwrap();
-    let error = dataset.labelled(Split::Train).unwrap_err().to_string();
+    let error = presses.some_labelled(Split::Train).unwrap_err().to_string();
     assert!(error.contains("bytes.npz"), "{error}");
 }
 
@@ -195,7 +200,7 @@ fn recordings_can_be_added_to_simulated_samples() {
     assert_eq!(meta(&out).unwrap()["materials"][8], "oak");
     assert!(both[0].shore.is_some_and(|shore| shore != 95.0));
     // The data set has both sources.
-    let both = Dataset::read(&out).unwrap();
+    let both = presses_of(&out);
     assert_eq!(both.sources[0].kinds(), [Kind::Simulated, Kind::Recorded]);
     let card = trained(&desk, &out);
     // The recorded object was learnt, so it validates nothing.
@@ -262,7 +267,7 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     let desk = Desk::new();
     let labels = ["level=1", "object=7", "shore=95"];
     let capture = desk.recording_of("a.mcap", &labels, |described| {
-        described.arm.stiffness_n_per_mm = Some(10.0);
+        described.sensor.arm.stiffness_n_per_mm = Some(10.0);
     });
     let out = desk.path("courses.npz");
     let sequences = ["--sequences", "--split", "test", text(&capture)];
@@ -270,43 +275,86 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     let account = String::from_utf8(output.stdout).unwrap();
     let expected = "1 press collected, 1 of them with the arm's approach, 0 left out";
     assert!(account.contains(expected), "{account}");
-    let courses = Courses::read(&out).unwrap();
-    let [press] = &courses.presses[..] else {
+    let presses = presses_of(&out);
+    let [press] = &presses.all[..] else {
         panic!("one press");
     };
-    assert_eq!((press.level, press.object, press.shore), (1, 7, 95.0));
+    let of_press = (press.level, press.object, press.shore);
+    assert_eq!(of_press, (1, Some(7), Some(95.0)));
     assert_eq!((press.split, press.arm_n_per_mm), (Split::Test, 10.0));
     assert_eq!(press.best, 3);
-    assert!((courses.frame(3).force_n() - f64::from(press.force_n)).abs() < 0.01);
-    let rounded = |values: &[f32]| -> Vec<i64> {
-        let values = values.iter();
-        values.map(|value| (value * 1e3).round() as i64).collect()
-    };
-    assert_eq!(rounded(&courses.time_s), [0, 200, 400, 600, 800]);
-    assert_eq!(rounded(&courses.approach_mm), [0, 1000, 2000, 3000, 4000]);
-    assert_eq!(courses.known, [1; 5]);
+    let force_n = f64::from(press.force_n.unwrap());
+    assert!((presses.frame(0).force_n() - force_n).abs() < 0.01);
+    let rounded = |value: f32| (value * 1e3).round() as i64;
+    let timed = presses.timed(0).moments.into_iter();
+    let moments: Vec<_> = timed
+        .map(|(time_s, mm)| (rounded(time_s), rounded(mm.unwrap())))
+        .collect();
+    let expected = [0, 1, 2, 3, 4].map(|step| (200 * step, 1000 * step));
+    assert_eq!(moments, expected);
 
     // Append presses on another object, without positions of the arm.
     let more = ["--sequences", "--append", "--split", "test", "--level", "2"];
     let output = collect(&out, &[&more[..], &[FIXTURE]].concat());
     assert!(output.status.success(), "{output:?}");
-    let both = Courses::read(&out).unwrap();
-    let added = &both.presses[1..];
-    let is_new =
-        |press: &hrn_train::data::courses::Press| press.object == 8 && press.shore.is_nan();
+    let both = presses_of(&out);
+    let added = &both.all[1..];
+    let is_new = |press: &Press| press.object == Some(8) && press.shore.is_none();
     assert!(!added.is_empty() && added.iter().all(is_new));
-    assert_eq!(both.known[5..].iter().max(), Some(&0));
+    assert_eq!(both.known(), 1);
     assert_eq!(meta(&out).unwrap()["materials"], json!(["unknown"]));
 
     let data = ["--model", COURSE_MODEL, "--data", text(&out)];
     let evaluated = hrn_train(&[&["evaluate", "--json"], &data[..]].concat());
     assert!(evaluated.status.success(), "{evaluated:?}");
     let figures: Value = serde_json::from_slice(&evaluated.stdout).unwrap();
-    assert_eq!(figures["n"], both.presses.len());
+    assert_eq!(figures["n"], both.all.len());
 
     // One file cannot hold both single frames and presses over time.
     let single = ["--append", "--level", "1", text(&capture)];
     assert_refused(&out, &single, 1, "has whole presses, not single frames");
+}
+
+#[test]
+fn the_sensor_and_the_rigid_piece_of_a_press_are_kept() {
+    let desk = Desk::new();
+    let on = |name: &str, sensor: &'static str, labels: &[&str]| {
+        desk.recording_of(name, labels, |described| {
+            described.sensor.name = sensor.into();
+        })
+    };
+    let captures = [
+        on("a.mcap", "left", &["level=1", "object=7"]),
+        on("b.mcap", "right", &["level=2", "object=8"]),
+        on("c.mcap", "right", &["reference=ball:6", "object=9"]),
+        on("d.mcap", "left", &["reference=flat:20", "object=10"]),
+    ];
+    let captures = captures.each_ref().map(|path| text(path));
+    let out = desk.path("presses.npz");
+    let sequences = ["--sequences"];
+    for captures in [&captures[..2], &captures[2..]] {
+        let arguments = [&["--append"], &sequences[..], captures].concat();
+        let output = collect(&out, &arguments);
+        assert!(output.status.success(), "{output:?}");
+    }
+    let all = presses_of(&out).all;
+    let found: Vec<_> = all
+        .iter()
+        .map(|press| (press.level, press.sensor, press.reference))
+        .collect();
+    let expected = [
+        (1, 0, None),
+        (2, 1, None),
+        (0, 1, Some(Reference::Ball { radius_mm: 6.0 })),
+        (0, 0, Some(Reference::Flat { width_mm: 20.0 })),
+    ];
+    assert_eq!(found, expected);
+    assert_eq!(meta(&out).unwrap()["sensors"], json!(["left", "right"]));
+
+    let strange = on("e.mcap", "left", &["reference=cube:3"]);
+    let arguments = ["--append", "--sequences", text(&strange)];
+    let expected = "label reference: found \"cube:3\"";
+    assert_refused(&out, &arguments, 1, expected);
 }
 
 #[test]
@@ -336,7 +384,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     let desk = Desk::new();
     let config = narrow(&desk);
     let capture = desk.recording_of("narrow.mcap", &[], |described| {
-        described.calibration.pitch_mm = Pitch::square(2.0);
+        described.sensor.calibration.pitch_mm = Pitch::square(2.0);
     });
     let capture = text(&capture);
     let out = desk.path("narrow.npz");
@@ -388,9 +436,15 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
     let narrow = narrow(&desk);
     let settings = desk.write("settings.toml", "[training]\nepochs = 1\n");
     let [fine, coarse] = ["fine.npz", "coarse.npz"].map(|name| desk.path(name));
-    for level in ["1", "2", "3", "4"] {
+    for (level, material) in [
+        ("1", "hard-plastic"),
+        ("2", "foam"),
+        ("3", "soft-candy"),
+        ("4", "yoga-mat"),
+    ] {
+        let capture = FIXTURE.replace("foam", material);
         for (out, config) in [(&fine, &["--config", text(&narrow)][..]), (&coarse, &[])] {
-            let given = ["--append", "--sequences", "--level", level, FIXTURE];
+            let given = ["--append", "--sequences", "--level", level, &capture];
             let output = collect(out, &[config, &given].concat());
             assert!(output.status.success(), "{output:?}");
         }
@@ -411,18 +465,11 @@ fn a_model_of_presses_is_of_the_pitch_of_its_recordings() {
     }
     // Single frames are no presses.
     let frames = desk.path("frames.npz");
-    assert!(
-        collect(&frames, &["--level", "1", FIXTURE])
-            .status
-            .success()
-    );
-    let of = ["evaluate", "--model", text(&model), "--data", text(&frames)];
-    let output = hrn_train(&of);
+    collected(&frames, &["--level", "1", FIXTURE]);
+    let of = ["--model", text(&model), "--data", text(&frames)];
+    let output = hrn_train(&[&["evaluate", "--split", "train"], &of[..]].concat());
     assert_eq!(output.status.code(), Some(1));
-    assert!(
-        errors(&output).contains("found single frames"),
-        "{output:?}"
-    );
+    assert!(errors(&output).contains("single frames"), "{output:?}");
 }
 
 #[test]
@@ -465,19 +512,21 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     drop(locked);
 
     // A data set has an array for all samples or for none.
-    let write = |change: fn(&mut Sample)| {
-        let mut samples = samples.clone();
-        samples.iter_mut().for_each(change);
-        write_data(&out, &samples, &json!({}));
+    let own = presses_of(&out);
+    let write = |change: fn(&mut Press)| {
+        let mut presses = own.clone();
+        presses.all.truncate(samples.len());
+        presses.all.iter_mut().for_each(change);
+        write_data(&out, &presses, &json!({}));
     };
-    let own = out.display();
+    let shown = out.display();
     write(|sample| sample.object = None);
-    let expected = format!("{FIXTURE}: has object, and {own} has not: make it a data set");
+    let expected = format!("{FIXTURE}: has object, and {shown} has not: make it a data set");
     assert_refused(&out, &object, 1, &expected);
     write(|sample| sample.force_n = None);
     assert_refused(&out, &object, 1, "has force, and ");
     write(|sample| sample.shore = Some(70.0));
-    let expected = format!("{FIXTURE}: has no shore, and {own} has: record with --label shore=");
+    let expected = format!("{FIXTURE}: has no shore, and {shown} has: record with --label shore=");
     assert_refused(&out, &object, 1, &expected);
     write(|sample| sample.material = Some(1));
     assert_refused(&out, &object, 1, "has no material, and ");
@@ -496,7 +545,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     assert_refused(&out, &same, 1, &expected);
     collected(&out, &object);
     // The file does not say who made it, and that is kept too.
-    let kinds = Dataset::read(&out).unwrap().sources[0].kinds();
+    let kinds = presses_of(&out).sources[0].kinds();
     assert_eq!(kinds, [Kind::Unknown, Kind::Recorded]);
 }
 
@@ -509,19 +558,23 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     let noise = desk.write("noise.mcap", [7; 1000]);
     let empty = desk.write("empty/notes.txt", "pressed by hand");
     let archive = desk.write("archive.npz", "PK\x03\x04");
-    let wrong = desk.recording("wrong.mcap", &["level=9"]);
+    let wrong = desk.recording("wrong.mcap", &["level=99"]);
     for (arguments, code, part) in [
         (
             &[FIXTURE][..],
             2,
             "has no label `level`: give its level with --level",
         ),
-        (&["--level", "5", FIXTURE], 2, "5"),
+        (&["--level", "17", FIXTURE], 2, "17"),
         (&["--level", "1", text(&none)], 66, "none.mcap"),
         (&["--level", "1", text(&zeros)], 1, "no press"),
         (&["--level", "1", text(&noise)], 1, "no press"),
         (&[text(&archive)], 1, "not an .npz file"),
-        (&[text(&wrong)], 1, "label level: found 9, expected a level"),
+        (
+            &[text(&wrong)],
+            1,
+            "label level: found \"99\", expected the name",
+        ),
         (
             &[text(empty.parent().unwrap())],
             1,
@@ -627,7 +680,7 @@ fn a_data_set_and_its_list_are_added_to_and_never_replaced() {
 fn the_most_recordings_decide_what_a_data_set_has() {
     let desk = Desk::new();
     let stray = desk.recording_of("stray.mcap", &[], |described| {
-        described.calibration.pitch_mm = Pitch::square(2.0);
+        described.sensor.calibration.pitch_mm = Pitch::square(2.0);
     });
     let named = desk.recording("named.mcap", &["material=oak"]);
     let usual = ["1", "2", "3"].map(|n| desk.recording(&format!("{n}.mcap"), &[&format!("n={n}")]));

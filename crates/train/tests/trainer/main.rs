@@ -9,14 +9,15 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use hrn_train::data::dataset::{self, Sample};
+use hrn_train::data::presses::{self, Layout, Presses};
 use serde_json::Value;
 
-mod adopt;
+mod check_model;
 mod collect;
 mod compare;
 mod course;
 mod doors;
+mod fit;
 mod strangers;
 mod train;
 mod property;
@@ -63,9 +64,9 @@ fn errors(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 
-fn write_data(path: &Path, samples: &[Sample], meta: &Value) {
+fn write_data(path: &Path, presses: &Presses, meta: &Value) {
     let file = File::create(path).unwrap();
-    dataset::write(file, samples, meta).unwrap();
+    presses::write(file, presses, Layout::Frames, meta).unwrap();
 }
 
 /// A directory with a data set of few presses, `d.npz`.

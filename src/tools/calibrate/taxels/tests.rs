@@ -1,3 +1,4 @@
+use std::path::Path;
 use std::sync::Arc;
 
 use super::super::{gather, plain};
@@ -117,12 +118,10 @@ fn correlation(fit: &Fit, truth: &[f32]) -> f64 {
 
 #[test]
 fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
-    let mut described = Description {
-        frame_rate_hz: 20.0,
-        ..Description::default()
-    };
+    let mut described = Description::default();
+    described.sensor.frame_rate_hz = 20.0;
     // The sensor needs no tare: it reads 0 at rest.
-    described.calibration.tare_frames = 0;
+    described.sensor.calibration.tare_frames = 0;
     let sensor = Sensor::new(described).unwrap();
     let sequence = Sequence::new(SequenceSettings {
         seed: 7,
@@ -138,7 +137,7 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
         sensor.layout().encode(&frame.raw, &mut bytes);
     }
     let hrn = Arc::new(Hrn::load(BUILT_IN_HRN).unwrap());
-    let presses = gather::presses(bytes.as_slice(), &sensor, hrn, false).unwrap();
+    let presses = gather::presses(bytes.as_slice(), Path::new("x"), &sensor, hrn, false).unwrap();
     let plain: Vec<Plain> = presses.iter().map(plain).collect();
     let fit = Fit::of(&plain, Array::JX255N, &[]).unwrap();
     let correlation = correlation(&fit, &gains);

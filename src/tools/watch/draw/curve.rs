@@ -8,7 +8,8 @@ use super::{Page, Rows};
 
 impl Page<'_> {
     pub(super) fn force(&mut self, area: Rect, sensor: &Sensor, link: Link) {
-        let present = |load: &Frame| format!("{:.2} N", load.force_n);
+        // A small negative sum is noise.
+        let present = |load: &Frame| format!("{:.2} N", load.force_n.unwrap_or(0.0).max(0.0));
         self.curve(area, "force", sensor, link, present, |load| load.force_n);
     }
 
@@ -16,22 +17,6 @@ impl Page<'_> {
         let present = |load: &Frame| format!("{} taxels", load.contact_area_taxels);
         let area_taxels = |load: &Load| load.contact_area_taxels as f32;
         self.curve(area, "contact area", sensor, link, present, area_taxels);
-    }
-
-    /// Force over the arm's way in the present or last press, if the arm's positions are known.
-    pub(super) fn way(&mut self, area: Rect, sensor: &Sensor) {
-        let mut rows = Rows(area);
-        let Some((forces, far)) = sensor.way(usize::from(area.width)) else {
-            return;
-        };
-        let Some(row) = rows.take(1) else { return };
-        let most = forces.iter().flatten().copied().fold(0.0, f32::max);
-        let rest = self.text(row, "force against approach ", self.look.heading());
-        let scale = format!(" to {far:.1} mm, to {most:.0} N");
-        self.text(rest, &scale, self.look.aside());
-        for (x, force) in (area.x..area.right()).zip(forces) {
-            self.bar(x, rows.0, force.map(|force| force / most));
-        }
     }
 
     /// A heading with the present value, if there is one, and the last 30 s.
@@ -64,18 +49,16 @@ impl Page<'_> {
     /// Draws one column of `area`, filled up to `share` of its height. `None` if the value is
     /// unknown.
     fn bar(&mut self, x: u16, area: Rect, share: Option<f32>) {
-        let bars = if self.look.unicode { BLOCKS } else { ASCII };
         let blue = Style::new().fg(Color::Indexed(75));
         // If nothing was ever pressed, the share is NaN, and the cast makes it 0.
         let eighths = share.map(|share| (share * 8.0 * f32::from(area.height)) as usize);
         for (below, y) in (area.top()..area.bottom()).rev().enumerate() {
             let (symbol, style) = match eighths {
                 Some(eighths) => (
-                    bars[eighths.saturating_sub(8 * below).min(8)],
+                    BLOCKS[eighths.saturating_sub(8 * below).min(8)],
                     self.look.style(blue, Modifier::empty()),
                 ),
-                None if self.look.unicode => ("\u{b7}", self.look.aside()),
-                None => (" ", self.look.aside()),
+                None => ("\u{b7}", self.look.aside()),
             };
             self.buffer[(x, y)].set_symbol(symbol).set_style(style);
         }
@@ -87,4 +70,3 @@ const BLOCKS: [&str; 9] = [
     " ", "\u{2581}", "\u{2582}", "\u{2583}", "\u{2584}", "\u{2585}", "\u{2586}", "\u{2587}",
     "\u{2588}",
 ];
-const ASCII: [&str; 9] = [" ", ".", "-", "-", "=", "+", "+", "#", "#"];

@@ -3,6 +3,7 @@
 use ratatui_core::layout::Rect;
 use ratatui_core::style::Color;
 
+use super::super::look::Look;
 use super::super::view::{Link, Sensor};
 use super::Page;
 
@@ -59,41 +60,28 @@ impl Page<'_> {
             let rows = row * taxels..(row + 1) * taxels;
             let places = rows.flat_map(|row| (0..taxels).map(move |n| (row, col * taxels + n)));
             let newtons = places.filter_map(|(row, col)| sensor.newtons(row, col));
-            newtons.reduce(f32::max).map(|n| (n / top).min(1.0).sqrt())
+            newtons
+                .reduce(f32::max)
+                .map(|n| (n / top).clamp(0.0, 1.0).sqrt())
         };
         for y in 0..area.height {
             for x in 0..area.width {
                 let (x_of, y_of) = (usize::from(x), usize::from(y));
                 let half = |half: usize| shade((2 * y_of + half) / scale, x_of / scale);
                 let (upper, lower) = (half(0), half(1));
-                let look = self.look;
                 let cell = &mut self.buffer[(area.x + x, area.y + y)];
                 if self.look.colours {
                     let colour = |share: Option<f32>| match share {
-                        Some(share) if link == Link::Live => look.heat(share),
+                        Some(share) if link == Link::Live => Look::heat(share),
                         Some(share) => Color::Indexed(GREY[step(share, GREY.len())]),
                         None => Color::Indexed(GREY[0]),
                     };
-                    if self.look.unicode {
-                        cell.set_char('\u{2580}').set_fg(colour(upper));
-                        cell.set_bg(colour(lower));
-                    } else {
-                        // The cell has one colour for both halves. It shows the greater one, so
-                        // that no touch vanishes.
-                        cell.set_char(' ').set_bg(colour(max(upper, lower)));
-                    }
+                    cell.set_char('\u{2580}').set_fg(colour(upper));
+                    cell.set_bg(colour(lower));
                 } else {
-                    let share = max(upper, lower);
+                    let share = upper.into_iter().chain(lower).reduce(f32::max);
                     let step = share.map_or(0, |share| step(share, CHARACTERS.len()));
-                    // Where nothing is pressed, the corners show how far the array goes.
-                    let is_corner =
-                        (x == 0 || x + 1 == area.width) && (y == 0 || y + 1 == area.height);
-                    let character = if step == 0 && is_corner {
-                        b'+'
-                    } else {
-                        CHARACTERS[step]
-                    };
-                    cell.set_char(char::from(character));
+                    cell.set_char(char::from(CHARACTERS[step]));
                 }
             }
         }
@@ -111,10 +99,6 @@ impl Page<'_> {
             self.text(place, &word, self.look.link(link));
         }
     }
-}
-
-fn max(one: Option<f32>, other: Option<f32>) -> Option<f32> {
-    one.into_iter().chain(other).reduce(f32::max)
 }
 
 /// The index of the step that a share of 0 to 1 falls into, of `steps` equal ones.

@@ -6,16 +6,14 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::{plain, text};
-use crate::tools::answer::{Answer, items};
+use crate::tools::answer::{Answer, items, with_shore};
 use crate::tools::readable::number;
+use crate::tools::score::Score;
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::sensor::LATE_PERIODS;
 
 /// How far back the curves go.
 pub(in crate::tools::watch) const WINDOW: Duration = Duration::from_secs(30);
-
-/// The most frames of a press whose approach is kept: 30 s at 1000 frames/s.
-const MOST_WAY: usize = 30_000;
 
 /// The number of verdicts kept for a sensor: more than a tall terminal shows.
 const VERDICTS: usize = 100;
@@ -30,14 +28,13 @@ pub(in crate::tools::watch) struct Sensor {
     /// The sensor's last frame.
     pub(in crate::tools::watch) frame: Option<Frame>,
     trace: VecDeque<Load>,
-    /// Approach in mm and force in newtons of the frames of the present or last press, where the
-    /// approach is known.
-    way: Vec<(f32, f32)>,
-    /// Whether the last point of `way` is of the newest frame.
-    is_way_current: bool,
     pub(in crate::tools::watch) press: Option<Press>,
     /// The verdicts, the newest press first.
     pub(in crate::tools::watch) verdicts: VecDeque<Verdict>,
+    /// What is being pressed, and how many verdicts are right.
+    pub(in crate::tools::watch) score: Score,
+    /// The context of the last press.
+    pub(super) context: Value,
 }
 
 /// The state of a link, as the daemon reports it.
@@ -45,8 +42,10 @@ pub(in crate::tools::watch) struct Sensor {
 pub(in crate::tools::watch) struct Status {
     pub(super) state: String,
     pub(super) reason: Option<String>,
+    pub(super) detail: Option<String>,
     pub(in crate::tools::watch) frames: u64,
     pub(in crate::tools::watch) frames_damaged: u64,
+    pub(in crate::tools::watch) frames_dropped: u64,
     pub(in crate::tools::watch) bytes_skipped: u64,
     pub(in crate::tools::watch) frame_rate_hz: Option<f64>,
 }
@@ -57,7 +56,8 @@ pub(in crate::tools::watch) struct Frame {
     pub(in crate::tools::watch) at: Duration,
     /// `[rows, cols]`, newtons a taxel.
     newtons: Vec<f32>,
-    pub(in crate::tools::watch) force_n: f32,
+    /// `None` until the sensor has a zero.
+    pub(in crate::tools::watch) force_n: Option<f32>,
     pub(in crate::tools::watch) contact_area_taxels: u32,
 }
 
@@ -83,14 +83,14 @@ pub(in crate::tools::watch) struct Press {
 pub(in crate::tools::watch) struct Verdict {
     pub(in crate::tools::watch) at: Duration,
     pub(in crate::tools::watch) press: u64,
-    pub(in crate::tools::watch) phase: String,
+    pub(in crate::tools::watch) is_early: bool,
+    /// Such as `63 +- 6 OO, firm`.
     pub(in crate::tools::watch) answer: String,
     /// Whether the answer must not look like a sure level.
     pub(in crate::tools::watch) is_weak: bool,
     pub(in crate::tools::watch) probabilities: Vec<f64>,
     pub(in crate::tools::watch) force_n: f64,
-    /// The Shore hardness and its interval.
-    pub(in crate::tools::watch) shore: Option<[f64; 3]>,
+    /// The advice, and the notes.
     pub(in crate::tools::watch) notes: Vec<String>,
 }
 
@@ -123,8 +123,10 @@ impl Sensor {
                 self.status = Some(Status {
                     state: text(event, "state"),
                     reason: event["reason"].as_str().map(plain),
+                    detail: event["detail"].as_str().map(plain),
                     frames: number(event, "frames"),
                     frames_damaged: number(event, "frames_damaged"),
+                    frames_dropped: number(event, "frames_dropped"),
                     bytes_skipped: number(event, "bytes_skipped"),
                     frame_rate_hz: event["frame_rate_hz"].as_f64(),
                 });
@@ -136,22 +138,11 @@ impl Sensor {
                     state: text(event, "state"),
                     reason: event["reason"].as_str().map(plain),
                 };
-                if press.state == "begin" {
-                    // The newest frame is the first one of this press. Its approach is often
-                    // unknown, because the position after it has not come yet. All points are then
-                    // of the press before.
-                    let first = usize::from(self.is_way_current);
-                    self.way.drain(..self.way.len().saturating_sub(first));
-                }
-                // The daemon may send past events after present ones.
-                let is_older = |known: &Press| (known.number, known.at) > (press.number, press.at);
-                if !self.press.as_ref().is_some_and(is_older) {
-                    self.press = Some(press);
-                }
+                self.press = Some(press);
+                self.context = event["context"].clone();
             }
             "hardness" => self.judge(event, at, labels),
             "frame" => self.show(event, at),
-            "history" => self.recall(event, at),
             _ => {}
         }
     }
@@ -161,53 +152,27 @@ impl Sensor {
             text: answer,
             is_weak,
         } = Answer::of(event, labels);
-        let shore = |key| event["shore"][key].as_f64();
-        let shore = shore("value").zip(shore("low")).zip(shore("high"));
+        let advice = event["advice"].as_str();
+        let notes = items(event, "notes").filter_map(Value::as_str);
         let verdict = Verdict {
             at,
             press: number(event, "press"),
-            phase: text(event, "phase"),
-            answer: plain(&answer),
+            is_early: event["phase"] == "early",
+            answer: plain(&with_shore(&answer, event)),
             is_weak,
             probabilities: items(event, "probabilities")
                 .filter_map(Value::as_f64)
                 .collect(),
             force_n: event["force_n"].as_f64().unwrap_or_default(),
-            shore: shore.map(|((value, low), high)| [value, low, high]),
-            notes: items(event, "notes")
-                .filter_map(Value::as_str)
+            notes: advice
+                .into_iter()
+                .chain(notes)
                 .map(|note| plain(note).replace('_', " "))
                 .collect(),
         };
-        // The newest press comes first, its final verdict before its early one. A repeated verdict
-        // may be known already.
-        let order = |one: &Verdict| (one.press, one.phase == "final");
-        let place = self
-            .verdicts
-            .partition_point(|known| order(known) > order(&verdict));
-        let is_known = |known: &Verdict| order(known) == order(&verdict);
-        if !self.verdicts.get(place).is_some_and(is_known) {
-            self.verdicts.insert(place, verdict);
-            self.verdicts.truncate(VERDICTS);
-        }
-    }
-
-    /// Puts the curves of earlier frames before those that are known. The newest of them is of `at`.
-    fn recall(&mut self, event: &Value, at: Duration) {
-        let first = self.trace.front().map_or(Duration::MAX, |load| load.at);
-        let load = |point: &Value| {
-            let age = Duration::try_from_secs_f64(point[0].as_f64()?).ok()?;
-            Some(Load {
-                at: at.checked_sub(age)?,
-                force_n: point[1].as_f64()? as f32,
-                contact_area_taxels: u32::try_from(point[2].as_u64()?).ok()?,
-            })
-        };
-        let past = items(event, "points").filter_map(load);
-        let past: Vec<Load> = past.filter(|load| load.at < first).collect();
-        for load in past.into_iter().rev() {
-            self.trace.push_front(load);
-        }
+        self.score.take(event);
+        self.verdicts.push_front(verdict);
+        self.verdicts.truncate(VERDICTS);
     }
 
     fn show(&mut self, event: &Value, at: Duration) {
@@ -218,11 +183,20 @@ impl Sensor {
         if newtons.len() != self.rows * self.cols {
             return;
         }
+        let force_n = event["force_n"].as_f64().map(|force_n| force_n as f32);
+        let contact_area_taxels =
+            u32::try_from(number(event, "contact_area_taxels")).unwrap_or_default();
+        self.frame = Some(Frame {
+            at,
+            newtons,
+            force_n,
+            contact_area_taxels,
+        });
+        let Some(force_n) = force_n else { return };
         let load = Load {
             at,
-            force_n: newtons.iter().sum(),
-            contact_area_taxels: u32::try_from(number(event, "contact_area_taxels"))
-                .unwrap_or_default(),
+            force_n,
+            contact_area_taxels,
         };
         while self
             .trace
@@ -232,16 +206,6 @@ impl Sensor {
             self.trace.pop_front();
         }
         self.trace.push_back(load);
-        let mm = event["approach_mm"].as_f64();
-        let mm = mm.filter(|_| self.way.len() < MOST_WAY);
-        self.way.extend(mm.map(|mm| (mm as f32, load.force_n)));
-        self.is_way_current = mm.is_some();
-        self.frame = Some(Frame {
-            at,
-            newtons,
-            force_n: load.force_n,
-            contact_area_taxels: load.contact_area_taxels,
-        });
     }
 
     /// Newtons of the taxel at a row and column in the last frame.
@@ -280,29 +244,6 @@ impl Sensor {
         }
         let filled = curve.into_iter().zip(held);
         filled.map(|(own, held)| own.or(held)).collect()
-    }
-
-    /// The greatest force in each of `parts` equal parts of the arm's way in the present or last
-    /// press, and how far the arm went in mm. `None` if the approach is unknown.
-    pub(in crate::tools::watch) fn way(&self, parts: usize) -> Option<(Vec<Option<f32>>, f32)> {
-        let far = self.way.iter().map(|&(mm, _)| mm).fold(0.0, f32::max);
-        if self.way.len() < 2 || far <= 0.0 || parts == 0 {
-            return None;
-        }
-        let mut forces = vec![None; parts];
-        for &(mm, force) in &self.way {
-            let part = (mm.max(0.0) / far * parts as f32) as usize;
-            let known: &mut Option<f32> = &mut forces[part.min(parts - 1)];
-            *known = Some(known.map_or(force, |most| most.max(force)));
-        }
-        // A slow sensor leaves parts without a frame. Such a part repeats the force of the part
-        // before it.
-        let mut before = None;
-        for force in &mut forces {
-            *force = force.or(before);
-            before = *force;
-        }
-        Some((forces, far))
     }
 
     /// The greatest force on a taxel in the last frame, in newtons.

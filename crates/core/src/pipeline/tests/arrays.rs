@@ -34,7 +34,7 @@ fn contact(array: Array, pitch: Pitch) -> RawFrame {
             pressure(y, x)
         });
         let newtons = parts.sum::<f64>() / (PARTS * PARTS) as f64 * pitch.area_mm2();
-        *count = (newtons / f64::from(COUNT_N)).round() as u16;
+        *count = (newtons / f64::from(COUNT_N)).round() as f32;
     }
     raw
 }
@@ -42,11 +42,11 @@ fn contact(array: Array, pitch: Pitch) -> RawFrame {
 /// The final verdict on the contact.
 fn verdict(array: Array, pitch: Pitch) -> Hardness {
     let mut pipeline = pipeline_of(|described| {
-        described.frame.cell = Some(Cell::U16le);
-        described.frame.rows = Some(array.rows);
-        described.frame.cols = Some(array.cols);
-        described.calibration.newtons_per_count = COUNT_N;
-        described.calibration.pitch_mm = pitch;
+        described.sensor.frame.cell = Some(Cell::U16le);
+        described.sensor.frame.rows = Some(array.rows);
+        described.sensor.frame.cols = Some(array.cols);
+        described.sensor.calibration.newtons_per_count = COUNT_N;
+        described.sensor.calibration.pitch_mm = pitch;
     });
     let (free, held) = (RawFrame::zero(array), contact(array, pitch));
     let (before, after) = (vec![free.clone(); 5], vec![free; 2]);

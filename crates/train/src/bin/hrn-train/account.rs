@@ -6,12 +6,10 @@ use std::path::Path;
 
 use hardnessd_core::verdict::Hrn;
 use hardnessd_simulator::Split;
-use hrn_train::compare::digits::{rounded, thousands};
-use hrn_train::data::courses::Courses;
-use hrn_train::data::dataset;
+use hrn_train::compare::tables::thousands;
+use hrn_train::data::presses::Presses;
 use hrn_train::judge::metrics::Evaluation;
-use hrn_train::model::course::course_of;
-use hrn_train::model::evaluated::{Case, Evaluated, NEAR_BORDER};
+use hrn_train::model::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
 
 /// The card of the model read from `path`.
 pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
@@ -114,20 +112,38 @@ pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
     text
 }
 
+/// What a second model does better than a first one.
+pub(super) fn of_difference(difference: &Difference) -> String {
+    let points = |share: f64| format!("{:+.1}", 100.0 * share);
+    let interval = match difference.interval {
+        Some([low, high]) => format!("95 %: {} to {}", points(low), points(high)),
+        None => "no interval: it needs two objects of each level, and presses that one alone judges rightly"
+            .to_owned(),
+    };
+    let [first, second] = difference.only;
+    format!(
+        "the second less the first  {} points of accuracy ({interval}); right alone: the first on {first} presses, \
+         the second on {second}\n",
+        points(difference.accuracy)
+    )
+}
+
 /// The figures of the levels, and the confusion matrix with a row for each true level.
 fn of_evaluation(evaluation: &Evaluation) -> String {
     let percent = |share: f64| share * 100.0;
-    let interval = evaluation.accuracy_interval_by_object.map_or_else(
-        || {
+    let by = |unit: &str, interval: Option<[f64; 2]>| {
+        interval.map(|[low, high]| {
+            let (low, high) = (percent(low), percent(high));
+            format!("95 % by {unit}: {low:.1} to {high:.1} %")
+        })
+    };
+    let interval = by("object", evaluation.accuracy_interval_by_object)
+        .or(by("cover", evaluation.accuracy_interval_by_cover))
+        .unwrap_or_else(|| {
             "no interval: it needs two objects of each level, and a right and a wrong verdict"
                 .to_owned()
-        },
-        |[low, high]| {
-            let (low, high) = (percent(low), percent(high));
-            format!("95 % by object: {low:.1} to {high:.1} %")
-        },
-    );
-    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| rounded(value, 4));
+        });
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
     let levels: String = (1..=evaluation.confusion.len())
         .map(|level| format!("{level:>7}"))
         .collect();
@@ -145,6 +161,7 @@ fn of_evaluation(evaluation: &Evaluation) -> String {
     format!(
         "samples            {}\n\
          accuracy           {:.1} % ({interval})\n\
+         balanced accuracy  {:.1} %\n\
          kappa              {}\n\
          kappa, quadratic   {}\n\
          calibration error  {:.1} %\n\
@@ -153,41 +170,46 @@ fn of_evaluation(evaluation: &Evaluation) -> String {
          {rows}",
         evaluation.n,
         percent(evaluation.accuracy),
+        percent(evaluation.balanced_accuracy),
         number(evaluation.kappa),
         number(evaluation.kappa_quadratic),
         percent(evaluation.ece),
-        rounded(evaluation.nll, 4)
+        format_args!("{:.4}", evaluation.nll)
     )
 }
 
-/// The number of presses of each level in each split, from the split, level and object of every press, and a warning if the levels
-/// were probably counted from 0.
-pub(super) fn of_data(presses: &[(Split, u8, Option<u32>)]) -> String {
+/// The number of presses of each level in each split, and a warning if the levels were probably counted
+/// from 0.
+pub(super) fn of_data(presses: &Presses) -> String {
     let mut text = String::new();
-    let levels = dataset::levels();
+    let levels: Vec<u8> = presses.levels().iter().map(|level| level.level).collect();
+    let count = |split, level| {
+        let all = presses.all.iter();
+        all.filter(|press| {
+            press.split == split && press.level == level && press.reference.is_none()
+        })
+        .count()
+    };
     for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
-        let of_split: Vec<u8> = (presses.iter())
-            .filter(|press| press.0 == split)
-            .map(|press| press.1)
-            .collect();
-        let presses_of = |level: u8| of_split.iter().filter(|&&of| of == level).count() as u64;
-        if of_split.is_empty() {
+        if presses.all.iter().all(|press| press.split != split) {
             continue;
         }
-        let mut counts: Vec<String> = (levels.iter())
-            .map(|level| {
-                format!(
-                    "level {} {}",
-                    level.level,
-                    thousands(presses_of(level.level))
-                )
-            })
+        let mut counts: Vec<String> = levels
+            .iter()
+            .map(|&level| format!("level {level} {}", thousands(count(split, level))))
             .collect();
-        counts.push(format!("unlabelled (level 0) {}", thousands(presses_of(0))));
+        counts.push(format!(
+            "unlabelled (level 0) {}",
+            thousands(count(split, 0))
+        ));
         let _ = writeln!(text, "{name} presses: {}", counts.join(", "));
     }
-    let has = |level: u8| presses.iter().any(|press| press.1 == level);
-    if let Some(highest) = levels.last().map(|level| level.level)
+    let has = |level: u8| {
+        [Split::Train, Split::Test]
+            .iter()
+            .any(|&split| count(split, level) > 0)
+    };
+    if let Some(&highest) = levels.last()
         && has(0)
         && !has(highest)
         && (1..highest).all(has)
@@ -202,14 +224,13 @@ pub(super) fn of_data(presses: &[(Split, u8, Option<u32>)]) -> String {
 }
 
 /// Warnings about levels with few labelled training presses, or none.
-pub(super) fn of_levels(presses: &[(Split, u8, Option<u32>)]) -> String {
+pub(super) fn of_levels(presses: &Presses) -> String {
     let mut objects: BTreeMap<u8, BTreeSet<Option<u32>>> = BTreeMap::new();
-    for &(split, level, object) in presses {
-        if split == Split::Train && level > 0 {
-            objects.entry(level).or_default().insert(object);
-        }
+    for place in presses.labelled(Split::Train) {
+        let press = &presses.all[place];
+        objects.entry(press.level).or_default().insert(press.object);
     }
-    let levels = dataset::levels();
+    let levels = presses.levels();
     let all = || levels.iter().map(|level| level.level);
     let missing: Vec<u8> = all().filter(|level| !objects.contains_key(level)).collect();
     let of_one = |level: &u8| {
@@ -243,16 +264,6 @@ fn listed(numbers: &[u8]) -> String {
         Some((last, rest)) if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
         _ => texts.concat(),
     }
-}
-
-/// The input `features` of every press, a line each.
-pub(super) fn features_csv(courses: &Courses) -> String {
-    let line = |press: usize| {
-        let features = course_of(courses, press).features();
-        let features: Vec<String> = features.iter().map(f32::to_string).collect();
-        features.join(",") + "\n"
-    };
-    (0..courses.presses.len()).map(line).collect()
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,

@@ -7,10 +7,9 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand, ValueEnum};
 use hardnessd_core::wording::named;
 use hardnessd_simulator::{
-    DatasetSettings, LawName, Materials, SensorDesigns, SensorProfile, Shapes, Split,
+    DatasetSettings, Materials, SensorDesigns, SensorProfile, Shapes, Split,
 };
-use hrn_train::data::dataset::LabelChoice;
-use hrn_train::methods::Method;
+use hrn_train::recipe::{self, Recipe};
 use hrn_train::settings::Profile;
 
 /// Trains and evaluates the hardness recognition network.
@@ -34,17 +33,22 @@ const COLLECTED: &str = "\
 
 /// What `compare --help` says below the options.
 const COMPARED: &str = "\
-    The tables contain all finished runs of DIR with the same data and profile. `settings.toml`, \
-    `revision`, `metrics.csv` and `compared.json` of a run are enough to keep. The controls of \
-    --course are logistic regressions: on features of the best frame, on modulus and radius by \
-    Hertz's law, and on features of the whole press without and with the arm's motion.";
+    It calls `train` once for each method, number of labels and seed, and leaves out the runs that \
+    have their model. `ours`, `nahrn` and `nihrn` share a stage, so they are one line of --plan. \
+    Models that take references get two presses of each rigid piece.";
+
+/// What `fit --help` says below the options.
+const FITTED: &str = "\
+    It compares the built-in model with these presses as references, regressions on features and on taxels, and from \
+    1,500 presses on the paper's network, each on objects that it has not met. Where nothing is better than the \
+    built-in model by more than chance, it writes references for it, in the place of M.onnx with the ending .npz. The \
+    levels are those of the label `level`, a number or a name, or of the label `shore`. Exit code 1: nothing is better \
+    than guessing.";
 
 /// What `check-model --help` says below the options.
 const CHECKED: &str = "\
-    Each line begins with ok; adopt: wrong or absent, and `adopt` corrects it; missing: wrong or \
-    absent, and you must change the file; or unseen: another part is wrong, so this cannot be \
-    checked. It also tries the memory and time of a verdict for a sensor of 5 frames/s. Exit \
-    code 78: a line is not ok.";
+    It prints everything that breaks the format at once, a line each. It also tries the memory and time of a \
+    verdict for a sensor of --fps. Exit code 78: there is such a line.";
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
@@ -52,20 +56,15 @@ pub(super) enum Command {
     Simulate(Simulate),
     /// Make a data set from recordings of known objects, with the daemon's own decoding and press selection
     Collect(Collect),
+    /// Make the best model for your robot from recordings of known objects
+    #[command(after_help = FITTED)]
+    Fit(Fit),
     /// Train one method
     Train(Train),
-    /// Train every method under several seeds and make the paper's tables; run it again to continue
+    /// Train methods under several seeds and make the paper's tables; run it again to continue
     Compare(Compare),
     /// Run an exported model on a data set
     Evaluate(Evaluate),
-    /// Write one page that shows a run or a comparison
-    Report {
-        /// Directory of the run or the comparison
-        directory: PathBuf,
-        /// New file for the page
-        #[arg(long, value_name = "R.html")]
-        out: PathBuf,
-    },
     /// Write the model of a finished run to a file of its own
     Export {
         /// Directory of the run
@@ -74,14 +73,15 @@ pub(super) enum Command {
         #[arg(long, value_name = "M.onnx")]
         out: PathBuf,
     },
-    /// Check an ONNX file that was made elsewhere against the model format, line by line
+    /// Check an ONNX file that was made elsewhere against the model format
     #[command(after_help = CHECKED)]
     CheckModel {
         /// The model file
         model: PathBuf,
+        /// Frames/s of the fastest sensor that it shall judge for
+        #[arg(long, value_name = "FPS", default_value_t = 5.0, value_parser = frame_rate)]
+        fps: f64,
     },
-    /// Turn an ONNX file that was made elsewhere into a model that the daemon loads
-    Adopt(Adopt),
     /// Check a model file as the daemon does and print its card
     Inspect {
         /// The model file
@@ -104,9 +104,6 @@ pub(super) struct Simulate {
     /// Materials: named (the paper's eight) or broad (each object has a random one)
     #[arg(long, default_value = "named", value_parser = named::<Materials>)]
     pub(super) materials: Materials,
-    /// Laws that broad materials are drawn from: solid, plastic, foam, layered [default: all]
-    #[arg(long, hide_short_help = true, value_name = "LAW", value_delimiter = ',', num_args = 1.., value_parser = named::<LawName>)]
-    pub(super) laws: Vec<LawName>,
     /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
     /// hardness of 50 to 51, 60 to 61 or 70 to 71
     #[arg(long, hide_short_help = true)]
@@ -129,7 +126,8 @@ pub(super) struct Simulate {
           value_parser = lowest_force_n)]
     pub(super) lowest_force: f32,
     /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
-    /// 8 to 60 mm, edges and points) or paper (rigid objects flat, soft ones round)
+    /// 8 to 60 mm, edges and points), flat (plates, bars, boxes and discs) or paper (rigid objects flat,
+    /// soft ones round). With --sequences, a third of the matched and wide objects is flat
     #[arg(long, default_value = "matched", value_parser = named::<Shapes>)]
     pub(super) shapes: Shapes,
     /// Spread of the sensor's taxels: clean or raw
@@ -145,15 +143,9 @@ pub(super) struct Simulate {
     /// Calibrate each sensor with weights, so that the mean sum of its taxels is the force of the press
     #[arg(long, hide_short_help = true)]
     pub(super) calibrated: bool,
-    /// Levels whose two materials change roles, such as 24
-    #[arg(long, hide_short_help = true, value_name = "LEVELS", value_parser = swapped_levels)]
-    pub(super) swapped_levels: Option<[bool; 4]>,
     /// Put all eight named materials into the test split
-    #[arg(long, hide_short_help = true, conflicts_with = "swapped_levels")]
+    #[arg(long, hide_short_help = true)]
     pub(super) all_test: bool,
-    /// Also draw samples of every material and a press of every level, to this new file
-    #[arg(long, value_name = "S.png")]
-    pub(super) sheet: Option<PathBuf>,
     /// Whole presses over time, with the arm's positions, in place of one frame a press
     #[arg(long)]
     pub(super) sequences: bool,
@@ -223,13 +215,29 @@ pub(super) struct Courses {
 }
 
 #[derive(Debug, clap::Args)]
+pub(super) struct Fit {
+    /// Recordings of `record`, directories with recordings, or data sets
+    #[arg(value_name = "DATA", required = true)]
+    pub(super) data: Vec<PathBuf>,
+    /// New file for the model
+    #[arg(long, value_name = "M.onnx")]
+    pub(super) out: PathBuf,
+    /// Configuration whose `[[level]]` tables name the levels, and whose first sensor describes raw bytes
+    #[arg(long, value_name = "F")]
+    pub(super) config: Option<PathBuf>,
+    /// Print the table as JSON
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+#[derive(Debug, clap::Args)]
 #[command(after_long_help = COLLECTED)]
 pub(super) struct Collect {
     /// Data set to write; a file that exists is left alone without --append
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
-    /// Hardness level, 1 (hard) to 4, or 0: unlabelled [default: the recording's label "level"]
-    #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=4))]
+    /// Hardness level, 1 (hard) to 16, or 0: unlabelled [default: the recording's label "level"]
+    #[arg(long, value_name = "L", value_parser = clap::value_parser!(u8).range(0..=16))]
     pub(super) level: Option<u8>,
     /// Number of the object that was pressed. All its presses must be in one split of one data set
     /// [default: the recording's label "object", else a new number]
@@ -259,34 +267,17 @@ pub(super) struct Collect {
     pub(super) captures: Vec<PathBuf>,
 }
 
-/// A value of `train --method`.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Trained {
-    Frames(Method),
-    Courses,
-}
-
-/// The name of [`Trained::Courses`].
-const COURSE: &str = "course";
-
-fn trained() -> impl TypedValueParser<Value = Trained> {
-    let of_courses = PossibleValue::new(COURSE).help(
-        "Judges the course of a press, with the arm's motion and references of the sensor, and gives its Shore \
-         hardness. Takes data of `simulate --sequences`",
-    );
-    let methods = Method::all().iter();
-    let of_frames = methods.filter_map(ValueEnum::to_possible_value);
-    PossibleValuesParser::new(of_frames.chain([of_courses])).map(|name| {
-        let method = Method::all().iter().find(|method| method.name() == name);
-        method.map_or(Trained::Courses, |&method| Trained::Frames(method))
-    })
+fn method() -> impl TypedValueParser<Value = &'static Recipe> {
+    let value = |recipe: &'static Recipe| PossibleValue::new(&*recipe.name).help(&*recipe.about);
+    PossibleValuesParser::new(recipe::all().iter().map(value))
+        .map(|name| recipe::named(&name).expect("clap lets only these names pass"))
 }
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Train {
     /// What to train
-    #[arg(long, value_parser = trained())]
-    pub(super) method: Trained,
+    #[arg(long, value_parser = method())]
+    pub(super) method: &'static Recipe,
     /// Data to learn from; several files may be named. All presses of an object must be in one file
     #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
@@ -299,7 +290,7 @@ pub(super) struct Train {
     /// Length of the training
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
-    /// Settings that override the profile's; config/hrn-train.toml has every key
+    /// Settings that override the method's; config/hrn-train.toml has every key
     #[arg(long, value_name = "F.toml")]
     pub(super) config: Option<PathBuf>,
     /// Continue a run that was stopped
@@ -308,12 +299,9 @@ pub(super) struct Train {
     /// Reuse finished stages of another run where they are identical; may be repeated
     #[arg(long, hide_short_help = true, value_name = "RUN")]
     pub(super) from: Vec<PathBuf>,
-    /// Number of labels to use [default: the method's share]
+    /// Number of labels to use, of whole objects [default: the method's share]
     #[arg(long, value_name = "N")]
     pub(super) labels: Option<usize>,
-    /// Which samples get their labels
-    #[arg(long, hide_short_help = true, default_value = "object")]
-    pub(super) label_choice: LabelChoice,
     /// Where to compute
     #[arg(long, default_value = "cpu")]
     pub(super) device: DeviceName,
@@ -325,19 +313,17 @@ pub(super) struct Train {
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = COMPARED)]
 pub(super) struct Compare {
-    /// The data set to learn from
-    ///
-    /// With --course, several may be named.
-    #[arg(long, value_name = "D.npz", num_args = 1.., required = true)]
+    /// Data to learn from; several files may be named [default: none, only make the tables of DIR again]
+    #[arg(long, value_name = "D.npz", num_args = 1..)]
     pub(super) data: Vec<PathBuf>,
     /// Directory of the comparison
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Methods to run: those of `train` but course [default: all]
-    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1.., hide_possible_values = true)]
-    pub(super) methods: Vec<Method>,
-    /// Also run every method with each of these numbers of labels, for a curve of accuracy against labels
-    #[arg(long, hide_short_help = true, value_name = "N", value_delimiter = ',', num_args = 1..)]
+    /// Methods to run [default: all but hrn; course only on whole presses]
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1.., hide_possible_values = true, value_parser = method())]
+    pub(super) methods: Vec<&'static Recipe>,
+    /// Also run every method with each of these numbers of labels
+    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
     pub(super) labels: Vec<usize>,
     /// Train with the seeds 1 to N
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST as u64))]
@@ -345,27 +331,12 @@ pub(super) struct Compare {
     /// Length of each training run
     #[arg(long, default_value = "paper")]
     pub(super) profile: Profile,
-    /// Run nothing: print a command line for each run that is not finished, to spread over machines
-    #[arg(long)]
+    /// Run nothing: print a command line for each run that is not done, for GNU parallel, Slurm or Ray
+    #[arg(long, requires = "data")]
     pub(super) plan: bool,
     /// Runs at a time, each on one thread [default: as many as there are cores]
     #[arg(long, value_name = "J")]
     pub(super) jobs: Option<std::num::NonZeroUsize>,
-    /// Also swap the two materials of each level: 16 times features, hrn15-strong and hrn15-tuned, 4 times
-    /// ours
-    #[arg(long, hide_short_help = true)]
-    pub(super) swaps: bool,
-    /// Compare models of whole presses instead, with simpler controls that are fitted on --data. All data must
-    /// have whole presses (`simulate --sequences`)
-    #[arg(long, hide_short_help = true, requires = "test", requires = "model",
-        conflicts_with_all = ["methods", "labels", "seeds", "profile", "plan", "jobs", "swaps"])]
-    pub(super) course: bool,
-    /// Test presses; may be given several times
-    #[arg(long, hide_short_help = true, value_name = "T.npz", num_args = 1.., requires = "course")]
-    pub(super) test: Vec<PathBuf>,
-    /// Model files, of either format. The others are compared with the first
-    #[arg(long, hide_short_help = true, value_name = "M.onnx", num_args = 1.., requires = "course")]
-    pub(super) model: Vec<PathBuf>,
 }
 
 /// Parses a force in newtons, from the least of `hardnessd simulate --force` to the greatest
@@ -413,19 +384,6 @@ fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses the digits of levels, in any order.
-fn swapped_levels(text: &str) -> Result<[bool; 4], String> {
-    let mut swapped = [false; 4];
-    for digit in text.chars() {
-        let place = digit.to_digit(10).and_then(|level| level.checked_sub(1));
-        match place.and_then(|place| swapped.get_mut(place as usize)) {
-            Some(level) => *level = true,
-            None => return Err("expected levels from 1 to 4, such as 24".to_owned()),
-        }
-    }
-    Ok(swapped)
-}
-
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(super) enum DeviceName {
     Cpu,
@@ -435,9 +393,9 @@ pub(super) enum DeviceName {
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Evaluate {
-    /// The model file
-    #[arg(long, value_name = "M.onnx")]
-    pub(super) model: PathBuf,
+    /// The model file. Given twice, the two are compared press by press
+    #[arg(long, value_name = "M.onnx", required = true)]
+    pub(super) model: Vec<PathBuf>,
     /// The data set. Of whole presses, a model of single frames judges the frame of maximal contact area
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
@@ -451,36 +409,25 @@ pub(super) struct Evaluate {
     /// objects are not judged
     #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub(super) labelled: usize,
+    /// Give the model up to this many presses of other objects on the same sensor, of which it knows nothing
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
+    pub(super) own: usize,
     /// Also write every verdict to this new file, as a line of CSV
     ///
     /// The columns are object, level, the verdict's level, probabilities and Shore hardness with its interval, true
     /// Shore hardness.
     #[arg(long, value_name = "V.csv")]
     pub(super) verdicts: Option<PathBuf>,
-    /// Also write the input `features` of every press of the data to this new file, as CSV
-    #[arg(long, hide_short_help = true, value_name = "F.csv")]
-    pub(super) features: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
 }
 
-#[derive(Debug, clap::Args)]
-pub(super) struct Adopt {
-    /// The ONNX file
-    pub(super) model: PathBuf,
-    /// The data set that it learnt from
-    #[arg(long, value_name = "D.npz")]
-    pub(super) data: PathBuf,
-    /// New file for the model
-    #[arg(long, value_name = "H.onnx")]
-    pub(super) out: PathBuf,
-    /// How it was made, in a few words [default: adopted from MODEL]
-    #[arg(long, value_name = "TEXT")]
-    pub(super) method: Option<String>,
-    /// What it was tried on, in a few words [default: by the origin of the data]
-    #[arg(long, value_name = "TEXT")]
-    pub(super) validation: Option<String>,
+fn frame_rate(text: &str) -> Result<f64, String> {
+    let found = text.parse().ok();
+    found
+        .filter(|hz| (0.01..=10_000.0).contains(hz))
+        .ok_or_else(|| "expected frames/s, 0.01 to 10000".to_owned())
 }
 
 fn split() -> impl TypedValueParser<Value = Split> {

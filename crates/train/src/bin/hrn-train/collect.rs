@@ -10,7 +10,9 @@ use anyhow::{Context as _, bail};
 use hardnessd_core::part;
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
-use hrn_train::data::collect::{self, Collection, Labelling, Part, Settings};
+use hrn_train::data::collect::{self, Collection, Labelling, Part, Settings, Unnumbered};
+use hrn_train::data::presses::Layout;
+use hrn_train::data::source::papers_levels;
 use hrn_train::run::disk::lock;
 
 use super::arguments::Collect;
@@ -29,16 +31,22 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let is_appended = arguments.append && out.exists();
     // No other call adds to the data set meanwhile, because the later one would undo the earlier one.
     let _locked = is_appended.then(|| lock(out)).transpose()?;
-    let earlier = is_appended.then(|| Part::of_data_set(out, arguments.sequences));
+    let layout = match arguments.sequences {
+        true => Layout::OverTime,
+        false => Layout::Frames,
+    };
+    let earlier = is_appended.then(|| Part::of_data_set(out, layout));
     let settings = Settings {
         sensor,
         hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
+        unnumbered: Unnumbered::One,
+        levels: papers_levels(),
         labelling: Labelling {
             level: arguments.level,
             object: arguments.object,
             split: arguments.split,
         },
-        sequences: arguments.sequences,
+        layout,
         skip_unusable: arguments.skip_unusable,
     };
     let collection = collect::collect(&captures, earlier.transpose()?, &settings);

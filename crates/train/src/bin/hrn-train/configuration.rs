@@ -1,13 +1,16 @@
 //! The sensor that a configuration of the daemon describes first.
 
-use std::fs;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
-use hardnessd_core::npy::{self, NpyError};
-use hardnessd_core::sensor::{Description, Sensor, SensorError};
+use hardnessd_core::npy;
+use hardnessd_core::press;
+use hardnessd_core::range::OutOfRange;
+use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tare::Gains;
+use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
-use toml::{Table, Value};
+use serde::Deserialize;
 
 use super::failure::Unreadable;
 
@@ -22,10 +25,19 @@ pub(super) enum ConfigurationError {
     Gains {
         path: PathBuf,
         file: PathBuf,
-        source: NpyError,
+        source: io::Error,
     },
-    #[error("{}: sensor.{source}", path.display())]
-    Sensor { path: PathBuf, source: SensorError },
+    #[error("{}: {source}", path.display())]
+    Sensor { path: PathBuf, source: OutOfRange },
+}
+
+/// The tables of a configuration that describe a sensor.
+#[derive(Deserialize)]
+struct Tables {
+    #[serde(default, rename = "sensor")]
+    sensors: Vec<sensor::Settings>,
+    #[serde(default)]
+    press: press::Settings,
 }
 
 /// Reads the first `[[sensor]]` table and the `[press]` table. The daemon's `check` checks the rest.
@@ -38,34 +50,61 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
         path: path.to_owned(),
         problem: wording::of_toml(&text, error),
     };
-    let mut file: Table = text.parse().map_err(|error| syntax(&error))?;
-    let sensors = file.remove("sensor");
-    let sensors = sensors.and_then(|sensors| sensors.try_into::<Vec<Table>>().ok());
-    let first = sensors.and_then(|sensors| sensors.into_iter().next());
-    let Some(mut table) = first else {
+    let tables: Tables = toml::from_str(&text).map_err(|error| syntax(&error))?;
+    let Some(mut sensor) = tables.sensors.into_iter().next() else {
         return Err(ConfigurationError::NoSensor(path.to_owned()).into());
     };
-    table.retain(|key, _| key != "port" && key != "baud");
-    table.extend(
-        file.remove("press")
-            .map(|press| ("press".to_owned(), press)),
-    );
-    let description: Result<Description, _> = Value::Table(table).try_into();
-    let mut description = description.map_err(|error| syntax(&error))?;
-    if let Some(Gains::File(file)) = &description.calibration.gains {
+    if let Some(Gains::File(file)) = &sensor.calibration.gains {
         let file = path.with_file_name("").join(file);
-        let refused = |source| ConfigurationError::Gains {
+        let refused = |source: io::Error| ConfigurationError::Gains {
             path: path.to_owned(),
             file: file.clone(),
             source,
         };
-        let bytes = fs::read(&file).map_err(|source| refused(NpyError::Io(source)))?;
+        let bytes = fs::read(&file).map_err(refused)?;
         let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
-        description.calibration.gains = Some(Gains::Taxels(rows));
+        sensor.calibration.gains = Some(Gains::Taxels(rows));
     }
+    let description = Description {
+        sensor,
+        press: tables.press,
+        ..Description::default()
+    };
     let sensor = Sensor::new(description).map_err(|source| ConfigurationError::Sensor {
         path: path.to_owned(),
         source,
     })?;
     Ok(sensor)
+}
+
+/// The levels of the `[[level]]` tables. `None` without such tables.
+pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
+    #[derive(serde::Deserialize)]
+    struct Named {
+        label: String,
+        shore: [f64; 2],
+    }
+    #[derive(serde::Deserialize)]
+    struct Tables {
+        #[serde(default)]
+        level: Vec<Named>,
+    }
+    let text = fs::read_to_string(path)?;
+    let tables: Tables = toml::from_str(&text).map_err(|error| ConfigurationError::Syntax {
+        path: path.to_owned(),
+        problem: wording::of_toml(&text, &error),
+    })?;
+    let level = |(
+        level,
+        Named {
+            label,
+            shore: [low, high],
+        },
+    )| Level {
+        level,
+        label,
+        shore: format!("{low}-{high}"),
+    };
+    let levels: Vec<Level> = (1..).zip(tables.level).map(level).collect();
+    Ok((!levels.is_empty()).then_some(levels))
 }

@@ -4,10 +4,9 @@ use std::path::PathBuf;
 
 use hardnessd_core::exit;
 use hrn_train::data::collect::{CollectError, Problem};
-use hrn_train::data::dataset::DatasetError;
-use hrn_train::methods::LabelsError;
-use hrn_train::model::foreign::Foreign;
+use hrn_train::data::presses::DatasetError;
 use hrn_train::settings::SettingsError;
+use hrn_train::train::LabelsError;
 
 use super::configuration::ConfigurationError;
 use hardnessd_core::verdict::ModelError;
@@ -49,10 +48,6 @@ pub(super) enum WrongUsage {
     NoObjects,
     #[error("{0}: works with `--materials {1}` only")]
     OtherMaterials(&'static str, &'static str),
-    #[error("--data: found {0} files, expected 1 without --course")]
-    ManyFiles(usize),
-    #[error("{0}: works with methods of single frames only")]
-    OfFrames(&'static str),
     #[error("{}: {} is another file of this command: name a new one", .0, .1.display())]
     Overwritten(&'static str, PathBuf),
 }
@@ -75,7 +70,7 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     let has = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if has(|e| {
         e.is::<WrongUsage>()
-            || matches!(e.downcast_ref(), Some(LabelsError::Range { .. }))
+            || e.is::<LabelsError>()
             || matches!(problem(e), Some(Problem::NoLevel))
     }) {
         exit::USAGE
@@ -89,10 +84,7 @@ pub(super) fn exit_code(error: &anyhow::Error) -> u8 {
     } else if has(<dyn std::error::Error>::is::<NoCuda>) {
         exit::UNAVAILABLE
     } else if has(|e| {
-        e.is::<ModelError>()
-            || e.is::<Foreign>()
-            || e.is::<SettingsError>()
-            || e.is::<ConfigurationError>()
+        e.is::<ModelError>() || e.is::<SettingsError>() || e.is::<ConfigurationError>()
     }) {
         exit::CONFIG
     } else if has(<dyn std::error::Error>::is::<std::io::Error>) {

@@ -7,6 +7,7 @@ mod compare;
 mod configuration;
 mod failure;
 mod files;
+mod fit;
 mod models;
 mod signals;
 mod simulate;
@@ -52,12 +53,11 @@ fn main() -> ExitCode {
         // Training runs on a thread of the pool. From outside, every operation on several threads
         // would first have to wake one of them.
         Command::Train(arguments) => rayon::scope(|_| train::train(&arguments)),
+        Command::Fit(arguments) => fit::fit(&arguments),
         Command::Compare(arguments) => compare::compare(arguments),
         Command::Evaluate(arguments) => models::evaluate(&arguments),
-        Command::Report { directory, out } => compare::report_of(&directory, &out),
         Command::Export { run, out } => models::export_run(&run, &out),
-        Command::CheckModel { model } => return models::check_model(&model),
-        Command::Adopt(arguments) => models::adopt_model(&arguments),
+        Command::CheckModel { model, fps } => return models::check_model(&model, fps),
         Command::Inspect { model } => models::inspect(&model),
     };
     match done.and_then(|account| Ok(print(&account)?)) {

@@ -1,86 +1,134 @@
-//! The commands on a model file: `evaluate`, `export`, `inspect`, `check-model` and `adopt`.
+//! The commands on a model file: `evaluate`, `export`, `inspect` and `check-model`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::Context as _;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{Format as ModelFormat, Hrn};
+use hardnessd_core::verdict::{self, Hrn, Verdict};
 use hardnessd_core::{exit, wording};
-use hrn_train::data::courses::{self, Courses};
-use hrn_train::data::dataset::{self, Dataset};
-use hrn_train::model::adopt::{self, Stated};
-use hrn_train::model::course::{self, Given};
-use hrn_train::model::evaluated::{Case, Evaluated};
-use hrn_train::model::export;
-use hrn_train::model::review::{self, Format, Review};
+use hrn_train::data::presses::{Presses, read_one};
+use hrn_train::model::evaluated::{Case, Difference, Evaluated, cases};
+use hrn_train::model::verdicts::{self, Given};
 
 use super::account;
-use super::arguments::{Adopt, Evaluate};
+use super::arguments::Evaluate;
 use super::failure::{NoRun, exit_code};
 use super::files::{check_new, load, load_with_bytes, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
-    let hrn = load(&arguments.model)?;
-    let outputs = [&arguments.verdicts, &arguments.features];
-    let outputs = outputs.into_iter().flatten();
-    outputs.map(PathBuf::as_path).try_for_each(check_new)?;
-    if Courses::is_at(&arguments.data)? {
-        return evaluate_courses(arguments, &hrn);
-    }
+    let models: Vec<Hrn> = arguments
+        .model
+        .iter()
+        .map(|path| load(path))
+        .collect::<Result<_, _>>()?;
     anyhow::ensure!(
-        hrn.format() == ModelFormat::Frame,
-        "{}: found single frames, expected presses over time, which the model judges (`--sequences`)",
-        arguments.data.display()
+        models.len() <= 2 && (models.len() == 1 || arguments.verdicts.is_none()),
+        "--model: found {}, expected one, or two without --verdicts",
+        models.len()
     );
-    let dataset = Dataset::read(&arguments.data)?;
-    warn_of_pitch(&arguments.data, dataset.pitch_mm(), &hrn);
-    dataset.warn_of_object_in_both_splits();
-    let indices = dataset.labelled(arguments.split)?;
-    evaluation_of(arguments, &hrn, &export::cases(&hrn, &dataset, &indices)?)
+    if let Some(path) = &arguments.verdicts {
+        check_new(path)?;
+    }
+    let presses = read_one(&arguments.data)?;
+    let judged = models.iter().map(|hrn| judge(arguments, &presses, hrn));
+    let judged: Vec<Vec<(usize, Verdict)>> = judged.collect::<anyhow::Result<_>>()?;
+    let of_cases = |verdicts: &Vec<(usize, Verdict)>| cases(&presses, verdicts);
+    let all: Vec<Vec<Case>> = judged.iter().map(of_cases).collect();
+    if let Some(path) = &arguments.verdicts {
+        write(path, account::csv(&all[0]).as_bytes())?;
+    }
+    let evaluations: Vec<Evaluated> = models
+        .iter()
+        .zip(&all)
+        .map(|(hrn, cases)| Evaluated::of(cases, &hrn.card().levels))
+        .collect();
+    let ([first, second], [of_first, of_second]) = (&all[..], &evaluations[..]) else {
+        let evaluation = &evaluations[0];
+        return Ok(match arguments.json {
+            true => serde_json::to_string(evaluation)? + "\n",
+            false => account::of_evaluated(evaluation),
+        });
+    };
+    let places = |verdicts: &[(usize, Verdict)]| -> Vec<usize> {
+        verdicts.iter().map(|&(place, _)| place).collect()
+    };
+    anyhow::ensure!(
+        places(&judged[0]) == places(&judged[1])
+            && models[0].card().levels == models[1].card().levels,
+        "the two models have other levels, or judge other presses: they cannot be compared"
+    );
+    let difference = Difference::of(first, second);
+    if arguments.json {
+        let both = serde_json::json!({"models": evaluations, "difference": difference});
+        return Ok(both.to_string() + "\n");
+    }
+    let name = |place: usize| arguments.model[place].display().to_string();
+    Ok(format!(
+        "{}\n{}\n{}\n{}\n{}",
+        name(0),
+        account::of_evaluated(of_first),
+        name(1),
+        account::of_evaluated(of_second),
+        account::of_difference(&difference)
+    ))
 }
 
-/// Writes the verdicts if that is asked for. Returns the evaluation as text.
-fn evaluation_of(arguments: &Evaluate, hrn: &Hrn, cases: &[Case]) -> anyhow::Result<String> {
-    if let Some(path) = &arguments.verdicts {
-        write(path, account::csv(cases).as_bytes())?;
+/// A model's verdicts on the presses that the arguments choose.
+fn judge(
+    arguments: &Evaluate,
+    presses: &Presses,
+    hrn: &Hrn,
+) -> anyhow::Result<Vec<(usize, Verdict)>> {
+    warn_of_pitch(&arguments.data, presses, hrn);
+    anyhow::ensure!(
+        hrn.card().method != "course" || presses.are_over_time(),
+        "{}: has single frames, and the model judges whole presses: make data with `simulate --sequences` \
+         or `collect --sequences`",
+        arguments.data.display()
+    );
+    let given = Given {
+        rigid: arguments.rigid,
+        labelled: arguments.labelled,
+        own: arguments.own,
+    };
+    let places = presses.some_labelled(arguments.split)?;
+    warn_of_force(&arguments.data, presses, &places, hrn);
+    let verdicts = verdicts::of(hrn, presses, &places, given)?;
+    anyhow::ensure!(
+        !verdicts.is_empty(),
+        "{}: no press is left to judge: give fewer --labelled",
+        arguments.data.display()
+    );
+    Ok(verdicts)
+}
+
+/// Prints a warning if most presses have forces that the model was not trained with.
+fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Hrn) {
+    let [least_n, most_n] = hrn.card().range.force_n;
+    let is_outside = |&&place: &&usize| {
+        let newtons: f32 = presses.frame(place).newtons.iter().sum();
+        newtons < 0.5 * least_n || newtons > 2.0 * most_n
+    };
+    let outside = places.iter().filter(is_outside).count();
+    if 2 * outside > places.len() {
+        hardnessd_core::stderr_line!(
+            "warning: {}: {outside} of {} presses are far from the {least_n} to {most_n} N of the model's training: \
+             is the unit right?",
+            data.display(),
+            places.len()
+        );
     }
-    let evaluation = Evaluated::of(cases, hrn.card().levels.len());
-    Ok(if arguments.json {
-        serde_json::to_string(&evaluation)? + "\n"
-    } else {
-        account::of_evaluated(&evaluation)
-    })
 }
 
 /// Prints a warning if the data are of a sensor with another pitch than the model's.
-fn warn_of_pitch(data: &Path, pitch_mm: f64, hrn: &Hrn) {
-    let (of_model, of_data) = (hrn.card().pitch_mm, pitch_mm as f32);
+fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Hrn) {
+    let (of_model, of_data) = (hrn.card().pitch_mm, presses.pitch_mm() as f32);
     if of_model != of_data {
         hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",
             data.display()
         );
     }
-}
-
-fn evaluate_courses(arguments: &Evaluate, hrn: &Hrn) -> anyhow::Result<String> {
-    let (courses, sources) = Courses::read_all(std::slice::from_ref(&arguments.data))?;
-    warn_of_pitch(&arguments.data, dataset::pitch_mm(&sources), hrn);
-    let given = Given {
-        rigid: arguments.rigid,
-        labelled: arguments.labelled,
-    };
-    let verdicts = course::verdicts(hrn, &courses, arguments.split, given, |course| course)?;
-    anyhow::ensure!(
-        !verdicts.is_empty(),
-        "{}: no press of this split has a level: choose the other --split, or other data",
-        arguments.data.display()
-    );
-    if let Some(path) = &arguments.features {
-        write(path, account::features_csv(&courses).as_bytes())?;
-    }
-    evaluation_of(arguments, hrn, &course::cases(&verdicts))
 }
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
@@ -102,40 +150,28 @@ pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
     Ok(account::of_model(path, &load(path)?))
 }
 
-/// The frame rate, in frames/s, from which the time limit for a verdict follows.
-const SLOWEST_HZ: f64 = 5.0;
-
 /// Checks a model file. The lines of the check are the output of the command, so they go to stdout
-/// even if the model does not pass.
-pub(super) fn check_model(path: &Path) -> ExitCode {
+/// even if the model does not pass. The time limit for a verdict follows from the frame rate.
+pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> ExitCode {
     let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
-        let Review { format, findings } = review::review(&bytes);
-        let mut lines = format!("{}: {}\n", path.display(), format.wanted());
-        for finding in &findings {
-            lines += &format!("{finding}\n");
+        let mut problems = verdict::problems(&bytes);
+        if problems.is_empty() {
+            // Try to run it as the daemon does, with its memory and time.
+            let most = trial::verdict_most(frame_rate_hz);
+            problems.extend(trial::load(&bytes, Some(most)).err());
         }
-        let mut passes = findings.iter().all(|finding| finding.problem.is_none());
-        if passes {
-            // Try the memory and time of a verdict, as the daemon does.
-            let most = trial::verdict_most(SLOWEST_HZ);
-            match trial::load(&bytes, Some(most)) {
-                Ok(_) => lines += "ok       memory and time of a verdict\n",
-                Err(error) => {
-                    passes = false;
-                    lines += &format!("missing  memory and time of a verdict: {error}\n");
-                }
-            }
-        } else if findings.iter().all(|f| f.problem.is_none() || f.is_mended) {
-            lines += &format!(
-                "`hrn-train adopt {} --data D.npz --out H.onnx` adds what is missing\n",
+        let mut lines: String = problems.iter().map(|problem| format!("{problem}\n")).collect();
+        if problems.is_empty() {
+            lines = format!(
+                "{}: a model that hardnessd loads, for sensors of up to {frame_rate_hz} frames/s\n",
                 path.display()
             );
-        } else if format != Format::Frame {
-            lines += "`hrn-train adopt` takes models of one frame only: add what is missing yourself \
-                      (docs/formats.md)\n";
+        } else {
+            lines += "`python3 -m hardnessd.adopt IN.onnx --out M.onnx` mends names, shapes and metadata of a model of \
+                      one frame; docs/formats.md has the format\n";
         }
         super::print(&lines)?;
-        Ok(passes)
+        Ok(problems.is_empty())
     });
     match checked {
         Ok(true) => ExitCode::SUCCESS,
@@ -145,32 +181,4 @@ pub(super) fn check_model(path: &Path) -> ExitCode {
             ExitCode::from(exit_code(&error))
         }
     }
-}
-
-pub(super) fn adopt_model(arguments: &Adopt) -> anyhow::Result<String> {
-    let bytes = read(&arguments.model)?;
-    check_new(&arguments.out)?;
-    let dataset = courses::single_frames(&arguments.data)?;
-    let name = arguments.model.file_name().unwrap_or_default();
-    let stated = Stated {
-        method: arguments
-            .method
-            .clone()
-            .unwrap_or_else(|| format!("adopted from {}", name.display())),
-        validation: arguments.validation.clone(),
-    };
-    let adopted = adopt::adopt(&bytes, &dataset, &stated);
-    let (model, done, evaluation) =
-        adopted.with_context(|| arguments.model.display().to_string())?;
-    let hrn = trial::load(&model, None).with_context(|| arguments.model.display().to_string())?;
-    write(&arguments.out, &model)?;
-    let mut account = String::new();
-    for change in done {
-        account += &format!("changed  {change}\n");
-    }
-    account += &format!("{}: sha256 {}\n", arguments.out.display(), hrn.sha256());
-    if let Some(evaluation) = evaluation {
-        account += &account::of_evaluated(&evaluation);
-    }
-    Ok(account)
 }

@@ -3,41 +3,27 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use hardnessd_core::frame::RawFrame;
 use hardnessd_simulator::{
-    Borders, BroadSensors, CourseSettings, DatasetSettings, Laws, Material, Materials, Sequence,
-    SequenceSettings,
+    Borders, BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns,
 };
 use hrn_train::data::simulated;
-use hrn_train::judge::sheet;
 
 use super::arguments::Simulate;
 use super::failure::WrongUsage;
-use super::files::{apart, check_new, write};
+use super::files::{check_new, write};
 
 /// The settings of the simulation.
 fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, WrongUsage> {
     let is_broad = arguments.materials == Materials::Broad;
-    let of_named = [
-        ("--swapped-levels", arguments.swapped_levels.is_some()),
-        ("--all-test", arguments.all_test),
-    ];
-    let of_broad = [
-        ("--laws", !arguments.laws.is_empty()),
-        ("--gaps", arguments.gaps),
-    ];
-    let (strange, usual) = if is_broad {
-        (of_named, "named")
-    } else {
-        (of_broad, "broad")
-    };
-    if let Some((option, _)) = strange.into_iter().find(|(_, is_given)| *is_given) {
-        return Err(WrongUsage::OtherMaterials(option, usual));
+    if is_broad && arguments.all_test {
+        return Err(WrongUsage::OtherMaterials("--all-test", "named"));
+    }
+    if !is_broad && arguments.gaps {
+        return Err(WrongUsage::OtherMaterials("--gaps", "broad"));
     }
     Ok(DatasetSettings {
         seed: arguments.seed,
         materials: arguments.materials,
-        laws: Laws::try_from(arguments.laws.clone()).unwrap_or_default(),
         borders: if arguments.gaps {
             Borders::Gaps
         } else {
@@ -58,7 +44,7 @@ fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, WrongUsag
         one_sensor: arguments.one_sensor.is_some(),
         cover_young_mpa: arguments.cover,
         calibrated: arguments.calibrated,
-        swapped_levels: arguments.swapped_levels.unwrap_or_default(),
+        ..DatasetSettings::default()
     })
 }
 
@@ -66,10 +52,6 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let settings = simulated_settings(arguments)?;
     if settings.objects == 0 && settings.test_objects == 0 {
         return Err(WrongUsage::NoObjects.into());
-    }
-    if let Some(sheet) = &arguments.sheet {
-        apart("--sheet", sheet, [arguments.out.as_path()])?;
-        check_new(sheet)?;
     }
     if arguments.sequences {
         return simulate_courses(arguments, settings);
@@ -80,21 +62,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let seconds = begun.elapsed().as_secs_f64();
 
     let count = samples.len();
-    let sheet = match &arguments.sheet {
-        Some(path) => {
-            let presses = match settings.materials {
-                Materials::Named => one_press_a_level(&settings),
-                Materials::Broad => Vec::new(),
-            };
-            Some((path, sheet::sheet(&samples, &presses)?))
-        }
-        None => None,
-    };
-    // The data set comes first, so that a full disk costs the picture.
     write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
-    if let Some((path, picture)) = sheet {
-        write(path, &picture)?;
-    }
     Ok(format!(
         "{}: {count} samples in {seconds:.1} s, {:.0} a second\n",
         arguments.out.display(),
@@ -113,6 +81,11 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
     };
     let settings = CourseSettings {
         objects,
+        flat_share: usual.flat_share,
+        highest_force_n: match asked.sensors {
+            Some(SensorDesigns::Broad) => BROAD_FORCE_N,
+            Some(SensorDesigns::Jx255n) | None => usual.highest_force_n,
+        },
         frame_rate_hz: asked.fps.unwrap_or(usual.frame_rate_hz),
         speed_mm_s: asked.speed.unwrap_or(usual.speed_mm_s),
         arm_n_per_mm: asked.arm.unwrap_or(usual.arm_n_per_mm),
@@ -156,6 +129,9 @@ fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::R
 /// Error of the stiffness that a robot reports, where each sensor has a number.
 const BROAD_ARM_ERROR: f64 = 0.15;
 
+/// The greatest force on broad sensors.
+const BROAD_FORCE_N: f32 = 40.0;
+
 /// `D-3.npz` for part 3 of `D.npz`.
 fn numbered(path: &Path, part: u32) -> PathBuf {
     let mut name = path.file_stem().unwrap_or_default().to_owned();
@@ -167,7 +143,7 @@ fn numbered(path: &Path, part: u32) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Simulates and writes one file of whole presses. The first of several files makes the sheet.
+/// Simulates and writes one file of whole presses.
 fn write_courses(
     arguments: &Simulate,
     settings: &CourseSettings,
@@ -177,15 +153,7 @@ fn write_courses(
     let courses = simulated::simulate_courses(settings, jobs(arguments));
     let seconds = begun.elapsed().as_secs_f64();
     let shard = settings.sensors.map(|sensors| sensors.shard);
-    let sheet = match (&arguments.sheet, shard) {
-        (Some(path), None) => Some((path, sheet::courses(&courses)?)),
-        (Some(path), Some(0)) => Some((path, sheet::sensors(&courses)?)),
-        (Some(_), Some(_)) | (None, _) => None,
-    };
     write(out, &simulated::courses_to_bytes(settings, &courses)?)?;
-    if let Some((path, picture)) = sheet {
-        write(path, &picture)?;
-    }
     let (count, wanted) = (courses.len() as u64, settings.presses());
     let frames: usize = courses.iter().map(|course| course.moments.len()).sum();
     let unseen = if shard.is_some() {
@@ -204,20 +172,4 @@ fn write_courses(
 
 fn jobs(arguments: &Simulate) -> usize {
     arguments.jobs.unwrap_or_else(simulated::all_cores)
-}
-
-/// One press of each training material, as the frames that the sensor sends over time.
-fn one_press_a_level(settings: &DatasetSettings) -> Vec<(Material, Vec<RawFrame>)> {
-    let press_of = |material| {
-        let sequence = Sequence::new(SequenceSettings {
-            seed: settings.seed,
-            materials: vec![material],
-            presses: Some(1),
-            shapes: settings.shapes,
-            profile: settings.profile,
-            ..SequenceSettings::default()
-        });
-        (material, sequence.map(|frame| frame.raw).collect())
-    };
-    Material::ALL[..4].iter().copied().map(press_of).collect()
 }

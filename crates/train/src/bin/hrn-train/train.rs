@@ -1,39 +1,23 @@
 //! `hrn-train train`.
 
-use std::path::Path;
 use std::time::Instant;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
 use hardnessd_core::wording;
-use hrn_train::data::dataset::LabelChoice;
-use hrn_train::methods::task::Task;
-use hrn_train::methods::{self, Request};
-use hrn_train::run::Run;
-use hrn_train::settings::{Profile, Settings};
+use hrn_train::data::presses::Presses;
+use hrn_train::settings::{self, Profile};
+use hrn_train::train::{self, Request};
 
 use super::account;
-use super::arguments::{DeviceName, Train, Trained};
-use super::failure::{NoCuda, Unreadable, WrongUsage};
+use super::arguments::{DeviceName, Train};
+use super::failure::{NoCuda, Unreadable};
 use super::files::read;
 
 pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
         end_with(parent)?;
     }
-    let profile = arguments.profile;
-    let defaults = match arguments.method {
-        Trained::Frames(method) => method.settings(profile),
-        Trained::Courses => methods::course::settings(profile),
-    };
-    let settings = overridden(defaults, arguments.config.as_deref())?;
-    let task = match arguments.method {
-        Trained::Frames(method) => Task::frames(&arguments.data, method)?,
-        Trained::Courses => {
-            check_options_of_courses(arguments)?;
-            Task::courses(&arguments.data)?
-        }
-    };
     for other in &arguments.from {
         let unreadable = |source| Unreadable {
             path: other.clone(),
@@ -41,68 +25,55 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
         };
         std::fs::read_dir(other).map_err(unreadable)?;
     }
+    let given = match &arguments.config {
+        Some(path) => {
+            let text = String::from_utf8_lossy(&read(path)?).into_owned();
+            settings::parse(&text).with_context(|| path.display().to_string())?
+        }
+        None => toml::Table::new(),
+    };
     let request = Request {
-        profile,
+        recipe: arguments.method,
+        data: arguments.data.clone(),
+        out: arguments.out.clone(),
+        profile: arguments.profile,
         seed: arguments.seed,
         labels: arguments.labels,
-        label_choice: arguments.label_choice,
-        settings,
+        given,
+        resume: arguments.resume,
+        from: arguments.from.clone(),
+        device: device(arguments.device)?,
     };
-    let description = task.description(&request)?;
-    let device = device(arguments.device)?;
-    let run = Run::open(&arguments.out, &description, arguments.resume)?
-        .taking_from(arguments.from.clone());
-    let presses = task.presses();
-    hardnessd_core::stderr_part!("{}", wording::lines(&account::of_data(&presses)));
-    hardnessd_core::stderr_part!("{}", account::of_levels(&presses));
+    let begun = Instant::now();
+    let evaluation = train::train(&request, |presses| say(presses, arguments.profile));
+    let evaluation = match &arguments.config {
+        // An error of a value names its file.
+        Some(path) => evaluation.map_err(|error| match error.is::<settings::SettingsError>() {
+            true => error.context(path.display().to_string()),
+            false => error,
+        }),
+        None => evaluation,
+    };
+    let figures = evaluation?.as_ref().map(account::of_evaluated);
+    Ok(format!(
+        "trained in {:.1} s: {}\n{}",
+        begun.elapsed().as_secs_f64(),
+        arguments.out.join("hrn.onnx").display(),
+        figures.unwrap_or_else(|| {
+            "not evaluated: the data has no labelled test presses\n".to_owned()
+        })
+    ))
+}
+
+/// Says what the data are.
+fn say(presses: &Presses, profile: Profile) {
+    hardnessd_core::stderr_part!("{}", wording::lines(&account::of_data(presses)));
+    hardnessd_core::stderr_part!("{}", account::of_levels(presses));
     if profile == Profile::Smoke {
         hardnessd_core::stderr_line!(
             "--profile smoke: tries the commands in seconds; too short to learn anything"
         );
     }
-    let begun = Instant::now();
-    let evaluation = task.train(&description, &run, &device)?;
-    let figures = evaluation.as_ref().map(account::of_evaluated);
-    Ok(account_of_run(begun, &run, figures))
-}
-
-/// Refuses options that mean nothing for whole presses.
-fn check_options_of_courses(arguments: &Train) -> Result<(), WrongUsage> {
-    let of_frames = [
-        ("--labels", arguments.labels.is_some()),
-        (
-            "--label-choice",
-            arguments.label_choice != LabelChoice::Object,
-        ),
-        ("--from", !arguments.from.is_empty()),
-    ];
-    match of_frames.into_iter().find(|(_, is_given)| *is_given) {
-        Some((option, _)) => Err(WrongUsage::OfFrames(option)),
-        None => Ok(()),
-    }
-}
-
-/// The duration of the training, the path of the model, and its figures on the data's test presses,
-/// if there are any.
-fn account_of_run(begun: Instant, run: &Run, figures: Option<String>) -> String {
-    format!(
-        "trained in {:.1} s: {}\n{}",
-        begun.elapsed().as_secs_f64(),
-        run.path("hrn.onnx").display(),
-        figures.unwrap_or_else(|| {
-            "not evaluated: the data has no labelled test presses\n".to_owned()
-        })
-    )
-}
-
-/// The settings with the values that a file overrides.
-fn overridden(settings: Settings, file: Option<&Path>) -> anyhow::Result<Settings> {
-    let Some(path) = file else {
-        return Ok(settings);
-    };
-    let text = String::from_utf8_lossy(&read(path)?).into_owned();
-    let overridden = settings.overridden(&text);
-    overridden.with_context(|| path.display().to_string())
 }
 
 fn device(name: DeviceName) -> Result<Device, NoCuda> {

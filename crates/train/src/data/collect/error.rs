@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::data::dataset::DatasetError;
+use crate::data::presses::{DatasetError, Layout};
 use hardnessd_core::recording::{self, PlaybackError};
 
 /// The reason that a file gives no samples.
@@ -117,6 +117,9 @@ pub enum Problem {
          is in a recording"
     )]
     NoPress,
+    /// A data set has the other layout.
+    #[error("{}", layout(*.0))]
+    Layout(Layout),
     /// A directory has no recording in it.
     #[error("no recording is in this directory")]
     Empty,
@@ -138,6 +141,13 @@ impl CollectError {
         let text = self.to_string();
         let reason = text.strip_prefix(&format!("{}: ", path.display()));
         reason.unwrap_or(&text).to_owned()
+    }
+}
+
+fn layout(expected: Layout) -> &'static str {
+    match expected {
+        Layout::Frames => "has whole presses, not single frames: collect it with --sequences",
+        Layout::OverTime => "has single frames, not whole presses: collect it without --sequences",
     }
 }
 

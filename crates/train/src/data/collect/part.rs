@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use serde_json::{Map, Value};
 
 use super::{CollectError, Problem, Settings, capture};
-use crate::data::courses::Courses;
-use crate::data::dataset::{self, Dataset, Object, Sample, file};
+use crate::data::presses::{self, Layout, Press, Presses, file};
+use crate::data::source::Object;
+use hardnessd_core::frame::Array;
 use hardnessd_simulator::Split;
 
 /// The generator of a data set that names none.
@@ -23,8 +24,12 @@ pub struct Part {
     pub(super) is_recording: bool,
     pub(super) presses: Presses,
     pub(super) pitch_mm: f64,
+    /// The array whose frames the presses have as they are.
+    pub(super) grid: Option<Array>,
     /// The name of each material that a press has.
     pub(super) materials: Vec<String>,
+    /// The name of each sensor that a press has. A data set may not say it.
+    pub(super) sensors: Vec<Option<String>>,
     /// The elements of `meta.captures`.
     pub(super) captures: Vec<Value>,
     /// The numbers of objects that neither a label nor an option gave.
@@ -42,18 +47,21 @@ impl Part {
         let bytes = file::whole(path);
         let bytes = bytes.map_err(|error| Problem::Unreadable(error).of(path))?;
         if bytes.starts_with(ARCHIVE) {
-            return Self::of_data_set(path, settings.sequences);
+            return Self::of_data_set(path, settings.layout);
         }
         capture::part(path, &bytes, settings).map_err(|problem| problem.of(path))
     }
 
-    /// Reads a data set: presses over time if `sequences`, else single frames.
+    /// Reads a data set of this layout.
     ///
     /// # Errors
     ///
     /// Returns an error if the file is not such a data set.
-    pub fn of_data_set(path: &Path, sequences: bool) -> Result<Self, CollectError> {
-        let meta = match dataset::meta(path)? {
+    pub fn of_data_set(path: &Path, layout: Layout) -> Result<Self, CollectError> {
+        if file::layout_of(path)? != layout {
+            return Err(Problem::Layout(layout).of(path));
+        }
+        let meta = match presses::meta(path)? {
             Value::Object(meta) => meta,
             _ => Map::new(),
         };
@@ -61,17 +69,7 @@ impl Part {
             let list = meta.get(key).and_then(Value::as_array);
             list.cloned().unwrap_or_default()
         };
-        let (presses, pitch_mm) = if sequences {
-            let pitch_mm = meta.get("pitch_mm").and_then(Value::as_f64);
-            (
-                Presses::Courses(Courses::read(path)?),
-                pitch_mm.unwrap_or(dataset::PITCH_MM),
-            )
-        } else {
-            let dataset = Dataset::read(path)?;
-            let pitch_mm = dataset.pitch_mm();
-            (Presses::Frames(dataset.samples), pitch_mm)
-        };
+        let presses = presses::read_one(path)?;
         let materials = list("materials").into_iter().enumerate();
         let mut materials: Vec<String> = materials
             .map(|(number, name)| {
@@ -79,10 +77,15 @@ impl Part {
                     .map_or_else(|| nameless(number), str::to_owned)
             })
             .collect();
-        let materials_used = presses.objects().into_iter();
-        let last = materials_used.filter_map(|(object, _)| object.material);
-        let all = last.max().map_or(0, |last| usize::from(last) + 1);
+        let last = presses.all.iter().filter_map(|press| press.material).max();
+        let all = last.map_or(0, |last| usize::from(last) + 1);
         materials.extend((materials.len()..all).map(nameless));
+        let sensors = list("sensors").into_iter();
+        let mut sensors: Vec<Option<String>> = sensors
+            .map(|name| name.as_str().map(str::to_owned))
+            .collect();
+        let last = presses.all.iter().map(|press| press.sensor).max();
+        sensors.resize(last.map_or(0, |last| last as usize + 1), None);
         let generators = meta.get("generator").and_then(Value::as_str);
         let generators = generators.unwrap_or(UNKNOWN).split(", ");
         let captures = list("captures");
@@ -91,8 +94,10 @@ impl Part {
         Ok(Self {
             path: path.to_owned(),
             is_recording: false,
-            pitch_mm,
+            pitch_mm: presses.pitch_mm(),
+            grid: presses.grid(),
             materials,
+            sensors,
             new_objects: new_objects
                 .filter_map(|number| number.try_into().ok())
                 .collect(),
@@ -104,26 +109,32 @@ impl Part {
         })
     }
 
+    /// The objects, each with its split.
+    pub(super) fn objects(&self) -> BTreeSet<(Object, Split)> {
+        let presses = self.presses.all.iter();
+        presses
+            .filter_map(|press| Some((press.pressed()?, press.split)))
+            .collect()
+    }
+
     /// The numbers of objects that a label or an option gave.
     pub(super) fn numbered_objects(&self) -> impl Iterator<Item = u32> {
-        let objects = self.presses.objects().into_iter();
+        let objects = self.objects().into_iter();
         let numbers = objects.map(|(object, _)| object.number);
         numbers.filter(|number| !self.new_objects.contains(number))
     }
 
-    pub(super) fn shape(&self) -> Shape {
-        let first = match &self.presses {
-            Presses::Frames(samples) => samples.first(),
-            Presses::Courses(_) => None,
-        };
+    pub(super) fn shape(&self, layout: Layout) -> Shape {
+        let first = self.presses.all.first();
         // Presses over time have a value for each.
-        let has = |test: fn(&Sample) -> bool| first.is_none_or(test);
+        let first = first.filter(|_| layout == Layout::Frames);
+        let has = |test: fn(&Press) -> bool| first.is_none_or(test);
         Shape {
             pitch_mm: self.pitch_mm,
-            object: has(|sample| sample.object.is_some()),
-            material: has(|sample| sample.material.is_some()),
-            force: has(|sample| sample.force_n.is_some()),
-            shore: has(|sample| sample.shore.is_some()),
+            object: has(|press| press.object.is_some()),
+            material: has(|press| press.material.is_some()),
+            force: has(|press| press.force_n.is_some()),
+            shore: has(|press| press.shore.is_some()),
         }
     }
 }
@@ -131,76 +142,6 @@ impl Part {
 /// The name of a material to which a data set gives none.
 fn nameless(number: usize) -> String {
     format!("material {number}")
-}
-
-/// Single frames, or presses over time.
-#[derive(Debug)]
-pub(super) enum Presses {
-    Frames(Vec<Sample>),
-    Courses(Courses),
-}
-
-impl Presses {
-    pub(super) fn len(&self) -> usize {
-        match self {
-            Self::Frames(samples) => samples.len(),
-            Self::Courses(courses) => courses.presses.len(),
-        }
-    }
-
-    /// The number of presses whose approach is known.
-    pub(super) fn known(&self) -> usize {
-        let Self::Courses(courses) = self else {
-            return 0;
-        };
-        let presses = 0..courses.presses.len();
-        presses
-            .filter(|&press| courses.known[courses.rows(press)].contains(&1))
-            .count()
-    }
-
-    /// The objects, each with its split.
-    pub(super) fn objects(&self) -> BTreeSet<(Object, Split)> {
-        match self {
-            Self::Frames(samples) => samples
-                .iter()
-                .filter_map(|sample| Some((sample.pressed()?, sample.split)))
-                .collect(),
-            Self::Courses(courses) => courses
-                .presses
-                .iter()
-                .map(|press| (press.pressed(), press.split))
-                .collect(),
-        }
-    }
-
-    /// Changes the numbers of objects, and those of materials to the ones in `materials`.
-    pub(super) fn renumber(&mut self, object: impl Fn(u32) -> u32, materials: &[u8]) {
-        let material = |number: u8| materials[usize::from(number)];
-        match self {
-            Self::Frames(samples) => {
-                for sample in samples {
-                    sample.object = sample.object.map(&object);
-                    sample.material = sample.material.map(material);
-                }
-            }
-            Self::Courses(courses) => {
-                for press in &mut courses.presses {
-                    press.object = object(press.object);
-                    press.material = material(press.material);
-                }
-            }
-        }
-    }
-
-    /// Adds other presses of the same kind.
-    pub(super) fn append(&mut self, other: Self) {
-        match (self, other) {
-            (Self::Frames(all), Self::Frames(samples)) => all.extend(samples),
-            (Self::Courses(all), Self::Courses(courses)) => all.append(courses, 0),
-            _ => unreachable!("all files of a call are read as one kind"),
-        }
-    }
 }
 
 /// What all samples of a data set have in common: the pitch, and the arrays that they have.

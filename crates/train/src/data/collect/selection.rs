@@ -3,19 +3,23 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use serde_json::Value;
+
 use hardnessd_core::event::{Event, Hardness, Phase, PressState};
 use hardnessd_core::frame::{Array, Frame, Stamp};
+use hardnessd_core::judge::{approach_by_speed, approach_speed_mm_s, is_informative};
 use hardnessd_core::motion::Track;
-use hardnessd_core::pipeline::{approach_by_speed, approach_speed_mm_s, is_informative};
 use hardnessd_core::press::thinned;
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Laying, ModelFrame, ROWS};
+use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, Resampling};
 
-use crate::data::dataset::PITCH_MM;
+use crate::data::source::{MOST_LEVELS, PITCH_MM};
 
 /// A press that was judged.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Judged {
+    /// The sensor's name.
+    pub(super) sensor: String,
     /// The chosen frame.
     pub(super) frame: ModelFrame,
     /// Total force of the chosen frame.
@@ -26,6 +30,13 @@ pub(super) struct Judged {
     pub(super) best: usize,
     /// Stiffness of the arm. 0 if the stiffness or the approach is unknown.
     pub(super) arm_n_per_mm: f32,
+    /// The number of the press.
+    pub(super) press: u64,
+    /// The whole array before the touch, with what the tare takes off.
+    pub(super) unloaded: Vec<f32>,
+    /// The level and the name of the object, if the context of the press says them.
+    pub(super) level: Option<u8>,
+    pub(super) object: Option<String>,
 }
 
 /// A frame of a press.
@@ -68,6 +79,9 @@ struct Held {
     last: u64,
     /// The speed of the approach when the press under way began, if it is known.
     speed_mm_s: Option<f64>,
+    /// The last frame before the first tare, and the two last ones between presses.
+    untared: Vec<f32>,
+    at_rest: [Vec<f32>; 2],
     sensor: Sensor,
 }
 
@@ -79,6 +93,8 @@ impl Default for Held {
             began: None,
             last: 0,
             speed_mm_s: None,
+            untared: Vec::new(),
+            at_rest: [Vec::new(), Vec::new()],
             sensor: Sensor::new(Description::default()).expect("the default is a sensor"),
         }
     }
@@ -88,6 +104,7 @@ impl Default for Held {
 struct Shown {
     mono: Duration,
     area: u32,
+    /// What a model gets of the frame.
     frame: Frame,
 }
 
@@ -113,16 +130,22 @@ impl Selection {
                     if !held.is_pressed {
                         held.frames.clear();
                     }
+                    let array = Array {
+                        rows: frame.rows,
+                        cols: frame.cols,
+                    };
+                    if !frame.tared {
+                        held.untared = frame.newtons.clone();
+                    } else if !held.is_pressed {
+                        let [before, newest] = &mut held.at_rest;
+                        *before = std::mem::replace(newest, frame.newtons.clone());
+                    }
+                    let newtons = frame.newtons.into();
+                    let threshold_n = held.sensor.thresholds().contact_threshold_n;
                     let shown = Shown {
                         mono: at.mono_of(frame.time),
                         area: frame.contact_area_taxels,
-                        frame: Frame {
-                            array: Array {
-                                rows: frame.rows,
-                                cols: frame.cols,
-                            },
-                            newtons: frame.newtons.into(),
-                        },
+                        frame: Frame { array, newtons }.felt(threshold_n),
                     };
                     held.frames.insert(frame.frame, shown);
                 }
@@ -132,8 +155,7 @@ impl Selection {
                     match press.state {
                         PressState::Begin => {
                             held.began = Some(press.frame);
-                            let (context, arm) =
-                                (press.context.as_ref(), &held.sensor.description().arm);
+                            let (context, arm) = (press.context.as_ref(), held.sensor.arm());
                             held.speed_mm_s = approach_speed_mm_s(context, arm);
                         }
                         PressState::End | PressState::Aborted => held.last = press.frame,
@@ -149,18 +171,39 @@ impl Selection {
 }
 
 impl Held {
+    /// The array before the touch. The newest frame between presses is the one that began the press.
+    fn unloaded(&self) -> Vec<f32> {
+        let [at_rest, touched] = &self.at_rest;
+        let of = |newtons: &[f32], place: usize| newtons.get(place).copied().unwrap_or(0.0);
+        let whole = |place| of(at_rest, place) + of(&self.untared, place);
+        (0..touched.len()).map(whole).collect()
+    }
+
     /// The press that has just ended.
     fn judged(&mut self, verdict: &Hardness, track: &Track) -> Option<Judged> {
         // The chosen frame of a press that began before the recording may be missing from it.
         let chosen = self.frames.get(&verdict.frame)?;
-        let pitch = self.sensor.description().calibration.pitch_mm;
-        let laying = Laying::new(&chosen.frame, pitch, grid_mm(&self.sensor));
+        let pitch = self.sensor.calibration().pitch_mm;
+        let resampling = Resampling::new(&chosen.frame, pitch, grid_mm(&self.sensor));
+        let said = |key| {
+            verdict
+                .context
+                .as_ref()
+                .and_then(|context| context.get(key))
+        };
+        let is_level = |level: &u8| (1..=MOST_LEVELS).contains(&usize::from(*level));
+        let level = |number| u8::try_from(number).ok().filter(is_level);
         let mut judged = Judged {
-            frame: laying.lay(&chosen.frame),
+            sensor: verdict.sensor.clone(),
+            frame: resampling.apply(&chosen.frame),
             force_n: verdict.force_n as f32,
             moments: Vec::new(),
             best: 0,
             arm_n_per_mm: 0.0,
+            press: verdict.press,
+            unloaded: self.unloaded(),
+            level: said("level").and_then(Value::as_u64).and_then(level),
+            object: said("object").and_then(Value::as_str).map(str::to_owned),
         };
         let Some(first) = self.began.take() else {
             return Some(judged);
@@ -178,7 +221,7 @@ impl Held {
             return Some(judged);
         };
         let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
-        let arm = &self.sensor.description().arm;
+        let arm = self.sensor.arm();
         let (begin, end) = (moments[0], moments[moments.len() - 1]);
         // The approach is what the daemon would give a model: from positions, or else from the speed.
         let way = if track.has_recent(end, arm.delay_ms) {
@@ -203,7 +246,7 @@ impl Held {
             judged.moments.push(KeptFrame {
                 time_s: before_s,
                 approach_mm: way[place].map(|mm| mm as f32),
-                frame: laying.lay(&pressed[place].1.frame),
+                frame: resampling.apply(&pressed[place].1.frame),
             });
         }
         if judged.is_known() {
@@ -213,14 +256,19 @@ impl Held {
     }
 }
 
+/// The array of a sensor whose frames a data set has as they are.
+pub(super) fn grid(sensor: &Sensor) -> Option<Array> {
+    let array = sensor.layout().array();
+    let pitch = sensor.calibration().pitch_mm;
+    let is_kept = array.rows <= ROWS && array.cols <= COLS && pitch.rows_mm == pitch.cols_mm;
+    is_kept.then_some(array)
+}
+
 /// The distance between the taxels of the grid on which a data set holds the frames of `sensor`. An
 /// array that fits into a data set is kept as it is.
 pub(super) fn grid_mm(sensor: &Sensor) -> f64 {
-    let pitch = sensor.description().calibration.pitch_mm;
-    let Array { rows, cols } = sensor.layout().array();
-    if rows <= ROWS && cols <= COLS && pitch.rows_mm == pitch.cols_mm {
-        pitch.rows_mm
-    } else {
-        PITCH_MM
+    match grid(sensor) {
+        Some(_) => sensor.calibration().pitch_mm.rows_mm,
+        None => PITCH_MM,
     }
 }

@@ -1,28 +1,75 @@
 //! Which presses a step learns from, and with which references.
 //!
 //! In: presses with the numbers of their sensors. Out: groups of presses of one sensor, with references
-//! that are drawn anew each time: none, rigid pieces, objects of known hardness, or both. So one
-//! network learns to judge with whatever a user has.
+//! that are drawn anew each time: none, the sensor's own presses of objects of which nothing is known,
+//! rigid pieces, objects of known hardness, or several of these. So one network learns to judge with
+//! whatever a robot has.
 
 use std::collections::BTreeMap;
 
 use super::Press;
-use hardnessd_core::verdict::{Borders, Piece};
+use crate::learn::Question;
+use hardnessd_core::verdict::{Borders, Knowledge, Piece};
 use hardnessd_simulator::random::Stream;
 
 /// The number of presses that are judged with the same references.
 pub(super) const GROUP: usize = 16;
-/// The share of the groups that have no references, of those whose sensor has some.
-const WITHOUT: f64 = 0.25;
+/// The share of the groups that have own presses, and their number.
+const OWN: f64 = 0.6;
+const LEAST_OWN: usize = 4;
+const MOST_OWN: usize = 16;
+/// The share of the groups whose own presses are of a lopsided mix of levels.
+const LOPSIDED: f64 = 0.5;
+/// The share of the groups that have neither rigid pieces nor labelled objects.
+const WITHOUT: f64 = 0.4;
 /// The shares of the others that have rigid pieces, each of the two forms, and labelled objects.
 const RIGID: f64 = 0.8;
 const FORM: f64 = 0.9;
 const LABELLED: f64 = 0.4;
 /// The most presses of each rigid piece, and of labelled objects.
 const MOST_RIGID: usize = 5;
-const MOST_LABELLED: usize = 8;
+const MOST_LABELLED: usize = 6;
 /// The share of the labelled objects whose Shore hardness is known, and not only the level.
 const MEASURED: f64 = 0.5;
+/// The share of the groups in which a rigid piece is judged too, if it is no reference.
+const JUDGED_RIGID: f64 = 0.3;
+
+/// The kinds of references that a group gets.
+#[derive(Debug, Clone, Copy)]
+struct Kinds {
+    own: bool,
+    rigid: bool,
+    labelled: bool,
+}
+
+impl Kinds {
+    fn draw(stream: &mut Stream) -> Self {
+        let own = stream.uniform() < OWN;
+        let has_pieces = stream.uniform() >= WITHOUT;
+        Self {
+            own,
+            rigid: has_pieces && stream.uniform() < RIGID,
+            labelled: has_pieces && stream.uniform() < LABELLED,
+        }
+    }
+
+    /// The kinds of a knowledge. Own presses and labelled objects come with rigid pieces in half of
+    /// the groups.
+    fn of(knowledge: Knowledge, stream: &mut Stream) -> Self {
+        let is_identified = stream.uniform() < 0.5;
+        let (own, rigid, labelled) = match knowledge {
+            Knowledge::None => (false, false, false),
+            Knowledge::Rigid => (false, true, false),
+            Knowledge::Own => (true, is_identified, false),
+            Knowledge::Labelled => (stream.uniform() < 0.5, is_identified, true),
+        };
+        Self {
+            own,
+            rigid,
+            labelled,
+        }
+    }
+}
 
 /// The presses of one sensor, as indices.
 #[derive(Debug, Default)]
@@ -35,15 +82,6 @@ struct Lot {
 /// The presses to learn from, by sensor.
 #[derive(Debug)]
 pub(super) struct Lots(Vec<Lot>);
-
-/// Presses of one sensor, and presses that serve as its references.
-#[derive(Debug, Clone, Default)]
-pub struct Drawn {
-    /// The presses to judge.
-    pub presses: Vec<Press>,
-    /// The references.
-    pub references: Vec<(Press, Piece)>,
-}
 
 impl Lots {
     /// Sorts the presses `train` by their sensors. Presses on rigid pieces count for these sensors,
@@ -67,6 +105,11 @@ impl Lots {
         Self(lots.into_values().collect())
     }
 
+    /// Whether a sensor has presses that may serve as references.
+    pub(super) fn have_references(&self) -> bool {
+        self.0.iter().any(Lot::is_identified)
+    }
+
     /// Numbers of lots, each as often as it has groups.
     pub(super) fn tickets(&self) -> Vec<usize> {
         let lots = self.0.iter().enumerate();
@@ -84,78 +127,155 @@ impl Lots {
         presses: &[Press],
         borders: &Borders,
         stream: &mut Stream,
-    ) -> Drawn {
+    ) -> Question {
         let lot = &self.0[lot];
         let mut order = lot.presses.clone();
-        let wanted = GROUP + MOST_LABELLED;
+        let wanted = GROUP + MOST_LABELLED + MOST_OWN;
         let drawn = shuffled(&mut order, wanted, stream);
         let (judged, others) = drawn.split_at(GROUP.min(drawn.len()));
-        let references = lot.references(others, presses, borders, stream);
-        Drawn {
-            presses: judged.iter().map(|&place| presses[place].clone()).collect(),
+        let others = without_objects_of(others, judged, presses);
+        let kinds = Kinds::draw(stream);
+        let references = lot.references(&others, kinds, presses, borders, stream);
+        let mut judged = judged.to_vec();
+        if stream.uniform() < JUDGED_RIGID {
+            judged.extend(lot.another_rigid(&references, stream));
+        }
+        Question {
+            presses: judged,
             references,
         }
     }
 
-    /// All presses of each lot in groups, the first half without references and the others with the
-    /// rigid pieces.
+    /// All presses of each lot in groups, with references as a knowledge of the sensor has them.
     pub(super) fn all(
         &self,
+        knowledge: Knowledge,
         presses: &[Press],
         borders: &Borders,
         stream: &mut Stream,
-    ) -> Vec<Drawn> {
-        let of_lot = |lot: &Lot| {
-            let groups = lot.presses.chunks(GROUP);
-            let drawn = groups.map(|group| Drawn {
-                presses: group.iter().map(|&place| presses[place].clone()).collect(),
-                references: lot.references(&[], presses, borders, stream),
-            });
-            drawn.collect::<Vec<_>>()
-        };
-        self.0.iter().flat_map(of_lot).collect()
+    ) -> Vec<Question> {
+        let mut questions = Vec::new();
+        for lot in &self.0 {
+            let mut order = lot.presses.clone();
+            for judged in lot.presses.chunks(GROUP) {
+                let others = shuffled(&mut order, lot.presses.len(), stream);
+                let others = without_objects_of(others, judged, presses);
+                let kinds = Kinds::of(knowledge, stream);
+                questions.push(Question {
+                    presses: judged.to_vec(),
+                    references: lot.references(&others, kinds, presses, borders, stream),
+                });
+            }
+        }
+        questions
     }
 }
 
+/// The presses `others` of objects that are not judged. A labelled press of an object that is judged
+/// would tell its label.
+fn without_objects_of(others: &[usize], judged: &[usize], presses: &[Press]) -> Vec<usize> {
+    let is_judged = |other: &usize| {
+        let mut objects = judged.iter().map(|&place| presses[place].object);
+        objects.any(|object| object == presses[*other].object)
+    };
+    let others = others.iter().copied();
+    others.filter(|other| !is_judged(other)).collect()
+}
+
 impl Lot {
-    /// Draws references. `others` are presses of objects that may serve as such.
+    /// Whether there are presses of rigid pieces. Only then do the numbers of sensors mean something.
+    fn is_identified(&self) -> bool {
+        self.rigid.iter().any(|form| !form.is_empty())
+    }
+
+    /// Draws references. `others` are presses of other objects than those judged.
     fn references(
         &self,
         others: &[usize],
+        kinds: Kinds,
         presses: &[Press],
         borders: &Borders,
         stream: &mut Stream,
-    ) -> Vec<(Press, Piece)> {
+    ) -> Vec<(usize, Piece)> {
         let mut references = Vec::new();
-        // The numbers of sensors mean something only where the data has rigid pieces.
-        let is_identified = self.rigid.iter().any(|form| !form.is_empty());
-        if !is_identified || stream.uniform() < WITHOUT {
+        if !self.is_identified() {
             return references;
         }
-        if stream.uniform() < RIGID {
+        if kinds.rigid {
             for form in &self.rigid {
                 if stream.uniform() < FORM {
                     let count = 1 + stream.below(MOST_RIGID);
                     for &place in shuffled(&mut form.clone(), count, stream) {
-                        let press = &presses[place];
-                        references.extend(press.piece.map(|piece| (press.clone(), piece)));
+                        references.extend(presses[place].piece.map(|piece| (place, piece)));
                     }
                 }
             }
         }
-        if !others.is_empty() && stream.uniform() < LABELLED {
-            let count = 1 + stream.below(others.len());
-            for &place in &others[..count] {
+        let mut others = others;
+        if kinds.labelled && !others.is_empty() {
+            let count = 1 + stream.below(MOST_LABELLED.min(others.len()));
+            let (labelled, rest) = others.split_at(count);
+            others = rest;
+            for &place in labelled {
                 let press = &presses[place];
                 let range = match press.shore {
                     Some(shore) if stream.uniform() < MEASURED => [shore; 2],
                     _ => borders.part(usize::from(press.level) - 1),
                 };
-                references.push((press.clone(), Piece::Shore { range }));
+                references.push((place, Piece::Shore { range }));
             }
+        }
+        if kinds.own {
+            let count = LEAST_OWN + stream.below(MOST_OWN - LEAST_OWN + 1);
+            let own = match stream.uniform() < LOPSIDED {
+                true => lopsided(others, count, presses, stream),
+                false => others.iter().copied().take(count).collect(),
+            };
+            references.extend(own.into_iter().map(|place| (place, Piece::UNKNOWN)));
         }
         references
     }
+
+    /// A press on a rigid piece that is none of these references.
+    fn another_rigid(&self, references: &[(usize, Piece)], stream: &mut Stream) -> Option<usize> {
+        let is_reference = |place: &usize| references.iter().any(|(other, _)| other == place);
+        let rigid = self.rigid.concat();
+        let rigid: Vec<usize> = rigid
+            .into_iter()
+            .filter(|place| !is_reference(place))
+            .collect();
+        (!rigid.is_empty()).then(|| rigid[stream.below(rigid.len())])
+    }
+}
+
+/// Up to `count` of `others`, in which one or two levels outweigh the rest.
+fn lopsided(others: &[usize], count: usize, presses: &[Press], stream: &mut Stream) -> Vec<usize> {
+    let mut of_level = BTreeMap::<u8, Vec<usize>>::new();
+    for &place in others {
+        of_level
+            .entry(presses[place].level)
+            .or_default()
+            .push(place);
+    }
+    // The cube of an exponential variate is at times far above its mean.
+    let mut weighed: Vec<(f64, Vec<usize>)> = of_level
+        .into_values()
+        .map(|places| ((-stream.uniform().max(1e-12).ln()).powi(3), places))
+        .collect();
+    let mut chosen = Vec::new();
+    while chosen.len() < count && !weighed.is_empty() {
+        let mut at = stream.uniform() * weighed.iter().map(|(weight, _)| weight).sum::<f64>();
+        let heavy = weighed.iter().position(|(weight, _)| {
+            at -= weight;
+            at <= 0.0
+        });
+        let level = heavy.unwrap_or(weighed.len() - 1);
+        chosen.extend(weighed[level].1.pop());
+        if weighed[level].1.is_empty() {
+            weighed.remove(level);
+        }
+    }
+    chosen
 }
 
 /// Draws up to `count` elements, each at most once, to the front.
@@ -166,4 +286,52 @@ fn shuffled<'a>(order: &'a mut [usize], count: usize, stream: &mut Stream) -> &'
         order.swap(place, other);
     }
     &order[..count]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::source::papers_levels;
+    use hardnessd_core::verdict::features::{Moment, frame_of};
+
+    #[test]
+    fn no_reference_is_a_press_of_an_object_that_is_judged() {
+        // Two presses of each of 20 objects, and two of a rigid piece.
+        let press = |number: u32, piece| Press {
+            moments: vec![Moment {
+                frame: frame_of(9.0, 5.0),
+                time_s: 0.0,
+                approach_mm: None,
+            }],
+            arm_n_per_mm: 0.0,
+            level: 2,
+            shore: Some(65.0),
+            object: Some(number / 2),
+            sensor: 0,
+            piece,
+        };
+        let mut presses: Vec<Press> = (0..40).map(|number| press(number, None)).collect();
+        let ball = Some(Piece::Ball { radius_mm: 10.0 });
+        presses.extend((40..42).map(|number| press(number, ball)));
+        let train: Vec<usize> = (0..40).collect();
+        let lots = Lots::of(&presses, &train);
+        let borders = Borders::of(&papers_levels()).unwrap();
+        let (mut labelled, mut own) = (0, 0);
+        for seed in 0..200 {
+            let mut stream = Stream::new(seed, "lots");
+            let drawn = lots.draw(0, &presses, &borders, &mut stream);
+            for &(place, piece) in &drawn.references {
+                let reference = &presses[place];
+                let is_same = |&judged: &usize| match reference.piece {
+                    Some(_) => judged == place,
+                    None => presses[judged].object == reference.object,
+                };
+                assert!(!drawn.presses.iter().any(is_same), "seed {seed}");
+                own += u32::from(piece.is_unknown());
+                labelled += u32::from(reference.piece.is_none() && !piece.is_unknown());
+            }
+        }
+        assert!(labelled > 100, "{labelled} labelled references");
+        assert!(own > 1000, "{own} own presses");
+    }
 }

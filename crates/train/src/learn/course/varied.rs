@@ -2,6 +2,7 @@
 //! trained on exact reports alone would trust every report.
 
 use super::Press;
+use crate::data::presses::Timed;
 use crate::settings::ArmReports;
 use hardnessd_core::verdict::{Extents, extents};
 use hardnessd_simulator::random::Stream;
@@ -10,6 +11,10 @@ use hardnessd_simulator::random::Stream;
 const LEAST_FRAMES: usize = 3;
 /// The slowest sensor sees one frame of this many.
 const MOST_FRAMES_A_STEP: usize = 8;
+/// A press takes this many times as long, at least and at most. The simulator presses in a second or two, and
+/// a robot may hold for half a minute. Simulated creep has times of all magnitudes alike, so a press that is
+/// drawn out is as likely as another.
+const STRETCH: (f64, f64) = (0.5, 16.0);
 /// This share of the training presses lies below a range of [`ArmReports::ranges`], and the same
 /// share above. The longest of a hundred thousand presses says little about training.
 const TAIL: f64 = 0.001;
@@ -22,6 +27,9 @@ impl ArmReports {
         let mut press = press.clone();
         if stream.uniform() < self.slower {
             press.slow_down(stream);
+        }
+        if self.stretched > 0.0 && stream.uniform() < self.stretched {
+            press.stretch(stream.range(STRETCH.0.ln(), STRETCH.1.ln()).exp());
         }
         if stream.uniform() < self.early && press.moments.len() > LEAST_FRAMES {
             let frames = LEAST_FRAMES + stream.below(press.moments.len() - LEAST_FRAMES);
@@ -63,7 +71,8 @@ impl ArmReports {
     /// The ranges of the training presses as training changes them: with the robot's errors, judged
     /// before the end, and as a slower sensor sees them. Of each number, one in a thousand presses
     /// lies below the range and one in a thousand above.
-    pub fn ranges<'a>(&self, presses: impl Iterator<Item = &'a Press> + Clone) -> Extents {
+    pub fn ranges(&self, presses: &[Timed]) -> Extents {
+        let presses = presses.iter();
         let whole = ranges_of(presses.clone().map(|press| press.extents(usize::MAX)));
         let early = presses.clone().map(|press| press.extents(LEAST_FRAMES));
         let slower = presses.map(|press| {
@@ -78,6 +87,14 @@ impl ArmReports {
         }
         if self.slower > 0.0 {
             ranges = joined(ranges, ranges_of(slower));
+        }
+        if self.stretched > 0.0 {
+            let (least, most) = (STRETCH.0 as f32, STRETCH.1 as f32);
+            let stretched = |[low, high]: [f32; 2]| [low * least, high * most];
+            let [duration, period, speed, ..] = &mut ranges;
+            *duration = duration.map(stretched);
+            *period = period.map(stretched);
+            *speed = speed.map(|[low, high]| [low / most, high / least]);
         }
         if self.unknown >= 1.0 {
             ranges[2..].fill(None);
@@ -124,14 +141,15 @@ fn joined(one: Extents, other: Extents) -> Extents {
     })
 }
 
-impl Press {
+impl Timed {
     /// The numbers of the press's first `frames` frames that `hrn.range` states.
     fn extents(&self, frames: usize) -> Extents {
-        let moments = self.moments.iter().take(frames);
-        let moments: Vec<_> = moments.map(|m| (m.time_s, m.approach_mm)).collect();
-        extents(&moments, self.arm_n_per_mm)
+        let frames = frames.min(self.moments.len());
+        extents(&self.moments[..frames], self.arm_n_per_mm)
     }
+}
 
+impl Press {
     /// Keeps every k-th frame, from a randomly chosen first one. The first frame kept becomes the
     /// press's begin, from which times and the approach count.
     fn slow_down(&mut self, stream: &mut Stream) {
@@ -149,6 +167,13 @@ impl Press {
             moment.time_s -= begin.time_s;
             let way = moment.approach_mm.zip(begin.approach_mm);
             moment.approach_mm = way.map(|(mm, first)| mm - first);
+        }
+    }
+
+    /// Makes everything take `factor` times as long.
+    fn stretch(&mut self, factor: f64) {
+        for moment in &mut self.moments {
+            moment.time_s *= factor as f32;
         }
     }
 
@@ -195,7 +220,7 @@ mod tests {
             arm_n_per_mm: 10.0,
             level: 1,
             shore: Some(80.0),
-            object: 0,
+            object: None,
             sensor: 0,
             piece: None,
         }
@@ -209,6 +234,7 @@ mod tests {
             exact: 0.0,
             early: 0.0,
             slower: 0.0,
+            stretched: 0.0,
             ..ArmReports::default()
         };
         let mut stream = Stream::new(1, "reports");
@@ -233,6 +259,7 @@ mod tests {
             exact: 1.0,
             early: 0.0,
             slower: 1.0,
+            stretched: 0.0,
             ..ArmReports::default()
         };
         let mut stream = Stream::new(3, "reports");
@@ -266,13 +293,15 @@ mod tests {
     }
 
     /// A press at `speed_mm_s` of ten frames, with this time between them.
-    fn pressed(speed_mm_s: f32, period_s: f32) -> Press {
-        let mut press = press();
-        for (place, moment) in (0_u8..).zip(&mut press.moments) {
-            moment.time_s = period_s * f32::from(place);
-            moment.approach_mm = Some(speed_mm_s * moment.time_s);
+    fn pressed(speed_mm_s: f32, period_s: f32) -> Timed {
+        let moment = |place: u8| {
+            let time_s = period_s * f32::from(place);
+            (time_s, Some(speed_mm_s * time_s))
+        };
+        Timed {
+            moments: (0..10).map(moment).collect(),
+            arm_n_per_mm: 10.0,
         }
-        press
     }
 
     const EXACT: ArmReports = ArmReports {
@@ -284,11 +313,12 @@ mod tests {
         clock_frames: 0.0,
         early: 0.0,
         slower: 0.0,
+        stretched: 0.0,
     };
 
     fn check_ranges(reports: &ArmReports, expected: [Option<[f32; 2]>; 5]) {
         let presses = [pressed(4.0, 0.1), pressed(8.0, 0.05)];
-        let found = reports.ranges(presses.iter());
+        let found = reports.ranges(&presses);
         for (found, expected) in found.into_iter().zip(expected) {
             let (Some(found), Some(expected)) = (found, expected) else {
                 assert_eq!(found, expected, "{reports:?}");
@@ -330,6 +360,21 @@ mod tests {
             wider([10.0; 2], 0.3),
         ];
         check_ranges(&early, varied);
+        let [_, _, _, way, arm] = exact;
+        let stretched = [
+            Some([0.225 * 0.99, 14.4 * 1.01]),
+            Some([0.025 * 0.99, 1.6 * 1.01]),
+            Some([0.25 * 0.99, 16.0 * 1.01]),
+            way,
+            arm,
+        ];
+        check_ranges(
+            &ArmReports {
+                stretched: 0.1,
+                ..EXACT
+            },
+            stretched,
+        );
         let unknown = [duration, period, None, None, None];
         check_ranges(
             &ArmReports {
@@ -344,17 +389,17 @@ mod tests {
             ..EXACT
         };
         check_ranges(&unknown_arm, [duration, period, speed, way, None]);
-        assert_eq!(EXACT.ranges([].iter()), [None; 5]);
+        assert_eq!(EXACT.ranges(&[]), [None; 5]);
     }
 
     #[test]
     fn one_press_of_many_is_no_range() {
-        let mut presses: Vec<Press> = (0..2000).map(|_| pressed(5.0, 0.1)).collect();
+        let mut presses: Vec<Timed> = (0..2000).map(|_| pressed(5.0, 0.1)).collect();
         presses[7] = pressed(5.0, 10.0);
-        let [duration, ..] = EXACT.ranges(presses.iter());
+        let [duration, ..] = EXACT.ranges(&presses);
         assert!(duration.unwrap()[1] < 1.0, "{duration:?}");
         // Of a thousand presses, one is more than the tail.
-        let [duration, ..] = EXACT.ranges(presses[..999].iter());
+        let [duration, ..] = EXACT.ranges(&presses[..999]);
         assert!(duration.unwrap()[1] > 90.0, "{duration:?}");
     }
 }

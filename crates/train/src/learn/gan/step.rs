@@ -19,8 +19,6 @@ pub struct Rules {
     pub game: Game,
     /// Lambda of Eq. (7).
     pub sigma_penalty: f64,
-    /// The gradient penalty on real images, if there is one.
-    pub gradient_penalty: Option<GradientPenalty>,
     /// Learning rate.
     pub rate: f64,
     /// The sensor applied to generated images before the discriminator judges them. `None` applies
@@ -28,40 +26,9 @@ pub struct Rules {
     pub sensing: Option<(Sensor, PixelScale)>,
 }
 
-/// The penalty R1: gamma / 2 times the mean square of the gradient of the discriminator's logits
-/// with respect to a real image (Mescheder et al. 2018, Eq. (9)).
-///
-/// The logits' slope along a standard normal direction has this square as its mean. A difference
-/// over a small step along such a direction stands for the slope, because a gradient of gradients
-/// would be needed otherwise (Lin et al. 2025, "Diffusion adversarial post-training", Eq. (5)).
-#[derive(Debug, Clone)]
-pub struct GradientPenalty {
-    /// The factor gamma.
-    pub gamma: f64,
-    /// A standard normal direction for each real image, `[batch, 1, 28, 28]`.
-    pub directions: Tensor<4>,
-}
-
-/// The step along a direction of [`GradientPenalty`], in an image's units: -1 is no force.
-const SLOPE_STEP: f64 = 0.01;
-
-impl GradientPenalty {
-    pub(super) fn loss(
-        &self,
-        discriminator: &Weights,
-        real: &Tensor<4>,
-        logits: Tensor<2>,
-    ) -> Tensor<1> {
-        let moved = real.clone() + self.directions.clone().mul_scalar(SLOPE_STEP);
-        let slopes = (judge(discriminator, moved).logits - logits).div_scalar(SLOPE_STEP);
-        let squares = slopes.powi_scalar(2).sum_dim(1).mean();
-        squares.mul_scalar(self.gamma / 2.0)
-    }
-}
-
 /// The discriminator's inputs in a step, besides generated images.
 #[derive(Debug)]
-pub struct Batch {
+pub struct Images {
     /// Real images `[batch, 1, 28, 28]`.
     pub real: Tensor<4>,
     /// Labelled images `[batch, 1, 28, 28]` and their targets `[batch, L]`.
@@ -72,7 +39,7 @@ pub struct Batch {
 pub fn step(
     generator: &mut Learner,
     discriminator: &mut Learner,
-    batch: &Batch,
+    batch: &Images,
     eta: Tensor<2>,
     rules: &Rules,
 ) -> (f64, f64) {
@@ -110,14 +77,13 @@ impl Generated {
 /// The tracked weights of the discriminator and its loss. Generated images are constants here.
 fn discrimination(
     discriminator: &Learner,
-    batch: &Batch,
+    batch: &Images,
     generated: &Generated,
     rules: &Rules,
 ) -> (Weights, Tensor<1>) {
     let tracked = discriminator.weights.tracked();
     let images = generated.images.clone().inner();
-    let penalty = rules.gradient_penalty.as_ref();
-    let loss = discriminator_loss(rules.game, &tracked, batch, images, penalty);
+    let loss = discriminator_loss(rules.game, &tracked, batch, images);
     (tracked, loss)
 }
 
@@ -146,9 +112,8 @@ pub(super) fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
 pub(super) fn discriminator_loss(
     game: Game,
     discriminator: &Weights,
-    batch: &Batch,
+    batch: &Images,
     generated: Tensor<4>,
-    penalty: Option<&GradientPenalty>,
 ) -> Tensor<1> {
     let labelled = batch.labelled.as_ref().map(|(images, targets)| {
         let judged = judge(discriminator, images.clone());
@@ -156,20 +121,14 @@ pub(super) fn discriminator_loss(
     });
     let real = judge(discriminator, batch.real.clone());
     let generated = judge(discriminator, generated);
-    let penalty =
-        penalty.map(|penalty| penalty.loss(discriminator, &batch.real, real.logits.clone()));
-    let loss = losses::discriminator(game, real, generated, labelled);
-    match penalty {
-        Some(penalty) => loss + penalty,
-        None => loss,
-    }
+    losses::discriminator(game, real, generated, labelled)
 }
 
 /// The generator's loss without [`penalty`].
 pub(super) fn generator_loss(
     game: Game,
     discriminator: &Weights,
-    batch: &Batch,
+    batch: &Images,
     generated: Tensor<4>,
 ) -> Tensor<1> {
     let generated = judge(discriminator, generated);

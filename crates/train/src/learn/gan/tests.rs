@@ -1,6 +1,6 @@
-//! Compares gradients of a whole step with finite differences, and checks how a stage starts.
+//! Compares gradients of a whole step with finite differences.
 
-use super::step::{discriminator_loss, generator_loss, judge, penalty};
+use super::step::{discriminator_loss, generator_loss, penalty};
 use super::*;
 use crate::net::network::{Normalisation, numbers};
 use burn::tensor::{DType, FloatDType, Tensor, TensorData};
@@ -35,8 +35,8 @@ fn doubles<const D: usize>(tensor: &Tensor<D>) -> Vec<f64> {
 /// One step's inputs, with weights as after some training, because the initial weights are so small
 /// that hardly anything reaches the logits.
 struct Case {
-    gan: Gan,
-    batch: Batch,
+    gan: [Weights; 2],
+    batch: Images,
     eta: Tensor<2>,
 }
 
@@ -52,7 +52,7 @@ fn case(game: Game) -> Case {
     let images = random([5, 1, ROWS, COLS]);
     let targets = hrn::targets([1, 2, 3, 4, 2].into_iter(), LEVELS, &device());
     let mut gan = initial(game, LEVELS, 3, &device());
-    for weights in [&mut gan.generator, &mut gan.discriminator] {
+    for weights in &mut gan {
         for (weight, number) in weights.entries.iter_mut().zip(0..) {
             let mut stream = Stream::new(9, &weight.name).child(number);
             let noise: Vec<f32> = (0..weight.dims.iter().product())
@@ -65,7 +65,7 @@ fn case(game: Game) -> Case {
     }
     Case {
         gan,
-        batch: Batch {
+        batch: Images {
             real,
             labelled: (game != Game::RealOrFake).then_some((images, targets)),
         },
@@ -76,11 +76,8 @@ fn case(game: Game) -> Case {
 impl Case {
     fn in_double(&self) -> Self {
         Self {
-            gan: Gan {
-                generator: in_double(&self.gan.generator),
-                discriminator: in_double(&self.gan.discriminator),
-            },
-            batch: Batch {
+            gan: self.gan.each_ref().map(in_double),
+            batch: Images {
                 real: double(&self.batch.real),
                 labelled: self
                     .batch
@@ -93,18 +90,13 @@ impl Case {
     }
 
     fn discriminator_loss(&self, game: Game, discriminator: &Weights) -> Tensor<1> {
-        let images = generator::images(
-            &self.gan.generator,
-            self.eta.clone(),
-            &mut Normalisation::Batch,
-        );
-        discriminator_loss(game, discriminator, &self.batch, images, None)
+        let images = generator::images(&self.gan[0], self.eta.clone(), &mut Normalisation::Batch);
+        discriminator_loss(game, discriminator, &self.batch, images)
     }
 
     fn generator_loss(&self, game: Game, generator: &Weights) -> Tensor<1> {
         let images = generator::images(generator, self.eta.clone(), &mut Normalisation::Batch);
-        generator_loss(game, &self.gan.discriminator, &self.batch, images)
-            .add(penalty(generator, 0.1))
+        generator_loss(game, &self.gan[1], &self.batch, images).add(penalty(generator, 0.1))
     }
 }
 
@@ -167,92 +159,14 @@ fn gradients_of_a_whole_step_agree_with_finite_differences() {
         let case = case(game);
         let exact = case.in_double();
         check(
-            &case.gan.discriminator,
+            &case.gan[1],
             |weights| case.discriminator_loss(game, weights),
             |weights| exact.discriminator_loss(game, weights),
         );
         check(
-            &case.gan.generator,
+            &case.gan[0],
             |weights| case.generator_loss(game, weights),
             |weights| exact.generator_loss(game, weights),
         );
     }
-}
-
-#[test]
-fn a_new_stage_starts_from_the_given_weights_with_fresh_moments() {
-    let gan = initial(Game::RealOrFake, LEVELS, 5, &device());
-    let state = State::fresh(gan.clone(), &GanSettings::default(), Sensor::of(&[]));
-    let checkpoint = state.checkpoint("");
-    assert_eq!(checkpoint.progress, Progress::default());
-    for (side, weights) in SIDES.iter().zip([gan.generator, gan.discriminator]) {
-        for given in &weights.entries {
-            let stored = |list: &str| {
-                let list = checkpoint.list(&format!("{side}{list}")).unwrap();
-                list.numbers(&given.name)
-            };
-            assert_eq!(stored("weights"), numbers(&given.values));
-            for moments in ["mean", "square"] {
-                assert!(stored(moments).iter().all(|moment| *moment == 0.0));
-            }
-        }
-    }
-}
-
-#[test]
-fn the_gradient_penalty_is_half_gamma_times_the_square_of_the_gradient() {
-    let case = case(Game::RealOrFake);
-    let (weights, real) = (&case.gan.discriminator, case.batch.real.clone());
-    let samples = real.dims()[0];
-    // The batch is normalised together, so a logit has a gradient with respect to all images.
-    let squares = (0..samples).map(|sample| {
-        let images = real.clone().autodiff().require_grad();
-        let logits = judge(&weights.tracked(), images.clone()).logits;
-        let gradients = logits.narrow(0, sample, 1).sum().backward();
-        numbers(&images.grad(&gradients).unwrap().powi_scalar(2).sum())[0]
-    });
-    let exact = squares.sum::<f32>() / samples as f32;
-
-    let mut stream = Stream::new(4, "directions");
-    let mut penalty = || {
-        let normal: Vec<f32> = (0..real.dims().iter().product())
-            .map(|_| stream.normal() as f32)
-            .collect();
-        let penalty = GradientPenalty {
-            gamma: 3.0,
-            directions: Tensor::from_data(TensorData::new(normal, real.dims()), &device()),
-        };
-        numbers(&penalty.loss(weights, &real, judge(weights, real.clone()).logits))[0]
-    };
-    let mean = (0..400).map(|_| penalty()).sum::<f32>() / 400.0;
-    let expected = 1.5 * exact;
-    assert!(
-        (mean - expected).abs() < 0.15 * expected,
-        "{mean}, not {expected}"
-    );
-}
-
-#[test]
-fn the_nearest_generator_is_kept_through_a_checkpoint() {
-    let settings = GanSettings {
-        keep: Keep::Best,
-        ..GanSettings::default()
-    };
-    let near = initial(Game::RealOrFake, LEVELS, 1, &device());
-    let far = initial(Game::RealOrFake, LEVELS, 2, &device());
-    let first = numbers(&near.generator.entries[0].values);
-    let sensor = Sensor::of(&[]);
-    let mut state = State::fresh(near, &settings, sensor);
-    let fresh = state.checkpoint("").lists;
-    let keep = |state: &mut State, distance| {
-        let generator = state.generator.evaluated();
-        state.keep(distance, generator, settings.keep);
-    };
-    keep(&mut state, 0.5);
-    state.generator.weights = far.generator;
-    keep(&mut state, 0.7);
-    let checkpoint = state.checkpoint("");
-    checkpoint.check_like(&fresh).unwrap();
-    let resumed = State::resumed(&checkpoint, &settings, sensor).unwrap();
-    assert_eq!(numbers(&resumed.kept().generator.entries[0].values), first);
 }

@@ -1,24 +1,29 @@
 //! The network of courses as ONNX nodes: from the inputs of format 3 to bins of Shore hardness, and to a
 //! press's embedding as a reference.
 
-use super::references::{self, EMBEDDING};
+use super::references::{self, BESIDE, EMBEDDING};
 use super::{JOINT, REFERENCES};
 use crate::net::builder::Builder;
-use crate::net::graph::{Graph, integer};
+use crate::net::graph::{Graph, Inputs, integer};
 use crate::net::network::Weights;
 use crate::net::standard::Standard;
 use hardnessd_core::verdict::PIECE;
-use hardnessd_core::verdict::features::FEATURES;
 
 /// The graph from the inputs of format 3 to the logits of the bins, before temperature, and their
-/// name. The press's embedding as a reference is in `reference`.
-pub fn graph(weights: &Weights, standard: &Standard) -> (Graph, String) {
+/// name. The press's embedding as a reference is in `reference`, if the model takes references.
+pub fn graph(weights: &Weights, standard: &Standard, inputs: Inputs) -> (Graph, String) {
     let mut b = Builder(Graph::default());
-    let rows = b.reshaped("features", &[FEATURES, 1], "features in rows");
-    let rows = standard.nodes(&mut b, &rows);
-    let features = b.reshaped(&rows, &[1, FEATURES], "features on one scale");
-    b.embedding(weights, &features);
-    let beside = b.beside(weights, &features);
+    let features = standard.scaled(&mut b, "features");
+    let beside = match inputs {
+        Inputs::References => {
+            b.embedding(weights, &features);
+            b.beside(weights, &features)
+        }
+        // What the network gets without any reference.
+        Inputs::Frame | Inputs::Parts(_) | Inputs::Features => {
+            b.0.constant("beside", &[1, BESIDE], &[0.0; BESIDE])
+        }
+    };
     let along = vec![integer("axis", 1)];
     let mut x = b.with(
         "Concat",

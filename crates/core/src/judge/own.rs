@@ -1,0 +1,202 @@
+//! The last presses of a sensor, of objects of which nobody said anything, as references of the sensor.
+//!
+//! In: presses that ended, each with what the model estimates without them. Out: [`References`] of
+//! Shore 0 to 100. They show the model what this sensor reads of everyday objects, so they help only
+//! where the objects differ.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::sensor::Sensor;
+use crate::verdict::{Course, Hrn, ModelError, Piece, ReferencePress, References};
+
+/// The fewest presses that are used.
+const LEAST: usize = 6;
+/// The least standard deviation of their estimated Shore hardness with which they are used. Presses of
+/// objects that are all alike make verdicts worse.
+const LEAST_SPREAD: f32 = 12.0;
+/// At most so many presses in a row are kept of one object.
+const MOST_IN_A_ROW: u32 = 2;
+/// Without names, presses are of one object if they follow each other within this time and lie no
+/// further apart.
+const SAME_WITHIN: Duration = Duration::from_secs(1);
+const SAME_WITHIN_MM: f64 = 7.0;
+
+/// The own presses of a sensor.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct OwnPresses {
+    /// SHA-256 of the model that computed them.
+    model: String,
+    /// The last press comes last.
+    presses: Vec<OwnPress>,
+    /// The press before, kept or not.
+    last: Option<PressedAt>,
+}
+
+/// A press as the model takes it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct OwnPress {
+    reference: References,
+    /// The estimated Shore hardness, without own presses.
+    shore: f32,
+}
+
+/// When and where a press was.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct PressedAt {
+    /// The name of its object.
+    object: Option<String>,
+    /// When it began and ended, by CLOCK_MONOTONIC.
+    times: [Duration; 2],
+    /// The centre of its best frame, in mm from the first taxel.
+    centre_mm: [f64; 2],
+    /// How many presses of its object it makes in a row.
+    pub(super) in_a_row: u32,
+}
+
+impl OwnPresses {
+    /// When and where the next press is.
+    pub(super) fn next(
+        &self,
+        object: Option<String>,
+        times: [Duration; 2],
+        centre_mm: [f64; 2],
+    ) -> PressedAt {
+        let is_same = |before: &PressedAt| match (&before.object, &object) {
+            (Some(before), Some(now)) => before == now,
+            (None, None) => {
+                let [rows, cols] = [0, 1].map(|k| centre_mm[k] - before.centre_mm[k]);
+                times[0].saturating_sub(before.times[1]) <= SAME_WITHIN
+                    && rows.hypot(cols) <= SAME_WITHIN_MM
+            }
+            _ => false,
+        };
+        let before = self.last.as_ref().filter(|before| is_same(before));
+        let in_a_row = before.map_or(1, |before| before.in_a_row.saturating_add(1));
+        PressedAt {
+            object,
+            times,
+            centre_mm,
+            in_a_row,
+        }
+    }
+
+    /// The references of presses of objects that are all different, if they may be used.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Hrn::judge`].
+    pub fn references_of(
+        hrn: &Hrn,
+        courses: &[Course],
+        most: usize,
+    ) -> Result<References, ModelError> {
+        let mut own = Self::default();
+        for course in courses {
+            own.keep(hrn, course, most)?;
+        }
+        Ok(own.references(hrn))
+    }
+
+    /// Remembers a press that ended, and keeps it if it says something new. At most `most` are kept.
+    pub(super) fn add(
+        &mut self,
+        press: PressedAt,
+        hrn: &Hrn,
+        course: &Course,
+        most: usize,
+    ) -> Result<(), ModelError> {
+        let is_new = press.in_a_row <= MOST_IN_A_ROW;
+        self.last = Some(press);
+        match is_new {
+            true => self.keep(hrn, course, most),
+            false => Ok(()),
+        }
+    }
+
+    fn keep(&mut self, hrn: &Hrn, course: &Course, most: usize) -> Result<(), ModelError> {
+        let most = most.min(hrn.most_references());
+        if most == 0 {
+            return Ok(());
+        }
+        let Some(shore) = hrn.judge_course(course)?.shore else {
+            return Ok(());
+        };
+        let reference = hrn.references(&[ReferencePress {
+            course: course.clone(),
+            piece: Piece::UNKNOWN,
+        }])?;
+        let room = most - 1;
+        if self.model != hrn.sha256() {
+            self.presses.clear();
+            self.model = hrn.sha256().to_owned();
+        }
+        self.presses
+            .drain(..self.presses.len().saturating_sub(room));
+        let shore = shore.value;
+        self.presses.push(OwnPress { reference, shore });
+        Ok(())
+    }
+
+    /// The presses as references, if they may be used.
+    pub(super) fn references(&self, hrn: &Hrn) -> References {
+        if self.presses.len() < LEAST || self.spread() < LEAST_SPREAD {
+            return References::NONE;
+        }
+        let most = hrn.most_references();
+        let presses = self.presses.iter();
+        presses.fold(References::NONE, |all, press| {
+            all.and(&press.reference, most)
+        })
+    }
+
+    /// The standard deviation of the estimated Shore hardness.
+    fn spread(&self) -> f32 {
+        let count = self.presses.len() as f32;
+        let mean = self.presses.iter().map(|press| press.shore).sum::<f32>() / count;
+        let squares = self
+            .presses
+            .iter()
+            .map(|press| (press.shore - mean).powi(2));
+        (squares.sum::<f32>() / count).sqrt()
+    }
+
+    /// The number of presses.
+    pub fn count(&self) -> usize {
+        self.presses.len()
+    }
+
+    /// The presses, if this model computed them. A recording or a file may hold anything.
+    pub(super) fn of_model(self, hrn: &Hrn) -> Self {
+        let is_one = |press: &OwnPress| {
+            press.shore.is_finite() && hrn.takes(&press.reference) && press.reference.is_one()
+        };
+        let is_usable = self.model == hrn.sha256()
+            && self.presses.len() <= hrn.most_references()
+            && self.presses.iter().all(is_one);
+        if is_usable { self } else { Self::default() }
+    }
+
+    /// The presses without where and when the last one was, which another start cannot compare with.
+    #[must_use]
+    pub fn for_another_start(mut self) -> Self {
+        self.last = None;
+        self
+    }
+}
+
+/// What own presses belong to: the model that computed them, and the array, its calibration and its arm.
+pub fn owner(sensor: &Sensor, hrn: &Hrn) -> String {
+    let described = sensor.description();
+    let of = (
+        hrn.sha256(),
+        hrn.known_references(),
+        sensor.layout().array(),
+        &described.sensor.calibration,
+        &described.sensor.arm,
+    );
+    let text = serde_json::to_vec(&of).expect("numbers and strings always serialise");
+    hex::encode(Sha256::digest(text))
+}

@@ -1,0 +1,110 @@
+//! A sensor that sends too much, and one whose press never ends.
+
+use super::*;
+
+fn status(events: &[Event]) -> Option<&Status> {
+    events.iter().rev().find_map(|event| match event {
+        Event::Status(status) => Some(status),
+        _ => None,
+    })
+}
+
+#[test]
+fn frames_above_twice_the_rate_are_dropped_counted_and_said_once() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let frame = bytes(&pipeline, &raw(0, 0));
+    let mut events = pipeline.opened(at(0));
+    // 100 frames/s of a sensor of 5.
+    for ms in (0..60_000).step_by(10) {
+        events.extend(pipeline.push(&frame, at(ms)));
+    }
+    assert_eq!(
+        words(&events),
+        ["Live", "Live (frames above 10 Hz are dropped)"]
+    );
+    let taken = events.len() as u64 - 2;
+    let status = pipeline.status(at(60_000));
+    assert_eq!(
+        (status.frames, status.frames_dropped),
+        (taken, 6_000 - taken)
+    );
+    assert!((645..655).contains(&taken), "{taken}");
+    // The measured rate is that of the sensor.
+    assert!(
+        (status.frame_rate_hz.unwrap() - 100.0).abs() < 1.0,
+        "{status:?}"
+    );
+    // The numbers of the frames have no gap.
+    let numbers: Vec<u64> = events
+        .iter()
+        .filter_map(|event| match event {
+            Event::Frame(frame) => Some(frame.frame),
+            _ => None,
+        })
+        .collect();
+    assert!(numbers.iter().copied().eq(0..taken));
+    // At its rate, nothing is dropped any more, and ten seconds later that is said.
+    let mut events = Vec::new();
+    for ms in (60_000..80_000).step_by(200) {
+        events.extend(pipeline.push(&frame, at(ms)));
+    }
+    assert_eq!(words(&events), ["Live"]);
+    assert_eq!(pipeline.status(at(80_000)).frames, taken + 100);
+}
+
+#[test]
+fn a_recording_that_begins_in_a_flood_goes_on_as_the_sensor_did() {
+    let mut first = pipeline(Preset::Jx255n);
+    let frame = bytes(&first, &raw(0, 0));
+    for ms in (0..10_000).step_by(10) {
+        first.push(&frame, at(ms));
+    }
+    let state = serde_json::to_string(&first.at_rest().unwrap()).unwrap();
+    let state = serde_json::from_str(&state).unwrap();
+    let mut second = Pipeline::resumed(first.sensor().clone(), test_support::hrn(), state);
+    for ms in (10_000..20_000).step_by(10) {
+        let events = first.push(&frame, at(ms));
+        assert_eq!(second.push(&frame, at(ms)), events);
+    }
+    assert_eq!(second.status(at(0)), first.status(at(0)));
+}
+
+#[test]
+fn bytes_that_are_not_read_are_counted_and_end_the_frame_before_them() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let frame = bytes(&pipeline, &raw(0, 0));
+    pipeline.push(&frame, at(0));
+    pipeline.push(&frame[..100], at(200));
+    pipeline.take(Input::Skipped(1_000), at(300)).unwrap();
+    // The rest of a frame is no frame.
+    pipeline.push(&frame[100..], at(400));
+    pipeline.push(&frame, at(600));
+    let status = pipeline.status(at(600));
+    let skipped = 1_000 + frame.len() as u64;
+    assert_eq!((status.frames, status.bytes_skipped), (2, skipped));
+    assert_eq!(pipeline.decoder.received(), 3 * frame.len() as u64 + 1_000);
+}
+
+#[test]
+fn a_press_that_is_not_released_is_said_with_its_taxels() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut stuck = RawFrame::default();
+    stuck.counts[28..56].fill(255.0);
+    let events = feed(&mut pipeline, 5, &vec![stuck; 160]);
+    let reason = "Live (not released for 30 s)";
+    assert!(
+        words(&events).contains(&reason.to_owned()),
+        "{:?}",
+        words(&events)
+    );
+    let status = status(&events).unwrap();
+    assert_eq!(
+        status.detail.as_deref(),
+        Some(
+            "taxels [1, 0], [1, 1], [1, 2], [1, 3] and 24 more: if nothing touches them, take a tare, \
+             or put them into dead_taxels"
+        )
+    );
+    assert_eq!(play(&mut pipeline, 165, &vec![raw(0, 0); 3]), ["Live"]);
+}

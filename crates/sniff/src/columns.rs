@@ -1,0 +1,400 @@
+//! Says what each byte of a frame is, as far as its own values show it.
+//!
+//! In: frames of one length. Out: a [`Kind`] for each byte, and the numbers that grow.
+
+use crate::model::{self, Near};
+use crate::period::Frames;
+use crate::pictures::some;
+
+/// What a byte of a frame does over the frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// It has one value, also while something presses.
+    Constant(u8),
+    /// It is a part of a number that grows steadily.
+    Number,
+    /// It changes as much in frames that hardly change as in others, as a checksum does.
+    Restless,
+    /// It changes in another way, as a taxel does.
+    Active,
+}
+
+/// A number that grows steadily: a counter or a clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Number {
+    pub(crate) at: usize,
+    /// Without high bytes that never change.
+    pub(crate) bytes: usize,
+    /// Whether the high byte is first. `None` for one byte.
+    pub(crate) is_big_endian: Option<bool>,
+    /// By how much it grows in a frame.
+    pub(crate) step: u64,
+    /// Whether it has begun again at 0. Then it has no higher bytes.
+    pub(crate) wraps: bool,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Columns {
+    pub(crate) kinds: Vec<Kind>,
+    /// The most frequent value of each byte.
+    pub(crate) rest: Vec<u8>,
+    pub(crate) numbers: Vec<Number>,
+    /// Its bytes as cells that never change, for cells of 1, 2 and 4 bytes.
+    pub(crate) resting: [Resting; 3],
+}
+
+/// The bits of each byte as a cell that never changes. 0 for bytes that change.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Resting {
+    pub(crate) bits: Vec<f64>,
+    pub(crate) total: f64,
+}
+
+/// Two frames that follow each other.
+type Pair<'a> = (&'a [u8], &'a [u8]);
+
+/// The share of frames in which damage may change a constant byte.
+const DAMAGED_SHARE: f64 = 0.05;
+/// The most bytes that count as restless. If there are more, they are noisy taxels.
+const MOST_RESTLESS: usize = 10;
+/// The mean difference of two random bytes is 64, counted the shorter way around.
+const RESTLESS_DIFFERENCE: f64 = 42.0;
+/// The bytes that a constant one is compared with: how many, how far away, and how long a mark is at most.
+const NEAR: usize = 64;
+const FARTHEST: usize = 4096;
+const MARK_BYTES: usize = 12;
+/// The most quiet frames that are looked at.
+const QUIET: usize = 100;
+/// The longest number.
+const MOST_NUMBER_BYTES: usize = 8;
+
+impl Kind {
+    pub(crate) fn constant(self) -> Option<u8> {
+        match self {
+            Kind::Constant(value) => Some(value),
+            _ => None,
+        }
+    }
+}
+
+impl Columns {
+    pub(crate) fn new(frames: &Frames) -> Self {
+        let period = frames.period();
+        let mut counts = vec![[0_u32; 256]; period];
+        for frame in frames.iter() {
+            for (count, &byte) in counts.iter_mut().zip(frame) {
+                count[usize::from(byte)] += 1;
+            }
+        }
+        let most = |count: &[u32; 256]| (0..=u8::MAX).max_by_key(|&byte| count[usize::from(byte)]);
+        let rest: Vec<u8> = counts.iter().filter_map(most).collect();
+        let others =
+            |(count, &rest): (&[u32; 256], &u8)| frames.len() as u32 - count[usize::from(rest)];
+        let changes: Vec<u32> = counts.iter().zip(&rest).map(others).collect();
+        let pairs: Vec<Pair> = frames
+            .pairs()
+            .map(|(a, b)| (frames.get(a), frames.get(b)))
+            .collect();
+        let kinds = (0..period).map(|at| {
+            let value = rest[at];
+            // Damage changes a byte in one frame, a press in several.
+            let held = pairs
+                .iter()
+                .filter(|(a, b)| a[at] != value && b[at] != value)
+                .count();
+            if held < 2 && f64::from(changes[at]) <= (DAMAGED_SHARE * frames.len() as f64).max(1.0)
+            {
+                Kind::Constant(value)
+            } else {
+                Kind::Active
+            }
+        });
+        let mut columns = Self {
+            kinds: kinds.collect(),
+            rest,
+            numbers: Vec::new(),
+            resting: Default::default(),
+        };
+        columns.find_numbers(&pairs);
+        columns.find_restless(&pairs);
+        columns.find_resting(frames);
+        columns
+    }
+
+    /// Finds the numbers. Where two of them overlap, the one that has grown from the fewest bytes is
+    /// right, and then the longest: the other order of some bytes often grows as steadily.
+    fn find_numbers(&mut self, pairs: &[Pair]) {
+        for bytes in [1, 2, 4] {
+            let places = 0..self.kinds.len();
+            let both = places.flat_map(|at| [(at, false), (at, true)]);
+            let mut found: Vec<(Number, usize)> = both
+                .filter_map(|(at, is_big_endian)| self.number(at, bytes, is_big_endian, pairs))
+                .collect();
+            found.sort_by_key(|(number, steady)| std::cmp::Reverse((number.bytes, *steady)));
+            for (number, _) in found {
+                let kinds = &mut self.kinds[number.at..number.at + number.bytes];
+                if !kinds.contains(&Kind::Number) {
+                    kinds.fill(Kind::Number);
+                    self.numbers.push(number);
+                }
+            }
+        }
+    }
+
+    /// The number at `at`, if these bytes are free and grow steadily, and how many pairs have about its
+    /// step.
+    fn number(
+        &self,
+        at: usize,
+        bytes: usize,
+        is_big_endian: bool,
+        pairs: &[Pair],
+    ) -> Option<(Number, usize)> {
+        let kinds = self.kinds.get(at..at + bytes)?;
+        // The lowest byte changes in any case.
+        let lowest = if is_big_endian { bytes - 1 } else { 0 };
+        if kinds.contains(&Kind::Number) || kinds[lowest] != Kind::Active {
+            return None;
+        }
+        let (step, mut steady) = steady_step(pairs, at, bytes, is_big_endian)?;
+        let mut number = Number {
+            at,
+            bytes,
+            is_big_endian: (bytes > 1).then_some(is_big_endian),
+            step,
+            wraps: false,
+        };
+        // A higher byte belongs to it if the longer number is as steady.
+        while number.bytes < MOST_NUMBER_BYTES {
+            let longer = [(false, number.at), (true, number.at.wrapping_sub(1))]
+                .into_iter()
+                .find_map(|(is_big_endian, at)| {
+                    let higher = if is_big_endian { at } else { at + number.bytes };
+                    if number.is_big_endian == Some(!is_big_endian)
+                        || self.kinds.get(higher) != Some(&Kind::Active)
+                    {
+                        return None;
+                    }
+                    let bytes = number.bytes + 1;
+                    let (step, more) = steady_step(pairs, at, bytes, is_big_endian)?;
+                    let longer = Number {
+                        at,
+                        bytes,
+                        is_big_endian: Some(is_big_endian),
+                        step,
+                        wraps: false,
+                    };
+                    (more >= steady).then_some((longer, more))
+                });
+            match longer {
+                Some(longer) => (number, steady) = longer,
+                None => break,
+            }
+        }
+        let bytes = number.at..number.at + number.bytes;
+        let value =
+            |frame: &[u8]| self::number(&frame[bytes.clone()], number.is_big_endian == Some(true));
+        // Damage may make it smaller too, but not by a step.
+        let mask = u64::MAX >> (64 - 8 * number.bytes);
+        number.wraps = pairs.iter().any(|(a, b)| {
+            let (before, after) = (value(a), value(b));
+            after < before && after.wrapping_sub(before) & mask <= 2 * number.step
+        });
+        Some((number, steady))
+    }
+
+    /// Whether a constant byte may be a high one of a number, which is 0 as long as the number is small.
+    pub(crate) fn is_high_byte(&self, at: usize) -> bool {
+        self.numbers.iter().any(|number| {
+            !number.wraps && self.is_high_byte_of(at, number.at, number.bytes, number.is_big_endian)
+        })
+    }
+
+    /// Whether a constant byte may be a high one of the number at `number`, of which `bytes` change.
+    pub(crate) fn is_high_byte_of(
+        &self,
+        at: usize,
+        number: usize,
+        bytes: usize,
+        is_big_endian: Option<bool>,
+    ) -> bool {
+        let period = self.kinds.len();
+        // How many zeros are between them, on the side of the high bytes.
+        let after = (at + 2 * period - number - bytes) % period;
+        let before = (number + 2 * period - at - 1) % period;
+        let are_zeros = |zeros: usize, from: usize| {
+            bytes + zeros < 4
+                && (0..=zeros).all(|by| self.kinds[(from + by) % period] == Kind::Constant(0))
+        };
+        is_big_endian != Some(true) && are_zeros(after, number + bytes)
+            || is_big_endian != Some(false) && are_zeros(before, at)
+    }
+
+    /// Whether a frame has all constant bytes, as one without damage has.
+    pub(crate) fn is_whole(&self, frame: &[u8]) -> bool {
+        self.kinds
+            .iter()
+            .zip(frame)
+            .all(|(kind, &byte)| kind.constant().is_none_or(|constant| constant == byte))
+    }
+
+    /// How much the taxels of two frames differ.
+    pub(crate) fn change(&self, a: &[u8], b: &[u8]) -> u32 {
+        let active = self.kinds.iter().zip(a.iter().zip(b));
+        let changes = active.filter(|(kind, _)| **kind == Kind::Active);
+        changes
+            .map(|(_, (a, b))| u32::from(a.abs_diff(*b).min(32)))
+            .sum()
+    }
+
+    fn find_restless(&mut self, pairs: &[Pair]) {
+        let active: Vec<usize> = (0..self.kinds.len())
+            .filter(|&at| self.kinds[at] == Kind::Active)
+            .collect();
+        let mut changed: Vec<(u32, Pair)> = pairs
+            .iter()
+            .map(|pair| (self.change(pair.0, pair.1), *pair))
+            .filter(|(change, _)| *change > 0)
+            .collect();
+        changed.sort_by_key(|(change, _)| *change);
+        // A taxel changes little where the others do.
+        let little = &changed[..changed.len() / 2];
+        if little.len() < 6 {
+            return;
+        }
+        // The mean difference, counted the shorter way around.
+        let is_restless = |&at: &usize| {
+            let differences = little.iter().map(|(_, (a, b))| {
+                let difference = a[at].wrapping_sub(b[at]);
+                f64::from(difference.min(difference.wrapping_neg()))
+            });
+            differences.sum::<f64>() / little.len() as f64 > RESTLESS_DIFFERENCE
+        };
+        let restless: Vec<usize> = active.iter().copied().filter(is_restless).collect();
+        if restless.len() <= MOST_RESTLESS.min(active.len() / 2) {
+            for at in restless {
+                self.kinds[at] = Kind::Restless;
+            }
+        }
+    }
+
+    /// What is known of bytes as cells of so many bytes that never change.
+    pub(crate) fn resting(&self, cell_bytes: usize) -> &Resting {
+        &self.resting[cell_bytes.ilog2().min(2) as usize]
+    }
+
+    fn find_resting(&mut self, frames: &Frames) {
+        let is_still = self.still(frames);
+        let period = self.kinds.len();
+        // The bytes near a byte at multiples of a distance. Constant ones that are close may be of the same
+        // mark.
+        let near = |at: usize, first: usize, step: usize| -> Vec<Near> {
+            let is_cell = |distance: usize, other: usize| match self.kinds[other] {
+                Kind::Active => true,
+                Kind::Constant(_) => distance > MARK_BYTES,
+                Kind::Number | Kind::Restless => false,
+            };
+            let of = |other: usize| Near {
+                rest: self.rest[other],
+                is_still: is_still[other],
+                is_constant: self.kinds[other].constant().is_some(),
+            };
+            let distances = (first..=(period / 2).min(FARTHEST)).step_by(step);
+            let sides = distances.flat_map(|distance| {
+                [
+                    (distance, (at + distance) % period),
+                    (distance, (at + period - distance) % period),
+                ]
+            });
+            let near = sides.filter(|&(distance, other)| is_cell(distance, other));
+            near.map(|(_, other)| of(other)).take(NEAR).collect()
+        };
+        let bits = |at: usize, cell_bytes: usize| match (self.kinds[at], cell_bytes) {
+            // Of cells of one byte those at odd distances are like those at even ones.
+            (Kind::Constant(value), 1) => {
+                model::resting(value, &near(at, 1, 2)).max(model::resting(value, &near(at, 2, 2)))
+            }
+            (Kind::Constant(value), step) => model::resting(value, &near(at, step, step)),
+            _ => 0.0,
+        };
+        self.resting = [1, 2, 4].map(|cell_bytes| {
+            let bits: Vec<f64> = (0..period).map(|at| bits(at, cell_bytes)).collect();
+            Resting {
+                total: bits.iter().sum(),
+                bits,
+            }
+        });
+    }
+
+    /// Whether each byte is always the same where nothing presses.
+    fn still(&self, frames: &Frames) -> Vec<bool> {
+        let activity = self.activity(frames);
+        let mut sorted = activity.clone();
+        sorted.sort_unstable();
+        let quarter = sorted.get(sorted.len() / 4).copied().unwrap_or(0);
+        let is_quiet = |&index: &usize| activity[index] <= quarter;
+        let quiet: Vec<usize> = (0..frames.len()).filter(is_quiet).collect();
+        let quiet = some(&quiet, QUIET);
+        let changes = |at: usize| {
+            quiet
+                .iter()
+                .filter(|&&index| frames.get(index)[at] != self.rest[at])
+                .count()
+        };
+        (0..self.kinds.len())
+            .map(|at| 20 * changes(at) < quiet.len())
+            .collect()
+    }
+
+    /// How much the taxels of each frame differ from their rest.
+    pub(crate) fn activity(&self, frames: &Frames) -> Vec<u32> {
+        let active: Vec<usize> = (0..self.kinds.len())
+            .filter(|&at| self.kinds[at] == Kind::Active)
+            .collect();
+        let of_frame = |frame: &[u8]| {
+            let changes = active
+                .iter()
+                .map(|&at| frame[at].abs_diff(self.rest[at]).min(64));
+            changes.map(u32::from).sum()
+        };
+        frames.iter().map(of_frame).collect()
+    }
+}
+
+/// The step of the number at `at`, and how many pairs have about this step, if nearly all have.
+fn steady_step(
+    pairs: &[Pair],
+    at: usize,
+    bytes: usize,
+    is_big_endian: bool,
+) -> Option<(u64, usize)> {
+    if pairs.len() < 8 {
+        return None;
+    }
+    let value = |frame: &[u8]| number(&frame[at..at + bytes], is_big_endian);
+    let mask = u64::MAX >> (64 - 8 * bytes);
+    let steps: Vec<u64> = pairs
+        .iter()
+        .map(|(a, b)| value(b).wrapping_sub(value(a)) & mask)
+        .collect();
+    let mut sorted = steps.clone();
+    sorted.sort_unstable();
+    let median = sorted[sorted.len() / 2];
+    let slack = median.min((mask - median).wrapping_add(1)) / 3;
+    let is_steady = |&&step: &&u64| {
+        let off = step.wrapping_sub(median) & mask;
+        off.min((mask - off).wrapping_add(1)) <= slack
+    };
+    let steady = steps.iter().filter(is_steady).count();
+    (median > 0 && 10 * steady >= 9 * steps.len()).then_some((median, steady))
+}
+
+/// The number in these bytes.
+pub(crate) fn number(bytes: &[u8], is_big_endian: bool) -> u64 {
+    let join = |value: u64, &byte: &u8| value << 8 | u64::from(byte);
+    if is_big_endian {
+        bytes.iter().fold(0, join)
+    } else {
+        bytes.iter().rev().fold(0, join)
+    }
+}

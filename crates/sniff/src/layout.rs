@@ -1,0 +1,368 @@
+//! Writes an array at its place as settings, and decodes the bytes with them.
+//!
+//! In: the [`Parts`] of a frame, and all the bytes. Out: a [`Proposal`] that the daemon's own decoder
+//! has tried.
+
+use std::ops::Range;
+
+use hardnessd_core::frame::{Array, RawFrame};
+use hardnessd_core::wire::{
+    Cell, Checksum, ChecksumOver, Decoder, FooterBytes, HexBytes, Layout, LengthField, Preset,
+    Settings,
+};
+
+use crate::checks::What;
+use crate::columns::{Columns, Number};
+use crate::places::Place;
+
+/// A layout, and the outcome of decoding the bytes with it.
+#[derive(Debug, Clone)]
+pub struct Proposal {
+    /// The settings of the layout.
+    pub settings: Settings,
+    /// Whether a known board has this layout, which its preset names.
+    pub is_board: bool,
+    /// The frames that the daemon's decoder finds.
+    pub frames: u64,
+    /// The damaged frames among the bytes.
+    pub frames_damaged: u64,
+    /// Share of all bytes that whole frames hold.
+    pub share: f64,
+    /// What else there is to say.
+    pub remarks: Vec<String>,
+}
+
+/// The bytes that are decoded at once.
+const CHUNK_BYTES: usize = 8 * 1024;
+/// The least share of the bytes that a layout must explain to be likely, and to be sure.
+const LIKELY_SHARE: f64 = 0.5;
+const SURE_SHARE: f64 = 0.9;
+/// One in as many frames may be damaged.
+const DAMAGED: u64 = 20;
+
+/// How many ways to divide a mark into tail and header are tried.
+const MOST_SPLITS: usize = 3;
+
+/// Hands each frame in `bytes` to `take`, as the daemon would decode it. Returns the number of damaged
+/// ones, and the share of the bytes that frames hold. `None` for impossible settings.
+pub(crate) fn decode(
+    settings: &Settings,
+    bytes: &[u8],
+    mut take: impl FnMut(RawFrame),
+) -> Option<(u64, f64)> {
+    let mut decoder = Decoder::new(Layout::new(settings).ok()?);
+    let mut damaged = 0;
+    let mut drain = |decoder: &mut Decoder| {
+        while let Some(item) = decoder.next_frame() {
+            match item {
+                Ok(found) => take(found.frame),
+                Err(_) => damaged += 1,
+            }
+        }
+    };
+    for chunk in bytes.chunks(CHUNK_BYTES) {
+        decoder.push(chunk);
+        drain(&mut decoder);
+    }
+    decoder.settle();
+    drain(&mut decoder);
+    let explained = decoder.received() - decoder.skipped() - decoder.pending().len() as u64;
+    Some((damaged, explained as f64 / bytes.len() as f64))
+}
+
+impl Proposal {
+    /// Decodes `bytes` with the settings. `None` if they find too few frames, or many damaged ones.
+    pub(crate) fn decoded(settings: Settings, is_board: bool, bytes: &[u8]) -> Option<Self> {
+        let mut frames = 0;
+        let (frames_damaged, share) = decode(&settings, bytes, |_| frames += 1)?;
+        (frames >= 3 && share >= LIKELY_SHARE && 4 * frames_damaged <= frames).then_some(Self {
+            settings,
+            is_board,
+            frames,
+            frames_damaged,
+            share,
+            remarks: Vec::new(),
+        })
+    }
+
+    /// The proposal for an array in frames.
+    pub(crate) fn of(parts: &Parts, bytes: &[u8]) -> Option<Self> {
+        let tried = [parts.check(), None]
+            .into_iter()
+            .flat_map(|check| parts.settings(check));
+        let mut decoded =
+            tried.filter_map(|(settings, is_board)| Self::decoded(settings, is_board, bytes));
+        let first = decoded.next()?;
+        let mut proposal = if first.explains_nearly_all() {
+            first
+        } else {
+            decoded.find(Self::explains_nearly_all).unwrap_or(first)
+        };
+        proposal.remarks = parts.remarks();
+        Some(proposal)
+    }
+
+    /// Whether the daemon would read nearly all that is sent.
+    pub(crate) fn explains_nearly_all(&self) -> bool {
+        self.share >= SURE_SHARE && DAMAGED * self.frames_damaged <= self.frames
+    }
+
+    /// The lines below `[sensor.frame]`.
+    pub fn toml(&self) -> String {
+        toml::to_string(&self.settings).expect("settings are keys and plain values")
+    }
+}
+
+/// The boards that a preset is of, and the arrays that they have. An empty list is for all arrays.
+const BOARDS: [(Preset, &[(usize, usize)]); 7] = [
+    (Preset::Jx255n, &[(28, 28)]),
+    (Preset::Jx255nU16, &[(28, 28)]),
+    (Preset::Jq, &[]),
+    (Preset::JqTail, &[]),
+    (Preset::JqU16, &[]),
+    (Preset::Flexitac, &[(12, 32), (16, 32), (32, 32)]),
+    (Preset::M1616, &[(16, 16)]),
+];
+
+/// The preset of a board with this layout, with its sides if they are not those of the preset.
+fn board(layout: &Layout) -> Option<Settings> {
+    let Array { rows, cols } = layout.array();
+    let of = BOARDS
+        .iter()
+        .filter(|(_, arrays)| arrays.is_empty() || arrays.contains(&(rows, cols)));
+    let presets = of.flat_map(|&(preset, _)| {
+        let named = Settings {
+            preset: Some(preset),
+            ..Settings::default()
+        };
+        [
+            named.clone(),
+            Settings {
+                rows: Some(rows),
+                cols: Some(cols),
+                ..named
+            },
+        ]
+    });
+    presets
+        .into_iter()
+        .find(|settings| Layout::new(settings).as_ref() == Ok(layout))
+}
+
+/// The parts of a frame of an array.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Parts<'a> {
+    pub(crate) columns: &'a Columns,
+    pub(crate) place: &'a Place,
+    pub(crate) array: Array,
+    pub(crate) cell: Cell,
+    /// How many numbers a taxel has, and which of them is read.
+    pub(crate) channels: usize,
+    pub(crate) channel: usize,
+    /// Where in the period a frame begins, if that is known.
+    pub(crate) begin: Option<usize>,
+}
+
+/// A stretch of the bytes beside the cells, counted from the end of the cells.
+type Beside = Range<usize>;
+
+/// A checksum, the place of its first byte, and where what it covers begins if it is not the cells.
+type Checked = (Checksum, usize, Option<usize>);
+
+impl Parts<'_> {
+    fn check(&self) -> Option<Checked> {
+        let check = self.place.check.as_ref()?;
+        match check.what {
+            What::From(checksum, begin) => Some((checksum, check.at.start, Some(begin))),
+            // Of several numbers a taxel, the cells that are read are not all that it covers.
+            What::Cells(checksum) if self.channels == 1 => Some((checksum, check.at.start, None)),
+            What::Cells(_) | What::Sum(_) => None,
+        }
+    }
+
+    /// The value of a byte beside the cells, if it may belong to a mark.
+    fn constant(&self, at: usize) -> Option<u8> {
+        let beside = &self.place.beside;
+        let (after, before) = self.place.skipped();
+        let is_high = self.columns.is_high_byte(beside.get(at)?.at);
+        let may_be = (after..beside.len() - before).contains(&at) && !is_high;
+        may_be.then(|| beside[at].constant())?
+    }
+
+    /// The end of the constant bytes that begin at `from`.
+    fn constant_end(&self, from: usize) -> usize {
+        let mut places = from..;
+        places
+            .find(|&at| self.constant(at).is_none())
+            .expect("there is an end of the bytes")
+    }
+
+    /// The likeliest mark: the constant bytes with the most that are not 0.
+    pub(crate) fn mark(&self) -> Option<Beside> {
+        let begins = (0..self.place.beside.len()).filter(|&at| {
+            self.constant(at).is_some() && (at == 0 || self.constant(at - 1).is_none())
+        });
+        let runs = begins.map(|start| start..self.constant_end(start));
+        let weight = |run: &Beside| {
+            run.clone()
+                .filter(|&at| self.constant(at) != Some(0))
+                .count()
+        };
+        runs.rev().max_by_key(weight).filter(|run| weight(run) > 0)
+    }
+
+    /// The settings for this array, the likeliest first, and whether a board has them.
+    fn settings(&self, check: Option<Checked>) -> Vec<(Settings, bool)> {
+        let begin = check
+            .and_then(|(_, _, begin)| begin)
+            .or_else(|| self.beginning());
+        let mark = match check {
+            Some((checksum, at, _)) => {
+                let end = at + checksum.bytes();
+                end..self.constant_end(begin.unwrap_or(end).max(end))
+            }
+            None => match self.mark() {
+                Some(mark) => mark,
+                None => return Vec::new(),
+            },
+        };
+        if mark.is_empty() || mark.clone().any(|at| self.constant(at).is_none()) {
+            return Vec::new();
+        }
+        let begin = begin.filter(|at| (mark.start..=mark.end).contains(at));
+        let splits = begin.into_iter().chain(mark.start..=mark.end);
+        let mut tried: Vec<(Settings, bool)> = splits
+            .filter_map(|split| {
+                let settings = self.of_split(&mark, split, check);
+                let layout = Layout::new(&settings).ok()?;
+                Some(board(&layout).map_or((settings, false), |board| (board, true)))
+            })
+            .collect();
+        if begin.is_none() {
+            tried.sort_by_key(|(_, is_board)| !is_board);
+        }
+        tried.truncate(MOST_SPLITS);
+        tried
+    }
+
+    /// The numbers of bytes between the mark and the cells, and between the cells and the mark.
+    pub(crate) fn around(&self) -> Option<(usize, usize)> {
+        let mark = self.mark()?;
+        Some((self.place.beside.len() - mark.end, mark.start))
+    }
+
+    /// The place beside the cells at which a frame begins.
+    fn beginning(&self) -> Option<usize> {
+        let period = self.columns.kinds.len();
+        let end = self.place.start + self.place.bytes;
+        let at = (self.begin? + 2 * period - end) % period;
+        (at <= self.place.beside.len()).then_some(at)
+    }
+
+    /// The settings for a frame that begins at `split` within the mark. No key is left to its
+    /// default.
+    fn of_split(&self, mark: &Beside, split: usize, check: Option<Checked>) -> Settings {
+        let values =
+            |range: Beside| -> Vec<u8> { range.filter_map(|at| self.constant(at)).collect() };
+        let (tail, mut sync) = (values(mark.start..split), values(split..mark.end));
+        let bytes = self.place.bytes as u16;
+        let fields = [
+            (LengthField::U16le, bytes.to_le_bytes().to_vec()),
+            (LengthField::U16be, bytes.to_be_bytes().to_vec()),
+            (LengthField::U8, vec![bytes as u8]),
+        ];
+        let is_field = |(field, written): &(LengthField, Vec<u8>)| {
+            self.channels == 1
+                && (*field != LengthField::U8 || bytes <= 0xFF)
+                && sync.len() > written.len()
+                && sync.ends_with(written)
+        };
+        let field = fields.into_iter().find(is_field);
+        let length = field.map_or(LengthField::None, |(field, written)| {
+            sync.truncate(sync.len() - written.len());
+            field
+        });
+        // The other numbers of the first taxel and of the last one are skipped too.
+        let number = self.cell.bytes();
+        let header = self.place.beside.len() - mark.end + self.channel * number;
+        let footer =
+            check.map_or(mark.start, |(_, at, _)| at) + (self.channels - 1 - self.channel) * number;
+        Settings {
+            sync: Some(HexBytes(sync)),
+            tail: (!tail.is_empty()).then_some(HexBytes(tail)),
+            length: Some(length),
+            header_bytes: (header > 0).then_some(header),
+            cell: Some(self.cell),
+            stride_bytes: (self.channels > 1).then_some(self.channels * number),
+            footer_bytes: (footer > 0).then_some(FooterBytes::Each(footer)),
+            checksum: Some(check.map_or(Checksum::None, |(checksum, ..)| checksum)),
+            checksum_over: matches!(check, Some((_, _, None))).then_some(ChecksumOver::Cells),
+            rows: Some(self.array.rows),
+            cols: Some(self.array.cols),
+            ..Settings::default()
+        }
+    }
+
+    fn remarks(&self) -> Vec<String> {
+        let period = self.columns.kinds.len();
+        let number = |number: &Number| {
+            let at = (number.at + 2 * period - self.place.start - self.place.bytes) % period;
+            let is_after = at < self.mark().map_or(0, |mark| mark.start);
+            let place = if is_after {
+                format!("{} after the last cell", bytes(at))
+            } else {
+                "before the cells".to_owned()
+            };
+            let kind = if number.step == 1 {
+                "a counter"
+            } else {
+                "a clock, or a counter"
+            };
+            format!(
+                "a number of {}, {place}, grows by about {} a frame: {kind}; it is skipped",
+                bytes(number.bytes),
+                number.step
+            )
+        };
+        let mut remarks: Vec<String> = self.columns.numbers.iter().map(number).collect();
+        if self.channels > 1 {
+            remarks.push(format!(
+                "each taxel has {} numbers; number {} is read, which changes most: for another, write other \
+                 header_bytes and footer_bytes, by {} a number",
+                self.channels,
+                self.channel + 1,
+                bytes(self.cell.bytes())
+            ));
+        }
+        let unknown = self.place.unknown().count();
+        if unknown > 0 {
+            remarks.push(format!(
+                "the meaning of {} beside the cells is unknown: skipped",
+                bytes(unknown)
+            ));
+        }
+        if let Some(check) = &self.place.check
+            && matches!(check.what, What::Sum(_))
+        {
+            let size = bytes(check.at.len());
+            remarks.push(format!(
+                "a sum of the cells takes {size}: no key describes it, so it is skipped"
+            ));
+        }
+        let is_checked_from_mark = matches!(self.check(), Some((_, _, Some(_))));
+        if !is_checked_from_mark && self.beginning().is_none() {
+            remarks.push(
+                "whether the mark begins a frame or ends it does not show here: record from the moment the sensor is \
+                 switched on, or read its data sheet"
+                    .to_owned(),
+            );
+        }
+        remarks
+    }
+}
+
+/// A number of bytes in words.
+fn bytes(number: usize) -> String {
+    let plural = if number == 1 { "" } else { "s" };
+    format!("{number} byte{plural}")
+}

@@ -1,0 +1,137 @@
+//! Finds the layout of an unknown array's frames in raw bytes.
+//!
+//! In: bytes as they came, with the times of their arrival where they are known, and what the user knows
+//! of the array. Out: ranked layouts, each tried with the daemon's own decoder, or the reason why there is
+//! none. It opens no port and no file, and prints nothing.
+//!
+//! The files below are in reading order, and each uses only those above it. `model` says how likely a
+//! layout is.
+
+mod numbers;
+mod pictures;
+mod model;
+mod period;
+mod columns;
+mod checks;
+mod places;
+mod layout;
+mod scale;
+mod found;
+mod coding;
+mod text;
+mod search;
+mod packed;
+
+use hardnessd_core::wire::{Cell, Layout, Preset, Settings};
+
+use coding::Coding;
+pub use found::{Doubt, Failure, Found, Known, Ranked, cell_name};
+pub use layout::Proposal;
+pub use scale::Scale;
+
+/// Bytes of a sensor.
+#[derive(Debug, Clone, Copy)]
+pub struct Capture<'a> {
+    /// The bytes, in order.
+    pub bytes: &'a [u8],
+    /// When bytes came, in order. Empty if that is not known.
+    pub arrivals: &'a [Arrival],
+}
+
+/// The arrival of some bytes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Arrival {
+    /// How many bytes came before them.
+    pub at: usize,
+    /// When they came, in seconds from any moment.
+    pub time_s: f64,
+}
+
+impl Capture<'_> {
+    /// Where bytes came after a pause. Between the parts of a frame the pauses are much shorter.
+    fn pauses(&self) -> Vec<usize> {
+        let gap = |pair: &[Arrival]| pair[1].time_s - pair[0].time_s;
+        let mut gaps: Vec<f64> = self.arrivals.windows(2).map(gap).collect();
+        gaps.sort_by(f64::total_cmp);
+        let Some(&long) = gaps.get(gaps.len() * 9 / 10) else {
+            return Vec::new();
+        };
+        let after_pause = self
+            .arrivals
+            .windows(2)
+            .filter(|pair| gap(pair) > long / 2.0);
+        after_pause.map(|pair| pair[1].at).collect()
+    }
+}
+
+/// The layouts that explain `capture`.
+///
+/// # Errors
+///
+/// Returns a [`Failure`] if nothing that the daemon could read is in the bytes.
+pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
+    let bytes = capture.bytes;
+    if bytes.is_empty() {
+        return Err(Failure::Nothing);
+    }
+    match coding::of(bytes) {
+        Some(Coding::Packed(framing)) => return packed::find(framing, bytes, known),
+        Some(Coding::Unreadable(words)) => return Err(Failure::Packed(words)),
+        Some(Coding::Doubled(words)) => {
+            let found = in_periods(capture, known);
+            return found
+                .ok()
+                .filter(|found| found.doubt.is_none())
+                .ok_or(Failure::Packed(words));
+        }
+        Some(Coding::TooSlow) => return Err(Failure::TooSlow),
+        Some(Coding::TooFast) => return Err(Failure::TooFast),
+        None => {}
+    }
+    if text::is_text(bytes) {
+        return text::find(bytes, known);
+    }
+    if let Some(found) = glove(bytes) {
+        return Ok(found);
+    }
+    in_periods(capture, known)
+}
+
+/// The layouts of frames of one length.
+fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
+    let bytes = capture.bytes;
+    let mut open = None;
+    let mut failure = Failure::NotPeriodic(bytes.len());
+    for period in period::periods(bytes) {
+        match search::in_frames(&period::Frames::new(bytes, &period), capture, known) {
+            Ok(found) if found.doubt.is_none() => return Ok(found),
+            Ok(found) => open = open.or(Some(found)),
+            // Several packets may seem to be one frame.
+            Err(packets @ Failure::Packets { .. }) => return Err(packets),
+            Err(other) if rank(&other) > rank(&failure) => failure = other,
+            Err(_) => {}
+        }
+    }
+    open.ok_or(failure)
+}
+
+/// The glove of Weihai JQ, whose packets have two lengths.
+fn glove(bytes: &[u8]) -> Option<Found> {
+    let settings = Settings {
+        preset: Some(Preset::JqGlove),
+        ..Settings::default()
+    };
+    let array = Layout::new(&settings).ok()?.array();
+    let proposal = Proposal::decoded(settings, true, bytes)?;
+    Some(Found::stated(array, Some(Cell::U8), proposal))
+}
+
+/// Of several failures, the one with the highest rank says most.
+fn rank(failure: &Failure) -> usize {
+    match failure {
+        Failure::TooLarge(_) => 3,
+        Failure::NoPress(_) => 2,
+        Failure::NoArray(_) => 1,
+        _ => 0,
+    }
+}

@@ -1,0 +1,363 @@
+//! The model: how many bits a lossless coder needs for the captured bytes under a layout.
+//!
+//! The layout that needs the fewest bits is the likeliest, and one that needs n bits more is 2^n times
+//! less likely. Pictures of one press are much alike, so all of them count as one. The bits of a layout
+//! are the sum of these terms:
+//!
+//! | term | what is coded | how |
+//! |---|---|---|
+//! | name | which layout it is | a rare type of cells, a long and narrow array and unknown bytes take more |
+//! | beside | what is beside the cells: constant bytes | 8 bits each, once; what is known beforehand takes none: a length, the high bytes of a number, the mark of a known board |
+//! | | numbers that grow, and checksums | none |
+//! | | other bytes | as cells on their own |
+//! | rest | a cell that never changes | by the cells near it: their values at rest, and whether they are as still |
+//! | presses | the change of each cell | by its neighbours in the array ([`Rows`]) |
+//! | | of cells on their own | by what they do in other presses ([`alone`]) |
+//!
+//! Changes are whole numbers of steps. They are coded as what is left of a prediction, by a geometric
+//! distribution whose mean is that of all changes with as much going on around them. This is how
+//! pictures are compressed without loss (LOCO-I, ISO 14495-1).
+
+use super::pictures::{Picture, Pictures};
+
+/// So many bits are odds of a thousand to one.
+pub(crate) const SURE_BITS: f64 = 10.0;
+/// The most bits in favour of a layout that one press may have.
+const PRESS_BITS: f64 = 10.0;
+/// The most bits against it.
+const AGAINST_BITS: f64 = 6.0;
+/// A constant byte that nothing predicts.
+pub(crate) const CONSTANT_BITS: f64 = 8.0;
+/// Another constant byte of 0, which pads.
+pub(crate) const ZERO_BITS: f64 = 6.0;
+/// What is known beforehand, but for whether it is there.
+pub(crate) const EXPECTED_BITS: f64 = 1.0;
+/// That bytes between the mark and the cells look like cells at rest, on each side.
+pub(crate) const SKIPPED_BITS: f64 = 8.0;
+/// That a board sends a byte of which nothing is known: one like a checksum, and one like a taxel.
+pub(crate) const UNKNOWN_BITS: f64 = 4.0;
+pub(crate) const UNKNOWN_TAXEL_BITS: f64 = 12.0;
+/// That a taxel changes as a checksum does.
+pub(crate) const RESTLESS_TAXEL_BITS: f64 = 12.0;
+/// That a taxel has several numbers, each more.
+pub(crate) const CHANNEL_BITS: f64 = 8.0;
+/// That the last binary digit of all numbers is not used.
+pub(crate) const UNUSED_DIGIT_BITS: f64 = 2.0;
+
+/// The most numbers of one taxel.
+pub(crate) const MOST_CHANNELS: usize = 4;
+/// What is left of a prediction is about this share of what goes on around, ...
+const LEFT_OF_AROUND: f32 = 0.1;
+/// ... and of how far the cells are from rest, for taxels differ.
+const LEFT_OF_OWN: f32 = 0.1;
+/// What goes on around is noise up to so many times the noise at rest.
+const NOISE: f32 = 4.0;
+
+/// The bits of a whole number by a Cauchy distribution of this width, which has no surprise that is too
+/// large.
+fn bits(left: f32, width: f32) -> f32 {
+    const PI: f32 = std::f32::consts::PI;
+    let width = width.max(1.0 / PI);
+    (PI * (width + left * left / width)).log2()
+}
+
+/// Predictions of a cell: like the one before it, like the one above it, like both, like both and on a slope
+/// with those above it, and on a plane.
+const PREDICTIONS: usize = 5;
+
+/// The bits of each press in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
+/// each. Where little goes on around, a cell is predicted to be at rest.
+pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64> {
+    let width = cols * channels;
+    let noise = pictures.noise;
+    let of_picture = |Picture { change, .. }: &Picture| {
+        let mut sums = [0.0_f64; PREDICTIONS];
+        for at in pictures.changing() {
+            let place = at % width;
+            let back = |by: usize| change[at - by];
+            let (has_west, has_north) = (place >= channels, at >= width);
+            let west = if has_west { back(channels) } else { 0.0 };
+            let north = if has_north { back(width) } else { 0.0 };
+            let east = if has_north && place + channels < width {
+                back(width - channels)
+            } else {
+                north
+            };
+            let (predicted, around) = match (has_west, has_north) {
+                (true, true) => {
+                    let corner = back(width + channels);
+                    let around =
+                        (west - corner).abs() + (north - corner).abs() + (north - east).abs();
+                    let both = (west + north) / 2.0;
+                    let slope = (both + (east - corner) / 4.0).round();
+                    (
+                        [west, north, both.round(), slope, west + north - corner],
+                        around,
+                    )
+                }
+                (true, false) => {
+                    let before = if place >= 2 * channels {
+                        back(2 * channels)
+                    } else {
+                        0.0
+                    };
+                    ([west; PREDICTIONS], 2.0 * (west - before).abs())
+                }
+                _ => ([north; PREDICTIONS], 2.0 * (north - east).abs()),
+            };
+            if around + west.abs() + north.abs() <= NOISE * noise {
+                let bits = f64::from(bits(change[at], noise));
+                sums.iter_mut().for_each(|sum| *sum += bits);
+                continue;
+            }
+            let width =
+                LEFT_OF_AROUND * around + LEFT_OF_OWN * (west.abs() + north.abs()) / 2.0 + noise;
+            for (sum, predicted) in sums.iter_mut().zip(predicted) {
+                *sum += f64::from(bits(change[at] - predicted, width));
+            }
+        }
+        sums
+    };
+    best_prediction(pictures, true, of_picture)
+}
+
+/// How much cells differ on average from those `by` places before them in the same row.
+pub(crate) fn difference(pictures: &Pictures, cols: usize, by: usize) -> f64 {
+    let (mut sum, mut count) = (0.0, 0_usize);
+    for Picture { change, .. } in pictures.presses.iter().flatten() {
+        for at in pictures.changing().filter(|at| at % cols >= by) {
+            sum += f64::from((change[at] - change[at - by]).abs());
+            count += 1;
+        }
+    }
+    sum / count.max(1) as f64
+}
+
+/// The bits of each press under the prediction that is best for all of them. All moments of a press count as
+/// one if it `is_once`.
+fn best_prediction<const N: usize>(
+    pictures: &Pictures,
+    is_once: bool,
+    of_picture: impl Fn(&Picture) -> [f64; N],
+) -> Vec<f64> {
+    let of_press = |press: &Vec<Picture>| {
+        let mut sums = [0.0; N];
+        for picture in press {
+            sums.iter_mut()
+                .zip(of_picture(picture))
+                .for_each(|(sum, bits)| *sum += bits);
+        }
+        sums.map(|sum| {
+            if is_once {
+                sum / press.len() as f64
+            } else {
+                sum
+            }
+        })
+    };
+    let presses: Vec<[f64; N]> = pictures.presses.iter().map(of_press).collect();
+    let total = |prediction: usize| presses.iter().map(|press| press[prediction]).sum::<f64>();
+    let best = (0..N)
+        .min_by(|&a, &b| total(a).total_cmp(&total(b)))
+        .unwrap_or(0);
+    presses.iter().map(|press| press[best]).collect()
+}
+
+/// The bits of each press in its later frames, whatever the shape of the array and how many numbers a taxel
+/// has: by the number that is before each at the best distance.
+pub(crate) fn later(pictures: &Pictures) -> Vec<f64> {
+    let at_distance = |distance: usize| {
+        best_prediction(pictures, false, |picture| {
+            let mut sums = [0.0_f64; LATER];
+            for at in pictures.changing() {
+                let bits = later_bits(pictures, picture, at, distance);
+                sums.iter_mut()
+                    .zip(bits)
+                    .for_each(|(sum, bits)| *sum += f64::from(bits));
+            }
+            sums
+        })
+    };
+    let total = |presses: &Vec<f64>| presses.iter().sum::<f64>();
+    let all = (0..=MOST_CHANNELS).map(at_distance);
+    all.min_by(|a, b| total(a).total_cmp(&total(b)))
+        .expect("there are distances")
+}
+
+/// Predictions of a cell in a later frame: it stays, or it grows by as much, or by the same factor, as those
+/// before it.
+const LATER: usize = 3;
+
+fn later_bits(
+    pictures: &Pictures,
+    Picture { change, before }: &Picture,
+    at: usize,
+    distance: usize,
+) -> [f32; LATER] {
+    let near = |of: &[f32]| {
+        let west = if distance > 0 && at >= distance {
+            of[at - distance]
+        } else {
+            0.0
+        };
+        (
+            west,
+            if distance > 0 && at >= 2 * distance {
+                west + of[at - 2 * distance]
+            } else {
+                west
+            },
+        )
+    };
+    let ((west, wide), (west_before, wide_before)) = (near(change), near(before));
+    let factor = if wide_before == 0.0 {
+        1.0
+    } else {
+        (wide / wide_before).clamp(0.0, 4.0)
+    };
+    let (now, then) = (change[at], before[at]);
+    let width =
+        LEFT_OF_AROUND * (west - west_before).abs() + LEFT_OF_OWN * then.abs() + pictures.noise;
+    [then, then + west - west_before, (then * factor).round()]
+        .map(|predicted| bits(now - predicted, width))
+}
+
+/// The bits of each press and cell in its first frame, if cells have nothing to do with those around them. A
+/// cell is about as far from rest as in the other presses, and, as if that were one more, as all cells are.
+pub(crate) fn alone(pictures: &Pictures) -> Vec<Vec<f64>> {
+    let far = |press: &Vec<Picture>| -> Vec<f32> {
+        let of_cell = |at: usize| {
+            press
+                .iter()
+                .map(|picture| picture.change[at].abs())
+                .sum::<f32>()
+                / press.len() as f32
+        };
+        (0..pictures.changes.len()).map(of_cell).collect()
+    };
+    let presses: Vec<Vec<f32>> = pictures.presses.iter().map(far).collect();
+    let count = presses.len() as f32;
+    let mean =
+        presses.iter().flatten().sum::<f32>() / (count * pictures.changing().count().max(1) as f32);
+    let of_press = |(press, far): (&Vec<Picture>, &Vec<f32>)| -> Vec<f64> {
+        let of_cell = |at: usize| {
+            if !pictures.changes[at] {
+                return 0.0;
+            }
+            let all = presses.iter().map(|press| press[at]).sum::<f32>();
+            let width = (all - far[at] + mean) / count + pictures.noise;
+            let sum: f32 = press
+                .iter()
+                .map(|picture| bits(picture.change[at], width))
+                .sum();
+            f64::from(sum / press.len() as f32)
+        };
+        (0..far.len()).map(of_cell).collect()
+    };
+    pictures
+        .presses
+        .iter()
+        .zip(&presses)
+        .map(of_press)
+        .collect()
+}
+
+/// The bits of each press and byte beside the cells, of which nothing is known.
+pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
+    let mut bits = alone(pictures);
+    for (bits, press) in bits.iter_mut().zip(&pictures.presses) {
+        for at in pictures.changing() {
+            let later = |picture| f64::from(later_bits(pictures, picture, at, 1)[0]);
+            bits[at] += press.iter().map(later).sum::<f64>();
+        }
+    }
+    bits
+}
+
+/// The bits by which one is more than the other, press by press.
+#[derive(Debug, Clone)]
+pub(crate) struct Score {
+    /// The bits of each press.
+    pub(crate) presses: Vec<f64>,
+    /// The bits of all that is coded once.
+    pub(crate) once: f64,
+}
+
+impl Score {
+    pub(crate) fn bits(&self) -> f64 {
+        self.once + self.presses.iter().sum::<f64>()
+    }
+
+    /// Whether this one is surely likelier than `other`. However much a press is in favour, it is one.
+    pub(crate) fn is_surely_less(&self, other: &Self) -> bool {
+        other.once - self.once + self.lead_of_presses(other) >= SURE_BITS
+    }
+
+    /// Whether this one is surely likelier than `other`, whose cells are the same but for a few at the ends.
+    /// Then presses say less.
+    pub(crate) fn is_surely_before(&self, other: &Self) -> bool {
+        other.once - self.once + self.lead_of_presses(other) / 2.0 >= SURE_BITS
+    }
+
+    fn lead_of_presses(&self, other: &Self) -> f64 {
+        let leads = other
+            .presses
+            .iter()
+            .zip(&self.presses)
+            .map(|(other, own)| other - own);
+        leads
+            .map(|lead| lead.clamp(-AGAINST_BITS, PRESS_BITS))
+            .sum()
+    }
+}
+
+/// A cell near another one.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Near {
+    /// Its value at rest.
+    pub(crate) rest: u8,
+    /// Whether it is always the same where nothing presses.
+    pub(crate) is_still: bool,
+    /// Whether it is always the same.
+    pub(crate) is_constant: bool,
+}
+
+/// The share of the cells near a still one that are still, of those near one that never changes that never
+/// do, of those near one that changes, and of those that may have any value at rest.
+const AS_STILL: f64 = 0.95;
+const AS_CONSTANT: f64 = 0.8;
+const STILL_CONSTANT: f64 = 0.25;
+const ANY_VALUE: f64 = 0.005;
+
+/// The bits of a cell that is always `value`, by the cells near it.
+pub(crate) fn resting(value: u8, near: &[Near]) -> f64 {
+    if near.is_empty() {
+        return CONSTANT_BITS;
+    }
+    let mut values: Vec<u8> = near.iter().map(|near| near.rest).collect();
+    values.sort_unstable();
+    let median = values[values.len() / 2];
+    let deviation = values
+        .iter()
+        .map(|value| f64::from(value.abs_diff(median)))
+        .sum::<f64>()
+        / values.len() as f64;
+    // A cell is about as far from one near it as these are from each other.
+    let width = (0.3 + 0.4 * deviation).max(2.0 / std::f64::consts::PI);
+    let likelihood = |near: &Near| {
+        let apart = f64::from(near.rest.abs_diff(value)) / width;
+        let still = if near.is_still {
+            AS_STILL
+        } else {
+            1.0 - AS_STILL
+        };
+        let constant = if near.is_constant {
+            AS_CONSTANT
+        } else {
+            STILL_CONSTANT
+        };
+        still * constant * 2.0 / (std::f64::consts::PI * width * (1.0 + apart * apart).powi(2))
+    };
+    let mean = near.iter().map(likelihood).sum::<f64>() / near.len() as f64;
+    -((1.0 - ANY_VALUE) * mean + ANY_VALUE / 256.0).log2()
+}

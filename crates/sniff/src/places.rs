@@ -1,0 +1,246 @@
+//! The places where the cells of a frame may be, the likeliest first.
+//!
+//! In: what each byte of a frame is. Out: [`Place`]s with the bits of what is beside the cells. Cells
+//! are anywhere in the period, and beside them is a mark.
+
+use crate::checks::{Check, What};
+use crate::columns::{Columns, Kind};
+use crate::model::{
+    CONSTANT_BITS, EXPECTED_BITS, RESTLESS_TAXEL_BITS, SKIPPED_BITS, UNKNOWN_BITS,
+    UNKNOWN_TAXEL_BITS, ZERO_BITS,
+};
+
+/// A stretch of each frame that may be the cells.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Place {
+    /// The place of the first cell, counted from where the frames begin.
+    pub(crate) start: usize,
+    /// The number of bytes of the cells.
+    pub(crate) bytes: usize,
+    /// What the other bytes are, from the last cell to the first cell of the next frame.
+    pub(crate) beside: Vec<Beside>,
+    /// What holds for the bytes beside the cells.
+    pub(crate) check: Option<Check>,
+}
+
+/// A byte beside the cells.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Beside {
+    /// Its place, counted from where the frames begin.
+    pub(crate) at: usize,
+    pub(crate) kind: Kind,
+    /// Whether it is likelier a part of a mark than a cell that never changes.
+    pub(crate) is_marking: bool,
+}
+
+impl Beside {
+    pub(crate) fn constant(&self) -> Option<u8> {
+        self.kind.constant()
+    }
+
+    fn is_resting(&self) -> bool {
+        self.constant().is_some() && !self.is_marking
+    }
+}
+
+/// The most bytes beside the cells.
+const MOST_BESIDE: usize = 40;
+/// The fewest bytes of the cells.
+const FEWEST_BYTES: usize = 4;
+/// Places that need this many more bits than the best one are left out.
+const MOST_BITS: f64 = 72.0;
+
+/// The `most` likeliest places, the likeliest first.
+pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
+    let period = columns.kinds.len();
+    let numbers: usize = columns.numbers.iter().map(|number| number.bytes).sum();
+    let mut found: Vec<(f64, Place)> = Vec::new();
+    for length in 1..=MOST_BESIDE.min(period.saturating_sub(FEWEST_BYTES)) {
+        for start in 0..period {
+            let beside = beside(columns, start, length);
+            let here = beside
+                .iter()
+                .filter(|beside| beside.kind == Kind::Number)
+                .count();
+            if here < numbers || !beside.iter().any(|beside| beside.is_marking) {
+                continue;
+            }
+            let place = Place {
+                start,
+                bytes: period - length,
+                beside,
+                check: None,
+            };
+            found.push((place.bits(columns, 2), place));
+        }
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let least = found.first().map_or(0.0, |(bits, _)| *bits);
+    let places = found
+        .into_iter()
+        .take_while(|(bits, _)| *bits <= least + MOST_BITS);
+    places.take(most).map(|(_, place)| place).collect()
+}
+
+/// The `length` bytes that end where the cells start.
+fn beside(columns: &Columns, start: usize, length: usize) -> Vec<Beside> {
+    let period = columns.kinds.len();
+    let of = |at: usize| {
+        let at = (start + period - length + at) % period;
+        let (kind, resting) = (columns.kinds[at], columns.resting(2).bits[at]);
+        let is_high = columns.is_high_byte(at);
+        Beside {
+            at,
+            kind,
+            is_marking: kind.constant().is_some() && !is_high && resting > constant_bits(kind),
+        }
+    };
+    (0..length).map(of).collect()
+}
+
+fn constant_bits(kind: Kind) -> f64 {
+    match kind.constant() {
+        Some(0) => ZERO_BITS,
+        Some(_) => CONSTANT_BITS,
+        None => 0.0,
+    }
+}
+
+impl Place {
+    /// The bits of what is coded once: the constant bytes beside the cells and in them, and that there
+    /// are unknown bytes.
+    pub(crate) fn bits(&self, columns: &Columns, cell_bytes: usize) -> f64 {
+        let field = self.length_field();
+        let of = |(index, beside): (usize, &Beside)| {
+            if columns.is_high_byte(beside.at) || self.is_high_byte_of_sum(columns, beside.at) {
+                return EXPECTED_BITS;
+            }
+            match field {
+                Some(end) if end == index + 1 => EXPECTED_BITS,
+                Some(end) if end == index + 2 => 0.0,
+                _ => constant_bits(beside.kind),
+            }
+        };
+        let constants: f64 = self.beside.iter().enumerate().map(of).sum();
+        let is_padding = |beside: &&Beside| {
+            beside.is_resting()
+                && !columns.is_high_byte(beside.at)
+                && !self.is_high_byte_of_sum(columns, beside.at)
+        };
+        let (after, before) = self.skipped();
+        let mut sides = [
+            self.beside[..after].iter().rfind(is_padding),
+            self.beside[self.beside.len() - before..]
+                .iter()
+                .find(is_padding),
+        ];
+        let skipped = SKIPPED_BITS * sides.iter_mut().flatten().count() as f64;
+        let resting = columns.resting(cell_bytes);
+        let in_cells = resting.total
+            - self
+                .beside
+                .iter()
+                .map(|beside| resting.bits[beside.at])
+                .sum::<f64>();
+        let is_restless = |kind: &Kind| *kind == Kind::Restless;
+        let restless = columns
+            .kinds
+            .iter()
+            .filter(|kind| is_restless(kind))
+            .count()
+            - self
+                .beside
+                .iter()
+                .filter(|beside| is_restless(&beside.kind))
+                .count();
+        let in_cells = in_cells + RESTLESS_TAXEL_BITS * restless as f64;
+        let of = |beside: &Beside| {
+            if beside.kind == Kind::Active {
+                UNKNOWN_TAXEL_BITS
+            } else {
+                UNKNOWN_BITS
+            }
+        };
+        constants + in_cells + skipped + self.unknown().map(of).sum::<f64>()
+    }
+
+    fn is_high_byte_of_sum(&self, columns: &Columns, at: usize) -> bool {
+        self.check.as_ref().is_some_and(|check| match check.what {
+            What::Sum(is_big_endian) => {
+                // What changes of it.
+                let changing = self.beside[check.at.clone()]
+                    .iter()
+                    .filter(|beside| beside.constant().is_none());
+                let first = changing.clone().next().map_or(0, |beside| beside.at);
+                columns.is_high_byte_of(at, first, changing.count(), Some(is_big_endian))
+            }
+            _ => false,
+        })
+    }
+
+    /// How many constant bytes beside the cells look like cells at rest, and are nothing else.
+    pub(crate) fn resting(&self, columns: &Columns) -> usize {
+        let field = self.length_field().map_or(0..0, |end| end - 2..end);
+        let beside = self.beside.iter().enumerate();
+        let resting = beside.filter(|(index, beside)| {
+            beside.is_resting()
+                && !field.contains(index)
+                && !columns.is_high_byte(beside.at)
+                && !self.is_high_byte_of_sum(columns, beside.at)
+        });
+        resting.count()
+    }
+
+    /// The bytes that change in an unknown way.
+    pub(crate) fn unknown(&self) -> impl Iterator<Item = &Beside> {
+        let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
+        let changes = |kind: Kind| matches!(kind, Kind::Active | Kind::Restless);
+        let unknown = self
+            .beside
+            .iter()
+            .enumerate()
+            .filter(move |(at, beside)| changes(beside.kind) && !checked.contains(at));
+        unknown.map(|(_, beside)| beside)
+    }
+
+    /// The numbers of bytes after the last cell and before the first one that are no part of a mark,
+    /// a check or a field: they look like cells at rest.
+    pub(crate) fn skipped(&self) -> (usize, usize) {
+        let after = self
+            .beside
+            .iter()
+            .take_while(|beside| beside.is_resting())
+            .count();
+        let before = self
+            .beside
+            .iter()
+            .rev()
+            .take_while(|beside| beside.is_resting())
+            .count();
+        let length = self.beside.len();
+        let checked = self.check.as_ref().map_or(length, |check| check.at.start);
+        let field_end = self.length_field().unwrap_or(0);
+        let before = if self.is_mark_of_words() { 0 } else { before };
+        (after.min(checked), before.min(length - field_end))
+    }
+
+    /// The end of a field of two bytes with the number of bytes of the cells.
+    fn length_field(&self) -> Option<usize> {
+        let bytes = self.bytes as u16;
+        let fields = [bytes.to_le_bytes(), bytes.to_be_bytes()].map(|field| field.map(Some));
+        let is_field = |pair: &[Beside]| {
+            fields
+                .iter()
+                .any(|field| pair.iter().map(Beside::constant).eq(*field))
+        };
+        self.beside.windows(2).position(is_field).map(|at| at + 2)
+    }
+
+    /// Whether the mark is written in words of two bytes, each with a high byte of 0.
+    fn is_mark_of_words(&self) -> bool {
+        let is_word = |word: &[Beside]| {
+            word.len() == 2 && word[0].constant().is_some() && word[1].constant() == Some(0)
+        };
+        self.beside.len() >= 4 && self.beside.chunks(2).all(is_word)
+    }
+}

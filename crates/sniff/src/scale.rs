@@ -1,0 +1,153 @@
+//! The newtons of a count, so that a tare passes and noise is no touch.
+//!
+//! In: a layout and all the bytes. Out: guesses for `[sensor.calibration]` and `[press]`.
+
+use hardnessd_core::frame::{Pitch, RawFrame};
+use hardnessd_core::tare::{self, NEWTONS_PER_COUNT};
+use hardnessd_core::wire::Settings;
+
+use crate::layout::decode;
+
+/// What to write beside the layout. What is `None` may be left out.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Scale {
+    /// Newtons of a count.
+    pub newtons_per_count: Option<f32>,
+    /// The difference from the other taxels at which a tare refuses.
+    pub tare_max_n: Option<f32>,
+    /// The newtons at which a taxel is in contact.
+    pub contact_threshold_n: Option<f32>,
+    /// The largest count.
+    pub most_counts: f32,
+    /// By how many counts a taxel at rest varies.
+    pub noise_counts: f32,
+}
+
+/// One in so many frames is quiet, that with the smallest change.
+const QUIET: usize = 4;
+/// As many taxels in contact begin a press, and as many may be touched in a tare.
+const TAXELS: usize = 3;
+/// As many frames make a tare.
+const TARE_FRAMES: usize = 5;
+/// The most frames that are looked at.
+const MOST_FRAMES: usize = 4000;
+/// Noise, and what taxels differ by at rest, are at most this share of the thresholds.
+const SMALL: f32 = 0.6;
+/// The largest value that a configuration may have.
+const MOST_NEWTONS_PER_COUNT: f32 = 1000.0;
+/// A press has at least so many newtons at its deepest taxel.
+const LEAST_PRESS_N: f32 = 1.0;
+
+impl Scale {
+    /// The scale for the frames in `bytes`.
+    pub fn of(settings: &Settings, bytes: &[u8]) -> Self {
+        let mut frames: Vec<RawFrame> = Vec::new();
+        decode(settings, bytes, |frame| {
+            if frames.len() < MOST_FRAMES {
+                frames.push(frame);
+            }
+        });
+        Self::of_frames(&frames)
+    }
+
+    fn of_frames(frames: &[RawFrame]) -> Self {
+        let Some(first) = frames.first() else {
+            return Self::default();
+        };
+        let taxels = first.counts.len();
+        let middle = |of: &[&RawFrame], taxel: usize| {
+            let mut counts: Vec<f32> = of.iter().map(|frame| frame.counts[taxel]).collect();
+            counts.sort_by(f32::total_cmp);
+            counts[counts.len() / 2]
+        };
+        let change = |frame: &&RawFrame, rest: &[f32]| -> f64 {
+            let taxels = frame.counts.iter().zip(rest);
+            taxels
+                .map(|(count, rest)| f64::from((count - rest).abs()))
+                .sum()
+        };
+        // Most frames may be pressed, but hardly at the same taxel.
+        let all: Vec<&RawFrame> = frames.iter().collect();
+        let rest: Vec<f32> = (0..taxels).map(|taxel| middle(&all, taxel)).collect();
+        let mut changes: Vec<f64> = all.iter().map(|frame| change(frame, &rest)).collect();
+        let by_place = changes.clone();
+        changes.sort_by(f64::total_cmp);
+        let quiet_change = changes[changes.len() / QUIET];
+        let quiet: Vec<&RawFrame> = all
+            .iter()
+            .zip(by_place)
+            .filter(|(_, change)| *change <= quiet_change)
+            .map(|(frame, _)| *frame)
+            .collect();
+        let rest: Vec<f32> = (0..taxels).map(|taxel| middle(&quiet, taxel)).collect();
+        // Damage makes one taxel of a frame larger.
+        let most_counts = all
+            .iter()
+            .map(|frame| third(frame.counts.to_vec()))
+            .fold(f32::MIN, f32::max);
+        let above = |frame: &&RawFrame| {
+            let taxels = frame.counts.iter().zip(&rest);
+            third(
+                taxels
+                    .map(|(count, rest)| (count - rest).max(0.0))
+                    .collect(),
+            )
+        };
+        let press = all.iter().map(above).fold(0.0, f32::max);
+        // What the third largest taxel varies by while a tare is taken.
+        let varies = |frames: &[&RawFrame]| {
+            let of_taxel = |taxel: usize| {
+                let counts = frames.iter().map(|frame| frame.counts[taxel]);
+                counts.clone().fold(f32::MIN, f32::max) - counts.fold(f32::MAX, f32::min)
+            };
+            third((0..taxels).map(of_taxel).collect())
+        };
+        let mut noises: Vec<f32> = quiet.chunks(TARE_FRAMES).map(varies).collect();
+        noises.sort_by(f32::total_cmp);
+        let noise = noises[noises.len() / 2];
+        let mut sorted = rest.clone();
+        sorted.sort_by(f32::total_cmp);
+        let median = sorted[taxels / 2];
+        let offset = third(rest.iter().map(|rest| (rest - median).max(0.0)).collect());
+
+        let (threshold, tare_max) = (
+            Pitch::JX255N.contact_threshold_n(),
+            tare::Settings::default().tare_max_n,
+        );
+        // Counts that are finer than a byte get fewer newtons: full scale is as many as that of a byte.
+        let is_whole = |frame: &RawFrame| frame.counts.iter().all(|count| count.fract() == 0.0);
+        let full_scale = match frames.iter().all(is_whole) {
+            true => (most_counts.max(255.0) + 1.0).log2().ceil().exp2() - 1.0,
+            // Volts, newtons and their like.
+            false => most_counts.max(press),
+        };
+        let by_scale = NEWTONS_PER_COUNT * f32::from(u8::MAX) / full_scale.max(f32::MIN_POSITIVE);
+        let by_noise = SMALL * threshold / noise.max(f32::MIN_POSITIVE);
+        let by_offset = SMALL * tare_max / offset.max(f32::MIN_POSITIVE);
+        let least = LEAST_PRESS_N / press.max(f32::MIN_POSITIVE).max(full_scale / 255.0);
+        let newtons = by_scale
+            .min(by_noise.min(by_offset).max(least))
+            .min(MOST_NEWTONS_PER_COUNT);
+        let above = |value: f32, default: f32| (value > default * 1.001).then_some(value);
+        Self {
+            newtons_per_count: ((newtons / NEWTONS_PER_COUNT - 1.0).abs() > 0.001)
+                .then_some(newtons),
+            tare_max_n: above(offset * newtons / SMALL, tare_max),
+            contact_threshold_n: above(noise * newtons / SMALL, threshold),
+            most_counts,
+            noise_counts: noise,
+        }
+    }
+}
+
+/// The third largest: one fewer than touch the sensor.
+fn third(mut values: Vec<f32>) -> f32 {
+    values.sort_by(f32::total_cmp);
+    values
+        .iter()
+        .rev()
+        .nth(TAXELS - 1)
+        .or(values.first())
+        .copied()
+        .unwrap_or(0.0)
+}

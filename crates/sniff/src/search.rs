@@ -1,0 +1,617 @@
+//! From frames of one length to layouts: the order of the search.
+//!
+//! In: frames, and what the user knows of the array. Out: ranked layouts, or the reason why there is
+//! none.
+
+use hardnessd_core::frame::{Array, MOST_SIDE};
+
+use crate::Capture;
+use crate::checks::{self, Check};
+use crate::columns::{Columns, Kind};
+use crate::found::{Doubt, Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
+use crate::layout::{Parts, Proposal};
+use crate::model::{
+    self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, Score, UNUSED_DIGIT_BITS,
+};
+use crate::numbers::{TYPES, Type};
+use crate::period::Frames;
+use crate::pictures::{Pictures, Presses, middle, some};
+use crate::places::{Place, places};
+
+/// The longest side that is tried, so that an array that is too large is found.
+const LONGEST_SIDE: usize = 128;
+/// The most places, and fewer of long frames.
+const MOST_PLACES: usize = 60;
+const FEWEST_PLACES: usize = 12;
+const PLACE_BYTES: usize = 60_000;
+/// What is left out at the ends of the cells to tell formats.
+const MARGIN: usize = 16;
+/// How many bytes are looked at first.
+const COARSE_BYTES: usize = 32_000;
+/// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
+const MANY: usize = 10;
+const LITTLE: usize = 4;
+/// The fewest bytes that show that every second one changes.
+const FEWEST_CHANGING: usize = 4;
+/// The most bytes of a mark that look like cells at rest.
+const MOST_RESTING: usize = 4;
+/// As many arrays are decoded: the mark of a known board counts only then.
+const RANKED: usize = 6;
+/// So many times as many places are tried for a checksum.
+const UNCHECKED: usize = 3;
+/// The most formats at a place, and the most arrays that are looked at closely.
+const MOST_FORMATS: usize = 8;
+const MOST_ARRAYS: usize = 40;
+/// Where a cell is so much more like one of the next but one than like its neighbour, a taxel has several
+/// numbers, and one number for each takes so many bits more.
+const INTERLEAVED: f64 = 0.7;
+const INTERLEAVED_BITS: f64 = 60.0;
+/// The number of frames that a checksum is tried on.
+const CHECKED: usize = 40;
+/// The bytes on each side of a mark that may be a checksum, and the most marks that are tried.
+const NEAR_MARK: usize = 16;
+const MOST_MARKS: usize = 8;
+/// The share of the packets whose number follows the one before.
+const COUNTING_SHARE: f64 = 0.95;
+
+/// How taxels are written: numbers of one type, several for each taxel.
+#[derive(Debug, Clone, Copy)]
+struct Format {
+    of: &'static Type,
+    channels: usize,
+}
+
+impl Format {
+    fn bytes(self) -> usize {
+        self.of.bytes * self.channels
+    }
+
+    fn numbers(self, bytes: &[u8]) -> Vec<f32> {
+        bytes
+            .chunks_exact(self.of.bytes)
+            .map(self.of.read)
+            .collect()
+    }
+
+    fn is(self, other: Self) -> bool {
+        std::ptr::eq(self.of, other.of) && self.channels == other.channels
+    }
+
+    fn name_bits(self) -> f64 {
+        self.of.name_bits + CHANNEL_BITS * (self.channels - 1) as f64
+    }
+
+    fn words(self) -> String {
+        match self.channels {
+            1 => self.of.words.to_owned(),
+            channels => format!("taxels of {channels} numbers each, {}", self.of.words),
+        }
+    }
+}
+
+/// An array at a place.
+#[derive(Debug, Clone)]
+struct Candidate {
+    array: Array,
+    format: Format,
+    place: Place,
+    score: Score,
+}
+
+/// The frames and what is known of them.
+struct Search<'a> {
+    frames: &'a Frames<'a>,
+    columns: &'a Columns,
+    presses: Presses,
+    coarse: Presses,
+    /// By press, the bits of each byte on its own.
+    alone: Vec<Vec<f64>>,
+}
+
+pub(crate) fn in_frames(
+    frames: &Frames,
+    capture: &Capture,
+    known: Known,
+) -> Result<Found, Failure> {
+    let period = frames.period();
+    // At a wrong distance, hardly a frame begins where the one before it ended.
+    if frames.len() < LEAST_FRAMES || 2 * frames.pairs().count() < frames.len() {
+        return Err(Failure::NotPeriodic(capture.bytes.len()));
+    }
+    let begin = frames.beginning(&capture.pauses());
+    let frames = &frames.inner();
+    let mut columns = Columns::new(frames);
+    mark_checksum(frames, &mut columns);
+    let columns = &columns;
+    let frames = &frames.retained(|frame| columns.is_whole(frame));
+    if !columns.kinds.contains(&Kind::Active) {
+        return Err(Failure::NoPress(period));
+    }
+    if let Some(packets) = packets(frames, columns) {
+        return Err(packets);
+    }
+    let most = (PLACE_BYTES / period).clamp(FEWEST_PLACES, MOST_PLACES);
+    let places = places(columns, UNCHECKED * most);
+    if places.is_empty() {
+        return Err(Failure::NoArray(period));
+    }
+    let presses = Presses::of(&columns.activity(frames))
+        .or_else(|| numbers_that_press(frames))
+        .ok_or(Failure::NoPress(period))?;
+    let bytes = Format {
+        of: &TYPES[0],
+        channels: 1,
+    };
+    let pictures = Pictures::of(&presses, |index| bytes.numbers(frames.get(index)))
+        .expect("bytes are numbers");
+    let alone = model::unknown(&pictures);
+    let search = Search {
+        frames,
+        columns,
+        coarse: presses.coarse((COARSE_BYTES / period).clamp(4, 16)),
+        presses,
+        alone,
+    };
+    let mut places: Vec<Place> = places
+        .into_iter()
+        .map(|place| search.checked(place, checks::long))
+        .collect();
+    places.sort_by(|a, b| a.bits(columns, 2).total_cmp(&b.bits(columns, 2)));
+    places.truncate(most);
+    let mut candidates = search.candidates(places, known);
+    for candidate in &mut candidates {
+        search.look_closely(candidate);
+    }
+    candidates.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
+    search.rank(&candidates, begin, capture.bytes, known)
+}
+
+impl Search<'_> {
+    fn pictures(&self, presses: &Presses, place: &Place, format: Format) -> Option<Pictures> {
+        let numbers = |index: usize| {
+            format.numbers(self.frames.from(
+                index,
+                place.start,
+                place.bytes / format.bytes() * format.bytes(),
+            ))
+        };
+        Pictures::of(presses, numbers)
+    }
+
+    /// The bits of a candidate, if the presses have these.
+    fn score(
+        &self,
+        place: &Place,
+        format: Format,
+        array: Array,
+        pictures: &Pictures,
+        presses: &[f64],
+    ) -> Score {
+        let unknown: Vec<usize> = place.unknown().map(|beside| beside.at).collect();
+        let beside = |alone: &Vec<f64>| unknown.iter().map(|&at| alone[at]).sum::<f64>();
+        let unused = if format.of.is_float {
+            0
+        } else {
+            pictures.step_exponent
+        };
+        Score {
+            presses: presses
+                .iter()
+                .zip(&self.alone)
+                .map(|(bits, alone)| bits + beside(alone))
+                .collect(),
+            once: place.bits(self.columns, format.of.bytes)
+                + name_bits(array)
+                + format.name_bits()
+                + UNUSED_DIGIT_BITS * f64::from(unused),
+        }
+    }
+
+    /// The formats that may be at a place, the likeliest first, by the order of the wire alone.
+    fn formats(&self, place: &Place, known: Known) -> Vec<Format> {
+        // What is at the ends may be no cells.
+        let ends = if place.bytes > 4 * MARGIN { MARGIN } else { 0 };
+        let place = &Place {
+            start: place.start + ends,
+            bytes: place.bytes - 2 * ends,
+            ..place.clone()
+        };
+        let mut found = Vec::new();
+        let types = TYPES
+            .iter()
+            .filter(|of| known.cell.is_none_or(|cell| cell == of.cell));
+        let most = if known.cell.is_none() {
+            MOST_CHANNELS
+        } else {
+            1
+        };
+        for of in types {
+            let Some(pictures) = self.pictures(&self.coarse, place, Format { of, channels: 1 })
+            else {
+                continue;
+            };
+            let later = later(&pictures).iter().sum::<f64>();
+            for format in (1..=most).map(|channels| Format { of, channels }) {
+                let cells = place.bytes / format.bytes();
+                // Each of several numbers of a taxel makes a picture.
+                let is_picture = |pictures: Pictures| {
+                    let alone: f64 = model::alone(&pictures).iter().flatten().sum();
+                    model::rows(&pictures, cells, 1).iter().sum::<f64>() < alone
+                };
+                if cells < 2
+                    || format.channels > 1 && !pictures.split(format.channels).all(is_picture)
+                {
+                    continue;
+                }
+                let bits = model::rows(&pictures, cells, format.channels)
+                    .iter()
+                    .sum::<f64>();
+                found.push((bits + later + format.name_bits(), format));
+            }
+        }
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        found.truncate(MOST_FORMATS);
+        found.into_iter().map(|(_, format)| format).collect()
+    }
+
+    /// Whether hardly any second byte of the cells ever changes, as high bytes do.
+    fn is_padded(&self, place: &Place) -> bool {
+        let period = self.frames.period();
+        let changing = |from: usize| {
+            let places = (from..place.bytes)
+                .step_by(2)
+                .map(|at| (place.start + at) % period);
+            places
+                .filter(|&at| self.columns.kinds[at].constant().is_none())
+                .count()
+        };
+        let (first, second) = (changing(0), changing(1));
+        first.max(second) >= FEWEST_CHANGING && first.min(second) * 10 < first.max(second)
+    }
+
+    /// Whether numbers are below 0, as those of a signed format are: many, and by little. Large numbers
+    /// without a sign are few, and pass through the least ones.
+    fn has_negative(&self, place: &Place, format: Format) -> bool {
+        let quarter = 2.0_f32.powi(8 * format.of.bytes as i32 - 2);
+        let (mut all, mut little, mut much) = (0, 0, 0);
+        for index in self.presses.frames() {
+            for number in format.numbers(self.frames.from(index, place.start, place.bytes)) {
+                all += usize::from(number != 0.0);
+                little += usize::from((-quarter..0.0).contains(&number));
+                much += usize::from(number < -quarter);
+            }
+        }
+        little * MANY > all && little > LITTLE * much
+    }
+
+    /// The likeliest arrays at all places.
+    fn candidates(&self, places: Vec<Place>, known: Known) -> Vec<Candidate> {
+        // Which formats are likely depends on where a number of four bytes begins.
+        let mut formats: [Option<Vec<Format>>; 4] = [const { None }; 4];
+        let mut found = Vec::new();
+        for place in places {
+            let formats =
+                formats[place.start % 4].get_or_insert_with(|| self.formats(&place, known));
+            for &mut format in formats {
+                if !place.bytes.is_multiple_of(format.bytes())
+                    || format.of.is_signed && !self.has_negative(&place, format)
+                {
+                    continue;
+                }
+                if format.of.bytes == 1 && self.is_padded(&place) {
+                    continue;
+                }
+                let count = place.bytes / format.bytes();
+                let place = self.checked(place.clone(), |spans, kinds| {
+                    checks::short(spans, kinds, format.of)
+                });
+                let Some(pictures) = self.pictures(&self.coarse, &place, format) else {
+                    continue;
+                };
+                let later = later(&pictures);
+                for array in known.arrays(count, LONGEST_SIDE) {
+                    // Where a smaller array may be it, the larger ones are not.
+                    if is_too_large(array) && count <= MOST_SIDE * MOST_SIDE {
+                        continue;
+                    }
+                    let bits = added(model::rows(&pictures, array.cols, format.channels), &later);
+                    let score = self.score(&place, format, array, &pictures, &bits);
+                    found.push(Candidate {
+                        array,
+                        format,
+                        place: place.clone(),
+                        score,
+                    });
+                }
+            }
+        }
+        found.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
+        found.truncate(MOST_ARRAYS);
+        found
+    }
+
+    /// Finds what holds for the bytes beside the cells.
+    fn checked(&self, place: Place, holding: impl Fn(&[&[u8]], &[Kind]) -> Option<Check>) -> Place {
+        if place.check.is_some() || place.unknown().next().is_none() {
+            return place;
+        }
+        let indices: Vec<usize> = (0..self.frames.len()).collect();
+        let (period, length) = (self.frames.period(), place.beside.len());
+        let first = (place.start + period - length) % period;
+        let span = |&index: &usize| self.frames.from(index, first, period + length);
+        let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
+        let kinds: Vec<Kind> = place.beside.iter().map(|beside| beside.kind).collect();
+        Place {
+            check: holding(&spans, &kinds),
+            ..place
+        }
+    }
+
+    fn look_closely(&self, candidate: &mut Candidate) {
+        let Candidate {
+            array,
+            format,
+            place,
+            score,
+        } = candidate;
+        if let Some(pictures) = self.pictures(&self.presses, place, *format) {
+            let bits = added(
+                model::rows(&pictures, array.cols, format.channels),
+                &later(&pictures),
+            );
+            *score = self.score(place, *format, *array, &pictures, &bits);
+            let differs = |by: usize| model::difference(&pictures, array.cols, by);
+            let is_interleaved = |by: &usize| {
+                array.cols.is_multiple_of(*by)
+                    && array.cols >= 3 * by
+                    && differs(*by) < INTERLEAVED * differs(1)
+            };
+            if format.channels == 1 && (2..=MOST_CHANNELS).any(|by| is_interleaved(&by)) {
+                score.once += INTERLEAVED_BITS;
+            }
+        }
+    }
+
+    fn parts<'a>(
+        &'a self,
+        candidate: &'a Candidate,
+        begin: Option<usize>,
+        channel: usize,
+    ) -> Parts<'a> {
+        let Candidate {
+            array,
+            format,
+            ref place,
+            ..
+        } = *candidate;
+        Parts {
+            columns: self.columns,
+            place,
+            array,
+            cell: format.of.cell,
+            channels: format.channels,
+            channel,
+            begin,
+        }
+    }
+
+    /// Decodes the likeliest candidates.
+    fn rank(
+        &self,
+        candidates: &[Candidate],
+        begin: Option<usize>,
+        bytes: &[u8],
+        known: Known,
+    ) -> Result<Found, Failure> {
+        let mut ranked: Vec<Ranked> = Vec::new();
+        for candidate in candidates {
+            let Candidate { array, format, .. } = *candidate;
+            let is_known =
+                |ranked: &Ranked| ranked.array == array && ranked.words == format.words();
+            if ranked.len() == RANKED || ranked.iter().any(is_known) {
+                continue;
+            }
+            if is_too_large(array) {
+                if ranked.is_empty() {
+                    return Err(Failure::TooLarge(array));
+                }
+                continue;
+            }
+            let Some(pictures) = self.pictures(&self.presses, &candidate.place, format) else {
+                continue;
+            };
+            let channels: Vec<Pictures> = pictures.split(format.channels).collect();
+            let of_channel = channels.iter().enumerate();
+            let (channel, strongest) = of_channel
+                .max_by(|(_, a), (_, b)| energy(a.strongest()).total_cmp(&energy(b.strongest())))
+                .expect("a taxel has a number");
+            let parts = self.parts(candidate, begin, channel);
+            let Some(proposal) = Proposal::of(&parts, bytes) else {
+                continue;
+            };
+            let mut score = candidate.score.clone();
+            let mut cells = None;
+            if proposal.is_board {
+                // A known board has a known mark.
+                let mark = parts.mark().map_or(0, |mark| mark.len());
+                score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
+            } else if !known.is_complete() {
+                cells = self.other_cells(candidate, candidates);
+            }
+            let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
+            let alone = self.score(&candidate.place, format, array, &pictures, &alone);
+            ranked.push(Ranked {
+                array,
+                words: format.words(),
+                cell: Some(parts.cell),
+                picture: strongest.strongest().to_vec(),
+                proposal: Some(proposal),
+                score,
+                alone,
+                cells,
+            });
+        }
+        Found::among(ranked, known.is_complete()).ok_or(Failure::NoArray(self.frames.period()))
+    }
+
+    /// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
+    /// cells.
+    fn other_cells(&self, best: &Candidate, candidates: &[Candidate]) -> Option<Doubt> {
+        let is_other = |other: &&Candidate| {
+            other.format.is(best.format)
+                && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
+                && !best.score.is_surely_before(&other.score)
+        };
+        let around = |candidate: &Candidate| self.parts(candidate, None, 0).around();
+        if let Some(other) = candidates.iter().find(is_other)
+            && let Some(((before, after), (other_before, other_after))) =
+                around(best).zip(around(other))
+        {
+            return Some(Doubt::Cells(before, after, other_before, other_after));
+        }
+        let resting = best.place.resting(self.columns);
+        (resting > MOST_RESTING).then_some(Doubt::Resting(resting))
+    }
+}
+
+/// The presses by the numbers of frames, where bytes alone show none: the low bytes of floats and of signed
+/// numbers change as much at rest. Of all types of cells, the one that shows the presses best.
+fn numbers_that_press(frames: &Frames) -> Option<Presses> {
+    let types = TYPES.iter().filter(|of| of.bytes > 1);
+    let ways = types.flat_map(|of| (0..of.bytes).map(move |begin| (of, begin)));
+    let found = ways.filter_map(|(of, begin)| {
+        let numbers = |frame: &[u8]| -> Vec<f32> {
+            frame[begin..].chunks_exact(of.bytes).map(of.read).collect()
+        };
+        let frames: Vec<Vec<f32>> = frames.iter().map(numbers).collect();
+        let activity = activity(&frames)?;
+        let presses = Presses::of(&activity)?;
+        let mut sorted = activity;
+        sorted.sort_unstable();
+        let at = |share: usize| f64::from(sorted[(sorted.len() - 1) * share / 100]);
+        Some(((at(98) - at(25)) / (at(25) - at(0)).max(1.0), presses))
+    });
+    let best = found.max_by(|a, b| a.0.total_cmp(&b.0));
+    best.filter(|(contrast, _)| *contrast > CONTRAST)
+        .map(|(_, presses)| presses)
+}
+
+/// A press stands out by so many times as much as frames at rest differ.
+const CONTRAST: f64 = 4.0;
+
+/// How far the numbers of each frame are from rest, by what they change from frame to frame.
+fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
+    let rest = middle(frames);
+    let mut activity = vec![0.0; frames.len()];
+    for cell in 0..rest.len() {
+        let of = |frame: &Vec<f32>| frame[cell];
+        if !frames.iter().map(of).all(f32::is_finite) {
+            continue;
+        }
+        let mut steps: Vec<f32> = frames
+            .windows(2)
+            .map(|pair| (of(&pair[1]) - of(&pair[0])).abs())
+            .collect();
+        steps.sort_by(f32::total_cmp);
+        let usual = steps.get(steps.len() / 2)?.max(f32::MIN_POSITIVE);
+        for (sum, frame) in activity.iter_mut().zip(frames) {
+            *sum += f64::from(((of(frame) - rest[cell]).abs() / usual).min(64.0));
+        }
+    }
+    Some(
+        activity
+            .into_iter()
+            .map(|sum| (sum * 16.0) as u32)
+            .collect(),
+    )
+}
+
+/// How much the cells of a picture change.
+fn energy(picture: &[f32]) -> f64 {
+    picture.iter().map(|change| f64::from(change.abs())).sum()
+}
+
+/// Marks the bytes of a checksum near a mark: they are no cells, even if they seem to change as cells do.
+fn mark_checksum(frames: &Frames, columns: &mut Columns) {
+    let period = frames.period();
+    if frames.len() == 0 || period < 2 * NEAR_MARK {
+        return;
+    }
+    let indices: Vec<usize> = (0..frames.len()).collect();
+    let indices = some(&indices, CHECKED);
+    let is_marking = |at: usize| {
+        columns.kinds[at]
+            .constant()
+            .is_some_and(|value| value != 0 && columns.resting(2).bits[at] > CONSTANT_BITS)
+    };
+    let runs = (0..period)
+        .filter(|&at| is_marking(at) && !is_marking((at + 1) % period))
+        .take(MOST_MARKS);
+    let found = runs.collect::<Vec<usize>>().into_iter().find_map(|mark| {
+        let first = (mark + period + 1 - NEAR_MARK) % period;
+        let kinds: Vec<Kind> = (0..2 * NEAR_MARK)
+            .map(|by| columns.kinds[(first + by) % period])
+            .collect();
+        let span = |&index: &usize| frames.from(index, first, period + 2 * NEAR_MARK);
+        let spans: Vec<&[u8]> = indices.iter().map(span).collect();
+        let check = checks::long(&spans, &kinds)
+            .filter(|check| matches!(check.what, checks::What::From(..)))?;
+        Some(
+            check
+                .at
+                .map(|at| (first + at) % period)
+                .collect::<Vec<usize>>(),
+        )
+    });
+    for at in found.into_iter().flatten() {
+        columns.kinds[at] = Kind::Restless;
+    }
+}
+
+/// The bits of each press that no shape changes.
+fn later(pictures: &Pictures) -> Vec<f64> {
+    added(model::later(pictures), &pictures.below_step_bits)
+}
+
+/// The bits of all cells of each press.
+fn sums(presses: &[Vec<f64>]) -> Vec<f64> {
+    presses.iter().map(|press| press.iter().sum()).collect()
+}
+
+fn added(mut a: Vec<f64>, b: &[f64]) -> Vec<f64> {
+    a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+    a
+}
+
+/// The packets of a frame, if their number shows: what presses is in the same packet of each frame.
+fn packets(frames: &Frames, columns: &Columns) -> Option<Failure> {
+    let bytes = frames.period();
+    (0..bytes).find_map(|at| {
+        let values = || frames.iter().map(|frame| frame[at]);
+        let (first, last) = (values().min()?, values().max()?);
+        let packets = usize::from(last - first) + 1;
+        if !(2..=MOST_SIDE).contains(&packets) || frames.len() < LEAST_FRAMES * packets {
+            return None;
+        }
+        let next = |value: u8| if value == last { first } else { value + 1 };
+        let pairs = frames.pairs().count();
+        let counting = frames
+            .pairs()
+            .filter(|&(a, b)| frames.get(b)[at] == next(frames.get(a)[at]));
+        let change = |distance: usize| {
+            let changes = frames
+                .at_distance(distance)
+                .map(|(a, b)| columns.change(frames.get(a), frames.get(b)));
+            let changes: Vec<u32> = changes.collect();
+            f64::from(changes.iter().sum::<u32>()) / changes.len() as f64
+        };
+        // A counter may begin again too, but then the frames before and after are alike.
+        (counting.count() as f64 >= COUNTING_SHARE * pairs as f64 && change(packets) < change(1))
+            .then_some(Failure::Packets {
+                bytes,
+                first,
+                last,
+                packets,
+            })
+    })
+}

@@ -1,0 +1,185 @@
+//! `hrn-train fit`.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::trial;
+use hardnessd_core::verdict::{Borders, Level};
+use hrn_train::fit::{self, Estimate, Fitted, Report, Request, Row, Written};
+
+use super::arguments::Fit;
+use super::configuration::{first_sensor, levels};
+use super::files::{apart, check_new, write};
+
+/// The most wrongly judged presses that are listed.
+const LISTED: usize = 20;
+
+pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
+    let (sensor, levels) = match &arguments.config {
+        Some(config) => (first_sensor(config)?, levels(config)?),
+        None => (Sensor::new(Description::default())?, None),
+    };
+    let references = arguments.out.with_extension("npz");
+    for out in [&arguments.out, &references] {
+        apart("--out", out, arguments.data.iter().map(PathBuf::as_path))?;
+        check_new(out)?;
+    }
+    let request = Request {
+        data: arguments.data.clone(),
+        sensor: sensor.clone(),
+        levels,
+    };
+    let Fitted { report, written } = fit::fit(&request)?;
+    let text = match arguments.json {
+        true => serde_json::to_string(&report)? + "\n",
+        false => of_report(&report),
+    };
+    let lines = match written {
+        None => {
+            super::print(&text)?;
+            bail!("nothing was written, because no candidate is better than guessing");
+        }
+        Some(Written::Model(bytes)) => {
+            let rate_hz = sensor.frame_rate_hz();
+            trial::load(&bytes, Some(trial::verdict_most(rate_hz)))
+                .context("the daemon refuses the model")?;
+            write(&arguments.out, &bytes)?;
+            let path = shown(&arguments.out);
+            format!("[model]\npath = {path}\n")
+        }
+        Some(Written::References(bytes, levels)) => {
+            write(&references, &bytes)?;
+            let own = levels
+                .as_deref()
+                .map(of_levels)
+                .transpose()?
+                .unwrap_or_default();
+            let path = shown(&references);
+            format!("references = {path}   # in the table of the [[sensor]]\n{own}")
+        }
+    };
+    if arguments.json {
+        return Ok(text);
+    }
+    Ok(format!(
+        "{text}\nThe daemon loads it. Its lines in the configuration:\n\n{lines}"
+    ))
+}
+
+/// A path as TOML has it.
+fn shown(path: &Path) -> String {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    toml::Value::from(path.to_string_lossy().into_owned()).to_string()
+}
+
+/// The `[[level]]` tables of levels that are parts of the scale.
+fn of_levels(levels: &[Level]) -> anyhow::Result<String> {
+    let borders = Borders::of(levels)?;
+    let table = |(place, level): (usize, &Level)| {
+        let label = toml::Value::from(level.label.as_str());
+        let [low, high] = borders.part(place);
+        format!("[[level]]\nlabel = {label}\nshore = [{low:?}, {high:?}]\n")
+    };
+    Ok(levels.iter().enumerate().map(table).collect())
+}
+
+fn of_report(report: &Report) -> String {
+    let mut text = format!("{} presses\n", report.presses);
+    for of in &report.levels {
+        let (level, objects) = (&of.level, of.objects);
+        let _ = writeln!(
+            text,
+            "  level {} {} ({}): {} presses of {objects} object{}",
+            level.level,
+            level.label,
+            level.shore,
+            of.presses,
+            if objects == 1 { "" } else { "s" }
+        );
+    }
+    let _ = writeln!(
+        text,
+        "\nbalanced accuracy (95 %)      on new objects           on later presses"
+    );
+    for row in report.candidates.iter().chain(&report.controls) {
+        text += &of_row(row);
+    }
+    if let Some(best) = &report.best {
+        let by = match report.chosen_by {
+            Some("new_objects") => "objects that it had not met",
+            _ => "later presses",
+        };
+        let _ = writeln!(text, "\n{best} on {by}:\ntruth \\ said");
+        for (of, row) in report.levels.iter().zip(&report.confusion) {
+            let counts: String = row.iter().map(|count| format!("{count:>6}")).collect();
+            let _ = writeln!(text, "  {:<16}{counts}", of.level.label);
+        }
+        for wrong in report.wrong.iter().take(LISTED) {
+            let _ = writeln!(
+                text,
+                "  wrong: {} is {}, {best} says {}",
+                wrong.press, wrong.level, wrong.said
+            );
+        }
+        if report.wrong.len() > LISTED {
+            let more = report.wrong.len() - LISTED;
+            let _ = writeln!(text, "  and {more} more, which --json lists");
+        }
+    }
+    for remark in &report.remarks {
+        let _ = writeln!(text, "\n{}.", capital(remark));
+    }
+    text
+}
+
+fn of_row(row: &Row) -> String {
+    if let Some(left_out) = &row.left_out {
+        return format!("  {:<27} left out: {left_out}\n", row.name);
+    }
+    let shown = |estimate: &Option<Estimate>| match estimate {
+        None => "-".to_owned(),
+        Some(of) => {
+            let percent = |share: f64| format!("{:.1}", 100.0 * share);
+            let interval = of.interval.map_or_else(String::new, |[low, high]| {
+                format!(" ({} to {})", percent(low), percent(high))
+            });
+            format!("{} %{interval}", percent(of.balanced_accuracy))
+        }
+    };
+    let (new, later) = (shown(&row.new_objects), shown(&row.later_presses));
+    format!("  {:<27} {new:<24} {later}\n", row.name)
+}
+
+fn capital(text: &str) -> String {
+    let mut chars = text.chars();
+    let first = chars.next().map(|first| first.to_uppercase().to_string());
+    first.unwrap_or_default() + chars.as_str()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_are_written_as_the_configuration_takes_them() {
+        let level = |(level, label, shore): (u8, &str, &str)| Level {
+            level,
+            label: label.to_owned(),
+            shore: shore.to_owned(),
+        };
+        let levels = [
+            (1, "green", ">65"),
+            (2, "half \"ripe\"", "40-65"),
+            (3, "ripe", "<=40"),
+        ];
+        let text = of_levels(&levels.map(level)).unwrap();
+        let tables: toml::Table = text.parse().unwrap();
+        let shore = |place: usize| tables["level"][place]["shore"].as_array().unwrap().clone();
+        assert_eq!(shore(0), [65.0, 100.0].map(toml::Value::from));
+        assert_eq!(shore(1), [40.0, 65.0].map(toml::Value::from));
+        assert_eq!(shore(2), [0.0, 40.0].map(toml::Value::from));
+        assert_eq!(tables["level"][1]["label"].as_str(), Some("half \"ripe\""));
+    }
+}

@@ -1,0 +1,246 @@
+//! `hrn-train fit`: recordings in, the best model for this robot out.
+//!
+//! In: recordings of known objects, or data sets. Out: the candidates with what each reaches on objects that it
+//! has not met and on later presses, and a model or references, whichever judges these presses best. Nothing is
+//! written unless it is better than guessing.
+
+pub mod candidate;
+pub mod comparison;
+pub mod folds;
+pub mod levels;
+pub mod report;
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::{Context as _, anyhow, ensure};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+
+use self::candidate::{Candidate, Entry};
+use self::comparison::{Compared, Comparison, Division, Outcome, What};
+pub use self::comparison::{Estimate, OfLevel};
+use self::folds::Fold;
+pub use self::report::{Report, Row, Wrong};
+use crate::data::collect::{self, Labelling, Settings, Unnumbered};
+use crate::data::presses::file::layout_of;
+use crate::data::presses::{Layout, Presses};
+use crate::data::source::papers_levels;
+use crate::model::export::{Exported, Learnt, validation};
+use hardnessd_core::references;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn, Level};
+use hardnessd_simulator::Split;
+use hardnessd_simulator::random::Stream;
+
+/// The fewest objects, and presses of each.
+const LEAST: [usize; 2] = [3, 2];
+/// The seed of everything random.
+const SEED: u64 = 1;
+/// The name of the control.
+const UNLOADED: &str = "the unloaded sensor alone";
+
+/// What to learn from.
+#[derive(Debug)]
+pub struct Request {
+    /// Recordings, directories of recordings, and data sets.
+    pub data: Vec<PathBuf>,
+    /// The sensor of recordings that do not describe their own.
+    pub sensor: Sensor,
+    /// The levels, if they are not those of the labels.
+    pub levels: Option<Vec<Level>>,
+}
+
+/// What `fit` found, and what to write.
+#[derive(Debug)]
+pub struct Fitted {
+    /// What was compared.
+    pub report: Report,
+    /// What to write. `None` if nothing is better than guessing.
+    pub written: Option<Written>,
+}
+
+/// A file for the daemon.
+#[derive(Debug)]
+pub enum Written {
+    /// An ONNX model.
+    Model(Vec<u8>),
+    /// References for the built-in model, and its levels where they are not its own.
+    References(Vec<u8>, Option<Vec<Level>>),
+}
+
+/// Compares the candidates and makes the best one.
+///
+/// # Errors
+///
+/// Fails if the data cannot be used, or have too few objects, presses or levels.
+pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
+    let presses = read(request)?;
+    let places: Vec<usize> = presses.labelled(Split::Train).collect();
+    check(&presses, &places)?;
+    let candidates = candidate::all(&presses, &places)?;
+    let control = candidate::unloaded(&presses, &places);
+    let divisions = [
+        folds::by_object(&presses, &places, SEED),
+        folds::by_time(&presses, &places),
+    ];
+    let usable = candidates.iter().filter(|(_, candidate)| candidate.is_ok());
+    let an_entry: usize = divisions.iter().flatten().map(Vec::len).sum();
+    let work = an_entry * (usable.count() + usize::from(control.is_some()));
+    let bar = ProgressBar::new(work as u64);
+    let style = ProgressStyle::with_template("{msg:10} {bar:30} {pos}/{len} fits, {eta} left");
+    bar.set_style(style.expect("the template is right"));
+    let compare = |name, candidate: Result<&Candidate, &String>| -> anyhow::Result<Compared> {
+        bar.set_message(name);
+        let outcome = |folds: &Vec<Fold>| match candidate {
+            Ok(candidate) => Outcome::of(candidate, &presses, folds, SEED, &bar).map(Some),
+            Err(_) => Ok(None),
+        };
+        let [new, later] = &divisions;
+        let new = new.as_ref().map(outcome).transpose()?.flatten();
+        let later = later.as_ref().map(outcome).transpose()?.flatten();
+        Ok(Compared {
+            name,
+            outcomes: [new, later],
+            left_out: candidate.err().cloned(),
+        })
+    };
+    let compared = candidates
+        .iter()
+        .map(|(name, candidate)| compare(name, candidate.as_ref()));
+    let compared: Vec<Compared> = compared.collect::<anyhow::Result<_>>()?;
+    let unloaded = control.ok_or_else(|| "only recordings have it".to_owned());
+    let control = compare(UNLOADED, unloaded.as_ref())?;
+    bar.finish_and_clear();
+    let comparison = Comparison {
+        presses: &presses,
+        places: &places,
+        candidates: compared,
+        control,
+    };
+    let choice = comparison.choice();
+    let report = comparison.report(&choice);
+    let written = match choice.writes {
+        None => None,
+        Some(What::References) => Some(write_references(&candidates, &presses, &places)?),
+        Some(What::Model(place)) => {
+            let (name, candidate) = &candidates[place];
+            let candidate = candidate
+                .as_ref()
+                .map_err(|left_out| anyhow!("{left_out}"))?;
+            let judged = comparison.candidates[place].outcomes[choice.division as usize].as_ref();
+            let judged = judged.context("the best candidate was judged")?;
+            let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
+                let mut stream = Stream::new(SEED, "calibration");
+                let calibration = judged.calibration(&presses, &learning.outputs(), &mut stream);
+                let learnt = Learnt {
+                    learning,
+                    weights,
+                    calibration: match choice.division {
+                        Division::NewObjects => calibration,
+                        // Presses of known objects promise nothing of others.
+                        Division::LaterPresses => calibration.without_sets(),
+                    },
+                    presses: &presses,
+                    train: &places,
+                };
+                let mut exported = Exported::of(&learnt, name, &presses.sources)?;
+                exported.card.validation = format!(
+                    "{} of {}",
+                    choice.division.words(),
+                    validation(&presses.kinds(&places))
+                );
+                exported.card.metrics["fit"] = json!(report.candidates);
+                exported.bytes()
+            })?;
+            Some(Written::Model(bytes))
+        }
+    };
+    Ok(Fitted { report, written })
+}
+
+/// References for the built-in model.
+fn write_references(
+    candidates: &[Entry],
+    presses: &Presses,
+    places: &[usize],
+) -> anyhow::Result<Written> {
+    let built_in = candidates
+        .iter()
+        .find_map(|(_, candidate)| match candidate {
+            Ok(Candidate::BuiltIn(hrn)) => Some(hrn),
+            _ => None,
+        });
+    let hrn = built_in.context("the built-in model cannot say these levels")?;
+    let own = candidate::references(hrn, presses, places)?;
+    let levels = &hrn.card().levels;
+    let is_own = *levels != papers_levels();
+    Ok(Written::References(
+        references::write(&own)?,
+        is_own.then(|| levels.clone()),
+    ))
+}
+
+/// Reads the labelled presses.
+fn read(request: &Request) -> anyhow::Result<Presses> {
+    let paths = collect::captures(&request.data)?;
+    let mut layout = Layout::OverTime;
+    for path in &paths {
+        let is_data_set = path.extension().is_some_and(|extension| extension == "npz");
+        if is_data_set && layout_of(path)? == Layout::Frames {
+            layout = Layout::Frames;
+        }
+    }
+    let labels = collect::labels(&paths);
+    let stated = paths.iter().find_map(|path| collect::levels(path));
+    let levels = match request.levels.clone().or(stated) {
+        Some(levels) => levels,
+        None => levels::of_labels(&labels)?,
+    };
+    let settings = Settings {
+        sensor: request.sensor.clone(),
+        hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
+        unnumbered: Unnumbered::Each,
+        levels: levels.clone(),
+        labelling: Labelling {
+            level: None,
+            object: None,
+            split: Split::Train,
+        },
+        layout,
+        skip_unusable: false,
+    };
+    Ok(collect::collect(&paths, None, &settings)?.into_presses(levels))
+}
+
+/// Refuses data with too little to learn from.
+fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
+    let [least_objects, least_presses] = LEAST;
+    let objects = folds::objects(presses, places);
+    let enough = objects
+        .values()
+        .filter(|own| own.len() >= least_presses)
+        .count();
+    ensure!(
+        enough >= least_objects,
+        "found {} labelled presses of {} objects, {enough} of them with {least_presses} presses or more; expected \
+         {least_objects} such objects: press more of them",
+        places.len(),
+        objects.len()
+    );
+    let count = presses.levels().len();
+    let beyond = presses
+        .of(places)
+        .map(|press| press.level)
+        .find(|&level| usize::from(level) > count);
+    if let Some(level) = beyond {
+        anyhow::bail!("found a press of level {level}, and {count} levels: name all levels");
+    }
+    let found: BTreeSet<u8> = presses.of(places).map(|press| press.level).collect();
+    ensure!(
+        found.len() > 1,
+        "all presses are of one level: press objects of another level too"
+    );
+    Ok(())
+}

@@ -1,0 +1,154 @@
+//! The interval of an accuracy, by a bootstrap over what was drawn independently.
+//!
+//! Presses of one object are near-copies, and so are those of all sensors under one cover, which press the
+//! same objects. An interval over presses would be too narrow.
+
+use std::collections::BTreeMap;
+
+use hardnessd_simulator::random::Stream;
+
+/// The number of draws.
+const DRAWS: usize = 2_000;
+
+/// A judged press.
+#[derive(Debug, Clone, Copy)]
+pub struct Drawn {
+    /// The stratum that its unit is drawn in.
+    pub stratum: u8,
+    /// The unit that it is drawn with.
+    pub unit: u32,
+    /// 1 if it was judged rightly and 0 if not, or the difference of two such numbers.
+    pub value: f64,
+}
+
+/// The mean that is estimated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Mean {
+    /// Over the presses.
+    OfPresses,
+    /// Over the strata, of the means over their presses.
+    OfStrata,
+}
+
+/// The sum of values and the number of presses of a unit.
+type Sum = [f64; 2];
+
+impl Mean {
+    fn of(self, strata: impl ExactSizeIterator<Item = Sum>) -> f64 {
+        let count = strata.len() as f64;
+        match self {
+            Self::OfPresses => {
+                let [sum, n] = total(strata);
+                sum / n
+            }
+            Self::OfStrata => strata.map(|[sum, n]| sum / n).sum::<f64>() / count,
+        }
+    }
+}
+
+/// The sums of the units of each stratum.
+fn strata(presses: &[Drawn]) -> Vec<Vec<Sum>> {
+    let mut strata = BTreeMap::<u8, BTreeMap<u32, Sum>>::new();
+    for press in presses {
+        let units = strata.entry(press.stratum).or_default();
+        let sum = units.entry(press.unit).or_default();
+        sum[0] += press.value;
+        sum[1] += 1.0;
+    }
+    let units = strata.into_values();
+    units.map(|units| units.into_values().collect()).collect()
+}
+
+/// The mean of the values of presses. NaN without any.
+pub fn mean(presses: &[Drawn], mean: Mean) -> f64 {
+    let strata = strata(presses);
+    mean.of(strata.iter().map(|units| total(units.iter().copied())))
+}
+
+/// The 95 % interval of the mean. Each draw takes units of each stratum, with replacement.
+/// `None` if a stratum has only one unit, because nothing then says how much its units vary, and if all
+/// values are the same, because every draw is then the same.
+///
+/// A draw of all n units would vary less than the units do, by (n - 1) / n. So a draw takes n - 1 of them, and
+/// counts each n / (n - 1) times (Rao and Wu 1988, "Resampling inference with complex survey data").
+pub fn of(presses: &[Drawn], mean: Mean) -> Option<[f64; 2]> {
+    let strata = strata(presses);
+    let is_one = strata.iter().any(|units| units.len() < 2);
+    let first = presses.first()?.value;
+    if is_one || presses.iter().all(|press| press.value == first) {
+        return None;
+    }
+    let mut stream = Stream::new(0, "bootstrap by object");
+    let mut draw = |units: &Vec<Sum>| {
+        let drawn = (1..units.len()).map(|_| units[stream.below(units.len())]);
+        let times = units.len() as f64 / (units.len() - 1) as f64;
+        total(drawn).map(|sum| sum * times)
+    };
+    let mut draws: Vec<f64> = (0..DRAWS)
+        .map(|_| mean.of(strata.iter().map(&mut draw)))
+        .collect();
+    draws.sort_by(f64::total_cmp);
+    Some([quantile(&draws, 0.025), quantile(&draws, 0.975)])
+}
+
+fn total(sums: impl Iterator<Item = Sum>) -> Sum {
+    sums.fold([0.0; 2], |[sum, n], [more, of]| [sum + more, n + of])
+}
+
+/// The quantile, linear between the two nearest values, as numpy does by default.
+fn quantile(sorted: &[f64], q: f64) -> f64 {
+    let place = q * (sorted.len() - 1) as f64;
+    let below = place.floor() as usize;
+    let above = (below + 1).min(sorted.len() - 1);
+    sorted[below] + (place - below as f64) * (sorted[above] - sorted[below])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 50 presses of each unit of one stratum, of which `right` were judged rightly.
+    fn units(right: &[usize]) -> Vec<Drawn> {
+        let presses = |(unit, &right): (u32, &usize)| {
+            (0..50).map(move |n| Drawn {
+                stratum: 1,
+                unit,
+                value: f64::from(u8::from(n < right)),
+            })
+        };
+        (0..).zip(right).flat_map(presses).collect()
+    }
+
+    #[test]
+    fn the_interval_is_the_normal_one_of_the_units() {
+        // Half of the units are all right. The mean's standard deviation is that of a sample, divided by the
+        // root of its number: also for few units, where a draw of all units would be too narrow.
+        for (count, tolerance) in [(400_u32, 0.08), (8, 0.25)] {
+            let right: Vec<usize> = (0..count).map(|n| 50 * (n % 2) as usize).collect();
+            let [low, high] = of(&units(&right), Mean::OfPresses).unwrap();
+            let deviation = 0.5 / f64::from(count - 1).sqrt();
+            let expected = 2.0 * 1.96 * deviation;
+            let found = high - low;
+            assert!(
+                (found / expected - 1.0).abs() < tolerance,
+                "{count}: {found}, expected {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn one_unit_of_a_stratum_has_no_interval() {
+        assert_eq!(of(&units(&[40]), Mean::OfPresses), None);
+        // Nothing varies where all verdicts are right.
+        assert_eq!(of(&units(&[50, 50, 50]), Mean::OfPresses), None);
+        let mut presses = units(&[40, 30]);
+        assert!(of(&presses, Mean::OfPresses).is_some());
+        presses.push(Drawn {
+            stratum: 2,
+            unit: 7,
+            value: 1.0,
+        });
+        assert_eq!(of(&presses, Mean::OfPresses), None);
+        assert_eq!(mean(&presses, Mean::OfStrata), 0.5 * (0.7 + 1.0));
+    }
+}

@@ -1,0 +1,295 @@
+//! Calibrates verdicts on held-out objects: the temperature (Guo et al. 2017, "On calibration of modern
+//! neural networks"), and for each knowledge of a sensor the limits of sets of levels and of intervals
+//! (split conformal prediction). The unit that counts is what is new on a robot: the cover, or the object
+//! if all presses are of one sensor.
+
+use std::collections::BTreeMap;
+
+use super::{Learning, Outputs};
+use crate::data::presses::Presses;
+use crate::net::network::Weights;
+use hardnessd_core::verdict::{Conformal, Knowledge, Limits, TAIL};
+use hardnessd_simulator::random::Stream;
+
+/// Sets of levels and intervals of Shore hardness miss the truth in at most this share of cases.
+pub const ALPHA: f32 = 0.1;
+/// The fewest held-out units with which [`ALPHA`] can be promised: with n units, at least one in
+/// n + 1 cases may exceed the greatest value among them.
+const LEAST_UNITS: usize = 9;
+/// A quantile is the mean over this many draws of one press from each unit.
+const DRAWS: usize = 50;
+
+/// The calibration computed from the held-out presses.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Calibration {
+    /// The divisor of the logits.
+    pub temperature: f32,
+    /// The limits for each knowledge of a sensor. Empty if nothing can be promised.
+    pub limits: BTreeMap<Knowledge, Limits>,
+    /// The number of held-out units, and of those whose Shore hardness was measured.
+    units: [usize; 2],
+}
+
+/// What the network says of a press of a held-out object.
+#[derive(Debug, Clone)]
+pub(crate) struct Judged {
+    /// The press's cover, or its object if all presses are of one sensor.
+    pub(crate) unit: u64,
+    /// The level, from 0.
+    pub(crate) level: usize,
+    /// The Shore hardness, if it was measured.
+    pub(crate) shore: Option<f32>,
+    /// The logits.
+    pub(crate) row: Vec<f32>,
+}
+
+impl Calibration {
+    /// Calibrates on the presses `held_out`, varied and with references like the training presses. Without
+    /// any, it changes nothing and promises nothing.
+    pub fn of(
+        learning: &dyn Learning,
+        presses: &Presses,
+        held_out: &[usize],
+        weights: &[Weights],
+        stream: &mut Stream,
+    ) -> Self {
+        let mut judged = BTreeMap::new();
+        for knowledge in Knowledge::ALL {
+            let questions = learning.questions(held_out, knowledge, stream);
+            let Some(questions) = questions.filter(|_| !held_out.is_empty()) else {
+                continue;
+            };
+            let rows = learning.judge(weights, &questions, Some(stream));
+            let asked = questions.iter().flat_map(|question| &question.presses);
+            let asked: Vec<usize> = asked.copied().collect();
+            let units = presses.units(&asked);
+            let one = |(number, (&place, row)): (usize, (&usize, Vec<f32>))| {
+                let press = &presses.all[place];
+                Judged {
+                    // A press without a known object is of an object of its own.
+                    unit: units
+                        .as_ref()
+                        .map_or(u64::MAX - place as u64, |units| units.1[number].into()),
+                    level: usize::from(press.level) - 1,
+                    shore: press.shore,
+                    row,
+                }
+            };
+            let of_knowledge = asked.iter().zip(rows).enumerate().map(one).collect();
+            judged.insert(knowledge, of_knowledge);
+        }
+        Self::on(&judged, &learning.outputs(), stream)
+    }
+
+    /// Calibrates on these.
+    pub(crate) fn on(
+        judged: &BTreeMap<Knowledge, Vec<Judged>>,
+        outputs: &Outputs,
+        stream: &mut Stream,
+    ) -> Self {
+        let of_truth = |judged: &Judged, temperature: f32| {
+            outputs.probabilities(&judged.row, temperature)[judged.level]
+        };
+        // Rare levels count as much as frequent ones.
+        let mut counts = BTreeMap::<usize, f64>::new();
+        let all = || judged.values().flatten();
+        for judged in all() {
+            *counts.entry(judged.level).or_default() += 1.0;
+        }
+        let loss = |temperature: f64| {
+            let loss = all().map(|judged| {
+                let p = of_truth(judged, temperature as f32).max(f32::MIN_POSITIVE);
+                -f64::from(p).ln() / counts[&judged.level]
+            });
+            loss.sum::<f64>()
+        };
+        let temperature = match all().next() {
+            None => 1.0,
+            Some(_) => least(loss),
+        };
+        let (mut limits, mut units) = (BTreeMap::new(), [0; 2]);
+        for (&knowledge, judged) in judged {
+            let wrong = by_unit(judged, |judged| Some(-of_truth(judged, temperature)));
+            // The share of the distribution beyond the truth, on its side.
+            let beyond = by_unit(judged, |judged| {
+                let below = outputs.below(&judged.row, temperature, judged.shore?)?;
+                Some(-below.min(1.0 - below))
+            });
+            let measured = by_unit(judged, |judged| judged.shore).len();
+            if knowledge == Knowledge::None {
+                units = [wrong.len(), measured];
+            }
+            if let Some(wrong) = quantile(&wrong, stream) {
+                let tail = quantile(&beyond, stream).map_or(TAIL, |beyond| -beyond);
+                let threshold = -wrong;
+                limits.insert(knowledge, Limits { threshold, tail });
+            }
+        }
+        Self {
+            temperature,
+            limits,
+            units,
+        }
+    }
+
+    /// The same without a promise of sets of levels.
+    pub(crate) fn without_sets(self) -> Self {
+        Self {
+            limits: BTreeMap::new(),
+            units: [0; 2],
+            ..self
+        }
+    }
+
+    /// What a file says of the limits.
+    pub fn conformal(&self) -> Option<Conformal> {
+        let none = self.limits.get(&Knowledge::None)?;
+        Some(Conformal {
+            alpha: ALPHA,
+            threshold: none.threshold,
+            contexts: self.limits.clone(),
+        })
+    }
+
+    /// What the calibration cannot promise, and why, in one line. `None` if it promises both the
+    /// sets of levels and the interval of the Shore hardness.
+    pub fn missing(&self) -> Option<String> {
+        let [units, measured] = self.units;
+        if units < LEAST_UNITS {
+            return Some(format!(
+                "held-out objects: found {units}, expected at least {LEAST_UNITS}: there are no sets \
+                 of levels, and nothing promises that the interval of the Shore hardness holds"
+            ));
+        }
+        (measured < LEAST_UNITS).then(|| {
+            format!(
+                "held-out objects with a measured Shore hardness: found {measured}, expected at \
+                 least {LEAST_UNITS}: nothing promises that the interval of the Shore hardness holds"
+            )
+        })
+    }
+}
+
+/// The temperature of least loss, between 1/8 and 8. The loss of logits is convex in 1/T, so a
+/// shrinking bracket finds its minimum.
+fn least(loss: impl Fn(f64) -> f64) -> f32 {
+    let (mut low, mut high) = (0.125_f64, 8.0_f64);
+    for _ in 0..60 {
+        let (left, right) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+        if loss(1.0 / left) < loss(1.0 / right) {
+            high = right;
+        } else {
+            low = left;
+        }
+    }
+    (2.0 / (low + high)) as f32
+}
+
+/// The values of the presses of each unit.
+fn by_unit(judged: &[Judged], value: impl Fn(&Judged) -> Option<f32>) -> Vec<Vec<f32>> {
+    let mut units = BTreeMap::<u64, Vec<f32>>::new();
+    for judged in judged {
+        units.entry(judged.unit).or_default().extend(value(judged));
+    }
+    units
+        .into_values()
+        .filter(|values| !values.is_empty())
+        .collect()
+}
+
+/// The split-conformal quantile of 1 - [`ALPHA`] for exchangeable units: with one press of each of n
+/// units, the value of rank ceil((1 - alpha)(n + 1)), averaged over draws of the presses. `None` with
+/// fewer units than the rank: no value is then large enough.
+fn quantile(units: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
+    let rank = ((1.0 - ALPHA) * (units.len() + 1) as f32).ceil() as usize;
+    if rank > units.len() {
+        return None;
+    }
+    let mut sum = 0.0;
+    for _ in 0..DRAWS {
+        let mut drawn: Vec<f32> = units
+            .iter()
+            .map(|own| own[stream.below(own.len())])
+            .collect();
+        drawn.sort_by(f32::total_cmp);
+        sum += drawn[rank - 1];
+    }
+    Some(sum / DRAWS as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_quantile_counts_units_not_presses() {
+        let mut stream = Stream::new(1, "quantile");
+        // 99 units of value 1 to 99; the last has a thousand presses.
+        let mut units: Vec<Vec<f32>> = (1..=99_u8).map(|n| vec![f32::from(n)]).collect();
+        units[98] = vec![99.0; 1000];
+        assert_eq!(quantile(&units, &mut stream), Some(90.0));
+        // Of nine units, the rank is the greatest value. Fewer units are too few for it.
+        assert_eq!(quantile(&units[..LEAST_UNITS], &mut stream), Some(9.0));
+        for few in 0..LEAST_UNITS {
+            assert_eq!(quantile(&units[..few], &mut stream), None, "{few}");
+        }
+    }
+
+    #[test]
+    fn the_temperature_undoes_overconfidence() {
+        // The larger logit is right in 3 of 4 cases, but the logits are 4 times those of
+        // probability 3/4.
+        let honest = 3.0_f32.ln();
+        let judged = (0..16).map(|unit| {
+            let level = usize::from(unit % 2 == 0);
+            let mut row = vec![0.0; 2];
+            row[if unit % 8 < 2 { 1 - level } else { level }] = 4.0 * honest;
+            Judged {
+                unit,
+                level,
+                shore: None,
+                row,
+            }
+        });
+        let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
+        let stream = &mut Stream::new(1, "calibration");
+        let found = Calibration::on(&judged, &Outputs::Levels, stream);
+        assert!((found.temperature - 4.0).abs() < 1e-2, "{found:?}");
+    }
+
+    #[test]
+    fn few_objects_give_no_sets_and_promise_nothing() {
+        let of = |objects: u64, measured: u64| {
+            let press = |n: u64| Judged {
+                unit: n / 3,
+                level: (n % 2) as usize,
+                shore: (n / 3 < measured).then_some(50.0),
+                row: vec![1.0, 1.0],
+            };
+            let judged = (0..3 * objects).map(press).collect();
+            let judged = BTreeMap::from([(Knowledge::None, judged)]);
+            let stream = &mut Stream::new(1, "calibration");
+            Calibration::on(&judged, &Outputs::Levels, stream)
+        };
+        let enough = of(9, 9);
+        let threshold =
+            |found: &Calibration| found.limits.get(&Knowledge::None).map(|l| l.threshold);
+        assert!(
+            (threshold(&enough).unwrap() - 0.5).abs() < 1e-3,
+            "{enough:?}"
+        );
+        assert_eq!(enough.missing(), None);
+        let few = of(8, 8);
+        assert_eq!(threshold(&few), None);
+        let missing = few.missing().unwrap();
+        assert!(
+            missing.contains("found 8, expected at least 9"),
+            "{missing}"
+        );
+        let unmeasured = of(9, 2);
+        assert!(threshold(&unmeasured).unwrap() > 0.0);
+        let missing = unmeasured.missing().unwrap();
+        assert!(missing.contains("Shore hardness: found 2"), "{missing}");
+        assert!(of(0, 0).missing().unwrap().contains("found 0"));
+    }
+}

@@ -1,0 +1,180 @@
+//! The verdicts of a model file on presses, beside references of their sensors.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use anyhow::ensure;
+
+use crate::data::presses::Presses;
+use crate::learn::course::piece;
+use hardnessd_core::frame::Array;
+use hardnessd_core::judge::OwnPresses;
+use hardnessd_core::verdict::{Course, Format, Hrn, Piece, ReferencePress, References, Verdict};
+use hardnessd_simulator::random::Stream;
+
+/// The references of its sensor that a model is given beside a press.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Given {
+    /// Presses of each rigid piece.
+    pub rigid: usize,
+    /// Objects of each level. Their presses are not judged.
+    pub labelled: usize,
+    /// The sensor's own presses of other objects, of which the model knows nothing.
+    pub own: usize,
+}
+
+impl Given {
+    /// What a run's evaluation gives a model: two presses of each piece.
+    pub const USUAL: Self = Self {
+        rigid: 2,
+        labelled: 0,
+        own: 0,
+    };
+}
+
+/// As many presses of each rigid piece on a sensor as are given.
+pub fn rigid(presses: &Presses, sensor: u32, given: Given) -> Vec<(usize, Piece)> {
+    let of_sensor = presses.all.iter().enumerate();
+    let pieces = of_sensor.filter(|(_, press)| press.sensor == sensor);
+    let pieces = pieces.filter_map(|(place, press)| Some((place, piece(press.reference?))));
+    let is_ball = |(_, piece): &(usize, Piece)| matches!(piece, Piece::Ball { .. });
+    let (balls, flats): (Vec<_>, Vec<_>) = pieces.partition(is_ball);
+    // The simulator presses harder each time, so presses that lie apart differ in force.
+    let spread = |of_piece: Vec<(usize, Piece)>| {
+        let count = given.rigid.min(of_piece.len());
+        let last = of_piece.len();
+        (1..=count).map(move |number| of_piece[number * last / count - 1])
+    };
+    spread(flats).chain(spread(balls)).collect()
+}
+
+/// A press as a reference of its sensor.
+pub fn reference(presses: &Presses, (place, piece): (usize, Piece)) -> ReferencePress {
+    ReferencePress {
+        course: presses.course(place),
+        piece,
+    }
+}
+
+/// The model with the references of each sensor, and the objects that serve as such.
+type Identified = (BTreeMap<u32, Hrn>, BTreeSet<Option<u32>>);
+
+/// The model with the references of each sensor that has some of these presses.
+fn identified(
+    hrn: &Hrn,
+    presses: &Presses,
+    places: &[usize],
+    given: Given,
+) -> anyhow::Result<Identified> {
+    let (mut models, mut objects) = (BTreeMap::new(), BTreeSet::new());
+    if hrn.most_references() == 0 || given == Given::default() {
+        return Ok((models, objects));
+    }
+    for (sensor, places) in by_sensor(presses, places) {
+        let mut own = rigid(presses, sensor, given);
+        let mut of_level = BTreeMap::<u8, BTreeSet<Option<u32>>>::new();
+        for place in places {
+            let press = &presses.all[place];
+            let of_level = of_level.entry(press.level).or_default();
+            if of_level.len() < given.labelled && of_level.insert(press.object) {
+                objects.insert(press.object);
+                let range = |shore| Piece::Shore { range: [shore; 2] };
+                own.extend(press.shore.map(|shore| (place, range(shore))));
+            }
+        }
+        let own = own.into_iter().take(hrn.most_references());
+        let own: Vec<ReferencePress> = own.map(|own| reference(presses, own)).collect();
+        models.insert(sensor, hrn.identified(hrn.references(&own)?)?);
+    }
+    Ok((models, objects))
+}
+
+/// The presses of each sensor.
+fn by_sensor(presses: &Presses, places: &[usize]) -> BTreeMap<u32, Vec<usize>> {
+    let mut by_sensor = BTreeMap::<u32, Vec<usize>>::new();
+    for &place in places {
+        let sensor = presses.all[place].sensor;
+        by_sensor.entry(sensor).or_default().push(place);
+    }
+    by_sensor
+}
+
+/// Own presses of a sensor, for each half of its objects from the other half: at most two of an object.
+fn own_presses(
+    hrn: &Hrn,
+    presses: &Presses,
+    of_sensor: &[usize],
+    count: usize,
+) -> anyhow::Result<[References; 2]> {
+    let mut of_half: [Vec<Course>; 2] = Default::default();
+    let mut order = of_sensor.to_vec();
+    Stream::new(0, "own presses").shuffle(&mut order);
+    let mut of_object = BTreeMap::<Option<u32>, u32>::new();
+    for place in order {
+        let object = presses.all[place].object;
+        let half = &mut of_half[1 - half_of(object)];
+        let of_object = of_object.entry(object).or_default();
+        *of_object += 1;
+        if *of_object <= 2 && half.len() < count {
+            half.push(presses.course(place));
+        }
+    }
+    let [first, second] = of_half;
+    let references = |courses: &[Course]| OwnPresses::references_of(hrn, courses, count);
+    Ok([references(&first)?, references(&second)?])
+}
+
+/// The half of the objects that an object belongs to.
+fn half_of(object: Option<u32>) -> usize {
+    object.map_or(0, |object| object as usize % 2)
+}
+
+/// The verdicts of a model on labelled presses, each with the press, beside the references of the press's
+/// sensor. A model of frames judges each press's best frame.
+///
+/// # Errors
+///
+/// Fails if the model has fewer levels than the data, or fails to judge a press.
+pub fn of(
+    hrn: &Hrn,
+    presses: &Presses,
+    places: &[usize],
+    given: Given,
+) -> anyhow::Result<Vec<(usize, Verdict)>> {
+    let levels = hrn.card().levels.len();
+    let (identified, objects) = identified(hrn, presses, places, given)?;
+    let mut own = BTreeMap::<u32, [References; 2]>::new();
+    if given.own > 0 {
+        for (sensor, of_sensor) in by_sensor(presses, places) {
+            own.insert(sensor, own_presses(hrn, presses, &of_sensor, given.own)?);
+        }
+    }
+    let mut verdicts = Vec::new();
+    for &place in places {
+        let press = &presses.all[place];
+        if objects.contains(&press.object) {
+            continue;
+        }
+        ensure!(
+            usize::from(press.level) <= levels,
+            "the model has {levels} levels, and the data has a press of level {}",
+            press.level
+        );
+        let verdict = match hrn.format() {
+            Format::Frame => hrn.judge(&presses.frame(place))?,
+            Format::Parts => {
+                let grid = presses.grid().unwrap_or(Array::JX255N);
+                hrn.card().check_array(grid)?;
+                hrn.judge_taxels(&presses.parts(place, grid))?
+            }
+            Format::Course { .. } => {
+                let of_sensor = identified.get(&press.sensor).unwrap_or(hrn);
+                let own = own.get(&press.sensor);
+                let none = References::NONE;
+                let own = own.map_or(&none, |own| &own[half_of(press.object)]);
+                of_sensor.judge_course_with(&presses.course(place), own)?.0
+            }
+        };
+        verdicts.push((place, verdict));
+    }
+    Ok(verdicts)
+}

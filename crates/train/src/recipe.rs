@@ -1,0 +1,171 @@
+//! The methods: recipes of `recipes.toml`, each of which names what learns.
+
+use std::collections::BTreeMap;
+use std::sync::LazyLock;
+
+use serde::Deserialize;
+
+use crate::net::losses::Game;
+use crate::settings::{Profile, Settings, SettingsError};
+
+/// What learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// The paper's recogniser, on frames.
+    Hrn,
+    /// A GAN whose discriminator becomes the recogniser (Odena 2016).
+    Sgan,
+    /// The same with feature matching (Salimans 2016).
+    Igan,
+    /// A logistic regression on the features of a press.
+    Features,
+    /// The same on the taxels of the array in parts of the press.
+    Taxels,
+    /// The network of whole presses.
+    Course,
+}
+
+impl Kind {
+    /// The game of a GAN.
+    pub fn game(self) -> Option<Game> {
+        match self {
+            Self::Sgan => Some(Game::FakeLevel),
+            Self::Igan => Some(Game::FeatureMatching),
+            Self::Hrn | Self::Features | Self::Taxels | Self::Course => None,
+        }
+    }
+}
+
+/// Where the recogniser's weights come from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Start {
+    /// Drawn at random.
+    #[default]
+    Random,
+    /// The discriminator of the USTGAN, without its last layer.
+    Ustgan,
+}
+
+/// A method.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// The name in commands, files and tables.
+    pub name: String,
+    /// What the method is, for `--help`.
+    pub about: String,
+    /// What learns.
+    pub learning: Kind,
+    /// The share of the labels that it uses, unless the user names a number.
+    pub labels: f64,
+    /// The recogniser's first weights.
+    #[serde(default)]
+    pub start: Start,
+    /// Whether the recogniser learns from generated samples first.
+    #[serde(default)]
+    pub pretrained: bool,
+    /// The steps of the training, instead of its epochs.
+    steps: Option<BTreeMap<Profile, u64>>,
+    #[serde(default)]
+    settings: toml::Table,
+    #[serde(default)]
+    paper: toml::Table,
+    #[serde(default)]
+    quick: toml::Table,
+    #[serde(default)]
+    smoke: toml::Table,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    recipe: Vec<Recipe>,
+}
+
+/// All methods, in the order of the tables.
+pub fn all() -> &'static [Recipe] {
+    static ALL: LazyLock<File> = LazyLock::new(|| {
+        let text = include_str!("../recipes.toml");
+        toml::from_str(text).expect("a test reads the built-in recipes")
+    });
+    &ALL.recipe
+}
+
+/// The method called `name`.
+pub fn named(name: &str) -> Option<&'static Recipe> {
+    all().iter().find(|recipe| recipe.name == name)
+}
+
+impl Recipe {
+    /// Whether the method learns from presses whose level it does not use.
+    pub fn needs_unlabelled(&self) -> bool {
+        self.start == Start::Ustgan || self.pretrained || self.learning.game().is_some()
+    }
+
+    /// Whether the method needs labelled samples of every level.
+    pub fn needs_every_level(&self) -> bool {
+        self.pretrained
+    }
+
+    /// The settings of a run that learns from `samples` presses. Those of the recipe come on top of the
+    /// profile's, and the `given` ones on top of the recipe's.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if a given value lies outside its range.
+    pub fn settings(
+        &self,
+        profile: Profile,
+        samples: usize,
+        given: &toml::Table,
+    ) -> Result<Settings, SettingsError> {
+        let of_profile = match profile {
+            Profile::Paper => &self.paper,
+            Profile::Quick => &self.quick,
+            Profile::Smoke => &self.smoke,
+        };
+        let mut settings = Settings::of(profile)
+            .with(self.settings.clone())?
+            .with(of_profile.clone())?;
+        if let Some(&steps) = self.steps.as_ref().and_then(|steps| steps.get(&profile)) {
+            // The given batch counts.
+            let batch = settings.with(given.clone())?.training.batch;
+            let an_epoch = samples.div_ceil(batch).max(1) as u64;
+            let epochs = u32::try_from(steps.div_ceil(an_epoch));
+            settings.training.epochs = epochs.unwrap_or(u32::MAX);
+        }
+        settings.with(given.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::settings::parse;
+
+    #[test]
+    fn all_settings_are_within_their_ranges() {
+        for recipe in all() {
+            for profile in [Profile::Paper, Profile::Quick, Profile::Smoke] {
+                let settings = recipe.settings(profile, 100, &toml::Table::new());
+                assert!(settings.is_ok(), "{}: {settings:?}", recipe.name);
+            }
+        }
+    }
+
+    #[test]
+    fn given_epochs_count_more_than_a_recipes_steps() {
+        let hrn = named("hrn").unwrap();
+        let epochs = |given: &str| {
+            let given = parse(given).unwrap();
+            let settings = hrn.settings(Profile::Quick, 250, &given).unwrap();
+            settings.training.epochs
+        };
+        // 250 samples are three steps of 100, or five of 50.
+        assert_eq!(epochs(""), 400);
+        assert_eq!(epochs("[training]\nbatch = 50"), 240);
+        assert_eq!(epochs("[training]\nepochs = 50"), 50);
+    }
+}

@@ -1,0 +1,143 @@
+//! `fit`: recordings in, the best model out.
+
+use std::fs;
+use std::fs::File;
+use std::path::Path;
+
+use hardnessd_core::frame::Array;
+use hardnessd_core::references;
+use hardnessd_core::verdict::{Format, Hrn, ModelFrame};
+use hrn_train::data::presses::{self, Layout, Press, Presses};
+use serde_json::{Value, json};
+
+use crate::{errors, hrn_train_in, succeed_in};
+
+/// Five presses of each object on an array of 4x4 taxels. Each object is its level and the column of the array
+/// that feels it, 0 to 3.
+fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
+    let mut presses = Presses::default();
+    for (object, &(level, col)) in (0..).zip(objects) {
+        for number in 0..5_u8 {
+            let press = Press {
+                level,
+                object: Some(object),
+                material: Some(0),
+                force_n: Some(f32::from(number)),
+                best: 9,
+                ..Press::default()
+            };
+            let moments = (0..10_u8).map(|moment| {
+                let mut frame = ModelFrame::default();
+                let newtons = 0.1 * f32::from(moment + 1) * (1.0 + 0.2 * f32::from(number));
+                for row in 12..16 {
+                    frame.newtons[row * 28 + 12 + col] = newtons;
+                }
+                (0.1 * f32::from(moment), None, frame)
+            });
+            presses.push(press, moments);
+        }
+    }
+    let level = |(number, label): (usize, &&str)| {
+        json!({"level": number + 1, "label": label, "shore": if levels.len() == 4 {
+            [">70", "61-70", "51-60", "<=50"][number]
+        } else {
+            "-"
+        }})
+    };
+    let levels: Vec<Value> = levels.iter().enumerate().map(level).collect();
+    let meta = json!({"grid": [4, 4], "pitch_mm": 3.5, "levels": levels});
+    presses::write(
+        File::create(path).unwrap(),
+        &presses,
+        Layout::OverTime,
+        &meta,
+    )
+    .unwrap();
+}
+
+const PAPERS: [&str; 4] = ["hard", "firm", "soft", "very-soft"];
+
+fn parsed(text: &str) -> Value {
+    serde_json::from_str(text).unwrap()
+}
+
+#[test]
+fn taxels_that_tell_the_level_become_a_model_of_the_array() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    // What is pressed looks the same from every column, so only the taxels tell the level.
+    let objects = [(1, 0), (1, 0), (2, 2), (2, 2), (2, 2)];
+    write(&path("d.npz"), &objects, &PAPERS);
+    let report = succeed_in(directory.path(), "fit d.npz --out m.onnx --json");
+    let report = parsed(&report);
+    let found = |name: &str, by: &str| {
+        let mut rows = report["candidates"].as_array().unwrap().iter();
+        let row = rows.find(|row| row["name"] == name).unwrap();
+        row[by]["balanced_accuracy"].as_f64().unwrap()
+    };
+    assert_eq!(found("taxels", "new_objects"), 1.0);
+    assert_eq!(found("taxels", "later_presses"), 1.0);
+    assert!(found("features", "new_objects") < 0.9);
+    assert_eq!(
+        [&report["best"], &report["chosen_by"], &report["writes"]],
+        ["taxels", "new_objects", "model"]
+    );
+    assert_eq!(report["wrong"], json!([]));
+
+    let hrn = Hrn::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
+    assert_eq!(hrn.format(), Format::Parts);
+    assert_eq!(hrn.card().grid, Some(Array { rows: 4, cols: 4 }));
+    let evaluation = "evaluate --json --split train --model m.onnx --data d.npz";
+    let evaluation = parsed(&succeed_in(directory.path(), evaluation));
+    assert_eq!(evaluation["accuracy"], 1.0);
+    // The same through `train`, which takes no copies of presses.
+    write(&path("e.npz"), &[(1, 0), (1, 1), (2, 2), (2, 3)], &PAPERS);
+    let train = "train --method taxels --profile smoke --data e.npz --out run";
+    succeed_in(directory.path(), train);
+    let again = Hrn::load(&fs::read(path("run/hrn.onnx")).unwrap()).unwrap();
+    assert_eq!(again.card().grid, hrn.card().grid);
+}
+
+#[test]
+fn presses_that_tell_nothing_become_references() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    // Each column has every level.
+    let objects = [(1, 0), (1, 2), (2, 0), (2, 2), (3, 0), (3, 2)];
+    write(&path("d.npz"), &objects, &PAPERS);
+    let text = succeed_in(directory.path(), "fit d.npz --out m.onnx");
+    assert!(text.contains("these presses become references"), "{text}");
+    assert!(!path("m.onnx").exists());
+    let references = references::read(&fs::read(path("m.npz")).unwrap()).unwrap();
+    assert_eq!(references.len(), 30, "all presses");
+    let line = format!("references = \"{}\"", path("m.npz").display());
+    assert!(text.contains(&line), "{text}");
+}
+
+#[test]
+fn what_cannot_be_fitted_is_said_in_one_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    let refused = |expected: &str| {
+        let output = hrn_train_in(directory.path(), "fit d.npz --out m.onnx");
+        assert_eq!(output.status.code(), Some(1));
+        let errors = errors(&output);
+        assert_eq!(
+            errors
+                .lines()
+                .filter(|line| line.contains(expected))
+                .count(),
+            1,
+            "{errors}"
+        );
+        assert!(!path("m.onnx").exists() && !path("m.npz").exists());
+    };
+    // The built-in model cannot say levels without ranges, and nothing else is better than guessing.
+    let five = ["a", "b", "c", "d", "e"];
+    write(&path("d.npz"), &[(1, 0), (1, 2), (5, 0), (5, 2)], &five);
+    refused("nothing was written, because no candidate is better than guessing");
+    write(&path("d.npz"), &[(1, 0), (2, 2)], &five);
+    refused("found 10 labelled presses of 2 objects");
+    write(&path("d.npz"), &[(1, 0), (1, 2), (1, 3)], &five);
+    refused("all presses are of one level");
+}

@@ -1,0 +1,85 @@
+"""A two-finger gripper with 16 taxels closes on printed cubes and cylinders of several hardness levels.
+
+https://github.com/YoussifAmin/Object_Hardness_Classification has volts and no newtons, no positions and no place of
+the taxels. Within one session the unloaded first row tells the level, so only later trials and another shape are judged.
+"""
+
+import dataclasses
+import sys
+
+import numpy as np
+
+URL = "https://github.com/YoussifAmin/Object_Hardness_Classification"
+COMMIT = "d34beb3b"
+
+SHAPES = ["Cubes", "Cylinders"]
+ROWS = 80
+# One step of the converter.
+VOLTS_A_COUNT = 6.25e-5
+LABELLED = (5, 10)
+# The default contact threshold, 0.07 N for taxels 3.5 mm apart, is two counts with this scale: just above the noise. The
+# unloaded volts of the taxels differ by more than the zero allows by default.
+SENSOR = """
+[[sensor]]
+name = "gripper"
+port = "/dev/null"
+frame_rate_hz = 20
+[sensor.frame]
+sync = "AA 55 C3 3C"
+length = "none"
+checksum = "none"
+cell = "u16le"
+rows = 4
+cols = 4
+[sensor.calibration]
+newtons_per_count = 0.035
+tare_max_n = 50
+"""
+
+
+@dataclasses.dataclass
+class Recorded:
+    """Presses: counts [presses, rows, taxels], level from 0, object, number of the trial, the sensor's table."""
+
+    counts: np.ndarray
+    level: np.ndarray
+    object: np.ndarray
+    trial: np.ndarray
+    sensor: str
+
+
+def read(path):
+    """Reads a clone, or an `.npz` file with `volts`, `level`, `shape` and `trial`."""
+    if path.suffix == ".npz":
+        arrays = np.load(path)
+        volts, level, shape, trial = (arrays[name] for name in ("volts", "level", "shape", "trial"))
+    else:
+        rows = []
+        for shape, name in enumerate(SHAPES):
+            for file in (path / "Dataset" / name / f"{ROWS}_Samples").glob("*/*.csv"):
+                rows.append((int(file.parent.name), shape, int(file.stem.split("_")[-1]), file))
+        if not rows:
+            sys.exit(f"{path}: no grasps")
+        rows.sort()
+        level, shape, trial = (np.array(column) for column in list(zip(*rows))[:3])
+        volts = np.array([np.loadtxt(row[3], delimiter=",") for row in rows])
+    counts = np.round(volts / VOLTS_A_COUNT).astype(int)
+    return Recorded(counts, level.astype(int), shape.astype(int), trial.astype(int), SENSOR)
+
+
+def splits(recorded, share):
+    """(title, presses to learn from, presses to judge)."""
+    level, shape, trial = recorded.level, recorded.object, recorded.trial
+    last = round(share * trial.max())
+    for title, of in [
+        ("cubes and cylinders, 3 levels, later trials", level < 3),
+        ("cubes, 4 levels, later trials", (shape == 0) & (level < 4)),
+    ]:
+        yield title, np.flatnonzero(of & (trial <= last)), np.flatnonzero(of & (trial > last))
+    cubes = (shape == 0) & (level < 3)
+    cylinders = (shape == 1) & (level < 3)
+    yield "cylinders by cubes, another shape", np.flatnonzero(cubes), np.flatnonzero(cylinders)
+    for labelled in LABELLED:
+        title = f"cylinders by cubes and the first {labelled} cylinders of each level"
+        learn, judge = cubes | (cylinders & (trial <= labelled)), cylinders & (trial > last)
+        yield title, np.flatnonzero(learn), np.flatnonzero(judge)

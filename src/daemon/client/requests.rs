@@ -1,0 +1,152 @@
+//! What a connection asks for: queries, and commands that change something.
+//!
+//! In: a request. Out: the lines of its answer, of which the last is `ok` or `error`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use serde_json::Value;
+use tokio::sync::oneshot;
+
+use super::{Access, Service};
+use crate::daemon::hub::{Closed, Line};
+use crate::daemon::request::motion::{self, Positions, ReportedPoint};
+use crate::daemon::request::{self, Context, Query, Request};
+use crate::daemon::sensor::{Command, SensorHandle, Sensors};
+use hardnessd_core::event::{Reply, Tared};
+
+/// The reason a request is answered with an `error`, in words: nobody tells reasons apart.
+pub(in crate::daemon) type Refused = String;
+
+/// The content of an `ok`.
+#[derive(Default)]
+pub(super) struct Done {
+    tare: Option<Tared>,
+    blackbox: Option<PathBuf>,
+}
+
+/// The answer to a query or a command.
+pub(super) async fn answer(
+    service: &Service,
+    request: Request,
+    id: Option<Value>,
+) -> Result<Vec<Arc<Line>>, Closed> {
+    let mut lines = Vec::new();
+    let done = match request {
+        Request::Get(query) => get(service, query, &mut lines).await?,
+        request => change(service, request).await,
+    };
+    lines.push(end(done, id));
+    Ok(lines)
+}
+
+/// The last line of an answer.
+pub(super) fn end(done: Result<Done, Refused>, id: Option<Value>) -> Arc<Line> {
+    Line::reply(&match done {
+        Ok(Done { tare, blackbox }) => Reply::Ok {
+            id,
+            tare,
+            blackbox: blackbox.map(|path| path.display().to_string()),
+        },
+        Err(message) => Reply::Error { message, id },
+    })
+}
+
+async fn get(
+    service: &Service,
+    query: Query,
+    lines: &mut Vec<Arc<Line>>,
+) -> Result<Result<Done, Refused>, Closed> {
+    match query {
+        Query::Status => lines.extend(service.hub.snapshot().await?.statuses()),
+        Query::Last => {
+            let sensors = service.hub.snapshot().await?.sensors;
+            lines.extend(sensors.into_iter().filter_map(|one| one.last));
+        }
+        Query::History(sensor) => match service.hub.history(sensor.clone()).await? {
+            Some(history) => lines.push(history.line(&sensor)),
+            None => return Ok(find(&service.sensors, "history", &sensor).map(|_| Done::default())),
+        },
+    }
+    Ok(Ok(Done::default()))
+}
+
+/// Carries out a request that changes something. Of all sockets, only the control socket may.
+async fn change(service: &Service, request: Request) -> Result<Done, Refused> {
+    let key = request.key();
+    if service.access == Access::ReadOnly {
+        return Err(format!(
+            "{key}: this socket changes nothing: send it to the control socket"
+        ));
+    }
+    let sensors = &service.sensors;
+    let mut done = Done::default();
+    match request {
+        Request::Tare(sensor) => {
+            let tared = ask(sensors, key, &sensor, Command::Tare).await?;
+            done.tare = Some(tared.map_err(|error| format!("tare: {error}"))?);
+        }
+        Request::Context(context) => set_context(sensors, context).await?,
+        Request::Motion(Positions { sensor, points }) => {
+            move_arm(sensors, &sensor, &points).await?;
+        }
+        Request::Blackbox(sensor) => {
+            let written = ask(sensors, key, &sensor, Command::Blackbox).await?;
+            done.blackbox = Some(written.map_err(|error| format!("blackbox: {error}"))?);
+        }
+        // They change nothing.
+        Request::Subscribe(_) | Request::Get(_) => {}
+    }
+    Ok(done)
+}
+
+/// Sets the context of a sensor.
+pub(in crate::daemon) async fn set_context(
+    sensors: &Sensors,
+    Context { sensor, context }: Context,
+) -> Result<(), Refused> {
+    let command = |reply| Command::Context(context, reply);
+    ask(sensors, "context.sensor", &sensor, command).await
+}
+
+/// Passes positions of the arm on to the task of `sensor`, which also records them. Positions from
+/// every source pass through this function.
+pub(in crate::daemon) async fn move_arm(
+    sensors: &Sensors,
+    sensor: &str,
+    points: &[ReportedPoint],
+) -> Result<(), Refused> {
+    // Read the clocks now, because the sensor's task may have other work to do first.
+    let placed = motion::placed(points, crate::daemon::now()).map_err(|error| error.to_string())?;
+    let command = |reply| Command::Motion(placed, reply);
+    let taken = ask(sensors, "motion.sensor", sensor, command).await?;
+    taken.map_err(|error| format!("motion.at[{}]: {error}", error.index))
+}
+
+/// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's
+/// key for that name.
+async fn ask<T>(
+    sensors: &Sensors,
+    key: &str,
+    name: &str,
+    command: impl FnOnce(oneshot::Sender<T>) -> Command,
+) -> Result<T, Refused> {
+    let sensor = find(sensors, key, name)?;
+    let (reply, answer) = oneshot::channel();
+    // An answer that does not come is dropped by a sensor's task that ends, or by a recorder whose
+    // queue is full.
+    let _ = sensor.commands.send(command(reply)).await;
+    answer
+        .await
+        .map_err(|_| format!("{key}: the daemon is stopping, or has no time for it"))
+}
+
+fn find(sensors: &Sensors, key: &str, name: &str) -> Result<SensorHandle, Refused> {
+    let sensors = sensors.current();
+    let found = sensors.iter().find(|sensor| sensor.name == name).cloned();
+    found.ok_or_else(|| {
+        let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+        let (found, names) = (request::short(name), names.join(", "));
+        format!("{key}: found {found}, expected one of {names}")
+    })
+}

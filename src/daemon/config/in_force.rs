@@ -1,0 +1,171 @@
+//! Every key in force and where it comes from, as TOML.
+
+use toml::{Table, Value};
+
+use super::Setup;
+use hardnessd_core::press;
+use hardnessd_core::tare::Gains;
+use hardnessd_core::wire::Preset;
+
+impl Setup {
+    /// Every key in force as a line of TOML, with a comment that says where the key comes from: `written`,
+    /// `default`, or a preset.
+    pub fn in_force(&self) -> String {
+        let mut config = self.config.clone();
+        for (table, sensor) in config.sensors.iter_mut().zip(&self.sensors) {
+            table.stale_after_ms = Some(sensor.stale_after().as_secs_f64() * 1e3);
+            let frame = table.frame.in_force();
+            table.frame = frame.expect("a sensor has been checked");
+        }
+        config.press = self.press_in_force();
+        let unix = &mut config.publish.unix;
+        (unix.path, unix.control_path) = (Some(unix.path()), Some(unix.control_path()));
+        if let Some(record) = &mut config.record {
+            record.dir = Some(record.dir());
+        }
+        let gains = self.shown_gains();
+        for table in &mut config.sensors {
+            table.calibration.gains = None;
+        }
+        // As text, an f32 has its own digits.
+        let text = toml::to_string(&config).expect("a configuration is TOML");
+        let mut table: Table = text.parse().expect("what was written can be read");
+        if let Some(Value::Array(sensors)) = table.get_mut("sensor") {
+            for (sensor, gains) in sensors.iter_mut().zip(gains) {
+                if let (Some(gains), Some(calibration)) = (gains, sensor.get_mut("calibration")) {
+                    let calibration = calibration.as_table_mut().expect("it is a table");
+                    calibration.insert("gains".to_owned(), Value::String(gains));
+                }
+            }
+        }
+        let mut lines = String::new();
+        self.table(&mut lines, &table, "", 0);
+        lines
+    }
+
+    /// The `[press]` table. A threshold that depends on the taxels is shown if it is that of all sensors.
+    fn press_in_force(&self) -> press::Settings {
+        let mut sensors = self
+            .sensors
+            .iter()
+            .map(|sensor| sensor.for_recording().press);
+        let first = sensors.next().unwrap_or_default();
+        match sensors.all(|press| press == first) {
+            true => first,
+            false => self.config.press.clone(),
+        }
+    }
+
+    /// The least and the greatest gain of each sensor that has some.
+    fn shown_gains(&self) -> Vec<Option<String>> {
+        let shown = |gains: &Gains| {
+            let (least, most) = gains.extent()?;
+            Some(format!("{least:.2} to {most:.2}"))
+        };
+        let sensors = self.config.sensors.iter();
+        sensors
+            .map(|table| table.calibration.gains.as_ref().and_then(shown))
+            .collect()
+    }
+
+    /// Adds the lines of a table. `above` is its key, and `index` that of the `[[sensor]]`.
+    fn table(&self, lines: &mut String, table: &Table, above: &str, index: usize) {
+        let full = |key: &str| match above {
+            "" => key.to_owned(),
+            above => format!("{above}.{key}"),
+        };
+        let is_tables = |value: &Value| match value {
+            Value::Array(list) => list.iter().any(Value::is_table),
+            value => value.is_table(),
+        };
+        for (key, value) in table.iter().filter(|(_, value)| !is_tables(value)) {
+            let source = self.source(&full(key), index);
+            *lines += &format!("{key} = {value}  # {source}\n");
+        }
+        for (key, value) in table.iter().filter(|(_, value)| is_tables(value)) {
+            let full = full(key);
+            match value {
+                Value::Array(list) => {
+                    let tables = list.iter().filter_map(Value::as_table);
+                    for (place, below) in tables.enumerate() {
+                        *lines += &format!("\n[[{full}]]\n");
+                        self.table(lines, below, &full, place);
+                    }
+                }
+                Value::Table(below) => {
+                    *lines += &format!("\n[{full}]\n");
+                    self.table(lines, below, &full, index);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// Where the value of a key comes from.
+    fn source(&self, key: &str, index: usize) -> String {
+        if self.text.is_written(index, key) {
+            return "written".to_owned();
+        }
+        let preset = |frame: &str| {
+            let preset = self.config.sensors[index].frame.preset();
+            let part = frame.split('.').next()?;
+            let is_its = preset != Preset::None && preset.keys().contains_key(part);
+            is_its.then(|| format!("preset {preset}"))
+        };
+        let frame = key.strip_prefix("sensor.frame.");
+        frame.and_then(preset).unwrap_or("default".to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::daemon::config::Config;
+
+    #[test]
+    fn every_key_in_force_is_shown_with_its_source() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("hardnessd.toml");
+        let text = "[[sensor]]\nport = \"/dev/ttyACM0\"\n[sensor.frame]\npreset = \"jq\"\nrows = 9\n\
+                    [[sensor]]\nname = \"own\"\nport = \"/dev/ttyACM1\"\n\
+                    frame = { sync = \"A5\" }\n[press]\nmax_seconds = 5.0\n";
+        std::fs::write(&path, text).unwrap();
+        let lines = Setup::load(&path, None).unwrap().in_force();
+        let (first, own) = lines.split_once("name = \"own\"").unwrap();
+        for line in [
+            "baud = 115200  # default",
+            "stale_after_ms = 600.0  # default",
+            "preset = \"jq\"  # written",
+            "sync = \"AA 55 03 99\"  # preset jq",
+            "length = \"none\"  # default",
+            "rows = 9  # written",
+            "newtons_per_count = 0.04  # default",
+        ] {
+            assert!(first.contains(&format!("{line}\n")), "{line} in {first}");
+        }
+        for line in [
+            "preset = \"none\"  # default",
+            "sync = \"A5\"  # written",
+            "checksum = \"none\"  # default",
+            "rows = 28  # default",
+        ] {
+            assert!(own.contains(&format!("{line}\n")), "{line} in {own}");
+        }
+        for line in [
+            "max_seconds = 5.0  # written",
+            "contact_threshold_n = 0.07  # default",
+            "mode = \"0660\"  # default",
+        ] {
+            assert!(lines.contains(&format!("{line}\n")), "{line} in {lines}");
+        }
+        // It is a configuration again, and the same one.
+        let again: Config = toml::from_str(&lines).unwrap();
+        let again = Setup::of(again, Path::new("again")).unwrap();
+        assert_eq!(
+            again.sensors[1].layout(),
+            Setup::load(&path, None).unwrap().sensors[1].layout()
+        );
+    }
+}

@@ -1,0 +1,204 @@
+//! The file of each sensor's own presses, which outlive the daemon.
+//!
+//! In: the own presses of a sensor after each press, and their owner. Out: files in a directory of the
+//! service, one for each sensor, each whole or not there; and at the next start what they hold, if the
+//! owner is still the same. One thread writes, so no sensor waits for a disk.
+
+use std::collections::BTreeMap;
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::{Duration, Instant};
+
+use anyhow::ensure;
+use serde::{Deserialize, Serialize};
+use tracing::{debug, warn};
+
+use super::config::directory_of_service;
+use crate::thread::{NoThread, spawn_thread};
+use hardnessd_core::judge::{OwnPresses, owner};
+use hardnessd_core::part::Part;
+use hardnessd_core::pipeline::Pipeline;
+
+/// The largest file that is read. Ours have a tenth of it.
+const MOST_BYTES: u64 = 1 << 20;
+/// The time from a press to the write. What changes meanwhile is written too.
+const PAUSE: Duration = Duration::from_secs(1);
+
+/// What a file holds.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    /// What the presses belong to, as [`owner`] says it.
+    owner: String,
+    presses: OwnPresses,
+}
+
+/// The files of own presses. Without a directory, own presses last as long as the daemon.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Store {
+    directory: Option<PathBuf>,
+    changed: Option<Sender<(String, Kept)>>,
+}
+
+impl Store {
+    /// The store in the directory that systemd or the user's environment names.
+    pub(super) fn of_environment() -> Result<Self, NoThread> {
+        let of_user = || {
+            let state = env::var_os("XDG_STATE_HOME").filter(|state| !state.is_empty())?;
+            Some(Path::new(&state).join("hardnessd"))
+        };
+        match directory_of_service("STATE_DIRECTORY").or_else(of_user) {
+            Some(directory) => Self::in_directory(directory),
+            None => Ok(Self::default()),
+        }
+    }
+
+    fn in_directory(directory: PathBuf) -> Result<Self, NoThread> {
+        let (sender, changed) = channel();
+        let own = directory.clone();
+        spawn_thread("own presses", move || write_all(&own, &changed))?;
+        Ok(Self {
+            directory: Some(directory),
+            changed: Some(sender),
+        })
+    }
+
+    /// Gives a pipeline the own presses of its sensor.
+    pub(super) fn load(&self, pipeline: &mut Pipeline) {
+        let Some(directory) = &self.directory else {
+            return;
+        };
+        let path = file_of(directory, pipeline.sensor().name());
+        match read(&path) {
+            Ok(Some(kept)) if kept.owner == owner(pipeline.sensor(), pipeline.hrn()) => {
+                pipeline.take_own_presses(kept.presses);
+            }
+            Ok(Some(_)) => {
+                debug!(path = %path.display(), "own presses of another calibration or model");
+            }
+            Ok(None) => {}
+            Err(error) => warn!(path = %path.display(), %error, "own presses are not read"),
+        }
+    }
+
+    /// Writes the own presses of a pipeline, soon.
+    pub(super) fn save(&self, pipeline: &Pipeline) {
+        let (Some(changed), sensor) = (&self.changed, pipeline.sensor()) else {
+            return;
+        };
+        let kept = Kept {
+            owner: owner(sensor, pipeline.hrn()),
+            presses: pipeline.own_presses().clone().for_another_start(),
+        };
+        // The thread ends only after all senders.
+        let _ = changed.send((sensor.name().to_owned(), kept));
+    }
+}
+
+fn file_of(directory: &Path, sensor: &str) -> PathBuf {
+    directory.join(format!("own-{sensor}.json"))
+}
+
+/// What a file holds. `None` if there is none.
+fn read(path: &Path) -> anyhow::Result<Option<Kept>> {
+    let Ok(found) = fs::metadata(path) else {
+        return Ok(None);
+    };
+    ensure!(found.is_file(), "found no file");
+    ensure!(
+        found.len() <= MOST_BYTES,
+        "found more than {MOST_BYTES} bytes"
+    );
+    Ok(Some(serde_json::from_slice(&fs::read(path)?)?))
+}
+
+/// Writes what comes, until all senders are gone. Of several changes of a sensor the last one counts.
+fn write_all(directory: &Path, changed: &Receiver<(String, Kept)>) {
+    let mut is_failing = false;
+    while let Ok(first) = changed.recv() {
+        let mut all = BTreeMap::from([first]);
+        let until = Instant::now() + PAUSE;
+        // The end of the daemon ends the wait.
+        while let Ok((sensor, kept)) =
+            changed.recv_timeout(until.saturating_duration_since(Instant::now()))
+        {
+            all.insert(sensor, kept);
+        }
+        for (sensor, kept) in all {
+            let path = file_of(directory, &sensor);
+            let written = fs::create_dir_all(directory).and_then(|()| {
+                let text = serde_json::to_vec(&kept)?;
+                Part::over(&path)?.write(&text)
+            });
+            // A full disk is one line, and not one for each press.
+            if let (Err(error), false) = (&written, is_failing) {
+                warn!(path = %path.display(), %error, "own presses are not written");
+            }
+            is_failing = written.is_err();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use hardnessd_core::frame::Stamp;
+    use hardnessd_core::pipeline::{Clock, Input};
+    use hardnessd_core::sensor::{Description, Sensor};
+    use hardnessd_core::verdict::{BUILT_IN, Hrn};
+    use hardnessd_simulator::{Sequence, SequenceSettings};
+
+    fn pipeline(change: impl FnOnce(&mut Description)) -> Pipeline {
+        let mut described = Description::default();
+        change(&mut described);
+        let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+        Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::FrameRate)
+    }
+
+    fn store(directory: &Path) -> Store {
+        Store::in_directory(directory.to_owned()).unwrap()
+    }
+
+    #[test]
+    fn own_presses_outlive_the_daemon_and_not_another_calibration() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut first = pipeline(|_| {});
+        let at = Stamp {
+            mono: Duration::ZERO,
+            wall: jiff::Timestamp::UNIX_EPOCH,
+        };
+        let frames = Sequence::new(SequenceSettings {
+            presses: Some(3),
+            ..SequenceSettings::default()
+        });
+        for frame in frames {
+            let mut bytes = Vec::new();
+            first.sensor().layout().encode(&frame.raw, &mut bytes);
+            first.take(Input::Bytes(bytes.into()), at).unwrap();
+        }
+        assert_eq!(first.own_presses().count(), 3);
+        let saving = store(directory.path());
+        saving.save(&first);
+        drop(saving);
+        let path = file_of(directory.path(), "sensor");
+        while !path.exists() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+
+        let loaded = |pipeline: Pipeline| {
+            let mut pipeline = pipeline;
+            store(directory.path()).load(&mut pipeline);
+            pipeline.own_presses().count()
+        };
+        assert_eq!(loaded(pipeline(|_| {})), 3);
+        let scaled = |of: &mut Description| of.sensor.calibration.newtons_per_count *= 2.0;
+        assert_eq!(loaded(pipeline(scaled)), 0);
+        let whole = fs::read(&path).unwrap();
+        fs::write(&path, &whole[..whole.len() / 2]).unwrap();
+        assert_eq!(loaded(pipeline(|_| {})), 0);
+    }
+}

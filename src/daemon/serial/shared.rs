@@ -1,0 +1,284 @@
+//! One port of several sensors: it has one owner, which hands each sensor what is for it.
+//!
+//! In: a link, and what each sensor wants to be sent. Out: the turns of the link, to each sensor that they
+//! concern. The sensors that ask for their frames take turns: the owner sends a request, and its sensor
+//! says when a frame came, or the time for it runs out. Bytes after a request go to the sensor that asked,
+//! because the answers of equal modules are alike. A sensor that does not ask gets all bytes.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
+
+use super::{Link, Settings, Turn};
+use crate::maybe;
+
+/// The most turns that wait for a sensor. When the queue is full, the owner waits.
+const TURNS: usize = 64;
+
+/// How long an answer may take, beside its bytes on the line: so many times as long as the slowest of late, ...
+const TIMES_AS_SLOW: u32 = 8;
+/// ... but at least and at most this time, which is also the time for the first answer.
+const LEAST_TIMEOUT: Duration = Duration::from_millis(30);
+const MOST_TIMEOUT: Duration = Duration::from_millis(100);
+
+/// After a request without an answer, no module that is silent is asked for this time. So silent modules
+/// take less than half of the time of the others.
+const REST: Duration = Duration::from_millis(150);
+
+/// What a link says, for several sensors.
+#[derive(Debug, Clone)]
+enum Said {
+    Opened,
+    Unavailable(String),
+    Bytes(Arc<[u8]>),
+    Skipped(u64),
+    Lost(String),
+    Stranger(SocketAddr),
+}
+
+/// A sensor's share of a port.
+#[derive(Debug)]
+pub(crate) struct Share {
+    index: usize,
+    turns: mpsc::Receiver<Said>,
+    /// Tells the owner that a frame of this sensor came.
+    frames: mpsc::Sender<usize>,
+    /// Changes when the owner has closed the port.
+    ended: watch::Receiver<()>,
+    /// The last turn, whose bytes are borrowed.
+    said: Option<Said>,
+}
+
+impl Share {
+    /// Waits for the next turn. Cancelling the wait loses nothing.
+    pub(super) async fn turn(&mut self) -> Turn<'_> {
+        match self.turns.recv().await {
+            Some(said) => match self.said.insert(said) {
+                Said::Opened => Turn::Opened,
+                Said::Unavailable(reason) => Turn::Unavailable(std::mem::take(reason)),
+                Said::Bytes(bytes) => Turn::Bytes(bytes),
+                Said::Skipped(bytes) => Turn::Skipped(*bytes),
+                Said::Lost(reason) => Turn::Lost(std::mem::take(reason)),
+                Said::Stranger(address) => Turn::Stranger(*address),
+            },
+            // The owner ends after its sensors.
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Records that frames come.
+    pub(super) fn proven(&self) {
+        // The owner notices the next one.
+        let _ = self.frames.try_send(self.index);
+    }
+
+    /// Gives the share back. The port is closed when all have done so, and then this returns.
+    pub(super) async fn close(self) {
+        let mut ended = self.ended;
+        drop((self.turns, self.frames));
+        let _ = ended.changed().await;
+    }
+}
+
+/// A request, and the sensors that read its answer.
+#[derive(Debug)]
+struct Ask {
+    request: Vec<u8>,
+    every: Duration,
+    members: Vec<usize>,
+    due: Instant,
+    /// How long the bytes of the answer take at least.
+    on_the_line: Duration,
+    /// How long an answer took of late.
+    slowest: Option<Duration>,
+    /// Whether the last request had no answer.
+    is_silent: bool,
+}
+
+/// Who is asked, and until when the answer may come.
+#[derive(Debug, Clone, Copy)]
+struct Asking {
+    ask: usize,
+    since: Instant,
+    until: Instant,
+}
+
+/// The owner of a port.
+#[derive(Debug)]
+struct Owner {
+    link: Link,
+    members: Vec<mpsc::Sender<Said>>,
+    asks: Vec<Ask>,
+    /// The members that do not ask.
+    listeners: Vec<usize>,
+    asking: Option<Asking>,
+    /// The last one that was asked, for bytes that come late.
+    last: Option<usize>,
+    is_open: bool,
+    /// From then on a silent module may be asked.
+    may_try: Instant,
+}
+
+/// Shares `link` among sensors with these settings. The owner runs until all shares are given back.
+pub(super) fn share(link: Link, settings: &[Settings]) -> Vec<Share> {
+    let (frames, frames_in) = mpsc::channel(TURNS);
+    let (ending, ended) = watch::channel(());
+    let (members, turns): (Vec<_>, Vec<_>) = settings.iter().map(|_| mpsc::channel(TURNS)).unzip();
+    let now = Instant::now();
+    let mut asks: Vec<Ask> = Vec::new();
+    let mut listeners = Vec::new();
+    for (index, settings) in settings.iter().enumerate() {
+        let Some((request, every)) = &settings.request else {
+            listeners.push(index);
+            continue;
+        };
+        match asks.iter_mut().find(|ask| ask.request == *request) {
+            Some(ask) => {
+                ask.every = ask.every.min(*every);
+                ask.members.push(index);
+            }
+            None => asks.push(Ask {
+                request: request.clone(),
+                every: *every,
+                members: vec![index],
+                due: now,
+                on_the_line: settings.on_the_line,
+                slowest: None,
+                is_silent: false,
+            }),
+        }
+    }
+    let owner = Owner {
+        link,
+        members,
+        asks,
+        listeners,
+        asking: None,
+        last: None,
+        is_open: false,
+        may_try: now,
+    };
+    tokio::spawn(async move {
+        owner.serve(frames_in).await;
+        drop(ending);
+    });
+    let shares = turns.into_iter().enumerate();
+    shares
+        .map(|(index, turns)| Share {
+            index,
+            turns,
+            frames: frames.clone(),
+            ended: ended.clone(),
+            said: None,
+        })
+        .collect()
+}
+
+impl Owner {
+    async fn serve(mut self, mut frames: mpsc::Receiver<usize>) {
+        loop {
+            let due = self.due();
+            let said = tokio::select! {
+                turn = self.link.turn() => match turn {
+                    Turn::Opened => Said::Opened,
+                    Turn::Unavailable(reason) => Said::Unavailable(reason),
+                    Turn::Bytes(bytes) => Said::Bytes(bytes.into()),
+                    Turn::Skipped(bytes) => Said::Skipped(bytes),
+                    Turn::Lost(reason) => Said::Lost(reason),
+                    Turn::Stranger(address) => Said::Stranger(address),
+                },
+                frame = frames.recv() => {
+                    let Some(member) = frame else {
+                        return;
+                    };
+                    self.link.proven();
+                    self.answered(member);
+                    continue;
+                }
+                () = maybe::until(due) => {
+                    self.ask(Instant::now());
+                    continue;
+                }
+            };
+            match said {
+                Said::Opened | Said::Unavailable(_) | Said::Lost(_) => {
+                    self.is_open = matches!(said, Said::Opened);
+                    self.asking = None;
+                }
+                Said::Bytes(_) | Said::Skipped(_) | Said::Stranger(_) => {}
+            }
+            for member in self.audience(&said) {
+                // A sensor that has ended takes nothing.
+                let _ = self.members[member].send(said.clone()).await;
+            }
+            // A sensor that never pauses leaves the others their turns.
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// The members that something concerns.
+    fn audience(&self, said: &Said) -> Vec<usize> {
+        let Some(asked) = self.last.filter(|_| matches!(said, Said::Bytes(_))) else {
+            return (0..self.members.len()).collect();
+        };
+        [self.asks[asked].members.as_slice(), &self.listeners].concat()
+    }
+
+    /// When there is something to do.
+    fn due(&self) -> Option<Instant> {
+        let due = |ask: &Ask| match ask.is_silent {
+            true => ask.due.max(self.may_try),
+            false => ask.due,
+        };
+        match self.asking {
+            _ if !self.is_open => None,
+            Some(asking) => Some(asking.until),
+            None => self.asks.iter().map(due).min(),
+        }
+    }
+
+    /// A frame of a member came.
+    fn answered(&mut self, member: usize) {
+        let mut asks = self.asks.iter_mut().enumerate();
+        let Some((index, ask)) = asks.find(|(_, ask)| ask.members.contains(&member)) else {
+            return;
+        };
+        // Whoever sends is not silent, even if it is late.
+        ask.is_silent = false;
+        if let Some(asking) = self.asking.filter(|asking| asking.ask == index) {
+            let took = asking.since.elapsed();
+            ask.slowest = Some(ask.slowest.unwrap_or_default().mul_f64(0.95).max(took));
+            self.asking = None;
+        }
+    }
+
+    /// Ends the wait for an answer, or asks the next one.
+    fn ask(&mut self, now: Instant) {
+        if let Some(asking) = self.asking.take() {
+            self.asks[asking.ask].is_silent = true;
+            self.may_try = now + REST;
+        }
+        let may_try = self.may_try <= now;
+        let asks = self.asks.iter_mut().enumerate();
+        let next = asks
+            .filter(|(_, ask)| ask.due <= now && (may_try || !ask.is_silent))
+            .min_by_key(|(_, ask)| ask.due);
+        let Some((index, ask)) = next else {
+            return;
+        };
+        self.link.request(&ask.request);
+        ask.due = (ask.due + ask.every).max(now);
+        let usual = ask.slowest.map(|slowest| slowest * TIMES_AS_SLOW);
+        let timeout = usual.unwrap_or(MOST_TIMEOUT);
+        let timeout = ask.on_the_line + timeout.clamp(LEAST_TIMEOUT, MOST_TIMEOUT);
+        self.last = Some(index);
+        self.asking = Some(Asking {
+            ask: index,
+            since: now,
+            until: now + timeout,
+        });
+    }
+}

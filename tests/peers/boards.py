@@ -1,0 +1,265 @@
+#!/usr/bin/env python3
+"""Every board of docs/boards.md, emulated over a real pty or a network, with the configuration that the page gives.
+
+    venv/bin/python tests/peers/boards.py target/debug/hardnessd
+
+Claims: the daemon reads the counts that each emulator sends, at their places; it sends what the board waits for; and the
+areas of a hand are all read at one port.
+"""
+
+import argparse
+import os
+import re
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import tomllib
+import tty
+
+from bench import Bench, free_port, wait_for
+
+PAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../docs/boards.md")
+
+
+def crc16_modbus(data):
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return struct.pack("<H", crc)
+
+
+def with_crc(data):
+    return data + crc16_modbus(data)
+
+
+def with_lrc(data):
+    return data + bytes([-sum(data) & 0xFF])
+
+
+def counts(cells):
+    return [(7 * place + 3) % 97 for place in range(cells)]
+
+
+def three_axes(cells):
+    """Fx and Fy with a sign, and Fz."""
+    return b"".join(struct.pack("bbB", -5, 9, count) for count in counts(cells))
+
+
+def xhand():
+    planes = struct.pack("<240H", *[999] * 240) + struct.pack("<120H", *counts(120))
+    rest = b"\x01\x02\x03" + planes + b"\x11\x22"
+    return b"\x55\xaa" + rest + bytes([sum(rest) & 0xFF])
+
+
+def linkerhand():
+    registers = [4242] * 10 + counts(72) + [17] * 14
+    return with_crc(bytes.fromhex("2704C0") + struct.pack(">96H", *registers))
+
+
+def anyskin():
+    chips = b"".join(struct.pack("<4f", 23.5, -1.0, 2.0, count - 1.25) for count in counts(5))
+    return chips + b"\r\n"
+
+
+def text(title, cells):
+    rows = [" ".join(map(str, cells[at : at + 6])) for at in range(0, len(cells), 6)]
+    return "\n".join([title, *rows]) + "\n"
+
+
+TWO = text("Sensor 1", counts(24)) + text("Sensor 2", [count + 1 for count in counts(24)]) + "END\n"
+PAXINI = b"\xaa\x55\xd7\x02\x01\x00\xfb\x0e\x04\x00\x00\xcd\x02"
+
+# The bytes of a frame, what the board waits for before each (or once, before the first), and the counts of each sensor.
+BOARDS = {
+    "dfrobot": (
+        with_crc(b"\x01\x04\x40" + struct.pack(">32H", *counts(32))),
+        bytes.fromhex("0104000700204013"),
+        [counts(32)],
+    ),
+    "xhand": (xhand(), None, [counts(120)]),
+    "paxini": (
+        with_lrc(PAXINI + b"\x00" + three_axes(239)),
+        with_lrc(bytes.fromhex("55AA09000100FB0E040000CD02")),
+        [counts(238)],
+    ),
+    "paxini_push": (
+        with_lrc(b"\xaa\x56\x00\xd4\x02\x00" + b"\xe2\xff\x0c\x00\x6e\x00" + three_axes(239)),
+        "once 55AA00101700010001D8",
+        [counts(238)],
+    ),
+    "anyskin": (anyskin(), None, [[count - 1.25 for count in counts(5)]]),
+    "linkerhand": (linkerhand(), with_crc(bytes.fromhex("270400480060")), [counts(72)]),
+    "twelve": (b"\xa5\x5a" + struct.pack("<64H", *[0xF000 | count for count in counts(64)]), None, [counts(64)]),
+    "left": (TWO.encode(), None, [counts(24), [count + 1 for count in counts(24)]]),
+    "round": (b"\xaa\x55" + bytes(counts(16)), None, [None]),
+    "flexitac": (b"\xaa\x55" + bytes(counts(512)), None, [counts(512)]),
+    "m1616": (b"\xaa\xab\xac" + struct.pack(">256H", *counts(256)) + b"\1\2\3\4", None, [counts(256)]),
+    "jq_glove": (
+        b"\xaa\x55\x03\x99\x01\x07" + bytes(counts(256)[:128]) + b"\xaa\x55\x03\x99\x02\x07" + bytes(counts(256)[128:])
+        + bytes(16),
+        None,
+        [counts(256)],
+    ),
+}
+
+
+class Serial:
+    """A board on a pty. With `asked`, it sends a frame whenever it has read these bytes."""
+
+    def __init__(self, path, frame, asked, rate):
+        self.ours, self.theirs = os.openpty()
+        tty.setraw(self.theirs)
+        os.symlink(os.ttyname(self.theirs), path)
+        os.set_blocking(self.ours, False)
+        self.frame, self.asked, self.rate = frame, asked, rate
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self._serve)
+        self.thread.start()
+
+    def _serve(self):
+        is_once = isinstance(self.asked, str)
+        wanted = bytes.fromhex(self.asked.split()[1]) if is_once else self.asked
+        heard, sends = b"", wanted is None
+        while not self.ended.wait(1 / self.rate if sends else 0.001):
+            try:
+                if wanted is not None:
+                    heard += os.read(self.ours, 4096)
+            except BlockingIOError:
+                pass
+            if wanted is not None and wanted in heard:
+                heard = b""
+                sends |= is_once
+                if not is_once:
+                    os.write(self.ours, self.frame)
+            try:
+                if sends:
+                    os.write(self.ours, self.frame)
+            except BlockingIOError:
+                pass  # Nobody reads yet.
+
+    def end(self):
+        self.ended.set()
+        self.thread.join()
+        os.close(self.ours)
+        os.close(self.theirs)
+
+
+def hand(listener):
+    """Answers Modbus TCP. A register holds its own number, modulo 97, and a high bit that is no count."""
+
+    def serve(connection):
+        stream = connection.makefile("rb")
+        try:
+            while len(request := stream.read(12)) == 12:
+                number, first, cells = struct.unpack(">H6xHH", request)
+                head = struct.pack(">HHHBBB", number, 0, 3 + 2 * cells, 1, 3, 2 * cells)
+                connection.sendall(head + struct.pack(">H", 0x8000 | first % 97) * cells)
+        except ConnectionError:
+            pass  # The daemon has ended.
+
+    while True:
+        try:
+            connection, _ = listener.accept()
+        except OSError:
+            return
+        threading.Thread(target=serve, args=(connection,), daemon=True).start()
+
+
+def presets():
+    """The boards that have a preset."""
+    for name, preset, rate in [("flexitac", "flexitac", 50), ("m1616", "m1616", 20), ("jq_glove", "jq-glove", 50)]:
+        yield f'[[sensor]]\nname = "{name}"\nport = "p"\nframe_rate_hz = {rate}.0\nbaud = 921600\n[sensor.frame]\npreset = "{preset}"\n'
+
+
+def newtons_are_counts(config):
+    """The same tables with a force of 1 N a count, and without a tare."""
+    tables = []
+    for table in re.split(r"(?m)^(?=\[\[sensor\]\])", config):
+        if table.strip():
+            if "[sensor.calibration]" not in table:
+                table += "[sensor.calibration]\n"
+            tables.append(table + "newtons_per_count = 1.0\ntare_frames = 0\n")
+    return "".join(tables)
+
+
+def check(binary, config, wanted, start=lambda bench: []):
+    """The daemon reads `wanted`, the counts by the sensors' names."""
+    with Bench(binary, sensors=()) as bench:
+        with open(bench.path("hardnessd.toml"), "w") as out:
+            out.write('[publish.unix]\npath = "events.sock"\n' + newtons_are_counts(config))
+        started = start(bench)
+        try:
+            bench.daemon()
+            tail = bench.events("--types", "frame,status")
+            found = lambda name: [
+                event for event in tail.events if event["type"] == "frame" and event["sensor"] == name
+            ]
+            for name, expected in wanted.items():
+                frames = wait_for(f"a frame of {name}", lambda name=name: found(name)[3:])
+                assert expected is None or all(frame["newtons"] == expected for frame in frames), (name, frames[0])
+            tail.kill()
+            tail.thread.join()
+        finally:
+            for one in started:
+                one.end()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("binary")
+    binary = parser.parse_args().binary
+    with open(PAGE) as page:
+        page = page.read()
+    blocks = re.findall(r"(?ms)^```toml\n(.*?)^```", page)
+    programs = dict(re.findall(r"(?ms)^```python\n# (\S+)\n(.*?)^```", page))
+    tried = set()
+    for block in [*blocks, *presets()]:
+        sensors = tomllib.loads(block)["sensor"]
+        name = sensors[0]["name"]
+        if name == "bridge":
+            continue
+        frame, asked, expected = BOARDS[name]
+        config = re.sub(r'(?m)^port = ".*"', 'port = "port"', block)
+        wanted = dict(zip([sensor["name"] for sensor in sensors], expected, strict=True))
+        rate = sensors[0]["frame_rate_hz"]
+        check(binary, config, wanted, lambda bench: [Serial(bench.path("port"), frame, asked, rate)])  # noqa: B023
+        tried.add(name)
+        print(f"{name}: {', '.join(wanted)}")
+    assert tried == BOARDS.keys(), tried ^ BOARDS.keys()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=hand, args=(listener,), daemon=True).start()
+        port = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        write = [sys.executable, "-c", programs["inspire.py"], port]
+        config = subprocess.run(write, capture_output=True, text=True, check=True).stdout
+        areas = tomllib.loads(config)["sensor"]
+        assert len(areas) == 17
+        wanted = {}
+        for area in areas:
+            cells = area["frame"]["rows"] * area["frame"]["cols"]
+            wanted[area["name"]] = [int(area["name"][5:]) % 97] * cells
+        check(binary, config, wanted)
+        print(f"inspire: {len(areas)} areas at one port")
+
+    class Bridge:
+        def __init__(self, port):
+            self.process = subprocess.Popen([sys.executable, "-c", programs["bridge.py"], port])
+
+        def end(self):
+            self.process.kill()
+            self.process.wait()
+
+    port = str(free_port())
+    (block,) = [block for block in blocks if 'name = "bridge"' in block]
+    expected = [row + col / 10 for row in range(4) for col in range(4)]
+    check(binary, block.replace("8300", port), {"bridge": expected}, lambda bench: [Bridge(port)])
+    print("bridge: UDP")
+
+
+if __name__ == "__main__":
+    main()
