@@ -243,17 +243,20 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
             (&aborted["press"], &aborted["reason"], &aborted["frames"]),
             (&json!(press), &json!("lost"), &json!(5))
         );
-        skipped += byte as u64;
         assert_eq!(lost["frames"], frames + 5, "byte {byte}");
-        assert_eq!(
-            (&lost["bytes_skipped"], &lost["frames_damaged"]),
-            (&json!(skipped), &json!(0)),
-            "byte {byte}"
+        assert_eq!(lost["frames_damaged"], 0, "byte {byte}");
+        // The kernel drops what nobody had read when the cable went.
+        let now = lost["bytes_skipped"].as_u64().unwrap();
+        assert!(
+            (skipped..=skipped + byte as u64).contains(&now),
+            "byte {byte}: {skipped}, {now}"
         );
+        skipped = now;
         shortest = shortest.min(since(unplugged, &lost));
         rig.cable.replug();
         rig.wake();
     }
+    assert!(skipped > 0);
     assert!(shortest < Duration::from_millis(100), "{shortest:?}");
 }
 
