@@ -26,9 +26,8 @@ use super::config::{self, Config};
 use super::hub::Line;
 use super::publish::Error;
 use super::relay::Worker;
-use hardnessd_core::frame::Pitch;
-use hardnessd_core::recording::{Entry, Found, MOTION};
-use hardnessd_core::{ros, sensor};
+use hardnessd_core::recording::{Found, MOTION};
+use hardnessd_core::ros;
 
 /// The most messages that wait for a viewer, about 1 MB. When there are more, the oldest are
 /// dropped.
@@ -61,12 +60,12 @@ pub(super) fn open(
     config: &Config,
 ) -> Result<(Worker, mpsc::Sender<Found>), Error> {
     let (address, robot) = (settings.listen, config.robot.clone());
-    let pitch = |sensor: &sensor::Settings| (sensor.name.clone(), sensor.calibration.pitch_mm);
-    let pitches: BTreeMap<_, _> = config.sensors.iter().map(pitch).collect();
+    let sensors = config.sensors.iter().map(|sensor| sensor.name.clone());
+    let sensors: Vec<String> = sensors.collect();
     let (viewers, entries) = mpsc::channel(ENTRIES);
     let worker = Worker::start(
         "foxglove",
-        move |_| Foxglove::open(address, &robot, pitches),
+        move |_| Foxglove::open(address, &robot, &sensors),
         |foxglove: Foxglove, lines| foxglove.work(lines, entries),
     )?;
     Ok((worker, viewers))
@@ -84,8 +83,6 @@ struct Topics {
     channels: BTreeMap<String, Arc<RawChannel>>,
     /// The last message of each topic that a late viewer gets at once.
     last: BTreeMap<String, Message>,
-    /// The distance between taxels of each sensor, by the sensor's name.
-    pitches: BTreeMap<String, Pitch>,
 }
 
 /// A listening server.
@@ -99,13 +96,9 @@ struct Foxglove {
 }
 
 impl Foxglove {
-    fn open(
-        address: SocketAddr,
-        robot: &str,
-        pitches: BTreeMap<String, Pitch>,
-    ) -> Result<Self, Error> {
+    fn open(address: SocketAddr, robot: &str, sensors: &[String]) -> Result<Self, Error> {
         let context = Context::new();
-        let topics = Topics::new(&context, pitches).map_err(failed)?;
+        let topics = Topics::new(&context, sensors).map_err(failed)?;
         let (queue, newcomers) = mpsc::channel(NEWCOMERS);
         let host = match address.ip() {
             IpAddr::V4(ip) => ip.to_string(),
@@ -173,15 +166,11 @@ fn failed(error: impl Display) -> Error {
 }
 
 impl Topics {
-    fn new(
-        context: &Arc<Context>,
-        pitches: BTreeMap<String, Pitch>,
-    ) -> Result<Self, FoxgloveError> {
+    fn new(context: &Arc<Context>, sensors: &[String]) -> Result<Self, FoxgloveError> {
         let mut channels = BTreeMap::new();
-        for sensor in pitches.keys() {
+        for sensor in sensors {
             for topic in [
                 ros::FRAME,
-                ros::GRID,
                 ros::CONTACT,
                 ros::HARDNESS,
                 ros::PRESS,
@@ -201,7 +190,6 @@ impl Topics {
         Ok(Self {
             channels,
             last: BTreeMap::new(),
-            pitches,
         })
     }
 
@@ -210,10 +198,7 @@ impl Topics {
             warn!(gap = line.json().trim_end(), "foxglove is too slow");
             return;
         };
-        let Some(&pitch) = self.pitches.get(event.sensor()) else {
-            return;
-        };
-        for (topic, time, bytes) in ros::encode_all(event, pitch) {
+        for (topic, time, bytes) in ros::encode_all(event) {
             let name = topic.of(event.sensor());
             let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);
             let message = Message { at_ns, bytes };
@@ -226,13 +211,8 @@ impl Topics {
         }
     }
 
-    /// Sends positions of the arm, or learns the distance of the taxels of a sensor that began anew.
-    fn follow(&mut self, found: &Found) {
-        if let Entry::State(state) = &found.entry {
-            let pitch_mm = state.sensor.description.sensor.calibration.pitch_mm;
-            self.pitches.insert(found.sensor.clone(), pitch_mm);
-            return;
-        }
+    /// Sends positions of the arm.
+    fn follow(&self, found: &Found) {
         let (topic, bytes) = found.message();
         if let Some(channel) = self.channels.get(&topic.of(&found.sensor)) {
             let at_ns = u64::try_from(found.at.wall.as_nanosecond()).unwrap_or(0);

@@ -361,8 +361,7 @@ struct Active {
 }
 
 impl SensorRecorder {
-    /// Also passes the positions of the arm and each new beginning on to `viewers`, as a recording has
-    /// them.
+    /// Also passes the positions of the arm on to `viewers`, as a recording has them.
     pub(crate) fn with_viewers(self, viewers: Option<mpsc::Sender<Found>>) -> Self {
         Self { viewers, ..self }
     }
@@ -373,40 +372,24 @@ impl SensorRecorder {
     }
 
     /// Records `input`, which `pipeline` is about to take.
-    pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input<'_>, at: Stamp) {
+    pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input, at: Stamp) {
         if let Some(active) = &mut self.active {
             active.follow(pipeline, at, Entry::Input(input.to_owned()));
         }
-        if matches!(input, Input::Motion(_)) {
-            self.show(pipeline, at, || Entry::Input(input.to_owned()));
-        }
-    }
-
-    /// Passes an entry on to the viewers, if there are any.
-    fn show(&self, pipeline: &Pipeline, at: Stamp, entry: impl FnOnce() -> Entry) {
-        let Some(viewers) = &self.viewers else {
-            return;
-        };
-        let found = Found {
-            sensor: pipeline.sensor().name().to_owned(),
-            at,
-            entry: entry(),
-        };
-        if let Err(mpsc::error::TrySendError::Full(found)) = viewers.try_send(found) {
-            let lost = match found.entry {
-                Entry::State(_) => "the sensor's new beginning",
-                _ => "the positions of the arm",
+        if let (Input::Motion(_), Some(viewers)) = (input, &self.viewers) {
+            let found = Found {
+                sensor: pipeline.sensor().name().to_owned(),
+                at,
+                entry: Entry::Input(input.to_owned()),
             };
-            warn!("viewers are too slow for {lost}");
+            if let Err(mpsc::error::TrySendError::Full(_)) = viewers.try_send(found) {
+                warn!("viewers are too slow for the positions of the arm");
+            }
         }
     }
 
     /// Records that `pipeline`, which is at rest, begins anew or has another model.
     pub(crate) fn begin_anew(&mut self, pipeline: &Pipeline, at: Stamp) {
-        let Some(state) = State::of(pipeline, &Labels::new()) else {
-            return;
-        };
-        self.show(pipeline, at, || Entry::State(Box::new(state)));
         if let Some(active) = &mut self.active {
             active.noted = None;
             active.begin(pipeline, at);

@@ -115,7 +115,6 @@ impl Ros2 {
                 (ros::FRAME, QosProfile::subscription_default()),
                 (ros::CONTACT, shown()),
                 (tools::IMAGE, shown()),
-                (tools::TACTILE_STATE, shown()),
             ] {
                 let space = format!(
                     "{}/tactile/{sensor}",
@@ -192,11 +191,7 @@ impl Ros2 {
         *highest = frame.newtons.iter().copied().fold(*highest, f32::max);
         let picture = tools::picture(frame, *highest);
         let (contact, _, numbers) = ros::contact(frame);
-        for (topic, bytes) in [
-            (contact, numbers),
-            (tools::IMAGE, picture),
-            (tools::TACTILE_STATE, tools::tactile_state(frame)),
-        ] {
+        for (topic, bytes) in [(contact, numbers), (tools::IMAGE, picture)] {
             // A subscriber that is too slow misses the message.
             let _ = self.send(&frame.sensor, topic, bytes);
         }

@@ -27,7 +27,7 @@ from websockets.sync.client import connect
 
 LAYOUT = pathlib.Path(__file__).resolve().parents[2] / "clients/foxglove/hardnessd.json"
 TABLE = '[publish.foxglove]\nlisten = "127.0.0.1:0"\n'
-TOPICS = ["contact", "frame", "grid", "hardness", "motion", "press", "status"]
+TOPICS = ["contact", "frame", "hardness", "motion", "press", "status"]
 PROTOCOL = "foxglove.sdk.v1"
 
 
@@ -146,18 +146,10 @@ def compare(got, events):
             for key in ("contact_area_taxels", "tared"):
                 assert getattr(message, key) == event[key], (key, message)
             assert same(message.approach_mm, event["approach_mm"], "approach_mm"), (message, event["approach_mm"])
-        elif topic in ("frame", "grid"):
+        elif topic == "frame":
             event = by_time[rfc3339(time_ns)]
             newtons = struct.unpack("<784f", bytes(message.data))
-            if topic == "grid":
-                # Its rows go up from the last.
-                newtons = [n for row in range(27, -1, -1) for n in newtons[28 * row : 28 * row + 28]]
-                assert (message.column_count, message.row_stride, message.cell_stride) == (28, 112, 4)
-                assert math.isclose(message.cell_size.x, 0.0035) and math.isclose(message.pose.position.x, -14 * 0.0035)
-                (field,) = message.fields
-                assert (message.frame_id, field.name, field.type) == ("forearm", "newtons", 7), message
-            else:
-                assert (message.height, message.width, message.encoding, message.step) == (28, 28, "32FC1", 112)
+            assert (message.height, message.width, message.encoding, message.step) == (28, 28, "32FC1", 112)
             assert all(abs(a - b) <= 0.0005 + 1e-6 for a, b in zip(newtons, event["newtons"], strict=True))
         elif topic == "motion":
             assert message.header.frame_id == "forearm" and len(message.at_ns) == len(message.approach_mm) > 0, message
@@ -167,7 +159,7 @@ def compare(got, events):
         else:
             continue
         compared[topic] += 1
-    assert compared["frame"] == compared["grid"] == compared["contact"] >= 0.9 * len(frames) > 50, (compared, len(frames))
+    assert compared["frame"] == compared["contact"] >= 0.9 * len(frames) > 50, (compared, len(frames))
     assert min(compared.values()) >= 2, compared
     assert any(not math.isnan(message.approach_mm) for topic, _, message in got if topic == "contact")
     return compared

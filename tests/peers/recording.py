@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-TOPICS = ["input", "frame", "hardness", "press", "status", "motion", "contact", "grid"]
+TOPICS = ["input", "frame", "hardness", "press", "status", "motion", "contact"]
 BAG = pathlib.Path(__file__).resolve().parents[2] / "clients/ros2/bag.py"
 
 

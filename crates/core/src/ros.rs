@@ -14,9 +14,8 @@ use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value;
 
 pub use self::frame::contact;
-pub use self::frame::{CONTACT, FRAME, GRID};
+pub use self::frame::{CONTACT, FRAME};
 use crate::event::Event;
-use crate::frame::Pitch;
 
 /// The bytes before every message: CDR, little-endian, no options (DDS-XTYPES 1.3, 7.6.3.1.2).
 pub const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
@@ -217,12 +216,11 @@ fn named(
     (topic, time, to_cdr(&message))
 }
 
-/// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has three
-/// messages. `pitch` is that of the sensor's taxels.
-pub fn encode_all(event: &Event, pitch: Pitch) -> Vec<(Topic, Timestamp, Vec<u8>)> {
+/// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has two.
+pub fn encode_all(event: &Event) -> Vec<(Topic, Timestamp, Vec<u8>)> {
     let mut messages = vec![encode(event)];
     if let Event::Frame(frame) = event {
-        messages.extend([frame::contact(frame), frame::grid(frame, pitch)]);
+        messages.push(contact(frame));
     }
     messages
 }

@@ -190,8 +190,7 @@ impl<W: Write> Writer<W> {
         let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) else {
             return Ok(());
         };
-        let pitch_mm = self.sensors[sensor].description.sensor.calibration.pitch_mm;
-        for (topic, time, bytes) in ros::encode_all(event, pitch_mm) {
+        for (topic, time, bytes) in ros::encode_all(event) {
             self.write(channel_id(sensor, topic), time, &bytes)?;
         }
         Ok(())

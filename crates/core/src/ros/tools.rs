@@ -1,5 +1,4 @@
-//! Messages for the usual tools of ROS: diagnostics, pictures, arrays of taxels, and the position
-//! of an arm.
+//! Messages for the usual tools of ROS: diagnostics, pictures, and the position of an arm.
 //!
 //! In: statuses, frames, and the bytes of a position. Out: messages for topics, and the position.
 //! ROS defines these messages; DDS needs only their names.
@@ -17,9 +16,6 @@ pub const DIAGNOSTICS: Topic = on_a_wire("diagnostics", "diagnostic_msgs/msg/Dia
 
 /// A colour picture, which every viewer shows without settings.
 pub const IMAGE: Topic = on_a_wire("image", "sensor_msgs/msg/Image");
-
-/// The taxels, for the tools of `tactile_toolbox`.
-pub const TACTILE_STATE: Topic = on_a_wire("tactile_state", "tactile_msgs/msg/TactileState");
 
 /// The position of the arm, from the robot. The configuration names the topic.
 pub const POSITION: Topic = on_a_wire("", "geometry_msgs/msg/PointStamped");
@@ -52,18 +48,6 @@ struct DiagnosticStatus {
 struct KeyValue {
     key: &'static str,
     value: String,
-}
-
-#[derive(Debug, Serialize)]
-struct TactileState {
-    header: Header,
-    sensors: Vec<ChannelFloat32>,
-}
-
-#[derive(Debug, Serialize)]
-struct ChannelFloat32 {
-    name: String,
-    values: Vec<f32>,
 }
 
 /// A `geometry_msgs/PointStamped`: a position of the arm.
@@ -141,17 +125,6 @@ pub fn picture(frame: &FrameEvent, most_n: f32) -> Vec<u8> {
         is_bigendian: 0,
         step: 3 * frame.cols as u32,
         data: Blob::from(pixels.collect::<Vec<u8>>()),
-    })
-}
-
-/// The frame as an array of taxels in newtons, row by row.
-pub fn tactile_state(frame: &FrameEvent) -> Vec<u8> {
-    to_cdr(&TactileState {
-        header: Header::new(frame.time, &frame.sensor),
-        sensors: vec![ChannelFloat32 {
-            name: frame.sensor.clone(),
-            values: frame.newtons.clone(),
-        }],
     })
 }
 
