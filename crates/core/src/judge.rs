@@ -289,16 +289,15 @@ impl Judge {
         let alone = |verdict: Verdict| (verdict, ReferenceKinds::NONE);
         let mut course = None;
         let (verdict, source, is_trained) = match self.hrn.format() {
-            Format::Frame if self.hrn.card().grid.is_none() => {
-                let judged = self.hrn.judge(&resampling.apply(&peak.frame));
-                (judged.map(alone), None, true)
-            }
             Format::Frame | Format::Parts => {
-                let checked = self.hrn.card().check_array(peak.frame.array);
-                let judged = checked.and_then(|()| match self.hrn.format() {
-                    Format::Parts => self.hrn.judge_taxels(&known.parts()),
-                    _ => self.hrn.judge_taxels(&peak.frame.newtons),
-                });
+                let card = self.hrn.card();
+                let taxels = match (self.hrn.format(), card.grid) {
+                    (Format::Parts, _) => known.parts(),
+                    (_, Some(_)) => peak.frame.newtons.to_vec(),
+                    (_, None) => resampling.apply(&peak.frame).newtons.to_vec(),
+                };
+                let checked = card.check_array(peak.frame.array);
+                let judged = checked.and_then(|()| self.hrn.judge_taxels(&taxels));
                 (judged.map(alone), None, true)
             }
             Format::Course { most_frames } => {

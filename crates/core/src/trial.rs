@@ -78,18 +78,22 @@ pub fn set_program(program: PathBuf) {
 ///
 /// # Errors
 ///
-/// Returns the errors of [`Hrn::load`]. Also returns [`ModelError::Trial`] if the trial refuses the
-/// file or does not complete, and [`ModelError::Slow`] if a verdict takes too long.
+/// Returns the errors of [`Hrn::load`], and an error if the trial does not complete or a verdict takes too
+/// long.
 pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
     if bytes.len() > verdict::MAX_FILE_BYTES {
-        return Err(ModelError::TooLarge { found: bytes.len() });
+        return Err(ModelError::too_large(bytes.len()));
     }
     if let Some(program) = PROGRAM.get() {
         let found = tried(Command::new(program).arg0(NAME), bytes)?;
         if let Some(expected) = most
             && found > expected
         {
-            return Err(ModelError::Slow { found, expected });
+            let [found, expected] = [found, expected].map(|time| time.as_secs_f64() * 1e3);
+            return Err(ModelError::new(format!(
+                "model takes {found:.1} ms for a verdict: expected at most {expected:.1} ms, a tenth of the \
+                 fastest sensor's frame period (but 1 to 20 ms)"
+            )));
         }
     }
     Hrn::load(bytes)
@@ -97,7 +101,7 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
 
 /// Runs a trial of the file in a child. Returns how long a verdict takes.
 fn tried(command: &mut Command, bytes: &[u8]) -> Result<Duration, ModelError> {
-    let refused = |problem: String| ModelError::Trial(format!("model: {problem}"));
+    let refused = |problem: String| ModelError::new(format!("model: {problem}"));
     let mut child = command
         // At its start, the trainer's allocator takes a GiB of address space. That is all that a
         // trial may have, so good models sometimes failed.
@@ -121,7 +125,7 @@ fn tried(command: &mut Command, bytes: &[u8]) -> Result<Duration, ModelError> {
             let verdict = Duration::try_from_secs_f64(verdict_us / 1e6);
             Ok(verdict.unwrap_or(Duration::MAX))
         }
-        Some(Answer::Refused(problem)) => Err(ModelError::Trial(problem)),
+        Some(Answer::Refused(problem)) => Err(ModelError::new(problem)),
         Some(Answer::Panicked(problem)) => Err(refused(format!(
             "the inference library failed on it: {problem}"
         ))),

@@ -22,28 +22,24 @@ mod shore;
 mod tried;
 
 use sha2::{Digest, Sha256};
-use tract_onnx::pb;
 use tract_onnx::prelude::*;
 
 pub use self::card::{
     Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Limits, Range, TAIL,
 };
 pub use self::course::{COURSE_FRAMES, Course, Extents, Sample, extents};
-pub use self::error::{
-    CHECK_TOLERANCE, LevelsError, MAX_FILE_BYTES, MIN_OPSET, ModelError, NodeProblem,
-    ReferencesError, SHORE_TOLERANCE,
-};
-use self::file::Outputs;
+pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
+use self::file::{File, Outputs};
 pub use self::file::{check_levels, check_line};
 pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
-use self::inputs::{Input, Lengths, Query};
+use self::inputs::{Input, Query};
 pub use self::probabilities::argmax;
 use self::probabilities::{largest_difference, softmax};
 pub use self::references::{
     Knowledge, MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
 };
 pub use self::settings::{BuiltIn, Settings};
-pub use self::shore::{Borders, BordersError, Distribution, Level, Shore};
+pub use self::shore::{Borders, Distribution, Level, Shore};
 pub use self::tried::Tried;
 use crate::frame::Array;
 
@@ -106,13 +102,7 @@ pub struct Verdict {
 #[derive(Debug, Clone)]
 pub struct Hrn {
     plan: Arc<TypedRunnableModel>,
-    format: Format,
-    /// The inputs of a model of courses, in the order of the file, and their lengths.
-    inputs: Vec<Input>,
-    lengths: Lengths,
-    outputs: Outputs,
-    card: Card,
-    checks: Arc<Checks>,
+    file: File,
     sha256: String,
     /// The references of the sensor whose presses are judged.
     references: References,
@@ -138,66 +128,55 @@ impl Hrn {
     ///
     /// Returns the errors of [`Hrn::load`], except those of the check frames.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
+        if bytes.len() > MAX_FILE_BYTES {
+            return Err(ModelError::too_large(bytes.len()));
+        }
         // The file's types and shapes of values inside the graph are not needed, and are unchecked.
         let onnx = tract_onnx::onnx().with_ignore_value_info(true);
-        let mut problems = Vec::new();
-        let examined = examine(bytes, &mut problems);
-        if let Some(first) = problems.into_iter().next() {
-            return Err(first);
-        }
-        let Examined {
-            mut proto,
-            card,
-            checks,
-            signature,
-        } = examined.expect("what is not read has a problem");
-
-        let graph_error = |error: TractError| ModelError::Graph(root_cause(&error));
+        let proto = onnx.proto_model_for_read(&mut &*bytes);
+        let mut proto = proto.map_err(|error| {
+            ModelError::new(format!("not an ONNX model: {}", error.root_cause()))
+        })?;
+        let file = File::read(&proto)?;
+        proto.graph.iter().try_for_each(guard::check_operators)?;
         // The inference library would keep a copy of the metadata.
         proto.metadata_props.clear();
-        let inference = onnx.model_for_proto_model(&proto).map_err(graph_error)?;
+        let inference = onnx.model_for_proto_model(&proto);
+        let mut inference = inference.map_err(ModelError::of_graph)?;
         // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
-        let shapes = match signature.format {
-            Format::Frame | Format::Parts => vec![signature.format.shape(card.grid)],
+        let shapes = match file.format {
+            Format::Frame | Format::Parts => vec![file.format.shape(file.card.grid)],
             Format::Course { .. } => {
-                let inputs = signature.inputs.iter();
-                inputs.map(|input| input.shape(signature.lengths)).collect()
+                let inputs = file.inputs.iter();
+                inputs.map(|input| input.shape(file.lengths)).collect()
             }
         };
-        let inference = shapes
-            .iter()
-            .enumerate()
-            .try_fold(inference, |model, (at, shape)| {
-                model.with_input_fact(at, f32::fact(shape).into())
-            });
-        let typed = inference.and_then(InferenceModelExt::into_typed);
+        for (at, shape) in shapes.iter().enumerate() {
+            let fixed = inference.with_input_fact(at, f32::fact(shape).into());
+            inference = fixed.map_err(ModelError::of_graph)?;
+        }
+        let typed = inference.into_typed();
         let typed = typed.and_then(TypedModel::into_decluttered);
-        let mut optimized = typed.map_err(graph_error)?;
+        let mut optimized = typed.map_err(ModelError::of_graph)?;
         guard::check_values(&optimized)?;
-        optimized.optimize().map_err(graph_error)?;
-        // The inference library does not compare a graph with the shapes that it declares.
-        for (name, output, length) in signature.shapes(card.levels.len()) {
-            let agreed = f32::fact([1, length]);
-            let computed = optimized.output_fact(output).map_err(graph_error)?;
-            if computed.without_value() != agreed {
-                return Err(ModelError::Signature {
-                    what: "outputs",
-                    found: format!("{name} computed as {computed:?}"),
-                    expected: format!("{agreed:?}"),
-                });
+        optimized.optimize().map_err(ModelError::of_graph)?;
+        for (name, output, lengths) in file.outputs() {
+            let fact = optimized
+                .output_fact(output)
+                .map_err(ModelError::of_graph)?;
+            let is_float = fact.datum_type == f32::datum_type();
+            let shape = fact.shape.as_concrete();
+            if !(is_float && matches!(shape, Some([1, length]) if lengths.contains(length))) {
+                let expected = format!("f32 [1, {} to {}]", lengths.start(), lengths.end());
+                let problem = format!("model output `{name}`: found {fact:?}, expected {expected}");
+                return Err(ModelError::new(problem));
             }
         }
-        let plan = optimized.into_runnable().map_err(graph_error)?;
-
+        let plan = optimized.into_runnable();
         Ok(Self {
-            plan,
-            format: signature.format,
-            inputs: signature.inputs,
-            lengths: signature.lengths,
-            outputs: signature.outputs,
-            card,
-            checks: Arc::new(checks),
+            plan: plan.map_err(ModelError::of_graph)?,
+            file,
             sha256: sha256_hex(bytes),
             references: References::NONE,
         })
@@ -210,7 +189,7 @@ impl Hrn {
 
     /// The description of the model in its file.
     pub fn card(&self) -> &Card {
-        &self.card
+        &self.file.card
     }
 
     /// The same model with other levels: other parts of the scale of its Shore hardness. The promise of
@@ -220,23 +199,26 @@ impl Hrn {
     ///
     /// Returns an error if the model gives no distribution over the scale, or the levels are no parts
     /// of it.
-    pub fn with_levels(mut self, levels: Vec<Level>) -> Result<Self, LevelsError> {
-        let Outputs::Bins { .. } = self.outputs else {
-            return Err(LevelsError::Fixed);
+    pub fn with_levels(mut self, levels: Vec<Level>) -> Result<Self, ModelError> {
+        let Outputs::Bins { .. } = self.file.outputs else {
+            return Err(ModelError::new(
+                "found levels, expected none: the model has levels of its own, and only a model of format 3 \
+                 takes others",
+            ));
         };
         Borders::of(&levels)?;
-        self.card.levels = levels;
+        self.file.card.levels = levels;
         Ok(self)
     }
 
     /// The input that the model judges.
     pub fn format(&self) -> Format {
-        self.format
+        self.file.format
     }
 
     /// The checks in the file.
     pub fn checks(&self) -> &Checks {
-        &self.checks
+        &self.file.checks
     }
 
     /// Judges what a model of format 1 takes: the taxels of a frame, or of the parts of a press, in the
@@ -244,14 +226,10 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`].
-    ///
-    /// # Panics
-    ///
-    /// Panics if the model takes another number of taxels.
+    /// Returns the errors of [`Self::judge`]. One of them is that the model takes another number of taxels.
     pub fn judge_taxels(&self, newtons: &[f32]) -> Result<Verdict, ModelError> {
-        let shape = self.format.shape(self.card.grid);
-        let input = match self.format {
+        let shape = self.file.format.shape(self.file.card.grid);
+        let input = match self.file.format {
             // As [`ModelFrame::pressed`].
             Format::Frame => {
                 let pressed: Vec<f32> = newtons.iter().map(|newtons| newtons.max(0.0)).collect();
@@ -259,42 +237,30 @@ impl Hrn {
             }
             _ => Tensor::from_shape(&shape, newtons),
         };
-        let input = input.map_err(inference_error)?;
+        let input = input.map_err(ModelError::of_judgement)?;
         self.verdict(&self.run(tvec!(input.into()))?, Knowledge::None)
     }
 
-    /// Judges one frame on the model's grid. A model of courses judges it as a press with one
-    /// frame and an unknown
-    /// approach.
+    /// Judges one frame on the model's grid, as a press with one frame and an unknown approach.
     ///
     /// # Errors
     ///
-    /// Returns [`ModelError::NotFinite`] if an output is NaN or infinite,
-    /// [`ModelError::Inference`] if the inference library fails, and [`ModelError::Grid`] if the model
-    /// takes frames of another array.
+    /// Returns an error if an output is NaN or infinite, the inference library fails, or the model takes
+    /// frames of another array.
     pub fn judge(&self, frame: &ModelFrame) -> Result<Verdict, ModelError> {
-        match self.format {
-            Format::Frame | Format::Parts => {
-                self.card.check_array(Array::JX255N)?;
-                match self.format {
-                    Format::Parts => self.judge_taxels(&frame.newtons.repeat(parts::PARTS)),
-                    _ => self.judge_taxels(&frame.newtons),
-                }
-            }
-            Format::Course { .. } => self.judge_course(&Course {
-                moments: vec![Sample {
-                    time_s: 0.0,
-                    approach_mm: None,
-                    frame: *frame,
-                }],
-                arm_n_per_mm: 0.0,
-            }),
-        }
+        self.judge_course(&Course {
+            moments: vec![Sample {
+                time_s: 0.0,
+                approach_mm: None,
+                frame: *frame,
+            }],
+            arm_n_per_mm: 0.0,
+        })
     }
 
     /// The most references that the model takes. Some models take none.
     pub fn most_references(&self) -> usize {
-        self.lengths.references
+        self.file.lengths.references
     }
 
     /// What the model takes of these presses. A model that takes no references returns
@@ -311,13 +277,13 @@ impl Hrn {
         let Outputs::Bins {
             reference: Some(reference),
             ..
-        } = self.outputs
+        } = self.file.outputs
         else {
             return Ok(References::NONE);
         };
-        let (found, most) = (presses.len(), self.lengths.references);
+        let (found, most) = (presses.len(), self.most_references());
         assert!(found <= most, "{found} references of {most}");
-        let mut features = Vec::with_capacity(found * self.lengths.features);
+        let mut features = Vec::new();
         for press in presses {
             let outputs = self.run_course(&Query {
                 course: &press.course,
@@ -334,19 +300,16 @@ impl Hrn {
     /// # Errors
     ///
     /// Returns an error if another model computed the references.
-    pub fn identified(&self, references: References) -> Result<Self, ReferencesError> {
+    pub fn identified(&self, references: References) -> Result<Self, ModelError> {
         if !self.takes(&references) {
-            let Lengths {
-                references: most,
-                features,
-                ..
-            } = self.lengths;
-            return Err(ReferencesError {
-                count: references.count,
-                numbers: references.features.len(),
-                most,
-                features,
-            });
+            return Err(ModelError::new(format!(
+                "references: found {} with {} numbers, expected at most {} with {} numbers each, as this model \
+                 computes them",
+                references.count,
+                references.features.len(),
+                self.most_references(),
+                self.file.lengths.features
+            )));
         }
         Ok(Self {
             references,
@@ -356,14 +319,10 @@ impl Hrn {
 
     /// Whether the model can take these references: none, or those that it computed.
     pub(crate) fn takes(&self, references: &References) -> bool {
-        let Lengths {
-            references: most,
-            features,
-            ..
-        } = self.lengths;
-        let is_of_this =
-            references.count <= most && references.features.len() == references.count * features;
-        references.count == 0 || is_of_this
+        let features = self.file.lengths.features;
+        references.count == 0
+            || references.count <= self.most_references()
+                && references.features.len() == references.count * features
     }
 
     /// The references of the sensor whose presses this model judges.
@@ -398,7 +357,7 @@ impl Hrn {
         course: &Course,
         own: &References,
     ) -> Result<(Verdict, ReferenceKinds), ModelError> {
-        let references = self.references.and(own, self.lengths.references);
+        let references = self.references.and(own, self.most_references());
         let verdict = self.judge_beside(course, &references)?;
         Ok((verdict, references.kinds()))
     }
@@ -408,25 +367,23 @@ impl Hrn {
         course: &Course,
         references: &References,
     ) -> Result<Verdict, ModelError> {
-        let last = course.moments.last().expect("a press has a frame");
-        match self.format {
-            Format::Frame => return self.judge(&last.frame),
-            Format::Parts => {
-                self.card.check_array(Array::JX255N)?;
-                let moments = course.moments.iter();
-                let moments: Vec<(f32, &[f32])> = moments
-                    .map(|moment| (moment.time_s, &moment.frame.newtons[..]))
-                    .collect();
-                return self.judge_taxels(&parts::parts(&moments));
-            }
-            Format::Course { .. } => {}
+        let moments = &course.moments;
+        let last = moments.last().expect("a press has a frame");
+        if let Format::Course { .. } = self.file.format {
+            let outputs = self.run_course(&Query {
+                course,
+                piece: None,
+                references,
+            })?;
+            return self.verdict(&outputs, references.kinds().knowledge());
         }
-        let outputs = self.run_course(&Query {
-            course,
-            piece: None,
-            references,
-        })?;
-        self.verdict(&outputs, references.kinds().knowledge())
+        self.file.card.check_array(Array::JX255N)?;
+        if self.file.format == Format::Frame {
+            return self.judge_taxels(&last.frame.newtons);
+        }
+        let moments = moments.iter();
+        let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
+        self.judge_taxels(&parts::parts(&moments.collect::<Vec<_>>()))
     }
 
     /// Judges one of [`Self::checks`].
@@ -435,7 +392,7 @@ impl Hrn {
     ///
     /// Returns the errors of [`Self::judge`].
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
-        match &*self.checks {
+        match &*self.file.checks {
             Checks::Frames(check) => self.judge_taxels(&check.frames[index]),
             Checks::Courses(check) => {
                 let press = &check.presses[index];
@@ -449,63 +406,61 @@ impl Hrn {
     }
 
     fn run_course(&self, query: &Query) -> Result<TVec<TValue>, ModelError> {
-        let (found, most) = (query.course.moments.len(), self.lengths.frames);
+        let (found, most) = (query.course.moments.len(), self.file.lengths.frames);
         assert!(found <= most, "{found} frames of {most}");
-        let tensor = |input: &Input| Ok(input.tensor(query, self.lengths)?.into());
-        let inputs: TractResult<TVec<TValue>> = self.inputs.iter().map(tensor).collect();
-        self.run(inputs.map_err(inference_error)?)
+        let tensor = |input: &Input| Ok(input.tensor(query, self.file.lengths)?.into());
+        let inputs: TractResult<TVec<TValue>> = self.file.inputs.iter().map(tensor).collect();
+        self.run(inputs.map_err(ModelError::of_judgement)?)
     }
 
     fn run(&self, inputs: TVec<TValue>) -> Result<TVec<TValue>, ModelError> {
-        self.plan.run(inputs).map_err(inference_error)
+        self.plan.run(inputs).map_err(ModelError::of_judgement)
     }
 
     /// What the outputs say.
     fn verdict(&self, outputs: &[TValue], knowledge: Knowledge) -> Result<Verdict, ModelError> {
-        let promised = self.card.conformal.as_ref();
-        let limits = promised.map(|promised| promised.limits(knowledge));
-        let (logits, probabilities, shore) = match &self.outputs {
+        let card = &self.file.card;
+        let limits = card
+            .conformal
+            .as_ref()
+            .map(|promised| promised.limits(knowledge));
+        let (logits, probabilities, shore) = match self.file.outputs {
             Outputs::Levels {
                 logits,
                 probabilities,
                 shore,
             } => {
-                let shore = match shore {
-                    Some(place) => match read(outputs, *place, "shore")?[..] {
-                        // An interval has to contain its value, so widen it if it does not.
-                        [value, low, high] => Some(Shore {
-                            value,
-                            low: low.min(value),
-                            high: high.max(value),
-                        }),
-                        _ => None,
-                    },
-                    None => None,
-                };
+                let shore = shore
+                    .map(|place| read(outputs, place, "shore"))
+                    .transpose()?;
+                // An interval has to contain its value, so widen it if it does not.
+                let shore = shore.map(|found| Shore {
+                    value: found[0],
+                    low: found[1].min(found[0]),
+                    high: found[2].max(found[0]),
+                });
+                let logits = read(outputs, logits, "logits")?;
                 (
-                    read(outputs, *logits, "logits")?,
-                    read(outputs, *probabilities, "probabilities")?,
+                    logits,
+                    read(outputs, probabilities, "probabilities")?,
                     shore,
                 )
             }
             Outputs::Bins { bins, .. } => {
-                let distribution = Distribution::of(&read(outputs, *bins, "bins")?);
-                let borders = Borders::of(&self.card.levels);
+                let distribution = Distribution::of(&read(outputs, bins, "bins")?);
+                let borders = Borders::of(&card.levels);
                 let borders = &borders.expect("the levels were checked when they came");
                 let probabilities = distribution.levels(borders);
                 let logits = probabilities.iter();
                 let logits = logits.map(|p| p.max(f32::MIN_POSITIVE).ln()).collect();
                 let tail = limits.map_or(TAIL, |limits| limits.tail);
-                (
-                    logits,
-                    probabilities,
-                    Some(distribution.shore(borders, tail)),
-                )
+                let shore = distribution.shore(borders, tail);
+                (logits, probabilities, Some(shore))
             }
         };
         let (best, confidence) = argmax(&probabilities);
         Ok(Verdict {
-            level: self.card.levels[best].level,
+            level: card.levels[best].level,
             logits,
             shore,
             levels: limits.map(|limits| limits.set(&probabilities)),
@@ -517,7 +472,7 @@ impl Hrn {
     /// The Shore hardness within the part of the scale that the level covers, if the levels are parts of
     /// the scale.
     pub fn within(&self, shore: Shore, level: u8) -> Shore {
-        let levels = &self.card.levels;
+        let levels = &self.card().levels;
         let place = levels.iter().position(|known| known.level == level);
         match (place, Borders::of(levels)) {
             (Some(place), Ok(borders)) => shore.within(borders.part(place)),
@@ -527,27 +482,24 @@ impl Hrn {
 
     /// Judges every check frame or press. The first judgement also warms up the plan.
     fn reproduce_check(&self) -> Result<(), ModelError> {
-        for check in 0..self.checks.count() {
+        let checks = self.checks();
+        for check in 0..checks.count() {
             let verdict = self.judge_check(check)?;
-            let same = |found: &[f32], expected: &[f32], most, what| {
+            let same = |found: &[f32], expected: &[f32], most: f32, what: &str| {
                 let difference = largest_difference(found, expected);
                 match difference > most {
-                    true => Err(ModelError::Differs {
-                        check,
-                        what,
-                        difference,
-                        most,
-                    }),
+                    true => Err(ModelError::new(format!(
+                        "check {check}: {what} by up to {difference:.6}: expected at most {most}"
+                    ))),
                     false => Ok(()),
                 }
             };
             let found = &verdict.probabilities;
-            let expected = self.checks.probabilities(check);
             let what = "probabilities differ from the trainer's";
-            same(found, expected, CHECK_TOLERANCE, what)?;
+            same(found, checks.probabilities(check), CHECK_TOLERANCE, what)?;
             let what = "`probabilities` differs from softmax(`logits`)";
             same(found, &softmax(&verdict.logits), CHECK_TOLERANCE, what)?;
-            if let (Some(found), Some(expected)) = (verdict.shore, self.checks.shore(check)) {
+            if let (Some(found), Some(expected)) = (verdict.shore, checks.shore(check)) {
                 let [found, expected] = [found, expected].map(<[f32; 3]>::from);
                 let what = "`shore` differs from the trainer's";
                 same(&found, &expected, SHORE_TOLERANCE, what)?;
@@ -557,90 +509,22 @@ impl Hrn {
     }
 }
 
-/// Reads a file's messages.
-fn decode(bytes: &[u8]) -> Result<pb::ModelProto, ModelError> {
-    if bytes.len() > MAX_FILE_BYTES {
-        return Err(ModelError::TooLarge { found: bytes.len() });
-    }
-    let mut reader = bytes;
-    let proto = tract_onnx::onnx().proto_model_for_read(&mut reader);
-    proto.map_err(|error| ModelError::NotOnnx(root_cause(&error)))
-}
-
-fn graph_of(proto: &pb::ModelProto) -> Result<&pb::GraphProto, ModelError> {
-    let graph = proto.graph.as_ref().filter(|_| proto.ir_version > 0);
-    graph.ok_or_else(|| ModelError::NotOnnx("no graph in it".into()))
-}
-
-/// What a file says before the inference library builds its graph.
-struct Examined {
-    proto: pb::ModelProto,
-    card: Card,
-    checks: Checks,
-    signature: file::Signature,
-}
-
-/// Everything in a model file that breaks the format, in the order in which [`Hrn::load`] reads it.
-/// What only running the graph shows is not among it.
-pub fn problems(bytes: &[u8]) -> Vec<ModelError> {
-    let mut problems = Vec::new();
-    examine(bytes, &mut problems);
-    problems
-}
-
-/// Reads a file, and adds a problem for each part that breaks the format.
-fn examine(bytes: &[u8], problems: &mut Vec<ModelError>) -> Option<Examined> {
-    let proto = file::kept(decode(bytes), problems)?;
-    let graph = file::kept(graph_of(&proto), problems)?;
-    file::kept(file::check_opset(&proto), problems);
-    file::kept(file::check_tensors_inside(graph), problems);
-    let described = file::metadata(&proto, problems);
-    let (format, levels, grid) = match &described {
-        Some((card, _)) => (card.format.as_str(), Some(card.levels.len()), card.grid),
-        None => (file::format_of(graph), None, None),
-    };
-    let signature = file::signature(graph, format, levels, grid, problems);
-    if let (Some((card, checks)), Some(signature)) = (&described, &signature) {
-        if let Outputs::Bins { .. } = signature.outputs {
-            file::kept(file::check_borders(&card.levels), problems);
-        }
-        if let Checks::Courses(check) = checks {
-            file::kept(file::check_lengths(check, signature.lengths), problems);
-        }
-    }
-    problems.extend(guard::operator_problems(graph));
-    let ((card, checks), signature) = described.zip(signature)?;
-    Some(Examined {
-        proto,
-        card,
-        checks,
-        signature,
-    })
-}
-
-#[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
-fn inference_error(error: TractError) -> ModelError {
-    ModelError::Inference(root_cause(&error))
-}
-
 /// An output's numbers.
 fn read(outputs: &[TValue], place: usize, output: &'static str) -> Result<Vec<f32>, ModelError> {
-    let view = outputs[place].try_as_plain_ram().map_err(inference_error)?;
-    let values = view.as_slice::<f32>().map_err(inference_error)?.to_vec();
+    let view = outputs[place].try_as_plain_ram();
+    let view = view.map_err(ModelError::of_judgement)?;
+    let values = view.as_slice::<f32>().map_err(ModelError::of_judgement)?;
     match values.iter().all(|value| value.is_finite()) {
-        true => Ok(values),
-        false => Err(ModelError::NotFinite { output }),
+        true => Ok(values.to_vec()),
+        false => Err(ModelError::new(format!(
+            "model gave a number that is not finite in `{output}`"
+        ))),
     }
 }
 
 /// The SHA-256 of `bytes` as 64 hexadecimal digits.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
-}
-
-/// The innermost message. The outer messages name only tract's own stages.
-fn root_cause(error: &TractError) -> String {
-    error.root_cause().to_string()
 }
 
 #[cfg(test)]

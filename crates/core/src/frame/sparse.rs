@@ -22,33 +22,20 @@ pub fn write(newtons: &[f32]) -> String {
     STANDARD.encode(bytes)
 }
 
-/// The reason why a text is not a frame.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum SparseError {
-    /// The text is not base64.
-    #[error("found no base64 ({0})")]
-    Text(#[from] base64::DecodeError),
-    /// The number of bytes is not a multiple of a taxel's bytes.
-    #[error("found {0} bytes, expected {BYTES} a taxel")]
-    Length(usize),
-    /// The place is outside the frame, or does not follow the place before it.
-    #[error("found place {0}, expected ascending places below {1}")]
-    Place(u16, usize),
-    /// The force is not finite.
-    #[error("found {0} N at a taxel, expected a finite number")]
-    Newtons(f32),
-}
-
 /// Reads the newtons of a frame of `taxels` taxels.
 ///
 /// # Errors
 ///
-/// Returns a [`SparseError`] if the text holds no such frame.
-pub fn read(text: &str, taxels: usize) -> Result<Vec<f32>, SparseError> {
-    let bytes = STANDARD.decode(text)?;
+/// Returns the problem, in words, if the text holds no such frame.
+pub fn read(text: &str, taxels: usize) -> Result<Vec<f32>, String> {
+    let bytes = STANDARD.decode(text);
+    let bytes = bytes.map_err(|error| format!("found no base64 ({error})"))?;
     let (written, rest) = bytes.as_chunks::<BYTES>();
     if !rest.is_empty() {
-        return Err(SparseError::Length(bytes.len()));
+        return Err(format!(
+            "found {} bytes, expected {BYTES} a taxel",
+            bytes.len()
+        ));
     }
     let mut all = vec![0.0; taxels];
     let mut least = 0;
@@ -56,10 +43,13 @@ pub fn read(text: &str, taxels: usize) -> Result<Vec<f32>, SparseError> {
         let place = u16::from_le_bytes([low, high]);
         let newtons = f32::from_le_bytes(newtons);
         if usize::from(place) >= taxels || place < least {
-            return Err(SparseError::Place(place, taxels));
+            let expected = format!("ascending places below {taxels}");
+            return Err(format!("found place {place}, expected {expected}"));
         }
         if !newtons.is_finite() {
-            return Err(SparseError::Newtons(newtons));
+            return Err(format!(
+                "found {newtons} N at a taxel, expected a finite number"
+            ));
         }
         all[usize::from(place)] = newtons;
         least = place + 1;

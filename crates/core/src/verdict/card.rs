@@ -130,10 +130,13 @@ impl Card {
     ///
     /// # Errors
     ///
-    /// Returns [`ModelError::Grid`] for such a sensor.
+    /// Returns an error for such a sensor.
     pub fn check_array(&self, found: Array) -> Result<(), ModelError> {
         match self.grid {
-            Some(expected) if expected != found => Err(ModelError::Grid { found, expected }),
+            Some(expected) if expected != found => Err(ModelError::new(format!(
+                "the model takes frames of {expected} taxels as they are, and the sensor has {found}: use the \
+                 model of this sensor, or none"
+            ))),
             _ => Ok(()),
         }
     }

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::grid::{ModelFrame, TAXELS};
-use crate::frame::sparse::{self, SparseError};
+use crate::frame::sparse;
 
 /// The fewest and the most frames that a model of courses may take.
 pub const COURSE_FRAMES: (usize, usize) = (3, 48);
@@ -127,50 +127,31 @@ impl From<Course> for Written {
     }
 }
 
-/// The reason why lists are not a press.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Unwritten {
-    #[error(
-        "{times} times, {positions} positions and {frames} frames in a press: as many of each, 1 to {}",
-        COURSE_FRAMES.1
-    )]
-    Lengths {
-        times: usize,
-        positions: usize,
-        frames: usize,
-    },
-    #[error("frame {0} of a press: {1}")]
-    Frame(usize, #[source] SparseError),
-}
-
 impl TryFrom<Written> for Course {
-    type Error = Unwritten;
+    type Error = String;
 
-    fn try_from(written: Written) -> Result<Self, Unwritten> {
+    fn try_from(written: Written) -> Result<Self, String> {
         let (times, positions) = (written.time_s.len(), written.approach_mm.len());
-        let frames = written.frames.len();
-        if times != frames || positions != frames || !(1..=COURSE_FRAMES.1).contains(&frames) {
-            return Err(Unwritten::Lengths {
-                times,
-                positions,
-                frames,
-            });
+        let (frames, most) = (written.frames.len(), COURSE_FRAMES.1);
+        if times != frames || positions != frames || !(1..=most).contains(&frames) {
+            return Err(format!(
+                "{times} times, {positions} positions and {frames} frames in a press: as many of each, 1 to {most}"
+            ));
         }
         let rows = written.time_s.iter().zip(&written.approach_mm);
-        let moments = rows.zip(&written.frames).enumerate();
-        let moment = |(place, ((&time_s, &approach_mm), frame)): (usize, ((&f32, _), &String))| {
+        let moment = |((&time_s, &approach_mm), frame): ((&f32, _), &String)| {
             let newtons = sparse::read(frame, TAXELS);
-            let newtons = newtons.map_err(|error| Unwritten::Frame(place, error))?;
+            let newtons = newtons.map_err(|error| format!("a frame of a press: {error}"))?;
             let newtons = newtons.try_into().expect("as many as were asked for");
-            let frame = ModelFrame { newtons };
-            Ok::<_, Unwritten>(Sample {
+            Ok::<_, String>(Sample {
                 time_s,
                 approach_mm,
-                frame,
+                frame: ModelFrame { newtons },
             })
         };
+        let moments = rows.zip(&written.frames).map(moment);
         Ok(Self {
-            moments: moments.map(moment).collect::<Result<_, _>>()?,
+            moments: moments.collect::<Result<_, _>>()?,
             arm_n_per_mm: written.arm_n_per_mm,
         })
     }

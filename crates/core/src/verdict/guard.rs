@@ -12,7 +12,7 @@ use tract_onnx::pb;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::ops::scan::Scan;
 
-use super::error::{ModelError, NodeProblem};
+use super::error::ModelError;
 use super::file::shown;
 
 /// Operators whose input decides which graph runs, and how often.
@@ -36,45 +36,34 @@ const TAKES_ANY_INTEGER: [&str; 12] = [
     "RmAxis",
 ];
 
-/// The first node with each problem of each operator.
-pub(super) fn operator_problems(graph: &pb::GraphProto) -> Vec<ModelError> {
-    let mut seen = HashSet::new();
-    let mut problems = Vec::new();
-    add_problems(graph, &mut seen, &mut problems);
-    problems
-}
-
-fn add_problems(
-    graph: &pb::GraphProto,
-    seen: &mut HashSet<(String, String)>,
-    problems: &mut Vec<ModelError>,
-) {
+/// Refuses the first operator that is not allowed, also in a graph within the graph.
+pub(super) fn check_operators(graph: &pb::GraphProto) -> Result<(), ModelError> {
     for node in &graph.node {
-        if let Err(problem) = check_operator(node) {
-            let name = match node.output.first() {
-                Some(output) if node.name.is_empty() => output,
-                _ => &node.name,
-            };
-            let operator = shown(&node.op_type).trim_matches('"').to_owned();
-            let node = format!("{} ({operator})", shown(name));
-            if seen.insert((operator, problem.to_string())) {
-                problems.push(ModelError::Node { node, problem });
+        let checked = match node.op_type.as_str() {
+            operator if RUN_GRAPHS.contains(&operator) => {
+                Err("an operator that runs a graph as an input of the model says is not supported")
             }
-        }
+            "TreeEnsembleClassifier" => check_trees(node),
+            _ => Ok(()),
+        };
+        let name = match node.output.first() {
+            Some(output) if node.name.is_empty() => output,
+            _ => &node.name,
+        };
+        checked.map_err(|problem| refused(name, &node.op_type, problem))?;
         let inner = node
             .attribute
             .iter()
             .filter_map(|attribute| attribute.g.as_ref());
-        inner.for_each(|graph| add_problems(graph, seen, problems));
+        inner.map(check_operators).collect::<Result<(), _>>()?;
     }
+    Ok(())
 }
 
-fn check_operator(node: &pb::NodeProto) -> Result<(), NodeProblem> {
-    match node.op_type.as_str() {
-        operator if RUN_GRAPHS.contains(&operator) => Err(NodeProblem::Operator),
-        "TreeEnsembleClassifier" => check_trees(node).map_err(NodeProblem::Trees),
-        _ => Ok(()),
-    }
+fn refused(node: &str, operator: &str, problem: &str) -> ModelError {
+    let (node, operator) = (shown(node), shown(operator));
+    let operator = operator.trim_matches('"');
+    ModelError::new(format!("model node {node} ({operator}): {problem}"))
 }
 
 /// Checks a forest: nodes and votes as lists, tree after tree. The inference library follows the
@@ -130,21 +119,17 @@ fn check_trees(node: &pb::NodeProto) -> Result<(), &'static str> {
 /// as the first one.
 pub(super) fn check_values(model: &TypedModel) -> Result<(), ModelError> {
     for node in model.nodes() {
-        let refused = |problem| ModelError::Node {
-            node: format!("{} ({})", shown(&node.name), node.op.name()),
-            problem,
-        };
+        let refused = |problem| Err(refused(&node.name, &node.op.name(), problem));
         let mut outputs = node.outputs.iter();
         if outputs.any(|output| output.fact.shape.as_concrete().is_none()) {
-            return Err(refused(NodeProblem::Shape));
+            return refused("the shape of its output depends on an input of the model");
         }
         if !TAKES_ANY_INTEGER.contains(&&*node.op.name()) {
             for &input in &node.inputs {
-                let fact = model.outlet_fact(input);
-                let fact = fact.map_err(|error| ModelError::Graph(super::root_cause(&error)))?;
+                let fact = model.outlet_fact(input).map_err(ModelError::of_graph)?;
                 let is_integer = fact.datum_type.is_integer() || fact.datum_type.is_tdim();
                 if is_integer && fact.konst.is_none() {
-                    return Err(refused(NodeProblem::Integers));
+                    return refused("it takes integers that depend on an input of the model");
                 }
             }
         }

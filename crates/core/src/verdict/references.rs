@@ -76,10 +76,9 @@ pub struct ReferencePress {
     pub piece: Piece,
 }
 
-/// The kinds of the references that a verdict was made with. In JSON it is `none`, or the kinds in the
+/// The kinds of the references that a verdict was made with. As text it is `none`, or the kinds in the
 /// order of the fields, joined by `+`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(into = "String", try_from = "String")]
 pub struct ReferenceKinds {
     /// Presses of objects of which nothing is known.
     pub own: bool,
@@ -139,29 +138,6 @@ impl fmt::Display for ReferenceKinds {
             .collect();
         f.write_str(if words.is_empty() { "none" } else { "" })?;
         f.write_str(&words.join("+"))
-    }
-}
-
-impl From<ReferenceKinds> for String {
-    fn from(kinds: ReferenceKinds) -> Self {
-        kinds.to_string()
-    }
-}
-
-impl TryFrom<String> for ReferenceKinds {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        let mut kinds = Self::NONE;
-        for word in text.split('+').filter(|word| *word != "none") {
-            match word {
-                "own" => kinds.own = true,
-                "rigid" => kinds.rigid = true,
-                "labelled" => kinds.labelled = true,
-                _ => return Err(format!("found {word:?}, expected own, rigid or labelled")),
-            }
-        }
-        Ok(kinds)
     }
 }
 

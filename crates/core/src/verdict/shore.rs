@@ -6,6 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::error::ModelError;
 use super::probabilities::{argmax, softmax};
 
 /// One hardness level, as `hello` publishes it.
@@ -77,24 +78,6 @@ pub struct Borders {
     shore: Vec<f32>,
 }
 
-/// The reason why levels are no parts of the scale. The message follows the word "found".
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum BordersError {
-    /// A level's range is no range.
-    #[error("`shore` {0:?}, which is no range such as \"60-70\", \">70\" or \"<=50\"")]
-    Range(String),
-    /// A level is not softer than the one before.
-    #[error("level {level} ({softer}), which is not softer than the level before it ({harder})")]
-    Order {
-        /// The number of the softer level.
-        level: u8,
-        /// Its range.
-        softer: String,
-        /// The range of the level before.
-        harder: String,
-    },
-}
-
 impl Borders {
     /// The borders of levels in their order, the hardest first. A border lies in the middle of a gap
     /// between two levels. The first and the last level go to the ends of the scale.
@@ -102,20 +85,26 @@ impl Borders {
     /// # Errors
     ///
     /// Returns an error if a range cannot be read, or two levels overlap.
-    pub fn of(levels: &[Level]) -> Result<Self, BordersError> {
+    pub fn of(levels: &[Level]) -> Result<Self, ModelError> {
+        let error = |found: String| {
+            let expected = "ranges of Shore OO from the hardest to the softest";
+            ModelError::new(format!("found {found}, expected {expected}"))
+        };
+        let no_range = "which is no range such as \"60-70\", \">70\" or \"<=50\"";
         let range = |level: &Level| {
-            range(&level.shore).ok_or_else(|| BordersError::Range(level.shore.clone()))
+            let text = &level.shore;
+            range(text).ok_or_else(|| error(format!("`shore` {text:?}, {no_range}")))
         };
         let ranges = levels.iter().map(range).collect::<Result<Vec<_>, _>>()?;
         let mut shore = vec![MOST];
         for (place, pair) in ranges.windows(2).enumerate() {
             let ([low, _], [_, high]) = (pair[0], pair[1]);
             if high > low || low >= shore[place] {
-                return Err(BordersError::Order {
-                    level: levels[place + 1].level,
-                    softer: levels[place + 1].shore.clone(),
-                    harder: levels[place].shore.clone(),
-                });
+                let (harder, softer) = (&levels[place], &levels[place + 1]);
+                return Err(error(format!(
+                    "level {} ({}), which is not softer than the level before it ({})",
+                    softer.level, softer.shore, harder.shore
+                )));
             }
             shore.push(0.5 * (low + high));
         }

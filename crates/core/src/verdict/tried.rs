@@ -63,7 +63,8 @@ impl Hrn {
         references: &References,
     ) -> Result<Tried, ModelError> {
         let mut tried = Tried::default();
-        let (Ok(borders), Format::Course { .. }) = (Borders::of(&self.card.levels), self.format)
+        let (Ok(borders), Format::Course { .. }) =
+            (Borders::of(&self.card().levels), self.format())
         else {
             return Ok(tried);
         };

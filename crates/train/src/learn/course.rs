@@ -16,7 +16,7 @@ use crate::net::standard::Standard;
 use crate::run::checkpoint;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, Moment};
-use hardnessd_core::verdict::{Borders, BordersError, Extents, Knowledge, Piece, argmax};
+use hardnessd_core::verdict::{Borders, Extents, Knowledge, ModelError, Piece, argmax};
 use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
@@ -132,7 +132,7 @@ impl<'a> Course<'a> {
         settings: &Settings,
         seed: u64,
         device: &'a Device,
-    ) -> Result<Self, BordersError> {
+    ) -> Result<Self, ModelError> {
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
         let prepared = prepared(presses);

@@ -82,28 +82,12 @@ fn another_array_is_refused() {
 
 #[test]
 fn a_grid_that_breaks_the_format_is_refused() {
-    let refused = |more: &[(&str, Value)], expected: &str| {
-        let bytes = model("parts", 8, more);
-        let error = Hrn::load(&bytes).unwrap_err().to_string();
-        assert!(error.contains(expected), "{error}");
-        assert!(problems(&bytes).iter().any(|p| p.to_string() == error));
-    };
-    let grid = |grid: Value| [("hrn.grid", grid)];
-    refused(
-        &grid(json!([0, 3])),
-        "expected [rows, columns], each 1 to 64",
-    );
-    refused(
-        &grid(json!([2, 65])),
-        "expected [rows, columns], each 1 to 64",
-    );
-    refused(
-        &grid(json!("2x3")),
-        "expected [rows, columns], each 1 to 64",
-    );
-    // Without a grid, the input is that of the model's own.
-    refused(&grid(Value::Null), "`hrn.check`");
-    let other = "frame f32 [1,1,4,3] or parts f32 [1,8,4,3]";
-    let check = json!({"frames": vec![vec![0.0; 12]; 4], "probabilities": vec![[0.5, 0.5]; 4]});
-    refused(&[("hrn.grid", json!([4, 3])), ("hrn.check", check)], other);
+    let sides = "expected [rows, columns], each 1 to 64";
+    for grid in [json!([0, 3]), json!([2, 65]), json!("2x3")] {
+        refused_by(&model("parts", 8, &[("hrn.grid", grid)]), sides);
+    }
+    let expected = "found parts f32 [1,8,2,3], expected frame f32 [1,1,28,28]";
+    refused_by(&model("parts", 8, &[("hrn.grid", Value::Null)]), expected);
+    let other = "expected frame f32 [1,1,4,3] or parts f32 [1,8,4,3]";
+    refused_by(&model("parts", 8, &[("hrn.grid", json!([4, 3]))]), other);
 }

@@ -47,8 +47,8 @@ const FITTED: &str = "\
 
 /// What `check-model --help` says below the options.
 const CHECKED: &str = "\
-    It prints everything that breaks the format at once, a line each. It also tries the memory and time of a \
-    verdict for a sensor of --fps. Exit code 78: there is such a line.";
+    It prints what the daemon would refuse, with the memory and time of a verdict for a sensor of --fps. Exit code \
+    78: it would refuse the file.";
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {

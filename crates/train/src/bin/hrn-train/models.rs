@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{self, Hrn, Verdict};
+use hardnessd_core::verdict::{Hrn, Verdict};
 use hardnessd_core::{exit, wording};
 use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::model::evaluated::{Case, Difference, Evaluated, cases};
@@ -154,24 +154,21 @@ pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
 /// even if the model does not pass. The time limit for a verdict follows from the frame rate.
 pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> ExitCode {
     let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
-        let mut problems = verdict::problems(&bytes);
-        if problems.is_empty() {
-            // Try to run it as the daemon does, with its memory and time.
-            let most = trial::verdict_most(frame_rate_hz);
-            problems.extend(trial::load(&bytes, Some(most)).err());
-        }
-        let mut lines: String = problems.iter().map(|problem| format!("{problem}\n")).collect();
-        if problems.is_empty() {
-            lines = format!(
+        // Try to run it as the daemon does, with its memory and time.
+        let most = trial::verdict_most(frame_rate_hz);
+        let problem = trial::load(&bytes, Some(most)).err();
+        let lines = match &problem {
+            None => format!(
                 "{}: a model that hardnessd loads, for sensors of up to {frame_rate_hz} frames/s\n",
                 path.display()
-            );
-        } else {
-            lines += "`python3 -m hardnessd.adopt IN.onnx --out M.onnx` mends names, shapes and metadata of a model of \
-                      one frame; docs/formats.md has the format\n";
-        }
+            ),
+            Some(problem) => format!(
+                "{problem}\n`python3 -m hardnessd.adopt IN.onnx --out M.onnx` mends names, shapes and metadata of a \
+                 model of one frame; docs/formats.md has the format\n"
+            ),
+        };
         super::print(&lines)?;
-        Ok(problems.is_empty())
+        Ok(problem.is_none())
     });
     match checked {
         Ok(true) => ExitCode::SUCCESS,

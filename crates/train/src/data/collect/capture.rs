@@ -260,7 +260,7 @@ impl Pressed {
             let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
             selection.describe(sensor.name(), sensor.description());
             let none = Track::default();
-            let events = pipeline.take(Input::Bytes(bytes.into()), NOT_LOOKED_AT);
+            let events = pipeline.take(Input::Bytes(bytes.to_vec()), NOT_LOOKED_AT);
             selection.take(events.unwrap_or_default(), NOT_LOOKED_AT, &none);
             selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT, &none);
             (Labels::new(), grid_mm(sensor), selection::grid(sensor))
