@@ -147,10 +147,10 @@ fn press(rig: &mut Rig, object: u32, hrn: &Arc<Hrn>, fps: f64, withdraws: bool) 
         };
         let position = vec![Point { at_ns, mm }];
         pipeline
-            .take(Input::Motion(position.into()), at)
+            .take(Input::Motion(position), at)
             .expect("time goes on");
         for event in pipeline
-            .take(Input::Bytes((&bytes).into()), at)
+            .take(Input::Bytes(bytes.clone()), at)
             .expect("bytes are taken")
         {
             let is_enough = match event {

@@ -178,7 +178,7 @@ mod tests {
         for frame in frames {
             let mut bytes = Vec::new();
             first.sensor().layout().encode(&frame.raw, &mut bytes);
-            first.take(Input::Bytes(bytes.into()), at).unwrap();
+            first.take(Input::Bytes(bytes), at).unwrap();
         }
         assert_eq!(first.own_presses().count(), 3);
         let saving = store(directory.path());

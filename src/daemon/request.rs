@@ -141,7 +141,7 @@ impl TryFrom<Map<String, Value>> for Context {
         };
         let (sensor, is_empty) = (name.clone(), fields.len() == 1);
         let context = Value::Object(fields);
-        event::check_context(&context).map_err(|error| error.to_string())?;
+        event::check_context(&context)?;
         Ok(Self {
             sensor,
             context: (!is_empty).then_some(context),

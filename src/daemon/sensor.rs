@@ -194,11 +194,11 @@ pub(crate) async fn serve(
                 }
                 is_new |= matches!(turn, Turn::Opened);
                 let input = match turn {
-                    Turn::Bytes(bytes) => Input::Bytes(bytes.into()),
+                    Turn::Bytes(bytes) => Input::Bytes(bytes.to_vec()),
                     Turn::Skipped(bytes) => Input::Skipped(bytes),
                     Turn::Opened => Input::Opened,
-                    Turn::Unavailable(reason) => Input::Unavailable(reason.into()),
-                    Turn::Lost(reason) => Input::Lost(reason.into()),
+                    Turn::Unavailable(reason) => Input::Unavailable(reason),
+                    Turn::Lost(reason) => Input::Lost(reason),
                     Turn::Stranger(address) => {
                         log::stranger(pipeline.sensor().name(), address);
                         continue;
@@ -239,7 +239,7 @@ pub(crate) async fn serve(
 fn take(
     pipeline: &mut Pipeline,
     recorder: &mut SensorRecorder,
-    input: Input<'_>,
+    input: Input,
     at: Stamp,
 ) -> Result<Vec<Event>, Refused> {
     recorder.note(pipeline, &input, at);
@@ -250,7 +250,7 @@ fn take(
 fn taken(
     pipeline: &mut Pipeline,
     recorder: &mut SensorRecorder,
-    input: Input<'_>,
+    input: Input,
     at: Stamp,
 ) -> Vec<Event> {
     let taken = take(pipeline, recorder, input, at);
@@ -270,7 +270,7 @@ fn take_positions(
         let input = Input::ClockSet(set.until_ns);
         taken(pipeline, recorder, input, super::now());
     }
-    let input = Input::Motion(placed.points.as_slice().into());
+    let input = Input::Motion(placed.points.clone());
     match take(pipeline, recorder, input, super::now()) {
         Err(Refused::Motion(step_back)) => Err(step_back),
         _ => Ok(()),
@@ -359,7 +359,7 @@ mod tests {
             }
             let mut bytes = Vec::new();
             pipeline.sensor().layout().encode(&raw, &mut bytes);
-            for event in pipeline.take(Input::Bytes(bytes.into()), now).unwrap() {
+            for event in pipeline.take(Input::Bytes(bytes), now).unwrap() {
                 if let Event::Frame(frame) = event
                     && pressed(ms)
                 {

@@ -307,7 +307,7 @@ fn levels(levels: &[Level]) -> String {
 
 /// Parses a label, `KEY=VALUE`.
 fn label(text: &str) -> Result<(String, String), LabelError> {
-    let (key, value) = text.split_once('=').ok_or(LabelError::NoKey)?;
+    let (key, value) = text.split_once('=').unwrap_or(("", text));
     check_label(key, value)?;
     Ok((key.to_owned(), value.to_owned()))
 }

@@ -195,18 +195,13 @@ fn play_entries(
     }
     if playback.sensors() == 0 {
         // A clip of a recording may lie inside one press.
-        let (found, expected) = match playback.left_out().is_empty() {
-            true => ("no state of a sensor", "a recording of hardnessd"),
-            false => (
-                "no sensor at rest",
-                "a recording with a moment between presses",
-            ),
+        let problem = match playback.left_out().is_empty() {
+            true => "found no state of a sensor, expected a recording of hardnessd",
+            false => "found no sensor at rest, expected a recording with a moment between presses",
         };
-        let found = found.to_owned();
-        return Err(unplayable(path)(recording::Error::Foreign {
-            found,
-            expected,
-        }));
+        return Err(unplayable(path)(recording::Error::Content(
+            problem.to_owned(),
+        )));
     }
     Ok(true)
 }
@@ -286,7 +281,7 @@ pub(super) fn feed(
         let points: Vec<Point> = motion.drain(..count.unwrap_or(motion.len())).collect();
         // An error means that the time of a point went back. The approach of its press is then
         // unknown. The pipeline takes its times from the recording and does not use this one.
-        let _ = pipeline.take(Input::Motion(points.into()), now());
+        let _ = pipeline.take(Input::Motion(points), now());
         let bytes = Input::Bytes((&chunk[..read]).into());
         let events = pipeline.take(bytes, now()).unwrap_or_default();
         warn(pipeline.unjudged());

@@ -24,7 +24,7 @@ use hardnessd_core::trial;
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, FooterBytes, Framing, HexBytes, Layout, LengthField,
-    PacketNumber, Packets, Preset, Settings,
+    Packets, Preset, Settings,
 };
 
 /// How long the daemon may take to answer.
@@ -107,7 +107,7 @@ fn layout(choices: &mut Choices) -> Option<Layout> {
         settings.packets = Some(Packets {
             count: usize::from(choices.byte() % 5),
             number_at: usize::from(choices.byte() % 5),
-            number: choices.of(&[PacketNumber::U8, PacketNumber::U16be]),
+            number: choices.of(&[Cell::U8, Cell::U16be]),
             first: choices.byte().into(),
             step: u16::from(choices.byte() % 3),
         });

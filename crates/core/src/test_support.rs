@@ -93,7 +93,7 @@ pub fn of_a_labelled_press(
     };
     let tare_frames = u64::from(sensor.calibration().tare_frames);
     for frame in 0..=tare_frames {
-        let input = Input::Bytes(bytes(0).into());
+        let input = Input::Bytes(bytes(0));
         pipeline.take(input, at(200 * frame)).unwrap();
     }
     let begin_ms = 200 * (tare_frames + 1);
@@ -103,7 +103,7 @@ pub fn of_a_labelled_press(
             mm: 0.25 * step as f64,
         };
         let points: Vec<Point> = (0..40).map(point).collect();
-        let input = Input::Motion(points.into());
+        let input = Input::Motion(points);
         pipeline.take(input, at(begin_ms)).unwrap();
     }
     let came = at(begin_ms);
@@ -113,7 +113,7 @@ pub fn of_a_labelled_press(
         .entry(0, came, &Entry::State(Box::new(state)))
         .unwrap();
     for (frame, counts) in (0..).zip([20, 40, 60, 80, 80, 0, 0]) {
-        let input = Input::Bytes(bytes(counts).into());
+        let input = Input::Bytes(bytes(counts));
         let came = at(begin_ms + 200 * frame);
         writer.entry(0, came, &Entry::Input(input)).unwrap();
     }

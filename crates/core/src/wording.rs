@@ -227,12 +227,6 @@ mod tests {
             of_usage(rendered),
             "unrecognized subcommand 'replya'; tip: a similar subcommand exists: 'replay'"
         );
-        let missing =
-            "error: the following required arguments were not provided:\n  <FILE>\n\nUsage: x";
-        assert_eq!(
-            of_usage(missing),
-            "the following required arguments were not provided: <FILE>"
-        );
     }
 
     #[test]
@@ -243,7 +237,6 @@ mod tests {
         for hidden in [
             "\n",
             "\u{1b}[2J",
-            "\u{7f}",
             "\u{85}",
             "\u{202e}",
             "\u{2066}",
@@ -261,20 +254,12 @@ mod tests {
                 "unknown field `boud`: did you mean `baud`?",
             ),
             (
-                "unknown field `col`, expected one of `rows`, `cols`, `cell`",
-                "unknown field `col`: did you mean `cols`?",
-            ),
-            (
                 "unknown variant `xml`, expected `text` or `json`",
                 "unknown variant `xml`, expected `text` or `json`",
             ),
             (
                 "invalid value: integer `-1`, expected u32",
                 "invalid value: integer `-1`, expected a whole number from 0 to 4294967295",
-            ),
-            (
-                "invalid type: string \"3\", expected f64",
-                "invalid type: string \"3\", expected a number",
             ),
         ] {
             assert_eq!(in_words(message), expected);

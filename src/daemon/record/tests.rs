@@ -75,7 +75,7 @@ fn after_a_gap_comes_a_state() {
     let reader = std::thread::spawn(move || drained(&inbox));
     for number in 0..20_000_u64 {
         let bytes = number.to_le_bytes().to_vec();
-        recorder.note(&pipeline, &Input::Bytes(bytes.into()), at(number));
+        recorder.note(&pipeline, &Input::Bytes(bytes), at(number));
     }
     drop(recorder);
     let (count, bad) = reader.join().unwrap();
@@ -97,7 +97,7 @@ fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
         })
         .collect();
     let mut pipeline = Pipeline::new(pressed.1, test_support::hrn(), Clock::Arrival);
-    let mut note = |pipeline: &mut Pipeline, (input, at): &(Input<'static>, Stamp)| {
+    let mut note = |pipeline: &mut Pipeline, (input, at): &(Input, Stamp)| {
         recorder.note(pipeline, input, *at);
         pipeline.take(input.to_owned(), *at).unwrap();
     };
@@ -134,7 +134,7 @@ fn a_flood_is_bounded_in_the_black_box() {
     let context = serde_json::json!({ "tags": vec![serde_json::json!({ "": 0 }); 100] });
     assert!(context.to_string().len() < 1024);
     for flood in [
-        Input::Bytes(vec![0; 1 << 16].into()),
+        Input::Bytes(vec![0; 1 << 16]),
         Input::Context(Some(context)),
     ] {
         assert!(Entry::Input(flood.to_owned()).weight() > 60_000);
@@ -165,7 +165,7 @@ fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
         at_ns: 5_000_000,
         mm: 1.5,
     };
-    let motion = Input::Motion(vec![point].into());
+    let motion = Input::Motion(vec![point]);
     recorder.note(&pipeline, &Input::Tick, at(6));
     recorder.note(&pipeline, &motion, at(7));
     // There is no room for another line, and nothing waits for it.

@@ -246,13 +246,13 @@ impl Worker {
                 let any = self.sensors.iter().any(|s| s.is_open != Some(false));
                 (!any).then(|| Error::Lost {
                     sensor: self.about.sensors[sensor].name().to_owned(),
-                    reason: reason.clone().into_owned(),
+                    reason: reason.clone(),
                 })
             }
             Entry::Input(Input::Unavailable(reason)) if self.sensors[sensor].is_open.is_none() => {
                 Some(Error::Unavailable {
                     sensor: self.about.sensors[sensor].name().to_owned(),
-                    reason: reason.clone().into_owned(),
+                    reason: reason.clone(),
                 })
             }
             _ => None,

@@ -129,8 +129,6 @@ impl Object {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
-
     use super::*;
 
     fn verdict(probabilities: &[f32], shore: Option<[f32; 3]>) -> Verdict {
@@ -203,14 +201,5 @@ mod tests {
             let all = [shore.value, shore.low, shore.high];
             assert!(!is_usable || all.iter().all(|x| x.is_finite()), "{shore:?}");
         }
-    }
-
-    #[test]
-    fn an_object_has_a_name_or_a_number() {
-        let name = |context: Value| object_of(Some(&context));
-        assert_eq!(name(json!({"object": "cup-3"})).as_deref(), Some("cup-3"));
-        assert_eq!(name(json!({"object": 3})).as_deref(), Some("3"));
-        assert_eq!(name(json!({"object": {}})), None);
-        assert_eq!(object_of(None), None);
     }
 }

@@ -54,23 +54,6 @@ fn positions_are_interpolated_and_none_is_made_up_after_the_latest() {
 }
 
 #[test]
-fn a_delay_looks_that_much_earlier() {
-    let mut track = Track::default();
-    let mut points = steady(0, 2000, 50);
-    // The arm stops at 1 s.
-    for point in &mut points {
-        point.mm = point.mm.min(10.0);
-    }
-    track.push(&points).unwrap();
-    let moments = [at(900), at(1000), at(1100), at(1200)];
-    let reported = |delay_ms| track.approach(at(900), &moments, delay_ms).unwrap();
-    let values = |reported: Vec<Option<f64>>| reported.into_iter().map(|mm| mm.unwrap().round());
-    assert!(values(reported(0.0)).eq([0.0, 1.0, 1.0, 1.0]));
-    assert!(values(reported(100.0)).eq([0.0, 1.0, 2.0, 2.0]));
-    assert!(values(reported(-100.0)).eq([0.0, 0.0, 0.0, 0.0]));
-}
-
-#[test]
 fn what_is_missing_jumps_or_steps_back_is_unknown_for_its_press_alone() {
     let hole = |from: i64, to: i64| {
         let mut points = steady(0, 10_000, 50);

@@ -1,7 +1,5 @@
 //! All that happens to a pipeline: the alphabet of live operation, of recordings and of replays.
 
-use std::borrow::Cow;
-
 use serde_json::Value;
 
 use super::Pipeline;
@@ -39,51 +37,31 @@ use crate::tare::RetareError;
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone, PartialEq)]
-pub enum Input<'a> {
+pub enum Input {
     /// The port is open.
     Opened,
     /// The port could not be opened, for this reason.
-    Unavailable(Cow<'a, str>),
+    Unavailable(String),
     /// Bytes came.
-    Bytes(Cow<'a, [u8]>),
+    Bytes(Vec<u8>),
     /// This many bytes came that were too many to be read. The next bytes do not continue the earlier
     /// ones.
     Skipped(u64),
     /// Time has passed.
     Tick,
     /// The device is gone, for this reason.
-    Lost(Cow<'a, str>),
+    Lost(String),
     /// A tare was requested.
     Tare,
     /// The controller's context.
     Context(Option<Value>),
     /// Positions of the arm from the robot.
-    Motion(Cow<'a, [Point]>),
+    Motion(Vec<Point>),
     /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
     /// moment of CLOCK_MONOTONIC, in nanoseconds.
     ClockSet(i64),
     /// The daemon stops.
     Shutdown,
-}
-
-impl Input<'_> {
-    /// A copy that borrows nothing.
-    pub fn to_owned(&self) -> Input<'static> {
-        let text = |text: &Cow<'_, str>| Cow::Owned(text.clone().into_owned());
-        match self {
-            Input::Opened => Input::Opened,
-            Input::Unavailable(reason) => Input::Unavailable(text(reason)),
-            Input::Bytes(bytes) => Input::Bytes(Cow::Owned(bytes.clone().into_owned())),
-            Input::Skipped(bytes) => Input::Skipped(*bytes),
-            Input::Tick => Input::Tick,
-            Input::Lost(reason) => Input::Lost(text(reason)),
-            Input::Tare => Input::Tare,
-            Input::Context(context) => Input::Context(context.clone()),
-            Input::Motion(points) => Input::Motion(Cow::Owned(points.to_vec())),
-            Input::ClockSet(until_ns) => Input::ClockSet(*until_ns),
-            Input::Shutdown => Input::Shutdown,
-        }
-    }
 }
 
 /// An input that was not taken as it came. It has no events.
@@ -104,14 +82,14 @@ impl Pipeline {
     /// # Errors
     ///
     /// Returns [`Refused`] for a tare that cannot be taken and for positions that step back in time.
-    pub fn take(&mut self, input: Input<'_>, at: Stamp) -> Result<Vec<Event>, Refused> {
+    pub fn take(&mut self, input: Input, at: Stamp) -> Result<Vec<Event>, Refused> {
         Ok(match input {
             Input::Opened => self.opened(at),
-            Input::Unavailable(reason) => self.unavailable(reason.into_owned(), at),
+            Input::Unavailable(reason) => self.unavailable(reason, at),
             Input::Bytes(bytes) => self.push(&bytes, at),
             Input::Skipped(bytes) => self.skip(bytes, at),
             Input::Tick => self.tick(at),
-            Input::Lost(reason) => self.lost(reason.into_owned(), at),
+            Input::Lost(reason) => self.lost(reason, at),
             Input::Shutdown => self.abort(Abort::Shutdown).into_iter().collect(),
             Input::Tare => {
                 self.retare()?;

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use crate::range::{self, OutOfRange};
 use crate::wording;
 
 /// Notes of the user by key, for example on the pressed object.
@@ -10,23 +9,8 @@ pub type Labels = BTreeMap<String, String>;
 
 /// The reason why a label is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum LabelError {
-    /// The label has no key.
-    #[error("the label has no key: write KEY=VALUE")]
-    NoKey,
-    /// The key or the value has hidden characters, so a reader would see something else.
-    #[error("found {0:?}, expected text without control or bidirectional characters")]
-    Hidden(String),
-    /// The label is too long.
-    #[error("found {found} characters, expected at most {MOST_CHARS}")]
-    Long {
-        /// The number of characters of the key and the value.
-        found: usize,
-    },
-    /// The value under this key must be a number.
-    #[error(transparent)]
-    Number(#[from] OutOfRange),
-}
+#[error("{0}")]
+pub struct LabelError(String);
 
 /// The longest label: a label is a note, not a document.
 const MOST_CHARS: usize = 1000;
@@ -50,31 +34,39 @@ const MOST_CHARS: usize = 1000;
 /// assert!(error.to_string().ends_with("expected a whole number from 0 to 4294967295"));
 /// ```
 pub fn check_label(key: &str, value: &str) -> Result<(), LabelError> {
+    let error = |problem: String| Err(LabelError(problem));
     if key.is_empty() {
-        return Err(LabelError::NoKey);
+        return error("the label has no key: write KEY=VALUE".to_owned());
     }
     let found = key.chars().count() + value.chars().count();
     if found > MOST_CHARS {
-        return Err(LabelError::Long { found });
+        return error(format!(
+            "found {found} characters, expected at most {MOST_CHARS}"
+        ));
     }
-    for text in [key, value] {
-        if !wording::is_plain(text) {
-            return Err(LabelError::Hidden(text.to_owned()));
-        }
+    if let Some(text) = [key, value]
+        .into_iter()
+        .find(|text| !wording::is_plain(text))
+    {
+        let expected = "text without control or bidirectional characters";
+        return error(format!("found {text:?}, expected {expected}"));
     }
-    match key {
-        "object" => {
-            let fits = value.parse::<u32>().is_ok();
-            range::check("object", value, fits, "a whole number from 0 to 4294967295")?;
-        }
+    let (fits, expected) = match key {
+        "object" => (
+            value.parse::<u32>().is_ok(),
+            "a whole number from 0 to 4294967295",
+        ),
         "shore" => {
             let shore = value.parse();
             let fits = shore.is_ok_and(|shore: f32| (0.0..=100.0).contains(&shore));
-            range::check("shore", value, fits, "a number from 0 to 100")?;
+            (fits, "a number from 0 to 100")
         }
-        _ => {}
+        _ => return Ok(()),
+    };
+    match fits {
+        true => Ok(()),
+        false => error(format!("{key}: found {value:?}, expected {expected}")),
     }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -14,11 +14,10 @@ use crate::ros::{self, Blob, Header, Topic};
 
 /// The channels of a sensor, in the order of their numbers. `recover` numbers the channels of a
 /// damaged file by this order.
-pub(super) const TOPICS: [Topic; 8] = [
+pub(super) const TOPICS: [Topic; 7] = [
     INPUT,
     MOTION,
     ros::FRAME,
-    ros::GRID,
     ros::CONTACT,
     ros::PRESS,
     ros::HARDNESS,
@@ -70,16 +69,14 @@ struct Version {
 }
 
 fn from_cdr<M: DeserializeOwned>(bytes: &[u8]) -> Result<M, Error> {
-    let foreign = |found: String| Error::Foreign {
-        found,
-        expected: "a message of ours",
-    };
+    let foreign =
+        |found: &str| Error::Content(format!("found {found}, expected a message of ours"));
     let body = bytes
         .strip_prefix(&ros::ENCAPSULATION)
-        .ok_or_else(|| foreign("bytes that are no little-endian CDR".to_owned()))?;
+        .ok_or_else(|| foreign("bytes that are no little-endian CDR"))?;
     cdr_encoding::from_bytes::<M, LittleEndian>(body)
         .map(|(message, _)| message)
-        .map_err(|error| foreign(format!("another message ({error})")))
+        .map_err(|error| foreign(&format!("another message ({error})")))
 }
 
 fn json(value: &impl Serialize) -> Vec<u8> {
@@ -131,11 +128,13 @@ pub(super) fn encode_state(sensor: &str, at: Stamp, state: &Value) -> Vec<u8> {
     })
 }
 
-fn foreign(found: String) -> Error {
-    Error::Foreign {
-        found,
-        expected: "an input of this version",
-    }
+fn foreign(found: &str) -> Error {
+    Error::Content(format!("found {found}, expected an input of this version"))
+}
+
+fn check_context(context: Option<&Value>) -> Result<(), Error> {
+    let checked = context.map_or(Ok(()), event::check_context);
+    checked.map_err(|problem| Error::Content(format!("context: {problem}")))
 }
 
 /// The moment of a message. MCAP's own time reaches further than that of a ROS header, but does not
@@ -147,7 +146,7 @@ fn stamp(header: &Header, mono_ns: u64, log_time_ns: u64) -> Result<Stamp, Error
     };
     Ok(Stamp {
         mono: std::time::Duration::from_nanos(mono_ns),
-        wall: wall.ok_or_else(|| foreign("an invalid time".to_owned()))?,
+        wall: wall.ok_or_else(|| foreign("an invalid time"))?,
     })
 }
 
@@ -163,9 +162,9 @@ pub(super) fn decode_motion(
     let points = moments.into_iter().zip(positions);
     let points: Vec<Point> = points.map(Point::from).collect();
     if !same || !points.iter().all(Point::is_usable) {
-        return Err(foreign("invalid positions".to_owned()));
+        return Err(foreign("invalid positions"));
     }
-    let motion = Input::Motion(points.into());
+    let motion = Input::Motion(points);
     Ok((message.header.frame_id, at, Entry::Input(motion)))
 }
 
@@ -177,10 +176,10 @@ pub(super) fn decode_entry(
     let message: InputMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
     let data = message.data.into_vec();
-    let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned().into();
-    let unreadable = |error: serde_json::Error| foreign(format!("other JSON ({error})"));
+    let text = |data: Vec<u8>| String::from_utf8_lossy(&data).into_owned();
+    let unreadable = |error: serde_json::Error| foreign(&format!("other JSON ({error})"));
     let entry = match message.kind {
-        0 => Entry::Input(Input::Bytes(data.into())),
+        0 => Entry::Input(Input::Bytes(data)),
         1 => Entry::Input(Input::Opened),
         2 => Entry::Input(Input::Unavailable(text(data))),
         3 => Entry::Input(Input::Lost(text(data))),
@@ -188,21 +187,20 @@ pub(super) fn decode_entry(
         5 => Entry::Input(Input::Tare),
         6 => {
             let context: Option<Value> = serde_json::from_slice(&data).map_err(unreadable)?;
-            context.as_ref().map_or(Ok(()), event::check_context)?;
+            check_context(context.as_ref())?;
             Entry::Input(Input::Context(context))
         }
         7 => Entry::Input(Input::Shutdown),
         9 => {
             let Version { format } = serde_json::from_slice(&data).map_err(unreadable)?;
             if format != FORMAT {
-                return Err(Error::Foreign {
-                    found: format!("a recording of format {format}"),
-                    expected: "format 3: play it with the version that wrote it",
-                });
+                return Err(Error::Content(format!(
+                    "found a recording of format {format}, expected format {FORMAT}: play it with the version \
+                     that wrote it"
+                )));
             }
             let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
-            let context = state.at_rest.context();
-            context.map_or(Ok(()), event::check_context)?;
+            check_context(state.at_rest.context())?;
             Entry::State(Box::new(state))
         }
         10 => {
@@ -213,11 +211,11 @@ pub(super) fn decode_entry(
             let bytes: u64 = serde_json::from_slice(&data).map_err(unreadable)?;
             // No line ever delivers so many.
             if bytes > u64::from(u32::MAX) {
-                return Err(foreign(format!("{bytes} bytes at once")));
+                return Err(foreign(&format!("{bytes} bytes at once")));
             }
             Entry::Input(Input::Skipped(bytes))
         }
-        other => return Err(foreign(format!("an input of kind {other}"))),
+        other => return Err(foreign(&format!("an input of kind {other}"))),
     };
     Ok((message.header.frame_id, at, entry))
 }

@@ -10,8 +10,7 @@ use crate::judge::Unjudged;
 use crate::motion::Track;
 use crate::pipeline::Pipeline;
 use crate::press::Abort;
-use crate::range::OutOfRange;
-use crate::verdict::{Course, Hrn, ModelError, ReferencesError};
+use crate::verdict::{Course, Hrn, ModelError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -66,25 +65,12 @@ impl Player {
 #[error("sensor {sensor:?}: {problem}")]
 pub struct PlaybackError {
     sensor: String,
-    problem: PlaybackProblem,
+    problem: Problem,
 }
 
-/// The reason why an entry cannot be played.
-#[derive(Debug, thiserror::Error)]
-pub enum PlaybackProblem {
-    /// The description of the sensor is not valid.
-    #[error(transparent)]
-    Sensor(#[from] OutOfRange),
-    /// The references are not as the model computes them.
-    #[error(transparent)]
-    References(#[from] ReferencesError),
-    /// The model does not take frames of this sensor.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// No pipeline can have this state.
-    #[error("state: found what no pipeline can have come to, expected the state of one")]
-    State,
-}
+/// The sensor is not valid, the model takes no frames of it or other references, or no pipeline can have
+/// the state.
+type Problem = Box<dyn std::error::Error + Send + Sync>;
 
 impl Playback {
     /// A playback without any sensor yet. The model is `hrn`. A sensor keeps the references of the
@@ -119,7 +105,7 @@ impl Playback {
     }
 
     /// The model with the references of a recorded sensor.
-    fn hrn_of(&self, recorded: &RecordedSensor) -> Result<Arc<Hrn>, ReferencesError> {
+    fn hrn_of(&self, recorded: &RecordedSensor) -> Result<Arc<Hrn>, ModelError> {
         if let Some(hrn) = self.identified.get(recorded.name()) {
             return Ok(hrn.clone());
         }
@@ -143,12 +129,7 @@ impl Playback {
         Ok(events)
     }
 
-    fn play(
-        &mut self,
-        sensor: &str,
-        at: Stamp,
-        entry: Entry,
-    ) -> Result<Vec<Event>, PlaybackProblem> {
+    fn play(&mut self, sensor: &str, at: Stamp, entry: Entry) -> Result<Vec<Event>, Problem> {
         let hrn = match &entry {
             Entry::State(state) => self.hrn_of(&state.sensor)?,
             Entry::Input(_) => self.hrn.clone(),
@@ -162,7 +143,8 @@ impl Playback {
                 let described = state.sensor.check()?;
                 hrn.card().check_array(described.layout().array())?;
                 if !state.at_rest.is_usable(described.layout().array()) {
-                    return Err(PlaybackProblem::State);
+                    let found = "what no pipeline can have come to";
+                    return Err(format!("state: found {found}, expected the state of one").into());
                 }
                 let mut pipeline = Pipeline::resumed(described, hrn, state.at_rest);
                 if self.keeps_courses {

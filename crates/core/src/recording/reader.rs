@@ -84,7 +84,7 @@ impl ChunkRecords {
         })
     }
 
-    fn read(&mut self) -> Result<Option<Record<'static>>, Error> {
+    fn read(&mut self) -> Result<Option<(Record<'static>, usize)>, Error> {
         while let Some(event) = self.reader.next_event() {
             match event? {
                 LinearReadEvent::ReadRequest(wanted) => {
@@ -96,7 +96,7 @@ impl ChunkRecords {
                     if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =
                         record
                     {
-                        return Ok(Some(record.into_owned()));
+                        return Ok(Some((record.into_owned(), data.len())));
                     }
                 }
             }
@@ -106,7 +106,8 @@ impl ChunkRecords {
 }
 
 impl Iterator for ChunkRecords {
-    type Item = Result<Record<'static>, Error>;
+    /// A record, and the number of its bytes.
+    type Item = Result<(Record<'static>, usize), Error>;
 
     fn next(&mut self) -> Option<Self::Item> {
         self.read().transpose()
@@ -188,7 +189,7 @@ impl<R: Read> Reader<R> {
         loop {
             match self.chunk.as_mut().and_then(Iterator::next) {
                 Some(record) => {
-                    if let Some(found) = self.take(record?)? {
+                    if let Some(found) = self.take(record?.0)? {
                         return Ok(Some(found));
                     }
                     continue;
@@ -209,10 +210,8 @@ impl<R: Read> Reader<R> {
                     self.bytes += read as u64;
                     if read == 0 && self.bytes < MAGIC.len() as u64 {
                         // Such a short file holds nothing that could be saved.
-                        return Err(Error::Foreign {
-                            found: format!("{} bytes", self.bytes),
-                            expected: "a recording",
-                        });
+                        let found = format!("found {} bytes, expected a recording", self.bytes);
+                        return Err(Error::Content(found));
                     }
                     self.linear.notify_read(read);
                     continue;

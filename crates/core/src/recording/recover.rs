@@ -79,23 +79,14 @@ pub fn recover<R: Read + Seek, W: Write>(
     let mut copy = Copy::new(good)?;
     while let Some(found) = scan.next().map_err(RecoverError::Read)? {
         match found {
-            Whole::Record(record) => copy.take(*record)?,
-            Whole::Chunk(chunk, place) => {
-                let mut is_whole = true;
-                for record in chunk {
-                    match record {
-                        Ok(record) => copy.take(record)?,
-                        Err(_) => is_whole = false,
-                    }
-                    if !is_whole {
-                        break;
-                    }
+            Whole::Record(record, bytes) => copy.take(*record, bytes)?,
+            Whole::Chunk(mut chunk, place) => loop {
+                match chunk.next() {
+                    Some(Ok((record, bytes))) => copy.take(record, bytes)?,
+                    Some(Err(_)) => break scan.lost.push((place, scan.place - place)),
+                    None => break scan.whole += 1,
                 }
-                match is_whole {
-                    true => scan.whole += 1,
-                    false => scan.lost.push((place, scan.place - place)),
-                }
-            }
+            },
             Whole::End => {}
         }
     }
@@ -107,7 +98,8 @@ pub fn recover<R: Read + Seek, W: Write>(
 
 /// What the scan found.
 enum Whole {
-    Record(Box<Record<'static>>),
+    /// A record, and the number of its bytes.
+    Record(Box<Record<'static>>, usize),
     /// A chunk, and its place. Its records may be damaged.
     Chunk(Box<ChunkRecords>, u64),
     /// The end of what is worth reading, or a chunk that is not read.
@@ -190,7 +182,8 @@ impl<R: Read + Seek> Scan<R> {
             Err(_) => return Ok(None),
         };
         let is_followed = end == self.length || self.record_at(end)?.is_some();
-        Ok(is_followed.then_some((Whole::Record(Box::new(record)), end)))
+        let record = Whole::Record(Box::new(record), body.len());
+        Ok(is_followed.then_some((record, end)))
     }
 
     /// The opcode and the end of the record at `place`, if there can be a record.
@@ -277,9 +270,7 @@ struct Copy<W: Write> {
 
 /// The most bytes of schemas, channels and metadata. Those of ours take some kilobytes, and those of other
 /// programs some hundreds. More of them are left out.
-const MOST_DESCRIBED_BYTES: usize = 16 << 20;
-/// The memory of a description beside its texts.
-const DESCRIPTION_BYTES: usize = 256;
+const MOST_DESCRIBED_BYTES: usize = 4 << 20;
 
 impl<W: Write> Copy<W> {
     fn new(good: W) -> Result<Self, Error> {
@@ -302,36 +293,14 @@ impl<W: Write> Copy<W> {
         Ok((self.done, good))
     }
 
-    /// Whether there is room for a description.
-    fn has_room(&mut self, record: &Record<'_>) -> bool {
-        let of_map = |map: &BTreeMap<String, String>| -> usize {
-            let texts = map.iter().map(|(key, value)| key.len() + value.len());
-            texts.map(|bytes| bytes + DESCRIPTION_BYTES).sum()
-        };
-        let bytes = match record {
-            Record::Metadata(metadata) => metadata.name.len() + of_map(&metadata.metadata),
-            Record::Schema { header, data } => {
-                header.name.len() + header.encoding.len() + data.len()
+    /// Adds a record of this many bytes.
+    fn take(&mut self, record: Record<'static>, bytes: usize) -> Result<(), Error> {
+        if !matches!(record, Record::Message { .. }) {
+            self.described_bytes = self.described_bytes.saturating_add(bytes);
+            if self.described_bytes > MOST_DESCRIBED_BYTES {
+                self.done.messages_unknown += 1;
+                return Ok(());
             }
-            Record::Channel(channel) => {
-                channel.topic.len() + channel.message_encoding.len() + of_map(&channel.metadata)
-            }
-            _ => return true,
-        };
-        let bytes = self
-            .described_bytes
-            .saturating_add(bytes + DESCRIPTION_BYTES);
-        let has_room = bytes <= MOST_DESCRIBED_BYTES;
-        if has_room {
-            self.described_bytes = bytes;
-        }
-        has_room
-    }
-
-    fn take(&mut self, record: Record<'static>) -> Result<(), Error> {
-        if !self.has_room(&record) {
-            self.done.messages_unknown += 1;
-            return Ok(());
         }
         match record {
             Record::Metadata(metadata) => self.out.write_metadata(&metadata)?,

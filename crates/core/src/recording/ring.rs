@@ -143,7 +143,7 @@ mod tests {
     fn a_flood_is_kept_for_as_long_as_there_is_room() {
         let mut ring = Ring::default();
         let state = state();
-        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20].into()));
+        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20]));
         for second in 0..50 {
             ring.push(at(second), state.clone());
             ring.push(at(second), flood.clone());
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn a_stretch_that_never_ends_is_dropped_until_the_next_state() {
         let mut ring = Ring::default();
-        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20].into()));
+        let flood = Entry::Input(Input::Bytes(vec![0; 1 << 20]));
         ring.push(at(0), state());
         for _ in 0..40 {
             ring.push(at(1), flood.clone());

@@ -16,9 +16,7 @@ use std::ops::Range;
 use super::cells::Cells;
 use super::checksum::{Checksum, ChecksumOver, Sums};
 use super::scan::{Context, Scan};
-use super::settings::{
-    Cell, FooterBytes, Framing, HexBytes, LengthField, PacketNumber, Packets, Settings,
-};
+use super::settings::{Cell, FooterBytes, Framing, HexBytes, LengthField, Packets, Settings};
 use crate::frame::{Array, RawFrame};
 use crate::range::{self, OutOfRange};
 
@@ -50,7 +48,7 @@ pub(super) struct Fixed {
 struct Numbering {
     /// The place of the number in a packet.
     at: usize,
-    number: PacketNumber,
+    number: Cell,
     first: u16,
     step: u16,
 }
@@ -452,10 +450,7 @@ impl Numbering {
             format_args!("a place in the header (header_bytes: {header_bytes})"),
         )?;
         range::check("packets.step", step, step > 0, "at least 1")?;
-        let max = match number {
-            PacketNumber::U8 => usize::from(u8::MAX),
-            PacketNumber::U16le | PacketNumber::U16be => usize::from(u16::MAX),
-        };
+        let max = number.range().map_or(0, |(_, most)| most as usize);
         let last = usize::from(first) + (count - 1) * usize::from(step);
         range::check(
             "packets.first",
@@ -479,11 +474,7 @@ impl Numbering {
     /// The place of `packet` among those of a frame by its number.
     fn index(self, packet: &[u8]) -> Option<usize> {
         let bytes = packet.get(self.at..self.at + self.number.bytes())?;
-        let number = match self.number {
-            PacketNumber::U8 => bytes[0].into(),
-            PacketNumber::U16le => u16::from_le_bytes([bytes[0], bytes[1]]),
-            PacketNumber::U16be => u16::from_be_bytes([bytes[0], bytes[1]]),
-        };
+        let number = self.number.read(bytes) as u16;
         let by = number.checked_sub(self.first)?;
         by.is_multiple_of(self.step)
             .then_some(usize::from(by / self.step))
@@ -492,21 +483,9 @@ impl Numbering {
     /// Writes the number of the packet at `index` into it.
     fn write(self, index: usize, packet: &mut [u8]) {
         let number = self.first + self.step * index as u16;
-        let bytes = match self.number {
-            PacketNumber::U8 => vec![number as u8],
-            PacketNumber::U16le => number.to_le_bytes().to_vec(),
-            PacketNumber::U16be => number.to_be_bytes().to_vec(),
-        };
+        let mut bytes = Vec::new();
+        self.number.write(number.into(), &mut bytes);
         packet[self.at..][..bytes.len()].copy_from_slice(&bytes);
-    }
-}
-
-impl PacketNumber {
-    fn bytes(self) -> usize {
-        match self {
-            PacketNumber::U8 => 1,
-            PacketNumber::U16le | PacketNumber::U16be => 2,
-        }
     }
 }
 

@@ -157,9 +157,9 @@ pub struct Packets {
     /// of a row, of a taxel or of the first cell.
     #[serde(default)]
     pub number_at: usize,
-    /// How the number is written.
+    /// How the number is written: as a cell.
     #[serde(default)]
-    pub number: PacketNumber,
+    pub number: Cell,
     /// The number of the first packet.
     #[serde(default = "one")]
     pub first: u16,
@@ -170,19 +170,6 @@ pub struct Packets {
 
 fn one() -> u16 {
     1
-}
-
-/// How the number of a packet is written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum PacketNumber {
-    /// One byte.
-    #[default]
-    U8,
-    /// Two bytes, low first.
-    U16le,
-    /// Two bytes, high first.
-    U16be,
 }
 
 /// How the bytes of a frame are packed, so that the end of a frame is a byte of its own.

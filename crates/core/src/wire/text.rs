@@ -55,26 +55,34 @@ struct Line {
 
 /// Why lines are no frame.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Refused {
+#[error("{0}")]
+pub(super) struct Refused(String);
+
+impl Refused {
     /// There are too few or too many numbers.
-    #[error("a line has {found} numbers, expected {cols} for a row or {cells} for a frame")]
-    Numbers {
-        found: usize,
-        cols: usize,
-        cells: usize,
-    },
-    /// Something where a number should be.
-    #[error("a line has {0:?} among its numbers")]
-    Word(String),
+    fn numbers(found: usize, cells: &Cells) -> Self {
+        let (cols, count) = (cells.array.cols, cells.count());
+        Self(format!(
+            "a line has {found} numbers, expected {cols} for a row or {count} for a frame"
+        ))
+    }
+
+    /// There is something where a number should be.
+    fn word(word: &[u8]) -> Self {
+        let shown = String::from_utf8_lossy(&word[..word.len().min(SHOWN_BYTES)]);
+        Self(format!(
+            "a line has {:?} among its numbers",
+            escaped(&shown)
+        ))
+    }
+
     /// There are too few or too many lines.
-    #[error("{found} lines with numbers come before one without, expected {rows}")]
-    Rows { found: usize, rows: usize },
-    /// The numbers are not what the mask asks for, or too large.
-    #[error("a number is not a whole one for the mask, or too large")]
-    Value,
-    /// The heading did not come.
-    #[error("no line has the heading {0:?}")]
-    Heading(String),
+    fn rows(found: usize, cells: &Cells) -> Self {
+        let rows = cells.array.rows;
+        Self(format!(
+            "{found} lines with numbers come before one without, expected {rows}"
+        ))
+    }
 }
 
 impl Lines {
@@ -99,14 +107,6 @@ impl Lines {
         };
         let cut = (end - self.begin).saturating_sub(most_kept);
         near.map_or(self.begin + cut, |line| line.start)
-    }
-
-    fn numbers(&self) -> usize {
-        self.held.iter().map(|line| line.numbers).sum()
-    }
-
-    fn refuse(&mut self, refused: Refused) {
-        self.refused.get_or_insert(refused);
     }
 }
 
@@ -149,6 +149,12 @@ pub(super) fn scan(
     context: Context,
     lines: &mut Lines,
 ) -> Scan {
+    let heading = text.heading.as_slice();
+    // Whether the first `end` bytes are most of a frame that was damaged.
+    let damage = |end: usize| {
+        let is_of_frame = context.in_sync && bytes.starts_with(heading);
+        u64::from(is_of_frame && 2 * numbers_in(&bytes[..end]) > cells.count())
+    };
     // One byte more than the longest frame is kept. It shows whether the first number of a frame is
     // the rest of a number that was cut.
     let most_kept = most_bytes(cells) + 1;
@@ -156,15 +162,18 @@ pub(super) fn scan(
         let (start, end) = (lines.begin, lines.read + length + 1);
         // Bytes that arrive one at a time are cut before the end of the line arrives. Bytes that arrive
         // at once are cut in the same way.
-        let cut = lines.cut(end, most_kept, text.heading.is_empty());
+        let cut = lines.cut(end, most_kept, heading.is_empty());
         if cut > 0 {
             return Scan::noise(cut);
         }
-        let found = if text.heading.is_empty() {
-            on_line(cells, bytes, start..end, lines, most_kept)
-        } else {
-            after_heading(text, cells, bytes, start..end, lines)
+        let found = match heading.is_empty() {
+            true => on_line(cells, bytes, start..end, lines, most_kept),
+            false => after_heading(heading, cells, bytes, start..end, lines),
         };
+        let found = found.unwrap_or_else(|refused| {
+            lines.refused.get_or_insert(refused);
+            Found::Nothing(end)
+        });
         match found {
             Found::Held(numbers) => {
                 lines.held.push_back(Line {
@@ -178,21 +187,14 @@ pub(super) fn scan(
                 lines.refused = None;
                 return Scan::Frame { bytes: end, frame };
             }
-            Found::Frame { start, .. } => {
-                // The line is read again when the bytes before the frame are gone.
-                let before = numbers_in(&bytes[..start]);
-                return Scan::past(start, damage(before, cells, context));
-            }
-            Found::Nothing { bytes, numbers } => {
-                return Scan::past(bytes, damage(numbers, cells, context));
+            // The line is read again when the bytes before the frame are gone.
+            Found::Frame { start: bytes, .. } | Found::Nothing(bytes) => {
+                return Scan::past(bytes, damage(bytes));
             }
         }
     }
     lines.read = bytes.len();
-    Scan::past(
-        lines.cut(bytes.len(), most_kept, text.heading.is_empty()),
-        0,
-    )
+    Scan::past(lines.cut(bytes.len(), most_kept, heading.is_empty()), 0)
 }
 
 /// What a line is.
@@ -201,13 +203,8 @@ enum Found {
     Held(usize),
     /// It ends a frame that begins at `start`.
     Frame { start: usize, frame: RawFrame },
-    /// The first `bytes` bytes are no frame. They have so many numbers.
-    Nothing { bytes: usize, numbers: usize },
-}
-
-/// Whether as many numbers are a frame that was damaged.
-fn damage(numbers: usize, cells: &Cells, context: Context) -> u64 {
-    u64::from(context.in_sync && 2 * numbers > cells.count())
+    /// So many bytes are no frame.
+    Nothing(usize),
 }
 
 /// What a line is where frames have no heading.
@@ -217,150 +214,94 @@ fn on_line(
     line: Range<usize>,
     lines: &mut Lines,
     most_kept: usize,
-) -> Found {
+) -> Result<Found, Refused> {
     let Array { rows, cols } = cells.array;
-    let (start, end) = (line.start, line.end);
+    let Range { start, end } = line;
     let line = &bytes[line];
     let numbers = numbers_in(line);
-    let nothing = |lines: &Lines, end: usize| Found::Nothing {
-        bytes: end,
-        numbers: lines.numbers() + numbers,
-    };
     // A word may end with the first cell.
     if numbers + 1 >= cells.count() {
-        match cells_at_end(line, cells.count(), cols) {
+        match cells_at_end(line, cells, cells.count()) {
             // Whether a longer frame is found would depend on how many bytes arrive at once.
-            Ok((first, _)) if line.len() - first >= most_kept => {}
-            Ok((first, values)) => {
-                let Some(frame) = cells.frame(values) else {
-                    lines.refuse(Refused::Value);
-                    return nothing(lines, end);
-                };
+            Ok((first, values)) if line.len() - first < most_kept => {
                 // Most of a frame before this one is a frame that lost its LF.
                 let before = numbers_in(&line[..first]);
                 let is_alone = 2 * before <= cells.count() && line.len() < most_kept;
                 let start = if is_alone { start } else { start + first };
-                return Found::Frame { start, frame };
+                let frame = of_values(cells, values)?;
+                return Ok(Found::Frame { start, frame });
             }
-            Err(refused) if 2 * numbers > cells.count() => lines.refuse(refused),
-            Err(_) => {}
+            Err(refused) if 2 * numbers > cells.count() => return Err(refused),
+            _ => {}
         }
     }
     if 2 * numbers > cells.count() {
-        lines.refuse(wrong_number(numbers, cells));
-        return nothing(lines, end);
+        return Err(Refused::numbers(numbers, cells));
     }
+    let held = lines.held.len();
     if numbers > 0 || has_damaged(line) {
         // Of more lines than a frame has, the first ones are in none.
-        if lines.held.len() >= 2 * rows {
-            let found = lines.held.len();
-            lines.refuse(Refused::Rows { found, rows });
-            return Found::Nothing {
-                bytes: lines.held[rows].start,
-                numbers: lines.held.iter().take(rows).map(|line| line.numbers).sum(),
-            };
+        if held >= 2 * rows {
+            lines.refused.get_or_insert(Refused::rows(held, cells));
+            return Ok(Found::Nothing(lines.held[rows].start));
         }
-        return Found::Held(numbers);
+        return Ok(Found::Held(numbers));
     }
     // The rows end here, if there are enough of them.
-    let held = lines.held.len();
     let Some(first) = held.checked_sub(rows) else {
-        if held > 0 {
-            let found = lines.held.iter().map(|line| line.numbers).max();
-            match found.filter(|&found| found != cols) {
-                Some(found) => lines.refuse(wrong_number(found, cells)),
-                None => lines.refuse(Refused::Rows { found: held, rows }),
-            }
-        }
-        return nothing(lines, end);
+        let most = lines.held.iter().map(|line| line.numbers).max();
+        return match most {
+            None => Ok(Found::Nothing(end)),
+            Some(found) if found != cols => Err(Refused::numbers(found, cells)),
+            Some(_) => Err(Refused::rows(held, cells)),
+        };
     };
-    let first_row = lines.held[first];
-    let of_rows = lines
-        .held
-        .range(first..)
-        .map(|row| &bytes[row.start..row.end]);
-    match in_rows(of_rows, cols) {
-        Ok((noise, values)) => match cells.frame(values) {
-            Some(frame) => Found::Frame {
-                start: first_row.start + noise,
-                frame,
-            },
-            None => {
-                lines.refuse(Refused::Value);
-                nothing(lines, end)
-            }
-        },
-        Err(refused) => {
-            lines.refuse(refused);
-            nothing(lines, end)
-        }
-    }
+    let of_rows = lines.held.range(first..);
+    let of_rows = of_rows.map(|row| &bytes[row.start..row.end]);
+    let (noise, values) = in_rows(of_rows, cells)?;
+    Ok(Found::Frame {
+        start: lines.held[first].start + noise,
+        frame: of_values(cells, values)?,
+    })
 }
 
-fn wrong_number(found: usize, cells: &Cells) -> Refused {
-    Refused::Numbers {
-        found,
-        cols: cells.array.cols,
-        cells: cells.count(),
-    }
+fn of_values(cells: &Cells, values: Vec<f32>) -> Result<RawFrame, Refused> {
+    let refused = || Refused("a number is not a whole one for the mask, or too large".to_owned());
+    cells.frame(values).ok_or_else(refused)
 }
 
 /// What a line is where a heading comes before each frame.
 fn after_heading(
-    text: &Text,
+    heading: &[u8],
     cells: &Cells,
     bytes: &[u8],
     line: Range<usize>,
-    lines: &mut Lines,
-) -> Found {
-    let heading = text.heading.as_slice();
-    let (start, end) = (line.start, line.end);
-    let found = bytes[line.clone()]
-        .windows(heading.len())
-        .rposition(|window| window == heading);
-    if let Some(at) = found {
-        if start + at > 0 {
-            let numbers = lines.numbers();
-            return Found::Nothing {
-                bytes: start + at,
-                numbers,
-            };
+    lines: &Lines,
+) -> Result<Found, Refused> {
+    let Range { start, end } = line;
+    let mut windows = bytes[line].windows(heading.len());
+    let skipped = match windows.rposition(|window| window == heading) {
+        Some(at) if start + at > 0 => return Ok(Found::Nothing(start + at)),
+        Some(_) => heading.len(),
+        None if !lines.held.is_empty() => 0,
+        None if numbers_in(&bytes[start..end]) == 0 => return Ok(Found::Nothing(end)),
+        None => {
+            let heading = String::from_utf8_lossy(heading);
+            return Err(Refused(format!("no line has the heading {heading:?}")));
         }
-    } else if lines.held.is_empty() {
-        if numbers_in(&bytes[line]) > 0 {
-            let heading = String::from_utf8_lossy(heading).into_owned();
-            lines.refuse(Refused::Heading(heading));
-        }
-        return Found::Nothing {
-            bytes: end,
-            numbers: 0,
-        };
-    }
-    let skipped = if found.is_some() { heading.len() } else { 0 };
+    };
     let numbers = numbers_in(&bytes[start + skipped..end]);
-    let all = lines.numbers() + numbers;
+    let all = numbers + lines.held.iter().map(|line| line.numbers).sum::<usize>();
     if all < cells.count() {
-        return Found::Held(numbers);
+        return Ok(Found::Held(numbers));
+    }
+    if all > cells.count() {
+        return Err(Refused::numbers(all, cells));
     }
     // The first held line begins with the heading.
-    let first = if lines.held.is_empty() { start } else { 0 };
-    let Array { cols, .. } = cells.array;
-    let values = cells_at_end(&bytes[first + heading.len()..end], cells.count(), cols);
-    let values = match values {
-        Ok((_, values)) if all == cells.count() => Ok(values),
-        Ok(_) => Err(wrong_number(all, cells)),
-        Err(refused) => Err(refused),
-    };
-    match values.map(|values| cells.frame(values)) {
-        Ok(Some(frame)) => Found::Frame { start: 0, frame },
-        other => {
-            lines.refuse(other.err().unwrap_or(Refused::Value));
-            Found::Nothing {
-                bytes: end,
-                numbers: all,
-            }
-        }
-    }
+    let (_, values) = cells_at_end(&bytes[heading.len()..end], cells, all)?;
+    let frame = of_values(cells, values)?;
+    Ok(Found::Frame { start: 0, frame })
 }
 
 /// The cells in these lines, one line for each row, and the number of bytes before the first cell that
@@ -368,25 +309,17 @@ fn after_heading(
 /// Separators before the first cell belong to it.
 fn in_rows<'a>(
     rows: impl Iterator<Item = &'a [u8]>,
-    cols: usize,
+    cells: &Cells,
 ) -> Result<(usize, Vec<f32>), Refused> {
-    let mut noise = 0;
-    let mut all = Vec::new();
+    let (mut noise, mut all) = (0, Vec::new());
     for (index, row) in rows.enumerate() {
-        let (first, values) = cells_at_end(row, cols, cols)?;
-        let before = &row[..first];
-        let word = tokens(before).next_back().filter(|word| !is_word(word));
-        if index == 0 {
-            noise = if word.is_some() { first } else { 0 };
-        } else if let Some(word) = word {
-            return Err(match number(word) {
-                Some(_) => Refused::Numbers {
-                    found: numbers_in(row),
-                    cols,
-                    cells: cols,
-                },
-                None => strange(word),
-            });
+        let (first, values) = cells_at_end(row, cells, cells.array.cols)?;
+        let mut before = tokens(&row[..first]);
+        match before.next_back().filter(|word| !is_word(word)) {
+            None => {}
+            Some(_) if index == 0 => noise = first,
+            Some(word) if number(word).is_none() => return Err(Refused::word(word)),
+            Some(_) => return Err(Refused::numbers(numbers_in(row), cells)),
         }
         all.extend(values);
     }
@@ -394,44 +327,30 @@ fn in_rows<'a>(
 }
 
 /// The last `count` numbers of `text`, and the place of the first of them. Words may be after them, and
-/// between rows of `cols` numbers.
+/// between rows.
 ///
 /// The first number may follow other bytes of its word, which are noise. They might also be damage:
 /// `5x12` may be noise `5x` before a cell of 12, or a cell of 5012 with a wrong byte. The bytes hold a
 /// whole frame either way, and a frame that is whole in the bytes is never lost.
-fn cells_at_end(text: &[u8], count: usize, cols: usize) -> Result<(usize, Vec<f32>), Refused> {
+fn cells_at_end(text: &[u8], cells: &Cells, count: usize) -> Result<(usize, Vec<f32>), Refused> {
     let mut values = Vec::with_capacity(count);
-    let mut words = tokens(text).rev();
-    while values.len() < count {
-        let Some(word) = words.next() else {
-            return Err(Refused::Numbers {
-                found: values.len(),
-                cols,
-                cells: count,
-            });
+    for word in tokens(text).rev() {
+        let is_first = values.len() + 1 == count;
+        let found = match number(word) {
+            Some(value) => Some((word.len(), value)),
+            None if is_first && (!is_word(word) || ends_with_number(word)) => number_at_end(word),
+            None if values.len().is_multiple_of(cells.array.cols) && is_word(word) => continue,
+            None => None,
         };
-        match number(word) {
-            Some(value) => values.push(value),
-            None if values.len() + 1 == count && (!is_word(word) || ends_with_number(word)) => {
-                let (_, value) = number_at_end(word).ok_or_else(|| strange(word))?;
-                values.push(value);
-            }
-            None if values.len().is_multiple_of(cols) && is_word(word) => continue,
-            None => return Err(strange(word)),
-        }
-        if values.len() == count {
+        let (length, value) = found.ok_or_else(|| Refused::word(word))?;
+        values.push(value);
+        if is_first {
             let end = word.as_ptr_range().end as usize - text.as_ptr() as usize;
-            let (length, _) = number_at_end(word).unwrap_or((word.len(), 0.0));
             values.reverse();
             return Ok((end - length, values));
         }
     }
-    Ok((text.len(), values))
-}
-
-fn strange(word: &[u8]) -> Refused {
-    let shown = String::from_utf8_lossy(&word[..word.len().min(SHOWN_BYTES)]);
-    Refused::Word(escaped(&shown))
+    Err(Refused::numbers(values.len(), cells))
 }
 
 fn numbers_in(text: &[u8]) -> usize {

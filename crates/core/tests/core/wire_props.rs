@@ -1,7 +1,7 @@
 //! Any chunking gives the same frames, noise never panics, and damage loses only the damaged frame.
 
 use hardnessd_core::frame::{Array, RawFrame};
-use hardnessd_core::wire::{Decoder, Layout, Preset, Settings};
+use hardnessd_core::wire::{Decoder, Layout, Settings};
 use proptest::prelude::*;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -52,7 +52,6 @@ fn mark_bytes(text: &str) -> usize {
         text if text.starts_with("preset = 'flexitac'") => 2,
         "preset = 'm1616'" => 3,
         text if text.contains("count = 3") => 5,
-        text if text.contains("framing") => 0,
         _ => 0,
     }
 }
@@ -86,11 +85,6 @@ fn frame(layout: &Layout, stream: &mut Stream) -> RawFrame {
 fn frames(layout: &Layout, seed: u64, count: usize) -> Vec<RawFrame> {
     let mut stream = Stream(seed);
     (0..count).map(|_| frame(layout, &mut stream)).collect()
-}
-
-fn noise(seed: u64, bytes: usize) -> Vec<u8> {
-    let mut stream = Stream(!seed);
-    (0..bytes).map(|_| stream.next_u64() as u8).collect()
 }
 
 fn encode(layout: &Layout, frames: &[RawFrame]) -> Vec<u8> {
@@ -157,24 +151,17 @@ fn every_layout_gives_back_what_it_encodes() {
 
 #[test]
 fn jx255n_is_790_bytes_and_its_bytes_are_frozen() {
-    let layout = layout("preset = 'jx255n'");
     let mut raw = RawFrame::default();
     raw.counts[0] = 1.0;
     raw.counts[783] = 255.0;
-    let bytes = encode(&layout, &[raw.clone()]);
+    let bytes = encode(&layout("preset = 'jx255n'"), &[raw.clone()]);
     assert_eq!(bytes.len(), 790);
     assert_eq!(bytes[..5], [0xBB, 0xAA, 0x10, 0x03, 0x01]);
     // This is CRC-16/MODBUS over the 788 bytes before it, by crcmod's "modbus".
     let crc = hardnessd_core::wire::Checksum::Crc16Modbus.of(&bytes[..788]);
     assert_eq!(bytes[788..], crc.to_le_bytes()[..2]);
-    let u16_layout = Layout::new(&Settings {
-        preset: Some(Preset::Jx255nU16),
-        ..Settings::default()
-    });
-    assert_eq!(
-        encode(&u16_layout.unwrap(), &[raw])[..4],
-        [0xBB, 0xAA, 0x20, 0x06]
-    );
+    let wide = encode(&layout("preset = 'jx255n-u16'"), &[raw]);
+    assert_eq!(wide[..4], [0xBB, 0xAA, 0x20, 0x06]);
 }
 
 #[test]
@@ -194,15 +181,8 @@ fn a_damaged_frame_costs_itself_alone() {
             let mut bytes = whole.clone();
             bytes.remove(first + lost);
             let (found, _) = decode(&layout, [bytes.as_slice()]);
-            assert!(
-                found.contains(&sent[0]),
-                "{preset:?} byte {lost}: frame before"
-            );
-            assert!(
-                found.contains(&sent[2]),
-                "{preset:?} byte {lost}: frame after"
-            );
-            assert!(found.len() <= 3, "{preset:?} byte {lost}");
+            let has_both = found.contains(&sent[0]) && found.contains(&sent[2]);
+            assert!(has_both && found.len() <= 3, "{preset:?} byte {lost}");
         }
     }
 }
@@ -296,41 +276,24 @@ fn in_rows(frames: &[RawFrame], end: &str) -> Vec<u8> {
 }
 
 #[test]
-fn rows_have_any_separator_and_line_end() {
-    let layout = layout("preset = 'csv'\nrows = 2\ncols = 3");
-    let text = "9 9\n\n1,2\t3\r\n 4  5,6 \r\n\r\n\nnoise\n1 2 3\n4 5 6\n\n1 2\n4 5 6\n\n";
-    let (found, damaged) = decode(&layout, [text.as_bytes()]);
-    assert_eq!(damaged, 1, "the frame with a short row");
-    assert_eq!(found.len(), 2);
-    for frame in found {
-        assert_eq!(frame.counts[..], SIX);
-    }
-}
-
-#[test]
 fn every_part_of_a_frame_stands_where_it_should() {
     // Two rows of three cells: the sensor's first row is 1 2 3, and its second is 4 5 6.
     let mut frame = RawFrame::zero(Array { rows: 2, cols: 3 });
     frame.counts.copy_from_slice(&SIX);
     for (text, expected) in [
-        ("", &[1, 2, 3, 4, 5, 6][..]),
-        ("order = 'serpentine'", &[1, 2, 3, 6, 5, 4]),
+        ("order = 'serpentine'", &[1, 2, 3, 6, 5, 4][..]),
         ("order = 'column-major'", &[1, 4, 2, 5, 3, 6]),
         ("length = 'u8'", &[6, 1, 2, 3, 4, 5, 6]),
         ("length = 'u16le'", &[6, 0, 1, 2, 3, 4, 5, 6]),
         ("length = 'u16be'", &[0, 6, 1, 2, 3, 4, 5, 6]),
-        ("cell = 'u16le'", &[1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0]),
         ("cell = 'u16be'", &[0, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6]),
-        // The checksum includes the sync: A5 + 21, and A5 ^ 7.
+        // The checksum includes the sync: A5 + 21.
         ("checksum = 'sum8'", &[1, 2, 3, 4, 5, 6, 0xBA]),
-        ("checksum = 'xor8'", &[1, 2, 3, 4, 5, 6, 0xA2]),
-        ("header_bytes = 2", &[0, 0, 1, 2, 3, 4, 5, 6]),
-        ("footer_bytes = 2", &[1, 2, 3, 4, 5, 6, 0, 0]),
         (
             "length = 'u8'\nheader_bytes = 1\nfooter_bytes = 1",
             &[6, 0, 1, 2, 3, 4, 5, 6, 0],
         ),
-        // The checksums of these bytes by zlib, by binascii.crc_hqx and by the Modbus specification.
+        // The checksums of these bytes by zlib and by binascii.crc_hqx.
         (
             "checksum = 'crc32'",
             &[1, 2, 3, 4, 5, 6, 0x30, 0xF5, 0xCB, 0xB8],
@@ -339,26 +302,13 @@ fn every_part_of_a_frame_stands_where_it_should() {
             "checksum = 'crc32-be'",
             &[1, 2, 3, 4, 5, 6, 0xB8, 0xCB, 0xF5, 0x30],
         ),
-        ("checksum = 'crc16-ccitt'", &[1, 2, 3, 4, 5, 6, 0x6A, 0x94]),
         (
             "checksum = 'crc16-ccitt-be'",
             &[1, 2, 3, 4, 5, 6, 0x94, 0x6A],
         ),
         (
-            "checksum = 'crc16-modbus-be'",
-            &[1, 2, 3, 4, 5, 6, 0xCC, 0x54],
-        ),
-        (
-            "footer_bytes = 1\nchecksum = 'crc32'",
-            &[1, 2, 3, 4, 5, 6, 0, 0xD4, 0x14, 0x63, 0xF4],
-        ),
-        (
             "footer_bytes = 1\nchecksum = 'crc32'\nchecksum_over = 'cells'",
             &[1, 2, 3, 4, 5, 6, 0, 0x24, 0x77, 0xF6, 0x81],
-        ),
-        (
-            "header_bytes = 1\npackets = { count = 2 }",
-            &[1, 1, 2, 3, 0xA5, 2, 4, 5, 6],
         ),
         (
             "header_bytes = 2\nfooter_bytes = [0, 1]\nchecksum = 'sum8'\nchecksum_over = 'cells'\n\
@@ -366,15 +316,13 @@ fn every_part_of_a_frame_stands_where_it_should() {
             &[0, 7, 1, 2, 3, 6, 0xA5, 0, 8, 4, 5, 6, 0, 15],
         ),
     ] {
-        let text = format!("preset = 'jq'\nsync = 'A5'\nrows = 2\ncols = 3\n{text}");
-        let layout = Layout::new(&toml::from_str(&text).unwrap()).unwrap();
+        let layout = layout(&format!(
+            "preset = 'jq'\nsync = 'A5'\nrows = 2\ncols = 3\n{text}"
+        ));
         let bytes = encode(&layout, &[frame.clone()]);
         assert_eq!(bytes, [&[0xA5], expected].concat(), "{text}");
-        assert_eq!(
-            decode(&layout, [bytes.as_slice()]),
-            (vec![frame.clone()], 0),
-            "{text}"
-        );
+        let found = decode(&layout, [bytes.as_slice()]);
+        assert_eq!(found, (vec![frame.clone()], 0), "{text}");
     }
 }
 
@@ -387,14 +335,9 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
             "length: found 784 payload bytes, expected at most 255",
         ),
         ("mask = 0x1FF", "mask: found 511, expected 1 to 255"),
-        ("mask = 0", "mask: found 0, expected 1 to 255"),
         (
             "preset = 'csv'\ntail = 'FF'",
             "tail: found a value, expected none: frames of preset csv have no such part",
-        ),
-        (
-            "preset = 'csv'\nchecksum_over = 'cells'",
-            "checksum_over: found a value, expected none: frames of preset csv",
         ),
         (
             "header_bytes = 8193",
@@ -413,12 +356,8 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
             "packets.count: found 3, expected 1 to 256 that divides the 256 cells evenly",
         ),
         (
-            "header_bytes = 1\npackets = { count = 0 }",
-            "packets.count: found 0",
-        ),
-        (
             "packets = { count = 2 }",
-            "packets.number_at: found 0, expected a place in the header (header_bytes: 0)",
+            "packets.number_at: found 0, expected a place",
         ),
         (
             "header_bytes = 1\npackets = { count = 2, first = 255 }",
@@ -429,19 +368,17 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
             "length: found a length field without sync",
         ),
     ] {
-        let error = Layout::new(&toml::from_str(text).unwrap())
-            .unwrap_err()
-            .to_string();
+        let error = Layout::new(&toml::from_str(text).unwrap());
+        let error = error.unwrap_err().to_string();
         assert!(error.starts_with(expected), "{text}: {error}");
     }
-    let error = toml::from_str::<Settings>("sync = 'B'")
-        .unwrap_err()
-        .to_string();
-    assert!(error.contains("pairs of hex digits"), "{error}");
-    let error = toml::from_str::<Settings>("footer_bytes = -1")
-        .unwrap_err()
-        .to_string();
-    assert!(error.contains("expected a number of bytes"), "{error}");
+    for (text, expected) in [
+        ("sync = 'B'", "pairs of hex digits"),
+        ("footer_bytes = -1", "expected a number of bytes"),
+    ] {
+        let error = toml::from_str::<Settings>(text).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
 }
 
 proptest! {
@@ -537,47 +474,12 @@ proptest! {
         }
     }
 
-    #[test]
-    fn a_frame_in_rows_survives_any_noise_before_it_that_does_not_end_with_a_digit(
-        noise in proptest::collection::vec(any::<u8>(), 0..40),
-        last in any::<u8>().prop_filter("part of the first cell", |b| !b"0123456789+-.eE".contains(b)),
-        seed in any::<u64>(),
-        chunk in 1_usize..100,
-    ) {
-        let layout = layout("preset = 'csv'");
-        let sent = frames(&layout, seed, 2);
-        let mut bytes = in_rows(&sent[..1], "\n");
-        bytes.extend(noise);
-        bytes.push(last);
-        bytes.extend(in_rows(&sent[1..], "\n"));
-        let (found, _) = decode(&layout, bytes.chunks(chunk));
-        prop_assert_eq!(found.first(), Some(&sent[0]));
-        prop_assert_eq!(found.last(), Some(&sent[1]));
-    }
-
-    #[test]
-    fn frames_between_noise_survive_where_the_layout_can_tell(
-        seed in any::<u64>(),
-        gaps in proptest::collection::vec(0_usize..900, 4),
-        index in 0_usize..2,
-    ) {
-        let layout = layout(LAYOUTS[index]);
-        let sent = frames(&layout, seed, 3);
-        let mut bytes = Vec::new();
-        for (index, frame) in sent.iter().enumerate() {
-            bytes.extend(noise(seed ^ index as u64, gaps[index]));
-            layout.encode(frame, &mut bytes);
-        }
-        bytes.extend(noise(seed, gaps[3]));
-        prop_assert_eq!(decode(&layout, [bytes.as_slice()]).0, sent);
-    }
 }
 
 #[test]
 fn a_missing_packet_costs_its_frame_alone_and_counts_as_damage_once() {
     for text in [
         "preset = 'jq-glove'",
-        "preset = 'jq-glove'\nchecksum = 'crc32'",
         "preset = 'jq-glove'\nfooter_bytes = 16\npackets = { count = 4 }\nchecksum = 'sum8'",
     ] {
         let layout = layout(text);
@@ -593,46 +495,19 @@ fn a_missing_packet_costs_its_frame_alone_and_counts_as_damage_once() {
             bytes.drain(marks[missing]..marks[missing + 1]);
             let mut expected = sent.clone();
             expected.remove(missing / of_frame);
-            for chunk in [1, 50, bytes.len()] {
+            for chunk in [1, bytes.len()] {
                 let found = decode(&layout, bytes.chunks(chunk));
                 assert_eq!(found, (expected.clone(), 1), "{text}: packet {missing}");
             }
         }
         // Packets in a wrong order are no frame.
         let mut bytes = whole.clone();
-        bytes[marks[of_frame]..marks[of_frame + 2]]
-            .rotate_left(marks[of_frame + 1] - marks[of_frame]);
+        let length = marks[of_frame + 1] - marks[of_frame];
+        bytes[marks[of_frame]..marks[of_frame + 2]].rotate_left(length);
         let (found, damaged) = decode(&layout, [bytes.as_slice()]);
         assert_eq!(found, [0, 2, 3].map(|at| sent[at].clone()), "{text}");
         assert!(damaged > 0, "{text}");
     }
-}
-
-#[test]
-fn lines_have_any_separators_brackets_and_words_before_them() {
-    let layout = layout("preset = 'csv'\nrows = 2\ncols = 3");
-    let banners = ["Calibrating, 100 samples ...\r\n", "\n", "[]\n", "done.\n"];
-    let lines = [
-        "1,2,3,4,5,6\n",
-        "frame: 1 2 3 4 5 6\r\n",
-        "frame:1\t2\t3\t4\t5\t6\n",
-        "12:30:01.250; 1; 2; 3; 4; 5; 6;\n",
-        "2026-11-26T12:30:01Z [[1, 2, 3], [4, 5, 6]]\r\n",
-        "123456,1,2,3,4,5,6\n",
-        "  1   2   3\t 4   5   6\n",
-    ];
-    let text = lines.join(&banners.concat());
-    let mut sent = RawFrame::zero(layout.array());
-    sent.counts.copy_from_slice(&SIX);
-    for chunk in [1, 7, text.len()] {
-        let found = decode(&layout, text.as_bytes().chunks(chunk));
-        assert_eq!(found, (vec![sent.clone(); lines.len()], 0), "by {chunk}");
-    }
-    let mut decoder = Decoder::new(layout);
-    decoder.push(text.as_bytes());
-    while decoder.next_frame().is_some() {}
-    let banner_bytes = banners.concat().len() * (lines.len() - 1);
-    assert_eq!(decoder.skipped(), banner_bytes as u64);
 }
 
 #[test]
@@ -728,22 +603,12 @@ fn cells_are_numbers_of_any_kind_at_any_distance() {
 fn a_float_that_is_no_number_is_damage() {
     for wrong in [f32::NAN, f32::INFINITY, -1e30] {
         let of = |floats: [f32; 3]| {
-            let cells = floats.iter().flat_map(|f| f.to_le_bytes());
-            [0xA5, 0x5A]
-                .into_iter()
-                .chain(cells)
-                .chain([0x0D, 0x0A])
-                .collect::<Vec<u8>>()
+            let cells = floats.map(f32::to_le_bytes).concat();
+            [&[0xA5, 0x5A], &cells[..], &[0x0D, 0x0A]].concat()
         };
-        let bytes = [
-            of([1.0, 2.0, 3.0]),
-            of([4.0, wrong, 6.0]),
-            of([7.0, 8.0, 9.0]),
-        ]
-        .concat();
+        let bytes = [of([1.0; 3]), of([4.0, wrong, 6.0]), of([7.0; 3])].concat();
         let found = counts("sync = 'A5 5A'\ncell = 'f32le'\ntail = '0D 0A'", &bytes);
-        let whole = vec![vec![1.0, 2.0, 3.0], vec![7.0, 8.0, 9.0]];
-        assert_eq!(found, (whole, 1), "{wrong}");
+        assert_eq!(found, (vec![vec![1.0; 3], vec![7.0; 3]], 1), "{wrong}");
     }
 }
 
@@ -806,29 +671,36 @@ fn a_frame_without_marks_begins_after_a_pause_and_one_that_was_asked_for_at_once
 }
 
 #[test]
-fn text_has_signs_decimals_and_words_beside_the_rows() {
+fn text_has_any_separators_signs_decimals_and_words_beside_the_rows() {
     let layout = |more: &str| layout(&format!("preset = 'csv'\nrows = 2\ncols = 3\n{more}"));
-    let expected = [1.5, -2.0, 3e2, 0.25, 5.0, 6.0];
-    for text in [
+    let banners = "Calibrating, 100 samples ...\r\n\n[]\ndone.\n";
+    let texts = [
         "1.5,-2,3e2,.25,5.,+6\n",
-        "1.5        -2\t\t\t\t   300    0.25            5 6\n",
+        "1.5        -2\t\t\t\t   300    0.25            5 6\r\n",
+        "frame:1.5\t-2\t300\t.25\t5\t6\n",
+        "12:30:01.250; 1.5; -2; 300; .25; 5; 6;\n",
+        "2026-11-26T12:30:01Z [[1.5, -2, 300], [.25, 5, 6]]\r\n",
+        "123456,1.5,-2,300,.25,5,6\n",
         "R0 1.5 -2 300 R1 0.25 5 6 kPa\n",
         "R0 1.5 -2 300\nR1 0.25 5 6\n\n",
         "{\n  \"row0\": [1.5, -2, 3e2],\n  \"row1\": [0.25, 5, 6]\n}\n",
         "0: 1.5 -2 300 mV\n1: 0.25 5 6 mV\n--\n",
         "| 1.5 | -2 300 |\n| 1.5 -2 300 |\n| 0.25 5 6 |\n+----+\n",
-    ] {
-        for chunk in [1, text.len()] {
-            let (found, _) = decode(&layout(""), text.as_bytes().chunks(chunk));
-            let found: Vec<_> = found.iter().map(|frame| frame.counts.to_vec()).collect();
-            assert_eq!(found, [expected.to_vec()], "{text:?} by {chunk}");
+    ];
+    let all = texts.join(banners);
+    for chunk in [1, 7, all.len()] {
+        let (found, _) = decode(&layout(""), all.as_bytes().chunks(chunk));
+        assert_eq!(found.len(), texts.len(), "by {chunk}");
+        for (text, frame) in texts.iter().zip(found) {
+            let expected = [1.5, -2.0, 3e2, 0.25, 5.0, 6.0];
+            assert_eq!(frame.counts[..], expected, "{text:?} by {chunk}");
         }
     }
     // One array of two.
     let dual = "Sensor 1\n1 2 3\n4 5 6\nSensor 2\n7 8 9\n1 1 1\nEND\n".repeat(3);
     for (heading, first) in [("Sensor 1", 1.0), ("Sensor 2", 7.0)] {
         let layout = layout(&format!("heading = '{heading}'"));
-        for chunk in [1, 9, dual.len()] {
+        for chunk in [1, dual.len()] {
             let (found, damaged) = decode(&layout, dual.as_bytes().chunks(chunk));
             let firsts: Vec<f32> = found.iter().map(|frame| frame.counts[0]).collect();
             assert_eq!(
@@ -849,15 +721,7 @@ fn what_is_wrong_with_a_line_is_said() {
             "a line has 5 numbers, expected 3 for a row or 6 for a frame",
         ),
         ("1,2,3,0x4,5,6,7\n", "a line has \"0x4\" among its numbers"),
-        (
-            "1,2,3,4,5..6,7,8,9,10\n",
-            "a line has \"5..6\" among its numbers",
-        ),
         ("1 2\n3 4\n\n", "a line has 2 numbers, expected 3 for a row"),
-        (
-            "1 2 3\n\n",
-            "1 lines with numbers come before one without, expected 2",
-        ),
         (
             "1 2 3\n4 5 6\n",
             "4 lines with numbers come before one without, expected 2",
@@ -897,14 +761,9 @@ fn a_search_takes_a_time_in_proportion_to_the_bytes() {
             &[0xAA][..],
         ),
         (
-            "sync = 'AA AA'\nrows = 64\ncols = 64\nheader_bytes = 8192\nchecksum = 'crc32'",
-            &[0xAA],
-        ),
-        (
             "tail = '00'\nrows = 64\ncols = 64\nheader_bytes = 8192\nchecksum = 'sum8'",
             &[0],
         ),
-        ("preset = 'csv'\nrows = 64\ncols = 64", b"1\n"),
         (
             "preset = 'csv'\nrows = 64\ncols = 64",
             b"1 2 3 4 5 6 7 8 9\n",
@@ -917,13 +776,7 @@ fn a_search_takes_a_time_in_proportion_to_the_bytes() {
         ("framing = 'cobs'\nrows = 64\ncols = 64", &[1]),
     ] {
         let layout = layout(text);
-        let bytes = |count: usize| {
-            part.iter()
-                .copied()
-                .cycle()
-                .take(count)
-                .collect::<Vec<u8>>()
-        };
+        let bytes = |count: usize| part.repeat(count.div_ceil(part.len()));
         let least = |count: usize| (0..3).map(|_| time_for(&layout, &bytes(count))).min();
         let (one, eight) = (least(64 * 1024).unwrap(), least(8 * 64 * 1024).unwrap());
         // Eight times as many bytes would take 64 times as long where the time grows with the square.

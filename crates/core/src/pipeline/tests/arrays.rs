@@ -1,7 +1,6 @@
 //! Tests that a press is the same press on every array.
 
 use super::*;
-use crate::event::Hardness;
 use crate::frame::Pitch;
 use crate::wire::Cell;
 
@@ -59,11 +58,7 @@ fn verdict(array: Array, pitch: Pitch) -> Hardness {
     let shown = shown.unwrap();
     assert_eq!((shown.rows, shown.cols), (array.rows, array.cols));
     assert_eq!(shown.newtons.len(), array.taxels());
-    let last = events.into_iter().rev().find_map(|event| match event {
-        Event::Hardness(verdict) if verdict.phase == Phase::Final => Some(verdict),
-        _ => None,
-    });
-    last.unwrap_or_else(|| panic!("no verdict on {array} at {pitch}"))
+    verdicts(events).pop().unwrap()
 }
 
 #[test]

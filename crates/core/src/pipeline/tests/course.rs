@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::*;
-use crate::event::{ApproachSource, Hardness};
+use crate::event::ApproachSource;
 use crate::tests::course_model::{self, course_model};
 
 /// A tared pipeline with an arm of 10 N/mm. Its model returns its own input.
@@ -36,14 +36,6 @@ fn positions(from_ms: i64, to_ms: i64) -> Vec<Point> {
             mm: 0.005 * ms.min(2800) as f64,
         })
         .collect()
-}
-
-fn verdicts(events: Vec<Event>) -> Vec<Hardness> {
-    let verdict = |event| match event {
-        Event::Hardness(verdict) => Some(verdict),
-        _ => None,
-    };
-    events.into_iter().filter_map(verdict).collect()
 }
 
 /// The verdicts on one press. Before each frame, the pipeline gets the positions that `told`
@@ -225,17 +217,12 @@ fn a_press_unlike_those_of_training_is_noted() {
         (0.7, none, outside),
         (1.0, none, none),
     ] {
-        let mut pipeline = tared(
-            &[(
-                "hrn.range",
-                json!({
-                    "force_n": [0, 100],
-                    "contact_area_taxels": [1, 784],
-                    "duration_s": [0.1, longest_s],
-                }),
-            )],
-            |_| {},
-        );
+        let range = json!({
+            "force_n": [0, 100],
+            "contact_area_taxels": [1, 784],
+            "duration_s": [0.1, longest_s],
+        });
+        let mut pipeline = tared(&[("hrn.range", range)], |_| {});
         pipeline.judge.track.push(&positions(1000, 9000)).unwrap();
         let found = judged(&mut pipeline, |_| Vec::new());
         let notes: Vec<&[Note]> = found.iter().map(|verdict| &verdict.notes[..]).collect();
@@ -296,10 +283,9 @@ fn a_long_press_is_thinned() {
         .map(|n| raw(9 + usize::from(n == 50), 60))
         .collect();
     let press = [&held[..], &vec![raw(0, 0); 2]].concat();
-    let found = verdicts(feed(&mut pipeline, 6, &press));
-    let last = found.last().unwrap();
+    let last = verdicts(feed(&mut pipeline, 6, &press)).pop().unwrap();
     assert_eq!(last.frame, 55);
-    let frames = given(last)[1];
+    let frames = given(&last)[1];
     assert!(frames == 7.0 || frames == 8.0, "{frames}");
     // The last time and the best frame's force are in the logits.
     let [first, second, third] = [0, 1, 2].map(|n| f64::from(last.probabilities[n]).ln());

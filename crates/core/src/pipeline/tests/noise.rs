@@ -1,7 +1,6 @@
 //! Tests that noise is no force: an array of 16x32 taxels of 12 bits that rests anywhere.
 
 use super::*;
-use crate::event::Hardness;
 use crate::test_support::hrn;
 use crate::test_support::noisy_array::{ARRAY, COUNT_N, NoisyArray, foot, noisy_sensor};
 
@@ -53,17 +52,10 @@ fn the_force_of_a_press_is_right_whatever_the_noise() {
             let mut array = NoisyArray::new(11, 300.0, noise);
             let forces_n = [&[0.0; 5][..], &[force_n; 20], &[0.0; 3]].concat();
             let events = feel(&mut array, COUNT_N as f32, &forces_n);
-            let verdict: Vec<&Hardness> = events
-                .iter()
-                .filter_map(|event| match event {
-                    Event::Hardness(verdict) if verdict.phase == Phase::Final => Some(verdict),
-                    _ => None,
-                })
-                .collect();
-            let [verdict] = verdict[..] else {
-                panic!("{noise}, {force_n} N: {} verdicts", verdict.len());
-            };
-            let off = verdict.force_n / force_n - 1.0;
+            let mut found = verdicts(events.clone());
+            found.retain(|verdict| verdict.phase == Phase::Final);
+            assert_eq!(found.len(), 1, "{noise}, {force_n} N");
+            let off = found[0].force_n / force_n - 1.0;
             assert!(off.abs() < 0.05, "{noise}, {force_n} N: {off}");
             let held = shown(&events).filter_map(|frame| frame.force_n);
             let held: Vec<f64> = held.filter(|&n| n > 0.5 * force_n).collect();

@@ -70,30 +70,23 @@ fn a_recording_that_another_program_rewrote_is_read_and_recovered() {
     }
 }
 
-/// The compressions of a chunk, with their names.
-const COMPRESSIONS: [(&str, Option<Compression>); 3] = [
-    ("none", None),
-    ("lz4", Some(Compression::Lz4)),
-    ("zstd", Some(Compression::Zstd)),
-];
-
 #[test]
 fn a_chunk_over_64_mib_is_said_to_be_too_long() {
     let (file, _) = recorded(10, 7);
-    for (name, compression) in COMPRESSIONS {
+    for compression in [None, Some(Compression::Lz4), Some(Compression::Zstd)] {
         let one_chunk = WriteOptions::new()
             .compression(compression)
             .chunk_size(None);
         let long = rewritten(&file, one_chunk, &[4 << 20; 16]);
         let error = Reader::new(&long[..]).find_map(Result::err).unwrap();
         let error = error.to_string();
-        assert!(error.starts_with("found a chunk of 68"), "{name}: {error}");
+        assert!(error.starts_with("found a chunk of 6"), "{error}");
         assert!(
-            error.contains("expected at most 67108864: `mcap recover`"),
-            "{name}: {error}"
+            error.contains("at most 67108864: `mcap recover`"),
+            "{error}"
         );
         let (found, _) = recover(Cursor::new(&long), Vec::new()).unwrap();
-        assert_eq!(found.messages, 0, "{name}");
-        assert_eq!(found.lost[0].0, chunk_starts(&long)[0] as u64, "{name}");
+        assert_eq!(found.messages, 0);
+        assert_eq!(found.lost[0].0, chunk_starts(&long)[0] as u64);
     }
 }
