@@ -239,7 +239,7 @@ fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
     };
     let mut nameless = good.clone();
     nameless.description.sensor.name = "\u{1b}[2J\n".to_owned();
-    let mut playback = Playback::new(hrn.clone());
+    let mut playback = Playback::new(hrn);
     let mut feed = |entry| {
         playback.feed(Found {
             sensor: "forearm".to_owned(),

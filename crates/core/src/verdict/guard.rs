@@ -51,11 +51,11 @@ pub(super) fn check_operators(graph: &pb::GraphProto) -> Result<(), ModelError> 
             _ => &node.name,
         };
         checked.map_err(|problem| refused(name, &node.op_type, problem))?;
-        let inner = node
+        let mut inner = node
             .attribute
             .iter()
             .filter_map(|attribute| attribute.g.as_ref());
-        inner.map(check_operators).collect::<Result<(), _>>()?;
+        inner.try_for_each(check_operators)?;
     }
     Ok(())
 }
