@@ -10,7 +10,7 @@
     python3 examples/real_presses squeezes EstimateModulus TactileEstimateModulus
 
 The daemon judges the presses of `stamp`. The other recordings have no frames that it could judge. `results/real` has
-those of real grasps. docs/results.md says what came out, and results/real-presses.md has the commits and more tables.
+four sets that `hrn-train fit` learns from. docs/results.md says what came out, and results/real-presses.md has the commits and more tables.
 """
 
 import argparse

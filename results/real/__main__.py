@@ -1,13 +1,14 @@
 """What `hrn-train fit` reaches on public recordings of real presses, beside controls and plain scikit-learn.
 
-    pip install numpy scikit-learn
+    pip install numpy scikit-learn scipy
     cargo build --release --workspace
     python3 results/real gripper --bin target/release
 
 It clones the repository of the set into the current directory, at the commit that the set names. `--data` names a clone,
 or an `.npz` file with the same arrays. No data is part of this repository.
 
-A set is a module with `read(path)`, which gives a `Recorded`; list it in SETS. A method is a function in methods.py.
+A set is a module with `read(path)`, which gives a `Recorded`, and `splits(recorded, share)`; list it in SETS. A method is
+a function in methods.py.
 """
 
 import argparse
@@ -15,11 +16,15 @@ import pathlib
 import subprocess
 import tempfile
 
+import forearm
 import gripper
+import holds
 import methods
+import numpy as np
+import palpation
 from product import Product
 
-SETS = {"gripper": gripper}
+SETS = {"forearm": forearm, "gripper": gripper, "holds": holds, "palpation": palpation}
 
 
 def arguments():
@@ -46,11 +51,12 @@ def main():
     recorded = module.read(given.data or clone(module))
     with tempfile.TemporaryDirectory() as directory:
         product = Product(given.bin, pathlib.Path(directory), recorded)
-        for title, learn, judge in module.splits(recorded, given.learn):
-            print(f"\n{title}: {len(learn)} learnt, {len(judge)} judged")
+        for title, parts in module.splits(recorded, given.learn):
+            judged = np.concatenate([judge for _, judge in parts])
+            print(f"\n{title}: {len(judged)} presses judged, {len(parts[0][0])} learnt from")
             for name, method in {"hrn-train fit, replayed": product.judge, **methods.ALL}.items():
-                said = method(recorded, learn, judge)
-                print(f"  {name:42} {methods.shown(recorded.level[judge], said)}")
+                said = np.concatenate([method(recorded, learn, judge) for learn, judge in parts])
+                print(f"  {name:42} {methods.shown(recorded.level[judged], said)}", flush=True)
             print(product.account)
 
 

@@ -4,10 +4,10 @@ https://github.com/YoussifAmin/Object_Hardness_Classification has volts and no n
 the taxels. Within one session the unloaded first row tells the level, so only later trials and another shape are judged.
 """
 
-import dataclasses
 import sys
 
 import numpy as np
+from recorded import Recorded
 
 URL = "https://github.com/YoussifAmin/Object_Hardness_Classification"
 COMMIT = "d34beb3b"
@@ -37,17 +37,6 @@ tare_max_n = 50
 """
 
 
-@dataclasses.dataclass
-class Recorded:
-    """Presses: counts [presses, rows, taxels], level from 0, object, number of the trial, the sensor's table."""
-
-    counts: np.ndarray
-    level: np.ndarray
-    object: np.ndarray
-    trial: np.ndarray
-    sensor: str
-
-
 def read(path):
     """Reads a clone, or an `.npz` file with `volts`, `level`, `shape` and `trial`."""
     if path.suffix == ".npz":
@@ -64,22 +53,22 @@ def read(path):
         level, shape, trial = (np.array(column) for column in list(zip(*rows))[:3])
         volts = np.array([np.loadtxt(row[3], delimiter=",") for row in rows])
     counts = np.round(volts / VOLTS_A_COUNT).astype(int)
-    return Recorded(counts, level.astype(int), shape.astype(int), trial.astype(int), SENSOR)
+    return Recorded(list(counts), level.astype(int), shape.astype(int), trial.astype(int), SENSOR)
 
 
 def splits(recorded, share):
-    """(title, presses to learn from, presses to judge)."""
+    """Later trials of both shapes, and another shape with and without a few of its presses."""
     level, shape, trial = recorded.level, recorded.object, recorded.trial
     last = round(share * trial.max())
     for title, of in [
         ("cubes and cylinders, 3 levels, later trials", level < 3),
         ("cubes, 4 levels, later trials", (shape == 0) & (level < 4)),
     ]:
-        yield title, np.flatnonzero(of & (trial <= last)), np.flatnonzero(of & (trial > last))
+        yield title, [(np.flatnonzero(of & (trial <= last)), np.flatnonzero(of & (trial > last)))]
     cubes = (shape == 0) & (level < 3)
     cylinders = (shape == 1) & (level < 3)
-    yield "cylinders by cubes, another shape", np.flatnonzero(cubes), np.flatnonzero(cylinders)
+    yield "cylinders by cubes, another shape", [(np.flatnonzero(cubes), np.flatnonzero(cylinders))]
     for labelled in LABELLED:
         title = f"cylinders by cubes and the first {labelled} cylinders of each level"
         learn, judge = cubes | (cylinders & (trial <= labelled)), cylinders & (trial > last)
-        yield title, np.flatnonzero(learn), np.flatnonzero(judge)
+        yield title, [(np.flatnonzero(learn), np.flatnonzero(judge))]

@@ -26,9 +26,15 @@ def by_regression(inputs):
 
 def taxels_over_time(recorded):
     """[presses, BINS x taxels]: the mean change of each taxel since its first row in equal parts of the recording."""
-    change = recorded.counts - recorded.counts[:, :1]
-    change = np.sign(change) * np.log1p(np.abs(change) / SCALE)
-    return np.concatenate([part.mean(axis=1) for part in np.array_split(change, BINS, axis=1)], axis=1)
+
+    def of(counts):
+        change = counts - counts[:1]
+        change = np.sign(change) * np.log1p(np.abs(change) / SCALE)
+        # A short press gives some of its rows to two parts.
+        edges = np.linspace(0, len(change), BINS + 1)
+        return [change[int(low) : max(int(high), int(low) + 1)].mean(axis=0) for low, high in zip(edges, edges[1:])]
+
+    return np.array([np.concatenate(of(counts)) for counts in recorded.counts])
 
 
 def guess(recorded, learn, judged):
@@ -39,7 +45,7 @@ def guess(recorded, learn, judged):
 
 ALL = {
     "scikit-learn, taxels in 8 parts of time": by_regression(taxels_over_time),
-    "control: the unloaded first row": by_regression(lambda recorded: recorded.counts[:, 0]),
+    "control: the unloaded first row": by_regression(lambda recorded: np.array([counts[0] for counts in recorded.counts])),
     "control: the most frequent level": guess,
 }
 

