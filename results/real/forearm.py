@@ -57,11 +57,11 @@ def touches(path):
 
 def read(path):
     counts, level, objects, trial = [], [], [], []
-    for stiff, names in enumerate([SOFT, STIFF]):
+    for soft, names in enumerate([STIFF, SOFT]):
         for name in names:
             of_name = touches(path / "data" / name / "touch_raw/skin_events/data.log")
             counts += of_name
-            level += [stiff] * len(of_name)
+            level += [soft] * len(of_name)
             objects += [len(set(objects))] * len(of_name)
             trial += range(1, len(of_name) + 1)
     if not counts:

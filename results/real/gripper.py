@@ -14,6 +14,7 @@ COMMIT = "d34beb3b"
 
 SHAPES = ["Cubes", "Cylinders"]
 ROWS = 80
+LEVELS = 4
 # One step of the converter.
 VOLTS_A_COUNT = 6.25e-5
 LABELLED = (5, 10)
@@ -53,7 +54,9 @@ def read(path):
         level, shape, trial = (np.array(column) for column in list(zip(*rows))[:3])
         volts = np.array([np.loadtxt(row[3], delimiter=",") for row in rows])
     counts = np.round(volts / VOLTS_A_COUNT).astype(int)
-    return Recorded(list(counts), level.astype(int), shape.astype(int), trial.astype(int), SENSOR)
+    # The set counts from the softest one; cylinders have the softest three.
+    level = LEVELS - 1 - level.astype(int)
+    return Recorded(list(counts), level, shape.astype(int), trial.astype(int), SENSOR)
 
 
 def splits(recorded, share):
@@ -61,12 +64,12 @@ def splits(recorded, share):
     level, shape, trial = recorded.level, recorded.object, recorded.trial
     last = round(share * trial.max())
     for title, of in [
-        ("cubes and cylinders, 3 levels, later trials", level < 3),
-        ("cubes, 4 levels, later trials", (shape == 0) & (level < 4)),
+        ("cubes and cylinders, 3 levels, later trials", level > 0),
+        ("cubes, 4 levels, later trials", (shape == 0) & (level >= 0)),
     ]:
         yield title, [(np.flatnonzero(of & (trial <= last)), np.flatnonzero(of & (trial > last)))]
-    cubes = (shape == 0) & (level < 3)
-    cylinders = (shape == 1) & (level < 3)
+    cubes = (shape == 0) & (level > 0)
+    cylinders = (shape == 1) & (level > 0)
     yield "cylinders by cubes, another shape", [(np.flatnonzero(cubes), np.flatnonzero(cylinders))]
     for labelled in LABELLED:
         title = f"cylinders by cubes and the first {labelled} cylinders of each level"

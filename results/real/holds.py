@@ -37,11 +37,11 @@ tare_max_n = 500
 
 def read(path):
     files, level = [], []
-    for hard, names in enumerate([SOFT, HARD]):
+    for soft, names in enumerate([HARD, SOFT]):
         for name in names:
             of_name = sorted((path / "data").glob(f"{name}_*_HOLD.mat"))
             files += of_name
-            level += [hard] * len(of_name)
+            level += [soft] * len(of_name)
     if not files:
         sys.exit(f"{path}: no holds")
     held = []

@@ -44,7 +44,7 @@ def read(path):
             # [steps, travel and taxels, repeats]
             pressed = arrays[f"Vertical_{row + 1}_{col + 1}"]
             counts += [pressed[:, 1:, repeat].astype(int) for repeat in range(REPEATS)]
-            level += [int(arrays["nodules"][row, col, 0] != 0)] * REPEATS
+            level += [int(arrays["nodules"][row, col, 0] == 0)] * REPEATS
             place += [row * SIDE + col] * REPEATS
     trial = np.tile(np.arange(1, REPEATS + 1), SIDE * SIDE)
     return Recorded(counts, np.array(level), np.array(place), trial, SENSOR)

@@ -9,7 +9,7 @@ GROUPS = 5
 
 @dataclasses.dataclass
 class Recorded:
-    """Presses: counts, [rows, taxels] each, level from 0, object, number of the trial, the sensor's table.
+    """Presses: counts, [rows, taxels] each, level from 0, the hardest one, object, number of the trial, the sensor's table.
 
     The first row of a press is unloaded.
     """

@@ -1,8 +1,8 @@
-"""`python3 -m hardnessd.plot RUN | evaluation.json | data.npz`: pictures of a training run, of figures and of presses.
+"""`python3 -m hardnessd.plot RUN | evaluation.json | fit.json | data.npz`: pictures of a training, of figures, of presses.
 
 A run directory of `hrn-train train` becomes its learning curves, and the figures of its evaluation. A file of `hrn-train
-evaluate --json` becomes a confusion matrix, and how often each confidence is right. A data set becomes presses as
-pictures, some of each level.
+evaluate --json` becomes a confusion matrix, and how often each confidence is right. A file of `hrn-train fit --json`
+becomes the candidates, the confusion of the best one and its wrong presses. A data set becomes presses as pictures.
 
 It needs matplotlib and numpy: pip install './clients/python[plot]'
 """
@@ -26,6 +26,8 @@ import numpy as np  # noqa: E402
 SHOWN = 8
 # A course from the frame that began it is shown in so many frames.
 MOMENTS = 8
+# Wrong presses that are named.
+NAMED = 24
 
 
 def curves(axes: Any, path: pathlib.Path) -> None:
@@ -53,21 +55,16 @@ def curves(axes: Any, path: pathlib.Path) -> None:
     axes.legend(lines, [str(line.get_label()) for line in lines], fontsize=7)
 
 
-def confusion(axes: Any, figures: Dict[str, Any]) -> None:
+def confusion(axes: Any, confused: List[List[int]], levels: List[str], title: str) -> None:
     """Counts of truth and verdict; the colour is the share of the true level."""
-    counts = np.array(figures["confusion"], float)
+    counts = np.array(confused, float)
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(shares, vmin=0, vmax=1, cmap="Blues")
     for truth, said in np.ndindex(*counts.shape):
         colour = "white" if shares[truth, said] > 0.6 else "black"
         axes.text(said, truth, f"{counts[truth, said]:.0f}", ha="center", va="center", color=colour)
-    levels = [str(level) for level in range(1, len(counts) + 1)]
     axes.set_xticks(range(len(levels)), levels)
     axes.set_yticks(range(len(levels)), levels)
-    balanced = figures.get("balanced_accuracy")
-    title = f"accuracy {100 * figures['accuracy']:.1f} %"
-    if balanced is not None:
-        title += f", balanced {100 * balanced:.1f} %"
     axes.set(title=title, xlabel="level of the verdict", ylabel="true level")
 
 
@@ -88,10 +85,45 @@ def of_figures(figures: Dict[str, Any], more: int = 0) -> Tuple[Any, List[Any]]:
     """A figure with confusion and reliability, and room for more on their left."""
     count = more + 1 + bool(figures.get("calibration"))
     figure, axes = plt.subplots(1, count, figsize=(5 * count, 4.5), layout="constrained", squeeze=False)
-    confusion(axes[0][more], figures)
+    title = f"accuracy {100 * figures['accuracy']:.1f} %"
+    if figures.get("balanced_accuracy") is not None:
+        title += f", balanced {100 * figures['balanced_accuracy']:.1f} %"
+    levels = [str(level) for level in range(1, len(figures["confusion"]) + 1)]
+    confusion(axes[0][more], figures["confusion"], levels, title)
     if figures.get("calibration"):
         reliability(axes[0][more + 1], figures)
     return figure, list(axes[0])
+
+
+def of_fit(report: Dict[str, Any]) -> Any:
+    """The candidates with their intervals, the confusion of the best one, and its wrong presses."""
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
+    rows = [row for row in report["candidates"] + report["controls"] if not row["left_out"]][::-1]
+    for offset, (key, name) in enumerate((("later_presses", "later presses"), ("new_objects", "new objects"))):
+        found = [(place, row[key]) for place, row in enumerate(rows) if row[key]]
+        shares = [100 * one["balanced_accuracy"] for _, one in found]
+        left.barh([place + 0.4 * offset - 0.2 for place, _ in found], shares, 0.38, label=name)
+        for (place, one), share in zip(found, shares):
+            if one["interval"]:
+                low, high = (100 * end for end in one["interval"])
+                ends = [[share - low], [high - share]]
+                left.errorbar(share, place + 0.4 * offset - 0.2, xerr=ends, color="black", capsize=2)
+    left.set_yticks(range(len(rows)), [row["name"] for row in rows])
+    left.set(title=f"{report['presses']} presses", xlabel="balanced accuracy, %", xlim=(0, 100))
+    left.legend(fontsize=8)
+    best = f"{report['best']}, {(report['chosen_by'] or '').replace('_', ' ')}" if report["best"] else "none is best"
+    confusion(middle, report["confusion"], [level["label"] for level in report["levels"]], best)
+    wrong = [f"{one['press']}: {one['level']}, said {one['said']}" for one in report["wrong"]]
+    more = [f"and {len(wrong) - NAMED} more"] if len(wrong) > NAMED else []
+    right.axis("off")
+    right.set_title(f"{len(wrong)} wrong presses")
+    right.text(0, 1, "\n".join(wrong[:NAMED] + more), va="top", fontsize=7, wrap=True, transform=right.transAxes)
+    return figure
+
+
+def of_json(path: pathlib.Path) -> Any:
+    found = json.loads(path.read_text())
+    return of_fit(found) if "candidates" in found else of_figures(found)[0]
 
 
 def of_run(path: pathlib.Path) -> Any:
@@ -147,7 +179,7 @@ def of_data(path: pathlib.Path) -> Any:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python3 -m hardnessd.plot", description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("path", type=pathlib.Path, help="a run directory, a file of `evaluate --json`, or a data set")
+    parser.add_argument("path", type=pathlib.Path, help="a run directory, a file of `evaluate --json` or `fit --json`, or a data set")
     parser.add_argument("--out", type=pathlib.Path, metavar="P.png", help="the picture [default: beside the input]")
     given = parser.parse_args()
     path = given.path
@@ -157,7 +189,7 @@ def main() -> None:
         elif path.suffix == ".npz":
             figure, out = of_data(path), path.with_suffix(".png")
         else:
-            figure, out = of_figures(json.loads(path.read_text()))[0], path.with_suffix(".png")
+            figure, out = of_json(path), path.with_suffix(".png")
     except (OSError, ValueError, KeyError) as error:
         sys.exit(f"{path}: {error}")
     figure.savefig(given.out or out, dpi=110)
