@@ -69,32 +69,32 @@ impl ArmReports {
 
 impl ArmReports {
     /// The ranges of the training presses as training changes them: with the robot's errors, judged
-    /// before the end, and as a slower sensor sees them. Of each number, one in a thousand presses
+    /// before the end, as a slower sensor sees them, and stretched. Each change counts alone, because
+    /// hardly a press has two of them to their ends. Of each number, about one in a thousand presses
     /// lies below the range and one in a thousand above.
     pub fn ranges(&self, presses: &[Timed]) -> Extents {
-        let presses = presses.iter();
-        let whole = ranges_of(presses.clone().map(|press| press.extents(usize::MAX)));
-        let early = presses.clone().map(|press| press.extents(LEAST_FRAMES));
-        let slower = presses.map(|press| {
-            let step = (press.moments.len() / LEAST_FRAMES).clamp(1, MOST_FRAMES_A_STEP);
-            let [_, period, ..] = press.extents(usize::MAX);
-            let slower = period.map(|ends| ends.map(|period_s| period_s * step as f32));
-            [None, slower, None, None, None]
-        });
+        let of = |frames: usize| ranges_of(presses.iter().map(|press| press.extents(frames)));
+        let whole = of(usize::MAX);
         let mut ranges = whole;
         if self.early > 0.0 {
-            ranges = joined(ranges, ranges_of(early));
+            ranges = joined(ranges, of(LEAST_FRAMES));
         }
         if self.slower > 0.0 {
+            let slower = presses.iter().map(|press| {
+                let step = (press.moments.len() / LEAST_FRAMES).clamp(1, MOST_FRAMES_A_STEP);
+                let [_, period, ..] = press.extents(usize::MAX);
+                let slower = period.map(|ends| ends.map(|period_s| period_s * step as f32));
+                [None, slower, None, None, None]
+            });
             ranges = joined(ranges, ranges_of(slower));
         }
         if self.stretched > 0.0 {
             let (least, most) = (STRETCH.0 as f32, STRETCH.1 as f32);
-            let stretched = |[low, high]: [f32; 2]| [low * least, high * most];
-            let [duration, period, speed, ..] = &mut ranges;
-            *duration = duration.map(stretched);
-            *period = period.map(stretched);
-            *speed = speed.map(|[low, high]| [low / most, high / least]);
+            let [duration, period, speed, ..] = whole;
+            let longer = |[low, high]: [f32; 2]| [low * least, high * most];
+            let speed = speed.map(|[low, high]| [low / most, high / least]);
+            let stretched = [duration.map(longer), period.map(longer), speed, None, None];
+            ranges = joined(ranges, stretched);
         }
         if self.unknown >= 1.0 {
             ranges[2..].fill(None);
@@ -226,16 +226,26 @@ mod tests {
         }
     }
 
+    const EXACT: ArmReports = ArmReports {
+        unknown: 0.0,
+        unknown_arm: 0.0,
+        exact: 1.0,
+        position: 0.0,
+        arm: 0.0,
+        clock_frames: 0.0,
+        early: 0.0,
+        slower: 0.0,
+        stretched: 0.0,
+    };
+
     #[test]
     fn errors_stay_within_what_was_asked_for() {
         let reports = ArmReports {
-            unknown: 0.0,
-            unknown_arm: 0.0,
             exact: 0.0,
-            early: 0.0,
-            slower: 0.0,
-            stretched: 0.0,
-            ..ArmReports::default()
+            position: 0.1,
+            arm: 0.3,
+            clock_frames: 1.0,
+            ..EXACT
         };
         let mut stream = Stream::new(1, "reports");
         let mut moved = 0.0_f32;
@@ -254,13 +264,8 @@ mod tests {
     #[test]
     fn a_slower_sensor_sees_the_press_from_its_own_first_frame() {
         let reports = ArmReports {
-            unknown: 0.0,
-            unknown_arm: 0.0,
-            exact: 1.0,
-            early: 0.0,
             slower: 1.0,
-            stretched: 0.0,
-            ..ArmReports::default()
+            ..EXACT
         };
         let mut stream = Stream::new(3, "reports");
         let mut steps = std::collections::BTreeSet::new();
@@ -304,91 +309,66 @@ mod tests {
         }
     }
 
-    const EXACT: ArmReports = ArmReports {
-        unknown: 0.0,
-        unknown_arm: 0.0,
-        exact: 1.0,
-        position: 0.0,
-        arm: 0.0,
-        clock_frames: 0.0,
-        early: 0.0,
-        slower: 0.0,
-        stretched: 0.0,
-    };
-
-    fn check_ranges(reports: &ArmReports, expected: [Option<[f32; 2]>; 5]) {
-        let presses = [pressed(4.0, 0.1), pressed(8.0, 0.05)];
-        let found = reports.ranges(&presses);
-        for (found, expected) in found.into_iter().zip(expected) {
-            let (Some(found), Some(expected)) = (found, expected) else {
-                assert_eq!(found, expected, "{reports:?}");
-                continue;
-            };
-            for (found, expected) in found.into_iter().zip(expected) {
-                assert!((found / expected - 1.0).abs() < 1e-4, "{found} {expected}");
-            }
-        }
-    }
-
     #[test]
     fn ranges_are_those_of_the_presses_as_training_varies_them() {
-        let wider =
-            |[least, most]: [f32; 2], by: f32| Some([least * (1.0 - by), most * (1.0 + by)]);
-        let (duration, period) = (wider([0.45, 0.9], 0.01), wider([0.05, 0.1], 0.01));
-        let (speed, way) = ([4.0, 8.0], [3.6, 3.6]);
-        let exact = [
-            duration,
-            period,
-            wider(speed, 0.01),
-            wider(way, 0.01),
-            wider([10.0; 2], 0.01),
-        ];
-        check_ranges(&EXACT, exact);
-        // The first three frames of the faster sensor, and every third frame of the slower one.
-        let early = ArmReports {
-            early: 0.1,
+        let [way, arm] = [Some([3.6, 3.6]), Some([10.0; 2])];
+        let [duration, period, speed] = [Some([0.45, 0.9]), Some([0.05, 0.1]), Some([4.0, 8.0])];
+        let slower = ArmReports {
             slower: 0.1,
+            ..EXACT
+        };
+        let stretched = ArmReports {
+            stretched: 0.1,
+            ..slower
+        };
+        let (longer, slow) = (Some([0.225, 14.4]), Some([0.25, 16.0]));
+        for (reports, expected) in [
+            (EXACT, [duration, period, speed, way, arm]),
+            // The first three frames of the faster sensor.
+            (
+                ArmReports {
+                    early: 0.1,
+                    ..EXACT
+                },
+                [Some([0.1, 0.9]), period, speed, Some([0.8, 3.6]), arm],
+            ),
+            // Every third frame of the slower one.
+            (slower, [duration, Some([0.05, 0.3]), speed, way, arm]),
+            // Sixteen times the slower one's period, and not sixteen times three.
+            (stretched, [longer, Some([0.025, 1.6]), slow, way, arm]),
+            (
+                ArmReports {
+                    unknown: 1.0,
+                    ..EXACT
+                },
+                [duration, period, None, None, None],
+            ),
+            (
+                ArmReports {
+                    unknown_arm: 1.0,
+                    ..EXACT
+                },
+                [duration, period, speed, way, None],
+            ),
+        ] {
+            let found = reports.ranges(&[pressed(4.0, 0.1), pressed(8.0, 0.05)]);
+            for (found, expected) in found.into_iter().zip(expected) {
+                let wider = expected.map(|[low, high]: [f32; 2]| [low * 0.99, high * 1.01]);
+                let near = |(a, b): (f32, f32)| (a / b - 1.0).abs() < 1e-4;
+                let is_near = match (found, wider) {
+                    (Some(a), Some(b)) => a.into_iter().zip(b).all(near),
+                    (found, wider) => found == wider,
+                };
+                assert!(is_near, "{reports:?}: {found:?}, expected {wider:?}");
+            }
+        }
+        let errors = ArmReports {
             position: 0.1,
             arm: 0.3,
             ..EXACT
         };
-        let varied = [
-            wider([0.1, 0.9], 0.01),
-            wider([0.05, 0.3], 0.01),
-            wider(speed, 0.1),
-            wider([0.8, 3.6], 0.1),
-            wider([10.0; 2], 0.3),
-        ];
-        check_ranges(&early, varied);
-        let [_, _, _, way, arm] = exact;
-        let stretched = [
-            Some([0.225 * 0.99, 14.4 * 1.01]),
-            Some([0.025 * 0.99, 1.6 * 1.01]),
-            Some([0.25 * 0.99, 16.0 * 1.01]),
-            way,
-            arm,
-        ];
-        check_ranges(
-            &ArmReports {
-                stretched: 0.1,
-                ..EXACT
-            },
-            stretched,
-        );
-        let unknown = [duration, period, None, None, None];
-        check_ranges(
-            &ArmReports {
-                unknown: 1.0,
-                ..EXACT
-            },
-            unknown,
-        );
-        let [duration, period, speed, way, _] = exact;
-        let unknown_arm = ArmReports {
-            unknown_arm: 1.0,
-            ..EXACT
-        };
-        check_ranges(&unknown_arm, [duration, period, speed, way, None]);
+        let [.., speed, _, arm] = errors.ranges(&[pressed(4.0, 0.1)]);
+        assert_eq!((speed, arm), (Some([3.6, 4.4]), Some([7.0, 13.0])));
         assert_eq!(EXACT.ranges(&[]), [None; 5]);
     }
 
