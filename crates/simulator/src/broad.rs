@@ -5,8 +5,6 @@
 //! materials, except for creep: three of them have one element, and a broad material has two. Three
 //! ranges have such a number near their middle.
 
-use serde::{Deserialize, Serialize};
-
 use super::body::Body;
 use super::durometer::{self, Durometer};
 use super::level::{self, Borders, LEVELS, level_of};
@@ -14,8 +12,7 @@ use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::{Stream, log_even};
 
 /// A law that materials are drawn from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LawName {
     /// An elastic solid.
     Solid,
@@ -44,55 +41,6 @@ impl LawName {
             LawName::Foam => "broad-foam",
             LawName::Layered => "broad-layered",
         }
-    }
-}
-
-/// The laws that materials are drawn from, by their index in [`LawName::ALL`]; at least one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<LawName>", into = "Vec<LawName>")]
-pub struct Laws([bool; 4]);
-
-impl Default for Laws {
-    /// All four laws.
-    fn default() -> Self {
-        Self([true; 4])
-    }
-}
-
-impl From<Laws> for Vec<LawName> {
-    fn from(laws: Laws) -> Self {
-        laws.iter().collect()
-    }
-}
-
-impl TryFrom<Vec<LawName>> for Laws {
-    type Error = NoLaw;
-
-    fn try_from(names: Vec<LawName>) -> Result<Self, NoLaw> {
-        let laws = Self(LawName::ALL.map(|law| names.contains(&law)));
-        if names.is_empty() {
-            Err(NoLaw)
-        } else {
-            Ok(laws)
-        }
-    }
-}
-
-/// The error of an empty list of laws.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("found no law, expected one or more of solid, plastic, foam, layered")]
-pub struct NoLaw;
-
-impl Laws {
-    fn iter(self) -> impl Iterator<Item = LawName> {
-        let all = LawName::ALL.into_iter().zip(self.0);
-        all.filter_map(|(law, is_in)| is_in.then_some(law))
-    }
-
-    /// Draws one of the laws that `fits` accepts, with equal probabilities.
-    fn draw(self, stream: &mut Stream, fits: impl Fn(LawName) -> bool) -> Option<LawName> {
-        let laws: Vec<LawName> = self.iter().filter(|&law| fits(law)).collect();
-        (!laws.is_empty()).then(|| laws[stream.below(laws.len())])
     }
 }
 
@@ -130,17 +78,14 @@ const ANISOTROPY: (f64, f64) = (1.0, 2.0);
 /// level 1 is stiffer than the durometer can distinguish well. There the modulus is log-uniform and
 /// the Shore hardness is the durometer's reading. A soft law whose reading falls into another level
 /// is drawn again. The stiff half has no layered objects, because a layer is the soft part of its
-/// object. If there is no other law, no object is drawn by the modulus.
-pub(super) fn draw(laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
+/// object.
+pub(super) fn draw(borders: Borders, stream: &mut Stream) -> Body {
     let shore = level::draw_shore(borders, stream);
     let level = level_of(shore);
-    let is_stiff = level == 1 && stream.uniform() < STIFF_SHARE;
-    if is_stiff && let Some(body) = stiff(laws, borders, stream) {
-        return body;
+    if level == 1 && stream.uniform() < STIFF_SHARE {
+        return stiff(borders, stream);
     }
-    let law = laws
-        .draw(stream, |_| true)
-        .expect("`Laws` has at least one");
+    let law = LawName::ALL[stream.below(LawName::ALL.len())];
     let substance = substance(law, shore, stream);
     Body {
         substance,
@@ -151,21 +96,22 @@ pub(super) fn draw(laws: Laws, borders: Borders, stream: &mut Stream) -> Body {
     }
 }
 
-fn stiff(laws: Laws, borders: Borders, stream: &mut Stream) -> Option<Body> {
+fn stiff(borders: Borders, stream: &mut Stream) -> Body {
+    const LAWS: [LawName; 3] = [LawName::Solid, LawName::Plastic, LawName::Foam];
     let (least, _) = LEVELS[0].shore(borders);
     loop {
-        let law = laws.draw(stream, |law| law != LawName::Layered)?;
+        let law = LAWS[stream.below(LAWS.len())];
         let young_mpa = log_even(STIFF_MPA, stream);
         let substance = substance(law, 100.0, stream);
         let shore = Durometer::new(&substance).reading(young_mpa);
         if shore > least {
-            return Some(Body {
+            return Body {
                 substance,
                 young_mpa,
                 shore,
                 level: level_of(shore),
                 material: material_index(law),
-            });
+            };
         }
     }
 }
@@ -219,131 +165,48 @@ fn even((low, high): (f64, f64), stream: &mut Stream) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::material::Material;
     use super::*;
-
-    fn only(law: LawName) -> Laws {
-        Laws::try_from(vec![law]).unwrap()
-    }
 
     #[test]
     fn a_durometer_reads_what_a_drawn_object_is_labelled_with() {
-        for law in LawName::ALL {
-            let mut stream = Stream::new(2, &format!("{law:?}").to_lowercase());
-            for borders in [Borders::Touching, Borders::Gaps] {
-                for _ in 0..8 {
-                    let body = draw(only(law), borders, &mut stream);
-                    let read = Durometer::new(&body.substance).reading(body.young_mpa);
-                    assert!(
-                        (read - body.shore).abs() < 0.1,
-                        "{law:?}: reads {read}: {body:?}"
-                    );
-                    assert_eq!(body.level, level_of(body.shore));
-                    let range = &LEVELS[usize::from(body.level) - 1];
-                    let (least, most) = range.shore(borders);
-                    let most = if range.level == 1 { 100.0 } else { most };
-                    assert!(least < body.shore && body.shore <= most, "{body:?}");
-                }
+        let mut stream = Stream::new(2, "labels");
+        for borders in [Borders::Touching, Borders::Gaps] {
+            for _ in 0..32 {
+                let body = draw(borders, &mut stream);
+                let read = Durometer::new(&body.substance).reading(body.young_mpa);
+                assert!((read - body.shore).abs() < 0.1, "reads {read}: {body:?}");
+                assert_eq!(body.level, level_of(body.shore));
+                let range = &LEVELS[usize::from(body.level) - 1];
+                let (least, most) = range.shore(borders);
+                let most = if range.level == 1 { 100.0 } else { most };
+                assert!(least < body.shore && body.shore <= most, "{body:?}");
             }
         }
     }
 
     #[test]
-    fn shore_is_even_and_laws_are_over_the_objects() {
+    fn shore_and_laws_are_even_and_half_of_level_1_is_stiff() {
         let mut stream = Stream::new(3, "broad");
-        let count = 400;
-        let shores: Vec<f64> = (0..count)
-            .map(|_| level::draw_shore(Borders::Touching, &mut stream))
+        let bodies: Vec<Body> = (0..400)
+            .map(|_| draw(Borders::Touching, &mut stream))
             .collect();
-        for from in [15.0, 35.0, 55.0, 75.0] {
-            let within = shores
-                .iter()
-                .filter(|&&shore| from < shore && shore <= from + 20.0)
-                .count();
+        let count = |is: &dyn Fn(&Body) -> bool| bodies.iter().filter(|body| is(body)).count();
+        // Of 80 degrees, 20 are in each of these ranges.
+        for from in [15.0, 30.0, 50.0] {
+            let within = count(&|body| from < body.shore && body.shore <= from + 20.0);
             assert!((70..130).contains(&within), "{within} from {from}");
         }
-        let gaps = (0..count).map(|_| level::draw_shore(Borders::Gaps, &mut stream));
-        assert!(gaps.into_iter().all(|shore| {
-            [50.0, 60.0, 70.0]
-                .iter()
-                .all(|&b| shore <= b || shore > b + 1.0)
-        }));
-        let drawn: Vec<LawName> = (0..400)
-            .map(|_| Laws::default().draw(&mut stream, |_| true).unwrap())
-            .collect();
         for law in LawName::ALL {
-            let count = drawn.iter().filter(|&&l| l == law).count();
-            assert!((70..130).contains(&count), "{law:?}: {count} of 400");
+            let own = count(&|body| body.material == material_index(law));
+            assert!((60..135).contains(&own), "{law:?}: {own} of 400");
         }
-    }
-
-    #[test]
-    fn half_of_level_1_is_stiff() {
-        let mut stream = Stream::new(4, "stiff");
-        let laws = Laws::try_from(vec![LawName::Solid, LawName::Layered]).unwrap();
-        let stiff = (0..130)
-            .map(|_| draw(laws, Borders::Touching, &mut stream))
-            .filter(|body| {
-                let is_stiff = body.young_mpa > 100.0;
-                assert!(!is_stiff || body.substance.law == Law::Solid);
-                is_stiff
-            })
-            .count();
         // Level 1 is 25 of 80, and half of it is stiff. Of that half,
         // log(3000 / 100) / log(3000 / 5), or 53 %, has a modulus above 100 MPa.
-        assert!((4..19).contains(&stiff), "{stiff} of 130");
-    }
-
-    #[test]
-    fn the_ranges_contain_the_named_materials() {
-        let within = |(low, high): (f64, f64), value: f64| low <= value && value <= high;
-        for material in Material::ALL {
-            let Substance {
-                nu,
-                law,
-                creep,
-                texture,
-            } = material.properties().substance;
-            let name = match law {
-                Law::Solid => LawName::Solid,
-                Law::Plastic { hardness } => {
-                    assert!(within(HARDNESS, hardness), "{material}");
-                    LawName::Plastic
-                }
-                Law::Foam {
-                    exponent,
-                    plateau,
-                    strain,
-                } => {
-                    assert!(
-                        within(EXPONENT, exponent) && within(PLATEAU, plateau),
-                        "{material}"
-                    );
-                    assert!(within(STRAIN, strain), "{material}");
-                    LawName::Foam
-                }
-                Law::Layered { .. } => panic!("no named material has a layer"),
-            };
-            assert!(within(NU[name as usize], nu), "{material}: nu");
-            // Wood, hard plastic and plasticine have one term of creep.
-            for term in creep.into_iter().filter(|term| term.j > 0.0) {
-                let is_in = |(j, tau)| within(j, term.j) && within(tau, term.tau_s);
-                assert!(CREEP.into_iter().any(is_in), "{material}: {term:?}");
-            }
-            assert!(within(RMS_UM, texture.rms_um), "{material}");
-            assert!(within(SHORTEST_MM, texture.shortest_mm), "{material}");
-            assert!(within(LONGEST_MM, texture.longest_mm), "{material}");
-            assert!(within(HURST, texture.hurst), "{material}");
-            assert!(within(ANISOTROPY, texture.anisotropy), "{material}");
-        }
-    }
-
-    #[test]
-    fn laws_travel_as_their_names() {
-        let laws = Laws::try_from(vec![LawName::Foam, LawName::Solid]).unwrap();
-        let text = serde_json::to_string(&laws).unwrap();
-        assert_eq!(text, r#"["solid","foam"]"#);
-        assert_eq!(serde_json::from_str::<Laws>(&text).unwrap(), laws);
-        assert!(serde_json::from_str::<Laws>("[]").is_err());
+        let stiff = count(&|body| {
+            let is_layered = matches!(body.substance.law, Law::Layered { .. });
+            assert!(!is_layered || body.young_mpa < 100.0, "{body:?}");
+            body.young_mpa > 100.0
+        });
+        assert!((18..50).contains(&stiff), "{stiff} of 400");
     }
 }

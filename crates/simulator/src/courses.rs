@@ -1,8 +1,8 @@
 //! A data set of whole presses: frames over time, with the arm's motion as the robot reports it.
 //!
 //! Objects, materials and sensors are those of [`super::dataset`]. Speed, stiffness of the arm,
-//! frame rate, hold and the robot's errors are drawn anew for each press. Test presses of the same
-//! number are made alike in every material, as for single frames.
+//! frame rate and hold are drawn anew for each press. Test presses of the same number are made alike
+//! in every material, as for single frames.
 
 mod world;
 
@@ -10,18 +10,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-pub use self::world::{BroadSensors, REFERENCES, SensorDesigns, SensorSummary};
+pub use self::world::{BroadSensors, SensorDesigns};
 use super::body::{Body, draw_patch};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::Split;
 use super::motion::Arm;
 use super::object::{Family, POSTURES, Pose, Shapes};
-use super::press::{Bench, Cover, Specimen};
+use super::press::{Bench, Specimen};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
 use super::solved::SolvedPress;
-use super::subject::{Subject, shared_out, units, weights};
+use super::subject::{Subject, shared_out, units};
 use super::substance::Law;
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
@@ -36,50 +36,22 @@ pub struct CourseSettings {
     /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
     /// stops by force.
     pub objects: DatasetSettings,
-    /// The share of the objects of `matched` and `wide` shapes that have flat faces.
-    pub flat_share: f64,
-    /// The greatest force, N.
-    pub highest_force_n: f32,
     /// Least and greatest frame rate, drawn log-uniformly.
     pub frame_rate_hz: [f64; 2],
-    /// Least and greatest speed of the arm, drawn log-uniformly.
-    pub speed_mm_s: [f64; 2],
-    /// Least and greatest stiffness of the arm, drawn log-uniformly.
-    pub arm_n_per_mm: [f64; 2],
-    /// Least and greatest time that the arm holds its position, drawn uniformly.
-    pub hold_s: [f64; 2],
-    /// Greatest relative error of the reported positions and speeds, constant over a press.
-    pub position_error: f64,
-    /// Greatest relative error of the reported stiffness.
-    pub arm_error: f64,
-    /// Greatest error of the reported times, in frames, constant over a press.
-    pub clock_error_frames: f64,
-    /// Share of the presses for which the robot reports nothing.
-    pub unknown_share: f64,
     /// The sensors, if each is another one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensors: Option<BroadSensors>,
 }
 
 impl Default for CourseSettings {
-    /// 200 + 20 objects of the named materials in matched shapes, 6 presses each, and a robot
-    /// without errors.
+    /// 200 + 20 objects of the named materials in matched shapes, 6 presses each.
     fn default() -> Self {
         Self {
             objects: DatasetSettings {
                 presses: 6,
                 ..DatasetSettings::default()
             },
-            flat_share: 1.0 / 3.0,
-            highest_force_n: HIGHEST_FORCE_N as f32,
             frame_rate_hz: [5.0, 100.0],
-            speed_mm_s: [2.0, 20.0],
-            arm_n_per_mm: [3.0, 30.0],
-            hold_s: [0.2, 1.5],
-            position_error: 0.0,
-            arm_error: 0.0,
-            clock_error_frames: 0.0,
-            unknown_share: 0.0,
             sensors: None,
         }
     }
@@ -95,12 +67,20 @@ impl CourseSettings {
     /// level, and flat ones are flat.
     pub(super) fn flat_share(&self) -> f64 {
         match self.objects.shapes {
-            Shapes::Matched | Shapes::Wide => self.flat_share,
+            Shapes::Matched | Shapes::Wide => 1.0 / 3.0,
             Shapes::Flat | Shapes::Paper => 0.0,
         }
     }
 }
 
+/// The greatest force on sensors of many designs, N.
+const BROAD_FORCE_N: f64 = 40.0;
+/// Speed of the arm in mm/s, log-uniform.
+const SPEED_MM_S: [f64; 2] = [2.0, 20.0];
+/// Stiffness of the arm in N/mm, log-uniform.
+const ARM_N_PER_MM: [f64; 2] = [3.0, 30.0];
+/// The time that the arm holds its position, s, uniform.
+const HOLD_S: [f64; 2] = [0.2, 1.5];
 /// The number of frames kept before the frame that begins the press.
 const BEFORE: usize = 2;
 
@@ -111,7 +91,7 @@ pub struct LabelledCourse {
     pub moments: Vec<Sample>,
     /// Index of the frame that a model of one frame judges.
     pub best: usize,
-    /// The arm's stiffness as reported; 0 if it is not reported.
+    /// The arm's stiffness as reported.
     pub arm_n_per_mm: f32,
     /// Hardness level, 1 to 4; 0 for a reference.
     pub level: u8,
@@ -149,10 +129,8 @@ pub struct Sample {
     pub millinewtons: Box<[i16]>,
     /// Time since the frame that began the press; negative before it.
     pub time_s: f32,
-    /// How far the arm went since the begin, as reported; 0 if it is not reported.
+    /// How far the arm went since the begin.
     pub approach_mm: f32,
-    /// Whether the approach is reported.
-    pub known: bool,
 }
 
 /// The condition that stops the arm.
@@ -190,25 +168,24 @@ pub(super) struct Reading {
     pub(super) period_s: f64,
     /// Offset between the frames and the touch, as a part of a period.
     pub(super) phase: f64,
-    pub(super) errors: ReportErrors,
-}
-
-/// The errors of the robot's reports.
-#[derive(Clone, Copy)]
-pub(super) struct ReportErrors {
-    is_known: bool,
-    position_factor: f64,
-    pub(super) arm_factor: f64,
-    late_frames: f64,
 }
 
 impl Plan {
-    pub(super) fn draw(settings: &CourseSettings, stream: &mut Stream) -> Self {
+    /// Draws the plan of a press by an arm whose stiffness is in this range.
+    pub(super) fn draw(
+        settings: &CourseSettings,
+        arm_n_per_mm: [f64; 2],
+        stream: &mut Stream,
+    ) -> Self {
         let posture = stream.below(POSTURES);
         let lowest = f64::from(settings.objects.lowest_force_n);
-        let highest = f64::from(settings.highest_force_n);
         // Many sensors meet great forces, too, but most presses are gentle.
         let is_broad = settings.has_broad_sensors();
+        let highest = if is_broad {
+            BROAD_FORCE_N
+        } else {
+            HIGHEST_FORCE_N
+        };
         let force = |stream: &mut Stream| {
             let part = stream.uniform();
             lowest + (highest - lowest) * if is_broad { part * part } else { part }
@@ -227,18 +204,15 @@ impl Plan {
             position
         };
         let arm = Arm {
-            n_per_mm: log_even(settings.arm_n_per_mm, stream),
-            speed_mm_s: log_even(settings.speed_mm_s, stream),
+            n_per_mm: log_even(arm_n_per_mm, stream),
+            speed_mm_s: log_even(SPEED_MM_S, stream),
         };
-        let [least, most] = settings.hold_s;
+        let [least, most] = HOLD_S;
         let period_s = 1.0 / log_even(settings.frame_rate_hz, stream);
-        let mut off = |most: f64| stream.range(-most, most);
-        let errors = ReportErrors {
-            position_factor: 1.0 + off(settings.position_error),
-            arm_factor: 1.0 + off(settings.arm_error),
-            late_frames: off(settings.clock_error_frames),
-            is_known: stream.uniform() >= settings.unknown_share,
-        };
+        // A seed's presses stay what they were when four numbers were drawn here for a robot's errors.
+        for _ in 0..4 {
+            stream.next_u64();
+        }
         Self {
             posture,
             pose: stream.child(0),
@@ -249,7 +223,6 @@ impl Plan {
             reading: Reading {
                 period_s,
                 phase: stream.uniform(),
-                errors,
             },
         }
     }
@@ -268,38 +241,31 @@ pub fn courses(
     }
     let done = AtomicUsize::new(0);
     let of = &settings.objects;
-    let weights = weights(of);
-    let bench = || Bench::under(Cover::of(of.cover_young_mpa));
-    shared_out(&units(of), threads, bench, |bench, object, unit| {
-        let subject = Subject::draw(of, unit, &weights, settings.flat_share());
-        let mut made = Vec::with_capacity(of.presses as usize);
-        for press in 0..u64::from(of.presses) {
-            let mut paired = subject.draws.geometry.child(3).child(press);
-            let plan = Plan::draw(settings, &mut paired);
-            made.extend(subject.course(bench, &plan, object, press));
-            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-        }
-        made
-    })
+    shared_out(
+        &units(of),
+        threads,
+        Bench::default,
+        |bench, object, unit| {
+            let subject = Subject::draw(of, unit, settings.flat_share());
+            let mut made = Vec::with_capacity(of.presses as usize);
+            for press in 0..u64::from(of.presses) {
+                let mut paired = subject.draws.geometry.child(3).child(press);
+                let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
+                let read = subject.pressed(bench, &plan, press, |solved, force_n, noise| {
+                    let read = read_press(&subject.sensor, solved, plan.reading, noise)?;
+                    Some(subject.labelled(object, plan.course(plan.reading, force_n, read)))
+                });
+                made.extend(read);
+                progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+            }
+            made
+        },
+    )
 }
 
 impl Subject {
-    /// Press number `press`; `None` if it never begins or lasts too long.
-    fn course(
-        &self,
-        bench: &mut Bench,
-        plan: &Plan,
-        object: u32,
-        press: u64,
-    ) -> Option<LabelledCourse> {
-        self.pressed(bench, plan, press, |solved, force_n, noise| {
-            let read = read_press(&self.sensor, solved, &plan.reading, noise)?;
-            Some(self.labelled(plan, &plan.reading, object, force_n, read))
-        })
-    }
-
-    /// Presses, harder each time until the object's sensor feels it and `read` gives something.
-    /// `None` if that never happens, or the press lasts too long.
+    /// Makes press number `press`, harder each time until the object's sensor feels it and `read` gives
+    /// something. `None` if that never happens, or the press lasts too long.
     pub(super) fn pressed<T>(
         &self,
         bench: &mut Bench,
@@ -357,47 +323,42 @@ impl Subject {
         begins_press(&self.sensor.felt(&self.sensor.read(&forces, 1.0, noise)))
     }
 
-    pub(super) fn labelled(
-        &self,
-        plan: &Plan,
-        reading: &Reading,
-        object: u32,
-        force_n: f64,
-        read: ReadPress,
-    ) -> LabelledCourse {
+    /// A press with the labels of this object.
+    pub(super) fn labelled(&self, object: u32, press: LabelledCourse) -> LabelledCourse {
         LabelledCourse {
-            moments: read.moments,
-            best: read.best,
-            arm_n_per_mm: plan.reported_n_per_mm(reading),
             level: self.body.level,
             object,
             material: self.body.material,
-            force_n: force_n as f32,
             split: self.split,
             shore: self.body.shore as f32,
-            sensor: 0,
-            reference: None,
-            family: self.object.family(),
+            family: self.object.family,
             layered: matches!(self.body.substance.law, Law::Layered { .. }),
             young_mpa: self.body.young_mpa as f32,
-            frame_rate_hz: (1.0 / reading.period_s) as f32,
-            speed_mm_s: plan.arm.speed_mm_s as f32,
+            ..press
         }
     }
 }
 
 impl Plan {
-    /// The arm's stiffness as the robot reports it; 0 if it reports none.
-    pub(super) fn reported_n_per_mm(&self, reading: &Reading) -> f32 {
-        let ReportErrors {
-            is_known,
-            arm_factor,
-            ..
-        } = reading.errors;
-        if is_known {
-            (self.arm.n_per_mm * arm_factor) as f32
-        } else {
-            0.0
+    /// A press of this plan on a rigid disc, without labels.
+    pub(super) fn course(&self, reading: Reading, force_n: f64, read: ReadPress) -> LabelledCourse {
+        LabelledCourse {
+            moments: read.moments,
+            best: read.best,
+            arm_n_per_mm: self.arm.n_per_mm as f32,
+            level: 0,
+            object: 0,
+            material: 0,
+            force_n: force_n as f32,
+            split: Split::Train,
+            shore: f32::NAN,
+            sensor: 0,
+            reference: None,
+            family: Family::Disc,
+            layered: false,
+            young_mpa: f32::INFINITY,
+            frame_rate_hz: (1.0 / reading.period_s) as f32,
+            speed_mm_s: self.arm.speed_mm_s as f32,
         }
     }
 }
@@ -413,7 +374,7 @@ pub(super) struct ReadPress {
 pub(super) fn read_press(
     sensor: &Sensor,
     solved: &SolvedPress,
-    reading: &Reading,
+    reading: Reading,
     noise: &mut Stream,
 ) -> Option<ReadPress> {
     let frames = frames(sensor, solved, reading, noise);
@@ -422,7 +383,7 @@ pub(super) fn read_press(
         &sensor.thresholds(),
         reading.period_s,
     )?;
-    Some(kept(&frames, &seen, sensor.grid.pitch, solved, reading))
+    Some(kept(&frames, &seen, sensor.grid.pitch, solved))
 }
 
 /// The sensor's frames from a few before the touch to the release, with their times after the
@@ -430,7 +391,7 @@ pub(super) fn read_press(
 fn frames(
     sensor: &Sensor,
     solved: &SolvedPress,
-    reading: &Reading,
+    reading: Reading,
     noise: &mut Stream,
 ) -> Vec<(f64, Frame)> {
     let gain = sensor.press_gain(noise);
@@ -450,13 +411,7 @@ fn frames(
 }
 
 /// The frames to keep, on the model's grid, and the best frame among them.
-fn kept(
-    frames: &[(f64, Frame)],
-    seen: &Seen,
-    pitch: Pitch,
-    solved: &SolvedPress,
-    reading: &Reading,
-) -> ReadPress {
+fn kept(frames: &[(f64, Frame)], seen: &Seen, pitch: Pitch, solved: &SolvedPress) -> ReadPress {
     let begin = seen.contact[0];
     let best = seen
         .contact
@@ -467,23 +422,14 @@ fn kept(
         .chain(thin.iter().map(|&place| seen.contact[place]))
         .collect();
     let begin_s = frames[begin].0;
-    let ReportErrors {
-        is_known,
-        position_factor,
-        late_frames,
-        ..
-    } = reading.errors;
-    let late_s = late_frames * reading.period_s;
-    let reported_mm = |time_s: f64| position_factor * solved.motion.approach_mm(time_s - late_s);
     let resampling = Resampling::new(&frames[seen.best].1, pitch, Pitch::JX255N.rows_mm);
     let moment = |&place: &usize| {
         let (time_s, frame) = &frames[place];
-        let approach_mm = reported_mm(*time_s) - reported_mm(begin_s);
+        let approach_mm = solved.motion.approach_mm(*time_s) - solved.motion.approach_mm(begin_s);
         Sample {
             millinewtons: millinewtons(&resampling.apply(frame).newtons),
             time_s: (time_s - begin_s) as f32,
-            approach_mm: if is_known { approach_mm as f32 } else { 0.0 },
-            known: is_known,
+            approach_mm: approach_mm as f32,
         }
     };
     ReadPress {

@@ -37,11 +37,8 @@ mod courses;
 mod sequence;
 mod rig;
 
-pub use broad::{LawName, Laws, NoLaw};
-pub use courses::{
-    BroadSensors, CourseSettings, LabelledCourse, REFERENCES, Sample, SensorDesigns, SensorSummary,
-    courses,
-};
+pub use broad::LawName;
+pub use courses::{BroadSensors, CourseSettings, LabelledCourse, Sample, SensorDesigns, courses};
 pub use dataset::{LabelledSample, dataset};
 pub use level::{Borders, LEVELS, LevelRange, borders, level_of};
 pub use material::{Material, Split};

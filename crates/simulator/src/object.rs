@@ -67,6 +67,8 @@ const NOTHING_MM: f64 = 1e3;
 /// An object's outline, the same in every material.
 #[derive(Debug, Clone)]
 pub(super) struct Object {
+    /// The family of its shape.
+    pub(super) family: Family,
     solid: Solid,
     edge_mm: f64,
     /// Radius of curvature of the three pairs of faces; negative for hollow faces.
@@ -75,8 +77,9 @@ pub(super) struct Object {
 
 #[derive(Debug, Clone, Copy)]
 enum Solid {
-    Ball {
-        radius: f64,
+    /// A ball or a pebble.
+    Round {
+        axes: [f64; 3],
     },
     Cylinder {
         radius: f64,
@@ -90,9 +93,6 @@ enum Solid {
         tip: f64,
         flank_deg: f64,
     },
-    Pebble {
-        axes: [f64; 3],
-    },
     /// A cone, tip up.
     Point {
         tip: f64,
@@ -100,7 +100,6 @@ enum Solid {
     },
     /// A body with a flat face and free sides.
     Flat {
-        family: Family,
         face: FlatFace,
         height: f64,
     },
@@ -269,37 +268,68 @@ impl Object {
     /// fixes R / E* and no more, so it carries the hardness only if the range of radii is narrow. A
     /// flat soft face touches as a whole, whatever its hardness.
     pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Self {
-        let (weights, flat) = match shapes {
-            Shapes::Wide => return Self::wide(stream),
+        let weights = match shapes {
+            Shapes::Wide => WIDE,
             Shapes::Flat => return Self::flat(stream),
-            Shapes::Matched => (MATCHED, false),
-            Shapes::Paper if level == 1 => (RIGID, true),
-            Shapes::Paper => (SOFT, false),
+            Shapes::Matched => MATCHED,
+            Shapes::Paper if level == 1 => RIGID,
+            Shapes::Paper => SOFT,
         };
-        let family = family(&weights, stream);
-        let mut pick = |low, high| stream.range(low, high);
-        let solid = match family {
-            0 => Solid::Ball {
-                radius: pick(24.0, 30.0),
-            },
-            1 => Solid::Cylinder {
-                radius: pick(16.0, 22.0),
-                length: pick(30.0, 60.0),
-            },
-            2 => block(stream),
-            3 => Solid::Wedge {
-                length: pick(25.0, 50.0),
-                tip: pick(4.0, 10.0),
-                flank_deg: pick(30.0, 45.0),
-            },
-            _ => Solid::Pebble {
-                axes: [pick(23.0, 29.0), pick(23.0, 29.0), pick(23.0, 29.0)],
-            },
+        let is_wide = shapes == Shapes::Wide;
+        let is_flat = shapes == Shapes::Paper && level == 1;
+        let radius = |matched: (f64, f64), stream: &mut Stream| match is_wide {
+            true => log_even(WIDE_RADIUS_MM, stream),
+            false => stream.range(matched.0, matched.1),
+        };
+        let tip = |stream: &mut Stream| match is_wide {
+            true => log_even(WIDE_TIP_MM, stream),
+            false => stream.range(4.0, 10.0),
+        };
+        let flank_deg = |stream: &mut Stream| stream.range(30.0, 45.0);
+        let (family, solid) = match drawn(&weights, stream) {
+            0 => {
+                let axes = [radius((24.0, 30.0), stream); 3];
+                (Family::Ball, Solid::Round { axes })
+            }
+            1 => {
+                let radius = radius((16.0, 22.0), stream);
+                let length = stream.range(30.0, 60.0);
+                (Family::Cylinder, Solid::Cylinder { radius, length })
+            }
+            2 => {
+                let sides = [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)];
+                let sides = sides.map(|(low, high)| stream.range(low, high));
+                (Family::Box, Solid::Block { sides })
+            }
+            3 => {
+                let wedge = Solid::Wedge {
+                    length: stream.range(25.0, 50.0),
+                    tip: tip(stream),
+                    flank_deg: flank_deg(stream),
+                };
+                (Family::Wedge, wedge)
+            }
+            4 => {
+                let axes = if is_wide {
+                    let radius = log_even(WIDE_RADIUS_MM, stream);
+                    std::array::from_fn(|_| radius * stream.range(0.9, 1.1))
+                } else {
+                    std::array::from_fn(|_| stream.range(23.0, 29.0))
+                };
+                (Family::Pebble, Solid::Round { axes })
+            }
+            _ => {
+                let point = Solid::Point {
+                    tip: tip(stream),
+                    flank_deg: flank_deg(stream),
+                };
+                (Family::Point, point)
+            }
         };
         let edge_mm = stream.range(1.0, 4.0);
         let crown_mm = std::array::from_fn(|_| {
-            if !flat {
-                return stream.range(31.0, 42.0);
+            if !is_flat {
+                return radius((31.0, 42.0), stream);
             }
             let radius = stream.range(800.0, 6000.0);
             if stream.uniform() < 0.3 {
@@ -309,49 +339,17 @@ impl Object {
             }
         });
         Self {
+            family,
             solid,
             edge_mm,
             crown_mm,
         }
     }
 
-    fn wide(stream: &mut Stream) -> Self {
-        let solid = match family(&WIDE, stream) {
-            0 => Solid::Ball {
-                radius: log_even(WIDE_RADIUS_MM, stream),
-            },
-            1 => Solid::Cylinder {
-                radius: log_even(WIDE_RADIUS_MM, stream),
-                length: stream.range(30.0, 60.0),
-            },
-            2 => block(stream),
-            3 => Solid::Wedge {
-                length: stream.range(25.0, 50.0),
-                tip: log_even(WIDE_TIP_MM, stream),
-                flank_deg: stream.range(30.0, 45.0),
-            },
-            4 => {
-                let radius = log_even(WIDE_RADIUS_MM, stream);
-                Solid::Pebble {
-                    axes: std::array::from_fn(|_| radius * stream.range(0.9, 1.1)),
-                }
-            }
-            _ => Solid::Point {
-                tip: log_even(WIDE_TIP_MM, stream),
-                flank_deg: stream.range(30.0, 45.0),
-            },
-        };
-        Self {
-            solid,
-            edge_mm: stream.range(1.0, 4.0),
-            crown_mm: std::array::from_fn(|_| log_even(WIDE_RADIUS_MM, stream)),
-        }
-    }
-
     /// Draws an object with flat faces, which stands or lies on something rigid.
     pub(super) fn flat(stream: &mut Stream) -> Self {
         let rectangle = |sides_mm| FlatFace::Rectangle { sides_mm };
-        let (family, face) = match family(&FLAT, stream) {
+        let (family, face) = match drawn(&FLAT, stream) {
             0 => {
                 let sides = if stream.uniform() < LARGE_SHARE {
                     LARGE_MM
@@ -383,8 +381,8 @@ impl Object {
             _ => log_even(HIGH_MM, stream),
         };
         Self {
+            family,
             solid: Solid::Flat {
-                family,
                 face,
                 height: height.min(SLENDER * narrow_mm),
             },
@@ -393,127 +391,93 @@ impl Object {
         }
     }
 
-    /// The family of its shape.
-    pub(super) fn family(&self) -> Family {
-        match self.solid {
-            Solid::Ball { .. } => Family::Ball,
-            Solid::Cylinder { .. } => Family::Cylinder,
-            Solid::Block { .. } => Family::Box,
-            Solid::Wedge { .. } => Family::Wedge,
-            Solid::Pebble { .. } => Family::Pebble,
-            Solid::Point { .. } => Family::Point,
-            Solid::Flat { family, .. } => family,
-        }
-    }
-
     /// The upper face in posture `posture` (0 to 5).
     pub(super) fn face(&self, posture: usize) -> Face {
         let edge = self.edge_mm;
-        let flat = |outline, height_mm| Face {
-            outline,
-            height_mm,
-            tilt_sd_deg: 0.1,
-            roughness: 1.0,
-            flat: None,
-        };
         match self.solid {
-            Solid::Ball { radius } => Face {
-                outline: Outline::Ellipsoid {
-                    x: radius,
-                    y: radius,
-                    z: radius,
-                },
-                height_mm: 2.0 * radius,
-                tilt_sd_deg: 1.5,
-                roughness: 1.0,
-                flat: None,
-            },
-            Solid::Pebble { axes } => {
+            Solid::Round { axes } => {
                 let up = posture % 3;
                 let (x, y, z) = (axes[(up + 1) % 3], axes[(up + 2) % 3], axes[up]);
                 Face {
-                    outline: Outline::Ellipsoid { x, y, z },
-                    height_mm: 2.0 * z,
                     tilt_sd_deg: 1.5,
-                    roughness: 2.0,
-                    flat: None,
+                    roughness: if self.family == Family::Pebble {
+                        2.0
+                    } else {
+                        1.0
+                    },
+                    ..Face::new(Outline::Ellipsoid { x, y, z }, 2.0 * z)
                 }
             }
             // A cylinder has four postures on its side and one on each end.
-            Solid::Cylinder { radius, length } if posture < 4 => flat(
-                Outline::Ridge {
+            Solid::Cylinder { radius, length } if posture < 4 => {
+                let ridge = Outline::Ridge {
                     radius,
                     half_length: 0.5 * length,
                     edge,
                     flank_deg: 90.0,
-                },
-                2.0 * radius,
-            ),
-            Solid::Cylinder { radius, length } => flat(
-                Outline::Disc {
+                };
+                Face::new(ridge, 2.0 * radius)
+            }
+            Solid::Cylinder { radius, length } => {
+                let crown = self.crown_mm[posture - 4];
+                let disc = Outline::Disc {
                     radius,
                     edge,
-                    crown: self.crown_mm[posture - 4],
-                },
-                length,
-            ),
+                    crown,
+                };
+                Face::new(disc, length)
+            }
             Solid::Block { sides } => {
                 let up = (posture + 2) % 3;
-                let (a, b) = (sides[(up + 1) % 3], sides[(up + 2) % 3]);
-                let outline = Outline::Rectangle {
-                    half_x: 0.5 * a,
-                    half_y: 0.5 * b,
-                    edge,
-                    crown: self.crown_mm[up],
-                };
-                flat(outline, sides[up])
+                let sides_mm = [sides[(up + 1) % 3], sides[(up + 2) % 3]];
+                let outline = FlatFace::Rectangle { sides_mm }.outline(edge, self.crown_mm[up]);
+                Face::new(outline, sides[up])
             }
             Solid::Wedge {
                 length,
                 tip,
                 flank_deg,
-            } => flat(
-                Outline::Ridge {
+            } => {
+                let ridge = Outline::Ridge {
                     radius: tip,
                     half_length: 0.5 * length,
                     edge,
                     flank_deg,
-                },
-                WEDGE_HEIGHT_MM,
-            ),
-            Solid::Point { tip, flank_deg } => flat(
-                Outline::Tip {
-                    radius: tip,
-                    flank_deg,
-                },
-                WEDGE_HEIGHT_MM,
-            ),
-            Solid::Flat { face, height, .. } => {
-                let crown = FLAT_CROWN_MM;
-                let outline = match face {
-                    FlatFace::Rectangle { sides_mm: [a, b] } => Outline::Rectangle {
-                        half_x: 0.5 * a,
-                        half_y: 0.5 * b,
-                        edge,
-                        crown,
-                    },
-                    FlatFace::Round { radius_mm } => Outline::Disc {
-                        radius: radius_mm,
-                        edge,
-                        crown,
-                    },
                 };
-                Face {
-                    flat: Some(face),
-                    ..flat(outline, height)
-                }
+                Face::new(ridge, WEDGE_HEIGHT_MM)
             }
+            Solid::Point { tip, flank_deg } => {
+                let radius = tip;
+                Face::new(Outline::Tip { radius, flank_deg }, WEDGE_HEIGHT_MM)
+            }
+            Solid::Flat { face, height } => Face {
+                flat: Some(face),
+                ..Face::new(face.outline(edge, FLAT_CROWN_MM), height)
+            },
+        }
+    }
+}
+
+impl FlatFace {
+    fn outline(self, edge: f64, crown: f64) -> Outline {
+        match self {
+            Self::Rectangle { sides_mm: [a, b] } => Outline::Rectangle {
+                half_x: 0.5 * a,
+                half_y: 0.5 * b,
+                edge,
+                crown,
+            },
+            Self::Round { radius_mm } => Outline::Disc {
+                radius: radius_mm,
+                edge,
+                crown,
+            },
         }
     }
 }
 
 /// Draws an index with the probabilities `weights`.
-fn family(weights: &[f64], stream: &mut Stream) -> usize {
+fn drawn(weights: &[f64], stream: &mut Stream) -> usize {
     let mut rest = stream.uniform();
     let place = weights.iter().position(|&weight| {
         rest -= weight;
@@ -524,60 +488,44 @@ fn family(weights: &[f64], stream: &mut Stream) -> usize {
     place.or(last).unwrap_or_default()
 }
 
-fn block(stream: &mut Stream) -> Solid {
-    Solid::Block {
-        sides: [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)]
-            .map(|(low, high)| stream.range(low, high)),
-    }
-}
-
 /// Height of wedges and points, which rest on their base with the tip up.
 const WEDGE_HEIGHT_MM: f64 = 30.0;
 
 impl Face {
-    /// A flat disc with a small edge, held to within this tilt.
-    pub(super) fn flat(radius: f64, tilt_sd_deg: f64) -> Self {
-        Face {
-            outline: Outline::Disc {
-                radius,
-                edge: 0.5,
-                crown: 1e6,
-            },
-            height_mm: 20.0,
-            tilt_sd_deg,
+    fn new(outline: Outline, height_mm: f64) -> Self {
+        Self {
+            outline,
+            height_mm,
+            tilt_sd_deg: 0.1,
             roughness: 1.0,
             flat: None,
+        }
+    }
+
+    /// A flat disc with a small edge, held to within this tilt.
+    pub(super) fn flat(radius_mm: f64, tilt_sd_deg: f64) -> Self {
+        let outline = FlatFace::Round { radius_mm }.outline(0.5, FLAT_CROWN_MM);
+        Self {
+            tilt_sd_deg,
+            ..Self::new(outline, 20.0)
         }
     }
 
     /// The face of a block.
     #[cfg(test)]
     pub(super) fn block(flat: FlatFace, height_mm: f64, edge_mm: f64) -> Self {
-        let object = Object {
-            solid: Solid::Flat {
-                family: Family::FlatBox,
-                face: flat,
-                height: height_mm,
-            },
-            edge_mm,
-            crown_mm: [FLAT_CROWN_MM; 3],
-        };
-        object.face(0)
+        Self {
+            flat: Some(flat),
+            ..Self::new(flat.outline(edge_mm, FLAT_CROWN_MM), height_mm)
+        }
     }
 
     /// The top of a ball.
     pub(super) fn ball(radius: f64) -> Self {
-        let outline = Outline::Ellipsoid {
-            x: radius,
-            y: radius,
-            z: radius,
-        };
-        Face {
-            outline,
-            height_mm: 2.0 * radius,
+        let [x, y, z] = [radius; 3];
+        Self {
             tilt_sd_deg: 0.0,
-            roughness: 1.0,
-            flat: None,
+            ..Self::new(Outline::Ellipsoid { x, y, z }, 2.0 * radius)
         }
     }
 
@@ -704,15 +652,10 @@ mod tests {
         let mut families = [0; Family::NAMES.len()];
         for k in 0..2000 {
             let object = Object::flat(&mut Stream::new(3, "flat").child(k));
-            let Solid::Flat {
-                family,
-                face,
-                height,
-            } = object.solid
-            else {
+            let Solid::Flat { face, height } = object.solid else {
                 panic!("{object:?} is not flat");
             };
-            families[family as usize] += 1;
+            families[object.family as usize] += 1;
             let narrow_mm = match face {
                 FlatFace::Rectangle { sides_mm: [a, b] } => a.min(b),
                 FlatFace::Round { radius_mm } => 2.0 * radius_mm,

@@ -22,7 +22,7 @@ pub(super) const CELLS: usize = 112;
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
 /// The JX255N's cover: E in MPa and thickness in mm (assumed: soft silicone).
-pub(super) const COVER_YOUNG_MPA: f64 = 3.0;
+const COVER_YOUNG_MPA: f64 = 3.0;
 const COVER_MM: f64 = 1.0;
 /// Poisson's ratio of every cover.
 const COVER_NU: f64 = 0.45;
@@ -34,12 +34,23 @@ pub(super) struct Cover {
     pub(super) thickness_mm: f64,
 }
 
+impl Default for Cover {
+    /// The cover of the JX255N.
+    fn default() -> Self {
+        Self {
+            young_mpa: COVER_YOUNG_MPA,
+            thickness_mm: COVER_MM,
+        }
+    }
+}
+
 impl Cover {
     /// A cover as thick as that of the JX255N.
+    #[cfg(test)]
     pub(super) fn of(young_mpa: f64) -> Self {
         Self {
             young_mpa,
-            thickness_mm: COVER_MM,
+            ..Self::default()
         }
     }
 
@@ -63,7 +74,8 @@ pub(super) struct Specimen {
     layer: Option<LayerKey>,
     /// What a block with free sides has beyond its layer.
     block: Option<Blocked>,
-    is_flat: bool,
+    /// Whether the face is flat.
+    pub(super) is_flat: bool,
 }
 
 /// A block under the sensor.
@@ -133,11 +145,6 @@ impl Specimen {
             block,
             is_flat: face.flat.is_some(),
         }
-    }
-
-    /// Whether the face is flat.
-    pub(super) fn is_flat(&self) -> bool {
-        self.is_flat
     }
 
     /// The plane-strain modulus E / (1 - nu^2), MPa.
@@ -380,7 +387,7 @@ pub(super) struct Step<'a> {
 impl Default for Bench {
     /// A bench for the default cover.
     fn default() -> Self {
-        Self::under(Cover::of(COVER_YOUNG_MPA))
+        Self::under(Cover::default())
     }
 }
 

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-pub(super) use self::design::Design;
+pub(super) use self::design::{BROAD_PITCHES_MM, Design};
 pub(super) use self::grid::Grid;
 use crate::random::Stream;
 use hardnessd_core::frame::{Array, Frame, RawFrame};

@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use super::body::{Body, draw_patch};
-use super::broad::{self, LawName, Laws};
+use super::broad::{self, LawName};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::level::Borders;
 use super::material::Material;
@@ -319,7 +319,7 @@ fn body(material: Option<Material>, draws: &Stream) -> Body {
     let mut draws = draws.child(3);
     match material {
         Some(material) => Body::named(material, &mut draws),
-        None => broad::draw(Laws::default(), Borders::Touching, &mut draws),
+        None => broad::draw(Borders::Touching, &mut draws),
     }
 }
 
@@ -356,88 +356,31 @@ impl Iterator for Sequence {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
-    use hardnessd_core::frame::{Array, Stamp};
-    use hardnessd_core::press::{self, Change, End, FrameAt, Marks, PressTracker};
-    use hardnessd_core::tare::{self, Tare};
 
-    /// The presses that the daemon sees with its default settings, each with its number of frames
-    /// in contact.
-    fn tracked(frames: &[SequenceFrame], rate_hz: f64) -> Vec<(u32, u64)> {
-        let calibration = tare::Settings {
-            tare_frames: 0,
-            ..tare::Settings::default()
-        };
-        let settings = press::Thresholds::default();
-        let contact = tare::Contact {
-            threshold_n: settings.contact_threshold_n,
-            area_taxels: settings.begin_area_taxels,
-        };
-        let tare = Tare::new(&calibration, Array::JX255N, contact);
-        let mut tracker = PressTracker::new(settings);
-        let mut seen = Vec::new();
-        for (number, frame) in (0_u32..).zip(frames) {
-            let mono = Duration::from_secs_f64(f64::from(number) / rate_hz);
-            let wall = jiff::Timestamp::UNIX_EPOCH;
-            let at = FrameAt {
-                frame: number.into(),
-                stamp: Stamp { mono, wall },
-            };
-            for change in tracker.push(&tare.apply(&frame.raw), Marks::default(), at) {
-                match change {
-                    Change::End {
-                        end: End::Release,
-                        frames,
-                        ..
-                    } => seen.push((frame.press, frames)),
-                    Change::Begin { .. } | Change::Settled { .. } => {}
-                    other => panic!("{other:?}"),
-                }
-            }
-        }
-        assert!(!tracker.is_pressed(), "the last press never ends");
-        seen
-    }
-
-    fn check(settings: &SequenceSettings) {
+    /// The frames of a sequence in which a tracker sees each press once, after enough rest.
+    fn check(settings: &SequenceSettings) -> Vec<SequenceFrame> {
         let rate = settings.frame_rate_hz;
-        let presses = settings.presses.unwrap();
-        let materials = settings.materials.clone();
-        let frames: Vec<SequenceFrame> = Sequence::new(settings.clone()).collect();
-        let expected: Vec<u32> = (1..=presses).collect();
-        let seen = tracked(&frames, rate);
-        let numbers: Vec<u32> = seen.iter().map(|&(press, _)| press).collect();
-        assert_eq!(numbers, expected, "{settings:?}");
-        // The presses are far shorter than 30 s, after which the daemon aborts a press.
-        assert!(seen.iter().all(|&(_, held)| (held as f64) < 15.0 * rate));
+        let sequence = Sequence::new(settings.clone());
+        let sensor = sequence.sensor.clone();
+        let frames: Vec<SequenceFrame> = sequence.collect();
         let first = frames.iter().position(|frame| frame.loaded).unwrap();
-        assert!(
-            first as f64 >= 10.0_f64.max(2.0 * rate),
-            "{first} frames of rest at {rate} Hz"
-        );
-        for frame in &frames {
-            assert!(
-                frame.loaded || frame.raw == RawFrame::default(),
-                "a count without load"
-            );
-            let material = frame
-                .press
-                .checked_sub(1)
-                .map(|k| materials[k as usize % materials.len()]);
-            assert_eq!(frame.material, material);
+        assert!(first as f64 >= 10.0_f64.max(2.0 * rate), "{first} frames");
+        for press in 1..=settings.presses.unwrap() {
+            let own = frames.iter().filter(|frame| frame.press == press);
+            let felt: Vec<_> = own.clone().map(|frame| sensor.felt(&frame.raw)).collect();
+            let seen = one_press(&felt, &sensor.thresholds(), 1.0 / rate);
+            let held = seen.expect("one press").contact.len();
+            // The presses are far shorter than 30 s, after which the daemon ends a press.
+            assert!((held as f64) < 15.0 * rate, "{held} frames");
+            let rest = own.clone().filter(|frame| !frame.loaded).count() as f64;
+            assert!(rest >= 5.0_f64.max(0.9 * rate), "{press} rests {rest}");
+            let material = settings.material(press);
+            assert!(own.clone().all(|frame| frame.material == material));
         }
-        for press in 1..=presses {
-            let rest = frames
-                .iter()
-                .filter(|frame| frame.press == press && !frame.loaded)
-                .count();
-            assert!(
-                rest as f64 >= 5.0_f64.max(0.9 * rate),
-                "press {press} rests {rest} frames"
-            );
-        }
+        let is_free = |frame: &SequenceFrame| frame.raw == RawFrame::default();
+        assert!(frames.iter().all(|frame| frame.loaded || is_free(frame)));
+        frames
     }
 
     #[test]
@@ -462,14 +405,12 @@ mod tests {
 
     #[test]
     fn a_longer_rest_comes_before_and_after_each_press() {
-        let settings = |rest_s| SequenceSettings {
+        let frames = check(&SequenceSettings {
             seed: 7,
             presses: Some(3),
-            rest_s,
+            rest_s: 30.0,
             ..SequenceSettings::default()
-        };
-        check(&settings(30.0));
-        let frames: Vec<SequenceFrame> = Sequence::new(settings(30.0)).collect();
+        });
         for press in 0..=3 {
             let own = frames.iter().filter(|frame| frame.press == press);
             let rests = own.filter(|frame| !frame.loaded).count();
@@ -541,12 +482,7 @@ mod tests {
             assert!(one.name.starts_with("random-"), "{one:?}");
             assert_eq!(one.level, crate::level_of(one.shore));
         }
-        let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
-        let numbers: Vec<u32> = tracked(&frames, 5.0)
-            .iter()
-            .map(|&(press, _)| press)
-            .collect();
-        assert_eq!(numbers, (1..=8).collect::<Vec<u32>>());
+        let frames = check(&settings);
         for frame in frames.iter().filter(|frame| frame.press > 0) {
             assert_eq!(frame.material.is_none(), frame.press > 4);
         }
@@ -562,31 +498,5 @@ mod tests {
         let run = |seed| Sequence::new(settings(seed)).collect::<Vec<_>>();
         assert_eq!(run(5), run(5));
         assert_ne!(run(5), run(6));
-    }
-
-    #[test]
-    #[ignore = "many presses, some 60 s: run it after a change of physics or sensor"]
-    fn a_tracker_sees_every_one_of_many_presses_once() {
-        for seed in 0..6 {
-            for frame_rate_hz in [5.0, 100.0] {
-                for (forces_n, profile, shapes) in [
-                    (vec![], SensorProfile::Clean, Shapes::Matched),
-                    (vec![1.0], SensorProfile::Raw, Shapes::Paper),
-                ] {
-                    check(&SequenceSettings {
-                        seed,
-                        frame_rate_hz,
-                        materials: Material::ALL.to_vec(),
-                        has_random: false,
-                        forces_n,
-                        presses: Some(40),
-                        rest_s: REST_S,
-                        shapes,
-                        profile,
-                        piece: None,
-                    });
-                }
-            }
-        }
     }
 }

@@ -4,11 +4,8 @@ use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
-use super::broad::Laws;
 use super::level::Borders;
-use super::material::{Material, Split};
 use super::object::Shapes;
-use super::press::COVER_YOUNG_MPA;
 use super::sensor::SensorProfile;
 
 /// The materials of the objects.
@@ -29,8 +26,6 @@ pub struct DatasetSettings {
     pub seed: u64,
     /// The materials of the objects.
     pub materials: Materials,
-    /// The laws that broad materials are drawn from.
-    pub laws: Laws,
     /// Whether broad materials avoid the levels' borders.
     pub borders: Borders,
     /// The number of objects of each training material. Broad materials have four times as many
@@ -50,19 +45,6 @@ pub struct DatasetSettings {
     pub shapes: Shapes,
     /// Spread of the sensors.
     pub profile: SensorProfile,
-    /// The seed of the sensors' gains, thresholds and dead taxels. `None` takes `seed`.
-    pub sensor_seed: Option<u64>,
-    /// Whether all presses of both splits are on one sensor.
-    pub one_sensor: bool,
-    /// Young's modulus of the sensors' cover, MPa.
-    pub cover_young_mpa: f64,
-    /// Whether the sensors are calibrated with weights: a count is then worth what makes the mean sum
-    /// the force, and not 0.04 N.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub calibrated: bool,
-    /// Whether the two materials of each level swap roles, from level 1. The paper's test material
-    /// then trains.
-    pub swapped_levels: [bool; 4],
 }
 
 impl Default for DatasetSettings {
@@ -71,7 +53,6 @@ impl Default for DatasetSettings {
         Self {
             seed: 0,
             materials: Materials::Named,
-            laws: Laws::default(),
             borders: Borders::Touching,
             objects: 50,
             test_objects: 5,
@@ -80,11 +61,6 @@ impl Default for DatasetSettings {
             lowest_force_n: 1.0,
             shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
-            sensor_seed: None,
-            one_sensor: false,
-            cover_young_mpa: COVER_YOUNG_MPA,
-            calibrated: false,
-            swapped_levels: [false; 4],
         }
     }
 }
@@ -95,30 +71,4 @@ impl DatasetSettings {
 
     /// The range of the least nominal force, N.
     pub const LOWEST_FORCES_N: RangeInclusive<f32> = 0.01..=25.0;
-
-    /// The range of the cover's Young's modulus, MPa: from that of a gel to that of a hard plastic.
-    pub const COVERS_MPA: RangeInclusive<f64> = 0.05..=100.0;
-
-    /// Whether the numbers of objects and presses, the least force and the cover lie within their
-    /// ranges.
-    pub fn is_possible(&self) -> bool {
-        self.objects.max(self.test_objects) <= Self::MOST
-            && (1..=Self::MOST).contains(&self.presses)
-            && Self::LOWEST_FORCES_N.contains(&self.lowest_force_n)
-            && Self::COVERS_MPA.contains(&self.cover_young_mpa)
-    }
-
-    /// The split of a material: the paper's, or the other one if the material's level is swapped.
-    /// An object's draws follow from the seed and the object's split, material and number. So all
-    /// data sets of a seed contain the same objects of a material if it has the same role.
-    pub fn split(&self, material: Material) -> Split {
-        if self.all_test {
-            return Split::Test;
-        }
-        let swapped = self.swapped_levels[usize::from(material.level()) - 1];
-        match (material.split(), swapped) {
-            (Split::Train, false) | (Split::Test, true) => Split::Train,
-            (Split::Test, false) | (Split::Train, true) => Split::Test,
-        }
-    }
 }

@@ -12,8 +12,6 @@ use super::broad;
 use super::level::LEVELS;
 use super::material::{Material, Split};
 use super::object::{Object, Shapes};
-use super::press::{Bench, Cover};
-use super::rigid::{self, Weight};
 use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
@@ -57,7 +55,13 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
     match settings.materials {
         Materials::Named => Material::ALL
             .into_iter()
-            .flat_map(|material| of(Origin::Named(material), settings.split(material)))
+            .flat_map(|material| {
+                let split = match settings.all_test {
+                    true => Split::Test,
+                    false => material.split(),
+                };
+                of(Origin::Named(material), split)
+            })
             .collect(),
         Materials::Broad => [Split::Train, Split::Test]
             .into_iter()
@@ -132,15 +136,6 @@ impl Draws {
     }
 }
 
-/// The weights that the sensors of these settings are calibrated with.
-pub(super) fn weights(settings: &DatasetSettings) -> Vec<Weight> {
-    if settings.calibrated {
-        rigid::weights(&mut Bench::under(Cover::of(settings.cover_young_mpa)))
-    } else {
-        Vec::new()
-    }
-}
-
 /// An object with its material and the sensor it is pressed on.
 pub(super) struct Subject {
     pub(super) split: Split,
@@ -152,31 +147,19 @@ pub(super) struct Subject {
 
 impl Subject {
     /// Draws a subject. A share of the objects has flat faces, whatever the shapes of the others.
-    pub(super) fn draw(
-        settings: &DatasetSettings,
-        unit: Unit,
-        weights: &[Weight],
-        flat_share: f64,
-    ) -> Self {
+    pub(super) fn draw(settings: &DatasetSettings, unit: Unit, flat_share: f64) -> Self {
         let draws = Draws::new(settings, unit);
         let mut hardness = draws.body.child(0);
         let body = match unit.origin {
             Origin::Named(material) => Body::named(material, &mut hardness),
-            Origin::Broad(_) => broad::draw(settings.laws, settings.borders, &mut hardness),
+            Origin::Broad(_) => broad::draw(settings.borders, &mut hardness),
         };
-        // Different stream names keep the splits' sensors apart, unless the setting asks for one
-        // sensor.
-        let (sensors, number) = match (settings.one_sensor, unit.split) {
-            (true, _) => ("one sensor", 0),
-            (false, Split::Train) => ("train sensor", unit.number % SENSORS),
-            (false, Split::Test) => ("test sensor", unit.number % SENSORS),
+        // Different stream names keep the splits' sensors apart.
+        let sensors = match unit.split {
+            Split::Train => "train sensor",
+            Split::Test => "test sensor",
         };
-        let sensor_seed = settings.sensor_seed.unwrap_or(settings.seed);
-        let of_sensor = Stream::new(sensor_seed, sensors).child(u64::from(number));
-        let mut sensor = Sensor::new(settings.profile, &of_sensor);
-        if settings.calibrated {
-            sensor.calibrate(weights);
-        }
+        let of_sensor = Stream::new(settings.seed, sensors).child((unit.number % SENSORS).into());
         let object = if draws.geometry.child(4).uniform() < flat_share {
             Object::flat(&mut draws.geometry.child(5))
         } else {
@@ -186,7 +169,7 @@ impl Subject {
             split: unit.split,
             object,
             body,
-            sensor,
+            sensor: Sensor::new(settings.profile, &of_sensor),
             draws,
         }
     }
@@ -198,14 +181,10 @@ mod tests {
 
     #[test]
     fn test_objects_are_paired_over_materials_but_for_the_papers_shapes() {
-        for (shapes, is_paired) in [
-            (Shapes::Matched, true),
-            (Shapes::Wide, true),
-            (Shapes::Flat, true),
-            (Shapes::Paper, false),
-        ] {
+        let foam = Origin::Named(Material::Foam);
+        let mat = Origin::Named(Material::YogaMat);
+        for shapes in [Shapes::Matched, Shapes::Wide, Shapes::Flat, Shapes::Paper] {
             let settings = DatasetSettings {
-                seed: 3,
                 shapes,
                 ..DatasetSettings::default()
             };
@@ -218,19 +197,10 @@ mod tests {
                 let stream = &mut Draws::new(&settings, unit).geometry.child(0);
                 format!("{:?}", Object::draw(shapes, 4, stream))
             };
-            for (one, other) in [
-                (
-                    Origin::Named(Material::Foam),
-                    Origin::Named(Material::YogaMat),
-                ),
-                (Origin::Broad(2), Origin::Broad(4)),
-            ] {
+            for [one, other] in [[foam, mat], [Origin::Broad(2), Origin::Broad(4)]] {
                 let first = draw(one, Split::Test, 1);
-                assert_eq!(
-                    first == draw(other, Split::Test, 1),
-                    is_paired,
-                    "{shapes:?}"
-                );
+                let is_paired = first == draw(other, Split::Test, 1);
+                assert_eq!(is_paired, shapes != Shapes::Paper, "{shapes:?}");
                 assert_ne!(first, draw(one, Split::Test, 0));
                 let train = draw(one, Split::Train, 1);
                 assert_ne!(train, draw(other, Split::Train, 1));

@@ -140,14 +140,4 @@ mod tests {
             );
         }
     }
-
-    #[test]
-    fn interpolation_passes_through_the_grid() {
-        let texture = Material::Foam.properties().substance.texture;
-        let patch = Patch::new(&texture, 1.0, 0.875, &mut Stream::new(3, "texture"));
-        for (i, j) in [(0, 0), (5, 127), (77, 3)] {
-            let at = patch.height_mm(0.875 * j as f64, 0.875 * i as f64);
-            assert!((at - patch.heights_mm[i * WIDTH + j]).abs() < 1e-6);
-        }
-    }
 }

@@ -9,13 +9,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-use super::{CourseSettings, LabelledCourse, Plan, Reading, read_press};
+use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading, read_press};
 use crate::material::Split;
 use crate::object::Family;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
-use crate::rigid::{self, FLAT_MM, Reference, Weight};
-use crate::sensor::{Design, Sensor};
+use crate::rigid::{self, FLAT_MM, Reference};
+use crate::sensor::{BROAD_PITCHES_MM, Design, Sensor};
 use crate::settings::DatasetSettings;
 use crate::solved::SolvedPress;
 use crate::subject::{Subject, Unit, shared_out, units};
@@ -45,10 +45,6 @@ pub struct BroadSensors {
     pub test_covers: u32,
     /// The number of electronics that read the presses on each cover.
     pub electronics: u32,
-    /// The part of the covers that is made, from 0, of `shards` parts.
-    pub shard: u32,
-    /// The number of parts.
-    pub shards: u32,
 }
 
 impl Default for BroadSensors {
@@ -59,14 +55,12 @@ impl Default for BroadSensors {
             covers: 200,
             test_covers: 20,
             electronics: 8,
-            shard: 0,
-            shards: 1,
         }
     }
 }
 
 /// Presses of each rigid piece on each sensor.
-pub const REFERENCES: u32 = 5;
+const REFERENCES: u32 = 5;
 /// Their forces, N: log-uniform, one in each fifth of this range.
 const REFERENCE_N: [f64; 2] = [3.0, 25.0];
 /// Radius of the rigid ball of a cover, mm.
@@ -77,6 +71,8 @@ const COVER_MM: [f64; 2] = [0.5, 8.0];
 /// The factor on the newtons of the sensors whose users state wrong ones, and how many these are.
 const WRONG: [f64; 2] = [0.5, 2.0];
 const WRONG_SHARE: f64 = 0.5;
+/// The most by which the reported stiffness of a sensor's arm is off, relatively.
+const ARM_ERROR: f64 = 0.15;
 
 /// One cover with the objects that are pressed on it.
 #[derive(Clone, Copy)]
@@ -87,35 +83,18 @@ struct Place {
     index: u32,
 }
 
-/// What a sensor of a data set is, as far as studies ask.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct SensorSummary {
-    /// Its number in the data set.
-    pub sensor: u32,
-    /// Distance between its taxels, mm.
-    pub pitch_mm: f64,
-    /// Whether its reading grows linearly with the force.
-    pub linear: bool,
-    /// The greatest share that an unloading taxel reads too much.
-    pub hysteresis: f32,
-    /// Young's modulus of its cover, MPa.
-    pub cover_mpa: f64,
-    /// Thickness of its cover, mm.
-    pub cover_mm: f64,
-}
-
 impl SensorDesigns {
     /// The distances between the taxels of the sensors, in mm.
     pub fn pitches_mm(self) -> [f64; 2] {
         match self {
-            Self::Broad => Design::BROAD_PITCHES_MM,
+            Self::Broad => BROAD_PITCHES_MM,
             Self::Jx255n => [Pitch::JX255N.rows_mm; 2],
         }
     }
 }
 
 impl BroadSensors {
-    /// The covers of this shard that objects are pressed on, and the number of all covers.
+    /// The covers that objects are pressed on.
     fn places(&self, of: &DatasetSettings) -> Vec<Place> {
         let train = self.covers.min(of.objects);
         let test = self.test_covers.min(of.test_objects);
@@ -128,7 +107,6 @@ impl BroadSensors {
         };
         of_split(Split::Train, 0, train)
             .chain(of_split(Split::Test, train, test))
-            .filter(|place| place.index % self.shards == self.shard)
             .collect()
     }
 
@@ -159,60 +137,6 @@ impl CourseSettings {
         places.iter().map(contacts).sum::<u64>() * u64::from(sensors.electronics)
     }
 
-    /// The sensors of this shard, whose number is that of a press's sensor. Empty if the settings
-    /// have one kind of sensor.
-    pub fn sensors(&self) -> Vec<SensorSummary> {
-        let Some(sensors) = &self.sensors else {
-            return Vec::new();
-        };
-        let summary = |place: Place, k: u32| {
-            let draws = self.draws(place);
-            let cover = self.cover(sensors.designs, &mut draws.child(0));
-            let electronics = draws.child(1).child(u64::from(k));
-            let design = self.design(sensors.designs, cover, &electronics);
-            SensorSummary {
-                sensor: place.index * sensors.electronics + k,
-                pitch_mm: design.pitch_mm,
-                linear: design.is_linear(),
-                hysteresis: design.hysteresis,
-                cover_mpa: cover.young_mpa,
-                cover_mm: cover.thickness_mm,
-            }
-        };
-        let places = sensors.places(&self.objects).into_iter();
-        places
-            .flat_map(|place| (0..sensors.electronics).map(move |k| summary(place, k)))
-            .collect()
-    }
-
-    fn draws(&self, place: Place) -> Stream {
-        let name = match place.split {
-            Split::Train => "train covers",
-            Split::Test => "test covers",
-        };
-        let seed = self.objects.sensor_seed.unwrap_or(self.objects.seed);
-        Stream::new(seed, name).child(u64::from(place.number))
-    }
-
-    fn cover(&self, designs: SensorDesigns, own: &mut Stream) -> Cover {
-        // Drawn for every design, so that what is drawn after it does not depend on the design.
-        let drawn = Cover {
-            young_mpa: log_even(COVER_MPA, own),
-            thickness_mm: log_even(COVER_MM, own),
-        };
-        match designs {
-            SensorDesigns::Broad => drawn,
-            SensorDesigns::Jx255n => Cover::of(self.objects.cover_young_mpa),
-        }
-    }
-
-    fn design(&self, designs: SensorDesigns, cover: Cover, electronics: &Stream) -> Design {
-        match designs {
-            SensorDesigns::Broad => Design::broad(cover.thickness_mm, &mut electronics.child(0)),
-            SensorDesigns::Jx255n => Design::jx255n(self.objects.profile),
-        }
-    }
-
     /// The names that a press's `material` indexes.
     pub fn material_names(&self) -> Vec<&'static str> {
         let mut names = crate::material_names(self.objects.materials);
@@ -221,7 +145,7 @@ impl CourseSettings {
     }
 }
 
-/// Simulates the presses of one shard; see [`super::courses()`].
+/// Simulates the presses; see [`super::courses()`].
 pub(super) fn courses(
     settings: &CourseSettings,
     sensors: &BroadSensors,
@@ -255,6 +179,7 @@ struct Station {
     place: Place,
     draws: Stream,
     bench: Bench,
+    arm_n_per_mm: f64,
     ball_mm: f64,
     electronics: Vec<Electronics>,
 }
@@ -268,60 +193,69 @@ struct Electronics {
 }
 
 impl Electronics {
-    fn draw(
-        settings: &CourseSettings,
-        designs: SensorDesigns,
-        number: u32,
-        (cover, weights): (Cover, &[Weight]),
-        draws: &Stream,
-    ) -> Self {
-        let is_broad = designs == SensorDesigns::Broad;
-        let design = settings.design(designs, cover, draws);
-        let mut sensor = Sensor::draw(design, &draws.child(1));
-        sensor.calibrate(weights);
-        let mut own = draws.child(2);
-        let wrong = log_even(WRONG, &mut own);
-        if own.uniform() < WRONG_SHARE && is_broad {
-            sensor.newtons_per_count *= wrong as f32;
-        }
-        Self {
-            number,
-            sensor,
-            period_s: 1.0 / log_even(settings.frame_rate_hz, &mut own),
-            arm_factor: 1.0 + own.range(-settings.arm_error, settings.arm_error),
-        }
-    }
-
-    /// How these electronics read a press of this plan.
-    fn reading(&self, plan: &Plan, noise: &mut Stream) -> Reading {
-        let mut reading = plan.reading;
-        reading.period_s = self.period_s;
-        reading.phase = noise.uniform();
-        reading.errors.arm_factor = self.arm_factor;
-        reading
+    /// A press of this plan as these electronics and the robot give it.
+    fn course(
+        &self,
+        plan: &Plan,
+        solved: &SolvedPress,
+        force_n: f64,
+        noise: &mut Stream,
+    ) -> Option<LabelledCourse> {
+        let reading = Reading {
+            period_s: self.period_s,
+            phase: noise.uniform(),
+        };
+        let read = read_press(&self.sensor, solved, reading, noise)?;
+        Some(LabelledCourse {
+            sensor: self.number,
+            arm_n_per_mm: (plan.arm.n_per_mm * self.arm_factor) as f32,
+            ..plan.course(reading, force_n, read)
+        })
     }
 }
 
 impl Station {
     fn draw(settings: &CourseSettings, sensors: &BroadSensors, place: Place) -> Self {
-        let draws = settings.draws(place);
+        let name = match place.split {
+            Split::Train => "train covers",
+            Split::Test => "test covers",
+        };
+        let draws = Stream::new(settings.objects.seed, name).child(place.number.into());
         let mut own = draws.child(0);
-        let cover = settings.cover(sensors.designs, &mut own);
-        let arm_n_per_mm = log_even(settings.arm_n_per_mm, &mut own);
+        let is_broad = sensors.designs == SensorDesigns::Broad;
+        // Drawn for every design, so that what is drawn after it does not depend on the design.
+        let drawn = Cover {
+            young_mpa: log_even(COVER_MPA, &mut own),
+            thickness_mm: log_even(COVER_MM, &mut own),
+        };
+        let cover = if is_broad { drawn } else { Cover::default() };
+        let arm_n_per_mm = log_even(ARM_N_PER_MM, &mut own);
         let mut bench = Bench::under(cover);
         let weights = rigid::weights(&mut bench);
         let electronics = |k: u32| {
-            let draws = draws.child(1).child(u64::from(k));
-            let number = place.index * sensors.electronics + k;
-            let under = (cover, weights.as_slice());
-            Electronics::draw(settings, sensors.designs, number, under, &draws)
+            let draws = draws.child(1).child(k.into());
+            let design = match sensors.designs {
+                SensorDesigns::Broad => Design::broad(cover.thickness_mm, &mut draws.child(0)),
+                SensorDesigns::Jx255n => Design::jx255n(settings.objects.profile),
+            };
+            let mut sensor = Sensor::draw(design, &draws.child(1));
+            sensor.calibrate(&weights);
+            let mut own = draws.child(2);
+            let wrong = log_even(WRONG, &mut own);
+            if own.uniform() < WRONG_SHARE && is_broad {
+                sensor.newtons_per_count *= wrong as f32;
+            }
+            Electronics {
+                number: place.index * sensors.electronics + k,
+                sensor,
+                period_s: 1.0 / log_even(settings.frame_rate_hz, &mut own),
+                arm_factor: 1.0 + own.range(-ARM_ERROR, ARM_ERROR),
+            }
         };
         Self {
-            settings: CourseSettings {
-                arm_n_per_mm: [arm_n_per_mm; 2],
-                ..*settings
-            },
+            settings: *settings,
             place,
+            arm_n_per_mm,
             ball_mm: log_even(BALL_MM, &mut own),
             electronics: (0..sensors.electronics).map(electronics).collect(),
             draws,
@@ -329,21 +263,24 @@ impl Station {
         }
     }
 
+    fn plan(&self, stream: &mut Stream) -> Plan {
+        Plan::draw(&self.settings, [self.arm_n_per_mm; 2], stream)
+    }
+
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
     fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
-        let pieces = [Reference::Flat { width_mm }, Reference::Ball { radius_mm }];
+        let flat = (Reference::Flat { width_mm }, Family::Disc);
+        let ball = (Reference::Ball { radius_mm }, Family::Ball);
         let material = self.settings.material_names().len() as u8 - 1;
         let mut made = Vec::new();
-        for (piece, reference) in (0_u32..).zip(pieces) {
+        for (piece, (reference, family)) in (0_u32..).zip([flat, ball]) {
             let face = rigid::face(reference);
             for press in 0..REFERENCES {
-                let draws = self
-                    .draws
-                    .child(2)
-                    .child((piece * REFERENCES + press).into());
+                let number = piece * REFERENCES + press;
+                let draws = self.draws.child(2).child(number.into());
                 let mut own = draws.child(0);
-                let plan = Plan::draw(&self.settings, &mut own);
+                let plan = self.plan(&mut own);
                 let part = (f64::from(press) + own.uniform()) / f64::from(REFERENCES);
                 let [least, most] = REFERENCE_N;
                 let force_n = least * (most / least).powf(part);
@@ -351,30 +288,16 @@ impl Station {
                 let (arm, hold_s) = (plan.arm, plan.hold_s);
                 let solved = SolvedPress::new(&mut self.bench, &specimen, arm, force_n, hold_s);
                 for electronics in &self.electronics {
-                    let mut noise = draws.child(2).child(u64::from(electronics.number));
-                    let reading = electronics.reading(&plan, &mut noise);
+                    let mut noise = draws.child(2).child(electronics.number.into());
+                    let press = electronics.course(&plan, &solved, force_n, &mut noise);
                     progress();
-                    let read = read_press(&electronics.sensor, &solved, &reading, &mut noise);
-                    made.extend(read.map(|read| LabelledCourse {
-                        moments: read.moments,
-                        best: read.best,
-                        arm_n_per_mm: plan.reported_n_per_mm(&reading),
-                        level: 0,
+                    made.extend(press.map(|press| LabelledCourse {
                         object: objects + 2 * self.place.index + piece,
                         material,
-                        force_n: force_n as f32,
                         split: self.place.split,
-                        shore: f32::NAN,
-                        sensor: electronics.number,
                         reference: Some(reference),
-                        family: match reference {
-                            Reference::Flat { .. } => Family::Disc,
-                            Reference::Ball { .. } => Family::Ball,
-                        },
-                        layered: false,
-                        young_mpa: f32::INFINITY,
-                        frame_rate_hz: (1.0 / reading.period_s) as f32,
-                        speed_mm_s: plan.arm.speed_mm_s as f32,
+                        family,
+                        ..press
                     }));
                 }
             }
@@ -386,21 +309,16 @@ impl Station {
     /// for these.
     fn object(&mut self, object: u32, unit: Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let flat_share = self.settings.flat_share();
-        let subject = Subject::draw(&self.settings.objects, unit, &[], flat_share);
+        let subject = Subject::draw(&self.settings.objects, unit, flat_share);
         let mut made = Vec::new();
         for press in 0..u64::from(self.settings.objects.presses) {
-            let mut paired = subject.draws.geometry.child(3).child(press);
-            let plan = Plan::draw(&self.settings, &mut paired);
+            let plan = self.plan(&mut subject.draws.geometry.child(3).child(press));
             let electronics = &self.electronics;
             let read = subject.pressed(&mut self.bench, &plan, press, |solved, force_n, noise| {
                 let of = |electronics: &Electronics| {
-                    let mut noise = noise.child(u64::from(electronics.number));
-                    let reading = electronics.reading(&plan, &mut noise);
-                    let read = read_press(&electronics.sensor, solved, &reading, &mut noise)?;
-                    Some(LabelledCourse {
-                        sensor: electronics.number,
-                        ..subject.labelled(&plan, &reading, object, force_n, read)
-                    })
+                    let mut noise = noise.child(electronics.number.into());
+                    let press = electronics.course(&plan, solved, force_n, &mut noise)?;
+                    Some(subject.labelled(object, press))
                 };
                 Some(electronics.iter().filter_map(of).collect::<Vec<_>>())
             });

@@ -23,7 +23,7 @@ pub(crate) struct Design {
     /// Time constant of the film's delay, s.
     pub(super) lag_s: f32,
     /// The greatest share that an unloading taxel reads too much.
-    pub(crate) hysteresis: f32,
+    pub(super) hysteresis: f32,
     /// The share of its force that a taxel gives to each of its four neighbours, through the cover.
     pub(super) crosstalk_neighbour: f32,
     /// The share of its force that the loaded taxels of its row and column read.
@@ -114,39 +114,10 @@ impl SensorProfile {
     }
 }
 
-/// The ranges of a broad design. Forces are those of a taxel 3.5 mm wide; wider taxels have more,
-/// by area. `results/simulator.md` gives their sources.
-pub(super) mod ranges {
-    pub(crate) const PITCH_MM: [f64; 2] = [2.0, 7.0];
-    pub(crate) const ACTIVE_SHARE: [f64; 2] = [0.6, 1.0];
-    /// Depth of stress in the cover, over the cover's thickness. The stiff base of a thin cover keeps
-    /// stress from spreading as far as in a thick one.
-    pub(crate) const DEPTH: [f64; 2] = [0.3, 1.0];
-    pub(crate) const EXPONENT: [f64; 2] = [0.6, 1.7];
-    pub(crate) const MOST_N: [f64; 2] = [1.5, 30.0];
-    pub(crate) const THRESHOLD_N: [f64; 2] = [0.01, 0.25];
-    /// Spread of the thresholds' logarithms.
-    pub(crate) const THRESHOLD_SIGMA: [f64; 2] = [0.15, 0.5];
-    pub(crate) const COUNT_N: [f64; 2] = [0.005, 0.1];
-    pub(crate) const LAG_S: [f64; 2] = [0.0, 0.08];
-    pub(crate) const HYSTERESIS: [f64; 2] = [0.0, 0.3];
-    pub(crate) const NEIGHBOUR: [f64; 2] = [0.0, 0.04];
-    pub(crate) const LINE: [f64; 2] = [0.0, 0.01];
-    pub(crate) const CREEP: [[f64; 2]; 2] = [[0.0, 0.08], [0.0, 0.1]];
-    pub(crate) const CREEP_S: [[f64; 2]; 2] = [[0.2, 1.0], [4.0, 16.0]];
-    pub(crate) const NOISE: [f64; 2] = [0.003, 0.03];
-    pub(crate) const NOISE_N: [f64; 2] = [0.002, 0.04];
-    /// The mean counts at rest, as a share of the full scale, and their spread as a share of the mean.
-    pub(crate) const REST: [f64; 2] = [0.002, 0.075];
-    pub(crate) const REST_SPREAD: [f64; 2] = [0.05, 0.5];
-    pub(crate) const DEAD: [f64; 2] = [0.0, 0.02];
-    pub(crate) const TAXEL: [f64; 2] = [0.02, 0.2];
-    pub(crate) const ROW: [f64; 2] = [0.0, 0.06];
-    pub(crate) const PRESS: [f64; 2] = [0.0, 0.16];
-}
-
+/// The distances between the taxels of broad designs, mm.
+pub(crate) const BROAD_PITCHES_MM: [f64; 2] = [2.0, 7.0];
 /// Thickness of the foil over the film.
-pub(super) const FOIL_MM: f64 = 0.3;
+const FOIL_MM: f64 = 0.3;
 /// The probabilities of the responses: linear, a power, one that levels. The others fall.
 const RESPONSES: [f64; 3] = [0.2, 0.35, 0.35];
 /// The share of the arrays without an activation threshold, whose every taxel has noise.
@@ -159,9 +130,6 @@ const LEAST_WIDTH_MM: f64 = 50.0;
 const COARSE_COUNT_N: f64 = 0.04;
 
 impl Design {
-    /// The distances between the taxels of broad designs.
-    pub(crate) const BROAD_PITCHES_MM: [f64; 2] = ranges::PITCH_MM;
-
     /// The simulated JX255N.
     pub(crate) fn jx255n(profile: SensorProfile) -> Self {
         Self {
@@ -195,10 +163,6 @@ impl Design {
         read.round().clamp(0.0, f32::from(self.full_scale_counts))
     }
 
-    pub(crate) fn is_linear(&self) -> bool {
-        self.response == Response::Linear
-    }
-
     /// How long the film is not settled after its load has gone, s.
     pub(crate) fn settled_s(&self) -> f64 {
         5.0 * f64::from(self.lag_s)
@@ -225,11 +189,10 @@ impl Design {
         }
     }
 
-    /// Draws the design of a sensor under a cover of this thickness.
+    /// Draws the design of a sensor under a cover of this thickness. The ranges of forces are those of a
+    /// taxel 3.5 mm wide; wider taxels have more, by area. `results/simulator.md` gives the sources.
     pub(crate) fn broad(cover_mm: f64, stream: &mut Stream) -> Self {
-        use ranges::*;
-        let even = |[low, high]: [f64; 2], stream: &mut Stream| stream.range(low, high);
-        let pitch_mm = log_even(PITCH_MM, stream);
+        let pitch_mm = log_even(BROAD_PITCHES_MM, stream);
         let area = (pitch_mm / Pitch::JX255N.rows_mm).powi(2);
         let whole = CELLS as f64 * CELL_MM;
         let is_small = stream.uniform() < SMALL_SHARE;
@@ -237,8 +200,8 @@ impl Design {
         let side = (if is_small { width_mm } else { whole } / pitch_mm).round() as usize;
         let side = side.min(MOST_SIDE);
         let kind = stream.uniform();
-        let exponent = log_even(EXPONENT, stream) as f32;
-        let most_n = (area * log_even(MOST_N, stream)) as f32;
+        let exponent = log_even([0.6, 1.7], stream) as f32;
+        let most_n = (area * log_even([1.5, 30.0], stream)) as f32;
         let [linear, power, levels] = RESPONSES;
         let response = if kind < linear {
             Response::Linear
@@ -250,21 +213,25 @@ impl Design {
         } else {
             Response::Falls { most_n }
         };
-        let threshold_n = area * log_even(THRESHOLD_N, stream);
-        let sigma = even(THRESHOLD_SIGMA, stream);
-        let count_n = log_even(COUNT_N, stream);
-        let creep = |k: usize, stream: &mut Stream| {
-            let (share, tau_s) = (even(CREEP[k], stream), log_even(CREEP_S[k], stream));
-            (share as f32, tau_s as f32)
-        };
+        let threshold_n = area * log_even([0.01, 0.25], stream);
+        // The spread of the thresholds' logarithms.
+        let sigma = stream.range(0.15, 0.5);
+        let count_n = log_even([0.005, 0.1], stream);
         let full_scale_counts = if count_n < COARSE_COUNT_N { 4095 } else { 255 };
         let mut of_rest = stream.child(0);
-        let counts = f64::from(full_scale_counts) * log_even(REST, &mut of_rest);
+        let counts = f64::from(full_scale_counts) * log_even([0.002, 0.075], &mut of_rest);
         let rest = Rest {
             counts,
-            spread: counts * even(REST_SPREAD, &mut of_rest),
+            spread: counts * of_rest.range(0.05, 0.5),
         };
         let is_restless = of_rest.uniform() < RESTLESS_SHARE;
+        let active_mm = pitch_mm * stream.range(0.6, 1.0);
+        // The stiff base of a thin cover keeps stress from spreading as far as in a thick one.
+        let depth_mm = FOIL_MM + cover_mm * log_even([0.3, 1.0], stream);
+        let mut creep = |share: [f64; 2], tau_s: [f64; 2]| {
+            let share = stream.range(share[0], share[1]) as f32;
+            (share, log_even(tau_s, stream) as f32)
+        };
         Self {
             rest: is_restless.then_some(rest),
             array: Array {
@@ -272,27 +239,30 @@ impl Design {
                 cols: side,
             },
             pitch_mm,
-            active_mm: pitch_mm * even(ACTIVE_SHARE, stream),
-            depth_mm: FOIL_MM + cover_mm * log_even(DEPTH, stream),
+            active_mm,
+            depth_mm,
             response,
-            creep: [creep(0, stream), creep(1, stream)],
-            lag_s: even(LAG_S, stream) as f32,
-            hysteresis: even(HYSTERESIS, stream) as f32,
-            crosstalk_neighbour: even(NEIGHBOUR, stream) as f32,
-            crosstalk_line: even(LINE, stream) as f32,
-            noise_ratio: log_even(NOISE, stream),
-            noise_n: area * log_even(NOISE_N, stream),
-            dead_share: even(DEAD, stream),
+            creep: [
+                creep([0.0, 0.08], [0.2, 1.0]),
+                creep([0.0, 0.1], [4.0, 16.0]),
+            ],
+            lag_s: stream.range(0.0, 0.08) as f32,
+            hysteresis: stream.range(0.0, 0.3) as f32,
+            crosstalk_neighbour: stream.range(0.0, 0.04) as f32,
+            crosstalk_line: stream.range(0.0, 0.01) as f32,
+            noise_ratio: log_even([0.003, 0.03], stream),
+            noise_n: area * log_even([0.002, 0.04], stream),
+            dead_share: stream.range(0.0, 0.02),
             threshold_median_n: threshold_n,
             threshold_bound_n: threshold_n * (3.0 * sigma).exp(),
             count_n: (area * count_n) as f32,
             full_scale_counts,
             least_counts: if stream.uniform() < 0.5 { 1.0 } else { 2.0 },
             spread: Spread {
-                taxel: even(TAXEL, stream),
-                row: even(ROW, stream),
-                column: even(ROW, stream),
-                press: even(PRESS, stream),
+                taxel: stream.range(0.02, 0.2),
+                row: stream.range(0.0, 0.06),
+                column: stream.range(0.0, 0.06),
+                press: stream.range(0.0, 0.16),
             },
         }
     }

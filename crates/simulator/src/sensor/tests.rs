@@ -1,4 +1,3 @@
-use super::design::{FOIL_MM, Response, ranges};
 use super::*;
 use crate::press::{CELL_MM, Window};
 
@@ -33,25 +32,9 @@ const WINDOW: Window = Window {
 };
 
 #[test]
-fn taxel_forces_add_up_to_the_force_at_every_pitch() {
+fn taxel_forces_add_up_to_the_force_in_its_place_at_every_pitch() {
     let (pressure, force) = smooth_load();
-    for pitch_mm in [1.75, 2.0, 2.9, 3.5, 4.4, 5.0, 7.0] {
-        let design = Design::jx255n(SensorProfile::Clean).at_pitch(pitch_mm);
-        let taxels = Grid::new(&design).taxel_forces(&pressure, WINDOW);
-        let sum: f64 = taxels.iter().map(|&f| f64::from(f)).sum();
-        // Cells have rounded places where they do not fit into the taxels.
-        let slack = if pitch_mm == 3.5 { 2e-3 } else { 0.02 };
-        assert!(
-            (sum / force - 1.0).abs() < slack,
-            "{pitch_mm} mm: {sum} N of {force} N"
-        );
-    }
-}
-
-#[test]
-fn a_load_stays_at_its_place_at_every_pitch() {
-    let (pressure, _) = smooth_load();
-    for pitch_mm in [1.75, 2.3, 3.5, 5.5, 7.0] {
+    for pitch_mm in [1.75, 2.3, 2.9, 3.5, 4.4, 5.5, 7.0] {
         let grid = Grid::new(&Design::jx255n(SensorProfile::Clean).at_pitch(pitch_mm));
         let taxels = grid.taxel_forces(&pressure, WINDOW);
         let (mut moment, mut sum) = (0.0, 0.0);
@@ -61,6 +44,9 @@ fn a_load_stays_at_its_place_at_every_pitch() {
             moment += f64::from(force) * from_middle * pitch_mm;
             sum += f64::from(force);
         }
+        // Cells have rounded places where they do not fit into the taxels.
+        let slack = if pitch_mm == 3.5 { 2e-3 } else { 0.02 };
+        assert!((sum / force - 1.0).abs() < slack, "{pitch_mm} mm: {sum} N");
         // The load's middle is cell 24 of the window.
         let expected = (30.0 + 24.5) * CELL_MM - 49.0;
         let found = moment / sum;
@@ -69,27 +55,6 @@ fn a_load_stays_at_its_place_at_every_pitch() {
             "{pitch_mm} mm: at {found}, not {expected}"
         );
     }
-}
-
-#[test]
-fn responses_are_as_they_are_named() {
-    let read = |response: Response, forces: [f32; 4]| forces.map(|force| response.of(force));
-    assert_eq!(
-        read(Response::Linear, [0.0, 1.0, 3.0, 9.0]),
-        [0.0, 1.0, 3.0, 9.0]
-    );
-    let power = Response::Power {
-        exponent: 0.5,
-        unit_n: 4.0,
-    };
-    assert_eq!(read(power, [0.0, 1.0, 4.0, 16.0]), [0.0, 2.0, 4.0, 8.0]);
-    let levels = read(Response::Levels { most_n: 3.0 }, [0.0, 3.0, 30.0, 3e6]);
-    assert!(levels.is_sorted() && levels[1] == 1.5 && (2.99..=3.0).contains(&levels[3]));
-    let falls = read(Response::Falls { most_n: 3.0 }, [0.3, 3.0, 6.0, 12.0]);
-    assert!(
-        falls[..3].is_sorted() && falls[2] == 3.0 && falls[3] < 2.5,
-        "{falls:?}"
-    );
 }
 
 #[test]
@@ -112,91 +77,6 @@ fn an_unloading_taxel_reads_late_and_too_much() {
     assert!(late[0] < 0.7 && late[4] > 0.3, "{late:?}");
     let free = read(&design, &[&course[..], &[0.0; 10]].concat());
     assert_eq!(free[15], 0.0);
-}
-
-#[test]
-fn broad_designs_draw_every_property_within_its_range() {
-    let cover_mm = 2.0;
-    let designs: Vec<Design> = (0..2000)
-        .map(|k| Design::broad(cover_mm, &mut Stream::new(3, "designs").child(k)))
-        .collect();
-    type Property = (&'static str, [f64; 2], fn(&Design) -> Option<f64>);
-    let properties: [Property; 22] = [
-        ("pitch", ranges::PITCH_MM, |d| Some(d.pitch_mm)),
-        ("active", ranges::ACTIVE_SHARE, |d| {
-            Some(d.active_mm / d.pitch_mm)
-        }),
-        ("depth", ranges::DEPTH, |d| {
-            Some((d.depth_mm - FOIL_MM) / 2.0)
-        }),
-        ("exponent", ranges::EXPONENT, |d| match d.response {
-            Response::Power { exponent, .. } => Some(exponent.into()),
-            _ => None,
-        }),
-        ("levels", ranges::MOST_N, |d| match d.response {
-            Response::Levels { most_n } => Some(of_area(d, most_n.into())),
-            _ => None,
-        }),
-        ("falls", ranges::MOST_N, |d| match d.response {
-            Response::Falls { most_n } => Some(of_area(d, most_n.into())),
-            _ => None,
-        }),
-        ("threshold", ranges::THRESHOLD_N, |d| {
-            Some(of_area(d, d.threshold_median_n))
-        }),
-        ("count", ranges::COUNT_N, |d| {
-            Some(of_area(d, d.count_n.into()))
-        }),
-        ("lag", ranges::LAG_S, |d| Some(d.lag_s.into())),
-        ("hysteresis", ranges::HYSTERESIS, |d| {
-            Some(d.hysteresis.into())
-        }),
-        ("neighbour", ranges::NEIGHBOUR, |d| {
-            Some(d.crosstalk_neighbour.into())
-        }),
-        ("line", ranges::LINE, |d| Some(d.crosstalk_line.into())),
-        ("creep", ranges::CREEP[0], |d| Some(d.creep[0].0.into())),
-        ("slow creep", ranges::CREEP[1], |d| {
-            Some(d.creep[1].0.into())
-        }),
-        ("noise", ranges::NOISE, |d| Some(d.noise_ratio)),
-        ("noise in N", ranges::NOISE_N, |d| {
-            Some(of_area(d, d.noise_n))
-        }),
-        ("rest", ranges::REST, |d| {
-            Some(d.rest?.counts / f64::from(d.full_scale_counts))
-        }),
-        ("dead", ranges::DEAD, |d| Some(d.dead_share)),
-        ("taxel", ranges::TAXEL, |d| Some(d.spread.taxel)),
-        ("row", ranges::ROW, |d| Some(d.spread.row)),
-        ("column", ranges::ROW, |d| Some(d.spread.column)),
-        ("press", ranges::PRESS, |d| Some(d.spread.press)),
-    ];
-    for (name, [low, high], of) in properties {
-        let found: Vec<f64> = designs.iter().filter_map(of).collect();
-        let least = found.iter().copied().fold(f64::INFINITY, f64::min);
-        let most = found.iter().copied().fold(0.0, f64::max);
-        let slack = 1e-4 * high;
-        assert!(
-            least >= low - slack && most <= high + slack,
-            "{name}: {least} to {most}"
-        );
-        let near = 0.1 * (high - low);
-        assert!(
-            least < low + near && most > high - near,
-            "{name}: {least} to {most}"
-        );
-    }
-    for design in &designs {
-        let side = design.array.rows;
-        let width_mm = side as f64 * design.pitch_mm;
-        assert!((7..=49).contains(&side) && (45.0..=102.0).contains(&width_mm));
-    }
-}
-
-/// A force on a taxel as on one of 3.5 mm.
-fn of_area(design: &Design, newtons: f64) -> f64 {
-    newtons / (design.pitch_mm / 3.5).powi(2)
 }
 
 #[test]

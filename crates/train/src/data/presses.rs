@@ -192,8 +192,7 @@ impl Presses {
             let moments = course.moments.iter().map(|moment| {
                 let millinewtons = moment.millinewtons.iter();
                 let newtons = millinewtons.map(|&mn| f32::from(mn) * MILLINEWTON);
-                let approach_mm = moment.known.then_some(moment.approach_mm);
-                (moment.time_s, approach_mm, newtons)
+                (moment.time_s, Some(moment.approach_mm), newtons)
             });
             all.add(press, moments);
         }

@@ -127,7 +127,7 @@ fn a_model_that_never_knew_the_arm_states_no_range_of_it() {
     let unknown = format!("{SETTINGS}\n[reports]\nunknown = 1.0\n");
     std::fs::write(at.join("settings.toml"), unknown).unwrap();
     let simulate = "simulate --sequences --materials broad --objects 3 --test-objects 1 --presses 2 --fps 10 \
-                    --speed 8 --arm 10 --seed 4 --out d.npz";
+                    --seed 4 --out d.npz";
     succeed_in(at, simulate);
     let train = "train --method course --data d.npz --config settings.toml --out one";
     let output = hrn_train_in(at, train);

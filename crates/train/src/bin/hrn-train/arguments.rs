@@ -133,16 +133,6 @@ pub(super) struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean", value_parser = named::<SensorProfile>)]
     pub(super) sensor_profile: SensorProfile,
-    /// Press all objects on the same sensor, which is drawn with this seed
-    #[arg(long, hide_short_help = true, value_name = "SEED", value_parser = seed())]
-    pub(super) one_sensor: Option<u64>,
-    /// Young's modulus of the sensor's cover in MPa, 0.05 to 100
-    #[arg(long, hide_short_help = true, value_name = "MPA", default_value_t = DatasetSettings::default().cover_young_mpa,
-          value_parser = cover_mpa)]
-    pub(super) cover: f64,
-    /// Calibrate each sensor with weights, so that the mean sum of its taxels is the force of the press
-    #[arg(long, hide_short_help = true)]
-    pub(super) calibrated: bool,
     /// Put all eight named materials into the test split
     #[arg(long, hide_short_help = true)]
     pub(super) all_test: bool,
@@ -161,39 +151,17 @@ fn sensors() -> impl TypedValueParser<Value = SensorDesigns> {
     PossibleValuesParser::new(["broad", "jx255n"]).try_map(|name| named(&name))
 }
 
-/// Options of `--sequences`. Each press draws its own value between two numbers, or takes the one number.
+/// Options of `--sequences`.
 #[derive(Debug, clap::Args)]
 #[group(requires = "sequences")]
 pub(super) struct Courses {
     /// With --sequences, drawn for each press: frames a second, 1 to 200 [default: 5..100]
-    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 200>)]
+    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = rates)]
     pub(super) fps: Option<[f64; 2]>,
-    /// Speed of the arm in mm/s, 1 to 100 [default: 2..20]
-    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 100>)]
-    pub(super) speed: Option<[f64; 2]>,
-    /// Stiffness of the arm in N/mm, 1 to 1000 [default: 3..30]
-    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<1, 1000>)]
-    pub(super) arm: Option<[f64; 2]>,
-    /// Seconds that the arm holds its position, 0 to 10, and three frames at least [default: 0.2..1.5]
-    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = range::<0, 10>)]
-    pub(super) hold: Option<[f64; 2]>,
-    /// Reported positions are off by up to this share, 0 to 0.5, constant within a press [default: 0]
-    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<50>)]
-    pub(super) position_error: Option<f64>,
-    /// The reported stiffness of the arm is off by up to this share, 0 to 0.9 [default: 0; 0.15 with
-    /// --sensors]
-    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<90>)]
-    pub(super) arm_error: Option<f64>,
-    /// Times of positions are off by up to this many frames, 0 to 5, constant within a press [default: 0]
-    #[arg(long, hide_short_help = true, value_name = "FRAMES", value_parser = part::<500>)]
-    pub(super) clock_error: Option<f64>,
-    /// Share of the presses in which the arm reports nothing, 0 to 1 [default: 0]
-    #[arg(long, hide_short_help = true, value_name = "SHARE", value_parser = part::<100>)]
-    pub(super) unknown: Option<f64>,
     /// Sensors: broad (each has a design of its own) or jx255n (many of the JX255N), with presses of rigid pieces
     /// too [default: eight of one design in each split]
     #[arg(long, value_parser = sensors(), hide_possible_values = true,
-          conflicts_with_all = ["sensor_profile", "one_sensor", "cover", "calibrated"])]
+          conflicts_with = "sensor_profile")]
     pub(super) sensors: Option<SensorDesigns>,
     /// With --sensors: covers that training objects are pressed on, at most one for each object of a material
     /// [default: 200]
@@ -208,10 +176,6 @@ pub(super) struct Courses {
     #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
           value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(super) electronics: Option<u32>,
-    /// Write this many files in place of one, each with other covers: D-0.npz, D-1.npz, ... [default: 1]
-    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
-          value_parser = clap::value_parser!(u32).range(1..=1000))]
-    pub(super) shards: Option<u32>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -353,34 +317,15 @@ fn seed() -> RangedU64ValueParser {
     clap::value_parser!(u64).range(..=i64::MAX as u64)
 }
 
-/// Parses a Young's modulus in MPa, from that of a gel to that of a hard plastic.
-fn cover_mpa(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(mpa) if DatasetSettings::COVERS_MPA.contains(&mpa) => Ok(mpa),
-        _ => Err("expected MPa from 0.05 to 100".to_owned()),
-    }
-}
-
-/// Parses `LOW..HIGH`, or one number for both, within bounds.
-fn range<const LEAST: u32, const MOST: u32>(text: &str) -> Result<[f64; 2], String> {
+/// Parses frames a second.
+fn rates(text: &str) -> Result<[f64; 2], String> {
     let (low, high) = text.split_once("..").unwrap_or((text, text));
-    let bounds = f64::from(LEAST)..=f64::from(MOST);
+    let bounds = 1.0..=200.0;
     match (low.parse::<f64>(), high.parse::<f64>()) {
         (Ok(low), Ok(high)) if bounds.contains(&low) && bounds.contains(&high) && low <= high => {
             Ok([low, high])
         }
-        _ => Err(format!(
-            "expected a number or LOW..HIGH, from {LEAST} to {MOST}"
-        )),
-    }
-}
-
-/// Parses a number from 0 to `HUNDREDTHS` / 100.
-fn part<const HUNDREDTHS: u32>(text: &str) -> Result<f64, String> {
-    let most = f64::from(HUNDREDTHS) / 100.0;
-    match text.parse() {
-        Ok(part) if (0.0..=most).contains(&part) => Ok(part),
-        _ => Err(format!("expected a number from 0 to {most}")),
+        _ => Err("expected a number or LOW..HIGH, from 1 to 200".to_owned()),
     }
 }
 

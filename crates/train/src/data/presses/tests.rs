@@ -42,10 +42,15 @@ fn courses() -> Presses {
             presses: 2,
             ..DatasetSettings::default()
         },
-        unknown_share: 0.5,
         ..CourseSettings::default()
     };
-    Presses::of_courses(&hardnessd_simulator::courses(&settings, 2, |_| ()))
+    let mut all = Presses::of_courses(&hardnessd_simulator::courses(&settings, 2, |_| ()));
+    // Of every second press, the robot reports nothing.
+    for press in all.all.iter_mut().step_by(2) {
+        press.arm_n_per_mm = 0.0;
+        all.approach_mm[press.moments.clone()].fill(None);
+    }
+    all
 }
 
 fn bytes_of(presses: &Presses, layout: Layout, meta: &serde_json::Value) -> Vec<u8> {
