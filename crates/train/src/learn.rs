@@ -1,7 +1,6 @@
 //! How networks learn: what each of them is, one loop that takes the steps of all, and the calibration of
 //! what was learnt.
 
-pub mod optimiser;
 pub mod learner;
 pub mod hrn;
 pub mod gan;

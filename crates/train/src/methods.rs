@@ -127,13 +127,16 @@ impl<'a> Stages<'a> {
     }
 
     fn gan<'b>(
-        &'b self,
+        &self,
         stage: &'static str,
         game: Game,
         real: &'b [usize],
         settings: &'b GanSettings,
         initial: [Weights; 2],
-    ) -> Gan<'b> {
+    ) -> Gan<'b>
+    where
+        'a: 'b,
+    {
         Gan {
             stage,
             game,
@@ -182,19 +185,10 @@ impl<'a> Stages<'a> {
         let Parts {
             train, unlabelled, ..
         } = self.parts;
+        let initial = gan::initial(game, self.levels(), self.seed, self.device);
         Gan {
-            stage,
-            game,
-            presses: self.presses,
-            real: unlabelled,
             labelled: train,
-            levels: self.levels(),
-            initial: gan::initial(game, self.levels(), self.seed, self.device),
-            scale: self.scale(),
-            sensor: gan::sensor(self.presses, unlabelled),
-            settings: &self.settings.ustgan,
-            seed: self.seed,
-            device: self.device,
+            ..self.gan(stage, game, unlabelled, &self.settings.ustgan, initial)
         }
     }
 

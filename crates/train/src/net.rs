@@ -1,10 +1,9 @@
 //! The networks: layers, weights, what they compute, and their losses.
 
-pub mod graph;
-pub mod image;
 pub mod layers;
 pub mod network;
-pub mod builder;
+pub mod graph;
+pub mod image;
 pub mod standard;
 pub mod bins;
 pub mod sensed;

@@ -88,7 +88,7 @@ impl Press {
     }
 
     /// The network's inputs.
-    fn inputs(&self, standard: &Standard) -> course::Inputs {
+    fn inputs(&self, standard: &Standard) -> Vec<f32> {
         let features = self.features();
         let standardised = features.iter().enumerate();
         standardised

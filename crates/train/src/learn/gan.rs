@@ -5,11 +5,10 @@
 //! starting weights. SGAN and IGAN also use labelled frames, and their discriminator becomes the
 //! recogniser.
 
-mod step;
 #[cfg(test)]
 mod tests;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 
 use super::hrn::Hrn;
 use super::learner::Learner;
@@ -18,15 +17,13 @@ use crate::data::presses::Presses;
 use crate::net::generator;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
-use crate::net::losses::Game;
-use crate::net::network::{self, FEATURES, Weights};
+use crate::net::losses::{self, Game, Judged};
+use crate::net::network::{self, FEATURES, Normalisation, Weights, numbers};
 use crate::net::sensed::Sensor;
 use crate::run::checkpoint;
 use crate::settings::{GanSettings, Training};
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
-
-pub use step::{Images, Rules, step};
 
 /// Generator and discriminator before training, in this order. The game determines the discriminator's
 /// head.
@@ -68,6 +65,98 @@ pub struct Gan<'a> {
     pub device: &'a Device,
 }
 
+/// The settings of a step.
+#[derive(Debug, Clone)]
+pub struct Rules {
+    /// The classes that the discriminator distinguishes, and the losses.
+    pub game: Game,
+    /// Lambda of Eq. (7).
+    pub sigma_penalty: f64,
+    /// Learning rate.
+    pub rate: f64,
+    /// The sensor applied to generated images before the discriminator judges them. `None` applies
+    /// no sensor.
+    pub sensing: Option<(Sensor, PixelScale)>,
+}
+
+/// The discriminator's inputs in a step, besides generated images.
+#[derive(Debug)]
+pub struct Images {
+    /// Real images `[batch, 1, 28, 28]`.
+    pub real: Tensor<4>,
+    /// Labelled images `[batch, 1, 28, 28]` and their targets `[batch, L]`.
+    pub labelled: Option<(Tensor<4>, Tensor<2>)>,
+}
+
+/// Takes a step of the discriminator, then one of the generator. Returns the losses of both.
+pub fn step(
+    generator: &mut Learner,
+    discriminator: &mut Learner,
+    batch: &Images,
+    eta: Tensor<2>,
+    rules: &Rules,
+) -> (f64, f64) {
+    // The generator does not change while the discriminator takes its step, so both steps use the
+    // same images. To the discriminator they are constants.
+    let making = generator.weights.tracked();
+    let mut images = generator::images(&making, eta, &mut Normalisation::Batch);
+    if let Some((sensor, scale)) = rules.sensing {
+        images = sensor.images(images, scale);
+    }
+    let judging = discriminator.weights.tracked();
+    let constant = images.clone().inner();
+    let loss = discriminator_loss(rules.game, &judging, batch, constant);
+    discriminator.step(&judging, &mut loss.backward(), rules.rate);
+
+    let fooled = generator_loss(rules.game, &discriminator.weights, batch, images);
+    let sum = fooled.add(penalty(&making, rules.sigma_penalty));
+    generator.step(&making, &mut sum.backward(), rules.rate);
+    let [loss, sum] = [loss, sum].map(|loss| f64::from(numbers(&loss)[0]));
+    (loss, sum)
+}
+
+/// Judges one batch. Each batch passes through the discriminator alone and is normalised by its own
+/// statistics: in a mixed batch, the statistics would reveal the share of real frames.
+fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
+    let features = network::trunk(discriminator, images, &mut Normalisation::Batch);
+    Judged {
+        logits: network::dense(discriminator, "head", features.clone()),
+        features,
+    }
+}
+
+fn discriminator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Images,
+    generated: Tensor<4>,
+) -> Tensor<1> {
+    let labelled = batch.labelled.as_ref().map(|(images, targets)| {
+        let judged = judge(discriminator, images.clone());
+        (judged.logits, targets.clone())
+    });
+    let real = judge(discriminator, batch.real.clone());
+    let generated = judge(discriminator, generated);
+    losses::discriminator(game, real, generated, labelled)
+}
+
+/// The generator's loss without [`penalty`].
+fn generator_loss(
+    game: Game,
+    discriminator: &Weights,
+    batch: &Images,
+    generated: Tensor<4>,
+) -> Tensor<1> {
+    let generated = judge(discriminator, generated);
+    let real = || judge(discriminator, batch.real.clone());
+    losses::generator(game, real, generated)
+}
+
+/// Lambda times Eq. (7)'s penalty on the mixture's sigma.
+fn penalty(generator: &Weights, lambda: f64) -> Tensor<1> {
+    losses::sigma_penalty(generator.tensor::<2>("mixture.sigma")).mul_scalar(lambda)
+}
+
 /// The sensor that measured the frames of these presses.
 pub fn sensor(presses: &Presses, places: &[usize]) -> Sensor {
     let frames: Vec<ModelFrame> = places.iter().map(|&press| presses.frame(press)).collect();
@@ -79,7 +168,7 @@ impl Gan<'_> {
         Stream::new(self.seed, &format!("{} {name}", self.stage))
     }
 
-    fn images(&self, places: &[usize]) -> burn::tensor::Tensor<4> {
+    fn images(&self, places: &[usize]) -> Tensor<4> {
         let frames: Vec<_> = places
             .iter()
             .map(|&press| self.presses.frame(press))

@@ -12,7 +12,6 @@ use burn::tensor::Device;
 use super::learner::Learner;
 use super::{Batch, Inputs, Learning, Origin, Outputs, Question, Recogniser, Side, Taken};
 use crate::data::presses::Presses;
-use crate::net::builder::Builder;
 use crate::net::graph::Graph;
 use crate::net::network::Weights;
 use crate::net::standard::Standard;
@@ -292,26 +291,25 @@ impl Learning for Regression<'_> {
     }
 
     fn graph(&self, weights: &[Weights]) -> Recogniser {
-        let mut b = Builder(Graph::default());
-        let columns = self.table.seen.columns();
+        let mut b = Graph::default();
         let (inputs, seen) = match self.table.seen {
             Seen::Unloaded(_) => unreachable!("a control is never written"),
             Seen::Features => (Inputs::Features, "features".to_owned()),
             Seen::Parts(array, bend_n) => {
-                let flat = b.reshaped("parts", &[1, columns], "taxels");
+                let flat = b.reshaped("parts", &[1, self.table.seen.columns()], "taxels");
                 let sign = b.node("Sign", &[&flat], "sign");
                 let size = b.node("Abs", &[&flat], "size");
                 let bend = b.scalar("bend", bend_n);
                 let size = b.node("Div", &[&size, &bend], "bent size");
-                let size = b.logarithm_of(&size, 1.0);
+                let size = b.logarithm_of(&size);
                 let seen = b.node("Mul", &[&sign, &size], "seen");
                 (Inputs::Parts(array), seen)
             }
         };
         let seen = self.standard.scaled(&mut b, &seen);
-        let raw = b.dense(&weights[0], "levels", [columns, self.levels], &seen);
+        let raw = b.dense(&weights[0], "levels", &seen);
         Recogniser {
-            graph: b.0,
+            graph: b,
             inputs,
             raw,
         }

@@ -9,11 +9,11 @@ use tract_onnx::pb;
 use crate::learn::{Inputs, Outputs, Recogniser};
 use crate::net::bins::{BINS, LIFTS};
 use crate::net::course::{EMBEDDING, REFERENCES};
-use crate::net::graph::{frame_input, integer, model, value_info};
+use crate::net::graph::{INPUT, integer, model, value_info};
 use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::parts::PARTS;
-use hardnessd_core::verdict::{Card, Checks, PIECE};
+use hardnessd_core::verdict::{COLS, Card, Checks, PIECE, ROWS};
 
 /// The file: the logits over the temperature, what follows from them, and the metadata.
 ///
@@ -31,13 +31,13 @@ pub fn bytes(
     let temperature = graph.constant("temperature", &[], &[temperature]);
     let mut divide = |output| {
         let inputs = [recogniser.raw.as_str(), temperature.as_str()];
-        graph.node("Div", &inputs, output, Vec::new());
+        graph.node("Div", &inputs, output);
     };
     let mut given = match outputs {
         Outputs::Levels => {
             divide("logits");
             let along = vec![integer("axis", 1)];
-            graph.node("Softmax", &["logits"], "probabilities", along);
+            graph.with("Softmax", &["logits"], "probabilities", along);
             let levels = card.levels.len();
             vec![
                 value_info("logits", &[1, levels]),
@@ -48,13 +48,13 @@ pub fn bytes(
             divide("bins on their scale");
             let lifts = graph.constant(LIFTS, &[1, BINS], lifts);
             let lifted = ["bins on their scale", lifts.as_str()];
-            graph.node("Add", &lifted, "bins", Vec::new());
+            graph.node("Add", &lifted, "bins");
             vec![value_info("bins", &[1, BINS])]
         }
     };
     let features = value_info("features", &[1, FEATURES]);
     let taken = match recogniser.inputs {
-        Inputs::Frame => vec![frame_input()],
+        Inputs::Frame => vec![value_info(INPUT, &[1, 1, ROWS, COLS])],
         Inputs::Parts(Array { rows, cols }) => vec![value_info("parts", &[1, PARTS, rows, cols])],
         Inputs::Features => vec![features],
         Inputs::References => {

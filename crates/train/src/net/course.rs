@@ -8,41 +8,57 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::bins::BINS;
+use crate::net::graph::{Graph, Inputs, integer};
 use crate::net::network::{Weights, dense};
-use hardnessd_core::verdict::Piece;
+use crate::net::standard::Standard;
 use hardnessd_core::verdict::features::FEATURES;
+use hardnessd_core::verdict::{PIECE, Piece};
 use hardnessd_simulator::random::Stream;
-
-pub use graph::graph;
-pub use references::EMBEDDING;
-
-mod graph;
-mod references;
 
 /// The most references that a model takes.
 pub const REFERENCES: usize = 32;
+/// The numbers of a reference's embedding.
+pub const EMBEDDING: usize = 64;
+/// The numbers that a sensor's references give beside a press: the mean of their embeddings, the mean
+/// weighted by how much each resembles the press (attention), whether there are references, and the
+/// logarithm of their count.
+const BESIDE: usize = 2 * EMBEDDING + 2;
+/// Width of the layer between a press and its embedding.
+const LAYER: usize = 96;
+/// The pieces' millimetres are divided by this, so that their logarithms are near 0.
+const MM: f32 = 10.0;
+/// The Shore hardness of 0, and of a step of 1.
+const MIDDLE: f32 = 55.0;
+const UNIT: f32 = 25.0;
+/// The divisor of an attention's scores.
+const SCORES: f32 = 8.0;
+/// The divisor of the logarithm of the count.
+const COUNT: f32 = 3.0;
 /// Share of the numbers of a layer that a training step leaves out.
 const DROPPED: f64 = 0.1;
 
 /// Names of layers with the numbers of their inputs and outputs.
 type Shapes<const N: usize> = [(&'static str, [usize; 2]); N];
+/// The layers over a reference, and the one that asks the references of a sensor.
+const OF_REFERENCES: Shapes<3> = [
+    ("reference1", [FEATURES + PIECE, LAYER]),
+    ("reference2", [LAYER, EMBEDDING]),
+    ("question", [FEATURES, EMBEDDING]),
+];
 /// The layers over a press and its sensor's references. All but the last have a ReLU and dropout.
 const JOINT: Shapes<4> = [
-    ("joint1", [FEATURES + references::BESIDE, 512]),
+    ("joint1", [FEATURES + BESIDE, 512]),
     ("joint2", [512, 256]),
     ("joint3", [256, 128]),
     ("head", [128, BINS]),
 ];
-
-/// The inputs of one press: its standardised features.
-pub type Inputs = Vec<f32>;
 
 /// Initial weights: N(0, 2 / inputs) before a ReLU. The variance is smaller before an attention and
 /// before the outputs, so that outputs begin near 1.
 pub fn initial(seed: u64, device: &Device) -> Weights {
     let root = Stream::new(seed, "course weights");
     let mut weights = Weights::default();
-    for (name, [inputs, outputs]) in references::LAYERS.into_iter().chain(JOINT) {
+    for (name, [inputs, outputs]) in OF_REFERENCES.into_iter().chain(JOINT) {
         let gain = match name {
             "question" | "head" => 0.2,
             _ => 2.0,
@@ -60,10 +76,10 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
 /// Presses of one sensor, with its references.
 #[derive(Debug, Clone, Default)]
 pub struct Group {
-    /// The presses to judge.
-    pub presses: Vec<Inputs>,
+    /// The standardised features of the presses to judge.
+    pub presses: Vec<Vec<f32>>,
     /// The references: a press on each piece.
-    pub references: Vec<(Inputs, Piece)>,
+    pub references: Vec<(Vec<f32>, Piece)>,
 }
 
 /// Logits of the bins `[presses, BINS]` of the presses of all groups, one group after the other.
@@ -74,7 +90,7 @@ pub fn outputs(
     mut dropout: Option<&mut Stream>,
     device: &Device,
 ) -> Tensor<2> {
-    let table = |rows: &mut dyn Iterator<Item = &Inputs>| {
+    let table = |rows: &mut dyn Iterator<Item = &Vec<f32>>| {
         let values: Vec<f32> = rows.flatten().copied().collect();
         let count = values.len() / FEATURES;
         Tensor::<2>::from_data(TensorData::new(values, [count, FEATURES]), device)
@@ -84,9 +100,9 @@ pub fn outputs(
         let embeddings = (!group.references.is_empty()).then(|| {
             let pieces: Vec<Piece> = group.references.iter().map(|&(_, piece)| piece).collect();
             let references = table(&mut group.references.iter().map(|(inputs, _)| inputs));
-            references::embeddings(weights, references, &pieces, device)
+            embeddings(weights, references, &pieces, device)
         });
-        let beside = references::beside(weights, presses.clone(), embeddings, device);
+        let beside = beside(weights, presses.clone(), embeddings, device);
         Tensor::cat(vec![presses, beside], 1)
     });
     let mut x = Tensor::cat(beside.collect(), 0);
@@ -112,6 +128,165 @@ fn kept(dims: [usize; 2], stream: &mut Stream, device: &Device) -> Tensor<2> {
     Tensor::from_data(TensorData::new(kept.collect::<Vec<f32>>(), dims), device)
 }
 
+/// What the network takes of a piece.
+fn columns(piece: Piece) -> [f32; PIECE] {
+    let [flat, width_mm, ball, radius_mm, known, low, high] = Piece::numbers(Some(piece));
+    let length = |is: f32, mm: f32| is * (mm.max(0.1) / MM).ln();
+    [
+        flat,
+        length(flat, width_mm),
+        ball,
+        length(ball, radius_mm),
+        known,
+        known * (0.5 * (low + high) - MIDDLE) / UNIT,
+        known * (high - low) / UNIT,
+    ]
+}
+
+/// The embeddings `[presses, EMBEDDING]` of presses `[presses, FEATURES]` on these pieces.
+fn embeddings(
+    weights: &Weights,
+    features: Tensor<2>,
+    pieces: &[Piece],
+    device: &Device,
+) -> Tensor<2> {
+    let columns: Vec<f32> = pieces.iter().flat_map(|&piece| columns(piece)).collect();
+    let columns = Tensor::<2>::from_data(TensorData::new(columns, [pieces.len(), PIECE]), device);
+    let all = Tensor::cat(vec![features, columns], 1);
+    let layer = activation::relu(dense(weights, "reference1", all));
+    activation::relu(dense(weights, "reference2", layer))
+}
+
+/// What the embeddings of one sensor say beside each of its presses: `[presses, BESIDE]`. All
+/// 0 without references.
+fn beside(
+    weights: &Weights,
+    features: Tensor<2>,
+    embeddings: Option<Tensor<2>>,
+    device: &Device,
+) -> Tensor<2> {
+    let presses = features.dims()[0];
+    let Some(embeddings) = embeddings else {
+        return Tensor::zeros([presses, BESIDE], device);
+    };
+    let count = embeddings.dims()[0] as f32;
+    let questions = dense(weights, "question", features);
+    let scores = questions.matmul(embeddings.clone().transpose());
+    let attention = activation::softmax(scores.div_scalar(SCORES), 1);
+    let attended = attention.matmul(embeddings.clone());
+    let mean = embeddings.mean_dim(0).repeat_dim(0, presses);
+    let counts = [1.0, count.ln_1p() / COUNT].repeat(presses);
+    let counts = Tensor::<2>::from_data(TensorData::new(counts, [presses, 2]), device);
+    Tensor::cat(vec![mean, attended, counts], 1)
+}
+
+/// The graph from the inputs of format 3 to the logits of the bins, before temperature, and their
+/// name. The press's embedding as a reference is in `reference`, if the model takes references.
+pub fn graph(weights: &Weights, standard: &Standard, inputs: Inputs) -> (Graph, String) {
+    let mut b = Graph::default();
+    let features = standard.scaled(&mut b, "features");
+    let beside = match inputs {
+        Inputs::References => {
+            let piece = piece_nodes(&mut b);
+            let all = b.joined(&[&features, &piece], "press and piece");
+            let x = b.dense(weights, "reference1", &all);
+            let x = b.node("Relu", &[&x], "reference1");
+            let x = b.dense(weights, "reference2", &x);
+            b.node("Relu", &[&x], "reference");
+            beside_nodes(&mut b, weights, &features)
+        }
+        // What the network gets without any reference.
+        Inputs::Frame | Inputs::Parts(_) | Inputs::Features => {
+            b.constant("beside", &[1, BESIDE], &[0.0; BESIDE])
+        }
+    };
+    let mut x = b.joined(&[&features, &beside], "press and references");
+    for (name, _) in JOINT {
+        x = b.dense(weights, name, &x);
+        if name != "head" {
+            x = b.node("Relu", &[&x], name);
+        }
+    }
+    (b, x)
+}
+
+/// Adds the nodes of [`columns`] from the input `piece`.
+fn piece_nodes(b: &mut Graph) -> String {
+    let axis = b.indices("piece axis", &[1]);
+    let names = [
+        "flat",
+        "width",
+        "ball",
+        "radius",
+        "known hardness",
+        "least",
+        "greatest",
+    ];
+    let [flat, width, ball, radius, known, low, high]: [String; PIECE] =
+        std::array::from_fn(|place| {
+            let name = names[place];
+            let [first, end] = [place, place + 1]
+                .map(|end| b.indices(&format!("piece {end} of {name}"), &[end as i64]));
+            b.node("Slice", &["piece", &first, &end, &axis], name)
+        });
+    let mut length = |is: &str, mm: &str| {
+        let least = b.scalar(&format!("least {mm}"), 0.1);
+        let scale = b.scalar(&format!("scale of {mm}"), MM);
+        let mm = b.node("Max", &[mm, &least], &format!("{mm} at least"));
+        let mm = b.node("Div", &[&mm, &scale], &format!("{mm} scaled"));
+        let mm = b.node("Log", &[&mm], &format!("{mm} log"));
+        b.node("Mul", &[is, &mm], &format!("{mm} known"))
+    };
+    let (width, radius) = (length(&flat, &width), length(&ball, &radius));
+    let sum = b.node("Add", &[&low, &high], "ends together");
+    let half = b.scalar("half", 0.5);
+    let middle = b.node("Mul", &[&sum, &half], "middle");
+    let zero = b.scalar("middle of the scale", MIDDLE);
+    let middle = b.node("Sub", &[&middle, &zero], "middle off");
+    let span = b.node("Sub", &[&high, &low], "span");
+    let unit = b.scalar("unit of hardness", UNIT);
+    let mut scaled = |x: &str| {
+        let x = b.node("Div", &[x, &unit], &format!("{x} in units"));
+        b.node("Mul", &[&known, &x], &format!("{x} known"))
+    };
+    let (middle, span) = (scaled(&middle), scaled(&span));
+    let columns = [&flat, &width, &ball, &radius, &known, &middle, &span];
+    b.joined(&columns.map(String::as_str), "piece columns")
+}
+
+/// Adds the nodes of [`beside`] from the inputs `references` and `given` and standardised features
+/// `[1, FEATURES]`.
+fn beside_nodes(b: &mut Graph, weights: &Weights, features: &str) -> String {
+    let all = b.reshaped("references", &[REFERENCES, EMBEDDING], "all references");
+    let ones = b.constant("each reference", &[REFERENCES, 1], &[1.0; REFERENCES]);
+    let count = b.node("MatMul", &["given", &ones], "count");
+    let one = b.scalar("one", 1.0);
+    let divisor = b.node("Max", &[&count, &one], "count at least 1");
+    let sum = b.node("MatMul", &["given", &all], "sum of references");
+    let mean = b.node("Div", &[&sum, &divisor], "mean of references");
+
+    let question = b.dense(weights, "question", features);
+    let transposed = vec![integer("transB", 1)];
+    let scores = b.with("Gemm", &[&question, &all], "scores", transposed);
+    let divisor = b.scalar("divisor of scores", SCORES);
+    let scores = b.node("Div", &[&scores, &divisor], "scores scaled");
+    // What is not given has no weight.
+    let missing = b.node("Sub", &["given", &one], "missing");
+    let low = b.scalar("low", 1e4);
+    let missing = b.node("Mul", &[&missing, &low], "missing scores");
+    let scores = b.node("Add", &[&scores, &missing], "scores of the given");
+    let along = vec![integer("axis", 1)];
+    let attention = b.with("Softmax", &[&scores], "softmax of scores", along);
+    let attention = b.node("Mul", &[&attention, "given"], "attention");
+    let attended = b.node("MatMul", &[&attention, &all], "attended");
+
+    let is_any = b.node("Min", &[&count, &one], "is any given");
+    let log = b.logarithm_of(&count);
+    let divisor = b.scalar("divisor of the count", COUNT);
+    let log = b.node("Div", &[&log, &divisor], "count scaled");
+    b.joined(&[&mean, &attended, &is_any, &log], "beside")
+}
+
 #[cfg(test)]
 mod tests {
     use std::slice;
@@ -119,7 +294,7 @@ mod tests {
     use super::*;
     use crate::net::network::numbers;
 
-    fn press(stream: &mut Stream) -> Inputs {
+    fn press(stream: &mut Stream) -> Vec<f32> {
         (0..FEATURES).map(|_| stream.normal() as f32).collect()
     }
 
@@ -130,7 +305,7 @@ mod tests {
         let device = Device::flex();
         let weights = initial(1, &device);
         let mut stream = Stream::new(2, "columns");
-        let presses: Vec<Inputs> = (0..32).map(|_| press(&mut stream)).collect();
+        let presses: Vec<Vec<f32>> = (0..32).map(|_| press(&mut stream)).collect();
         let references = presses[..4].iter().map(|press| (press.clone(), BALL));
         let group = Group {
             references: references.collect(),

@@ -1,14 +1,13 @@
 //! A network as a graph of ONNX nodes, from newtons to logits.
 //!
 //! In: nodes and constants, one by one. Out: the graph as tract's own ONNX types, so that the
-//! exported file and the daemon's reader share one schema, or a plan that computes it in this
-//! process.
+//! exported file and the daemon's reader share one schema.
 
 use tract_onnx::pb;
-use tract_onnx::prelude::*;
 
+use super::network::Weights;
 use hardnessd_core::frame::Array;
-use hardnessd_core::verdict::{COLS, MIN_OPSET, ModelFrame, ROWS};
+use hardnessd_core::verdict::MIN_OPSET;
 
 /// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
@@ -39,20 +38,24 @@ impl Graph {
     /// Adds an f32 constant and returns its name.
     pub fn constant(&mut self, name: &str, dims: &[usize], values: &[f32]) -> String {
         debug_assert_eq!(dims.iter().product::<usize>(), values.len(), "{name}");
-        self.raw(name, dims, pb::tensor_proto::DataType::Float, |raw| {
-            raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
-        })
+        let raw = values.iter().flat_map(|value| value.to_le_bytes());
+        self.raw(name, dims, pb::tensor_proto::DataType::Float, raw.collect())
+    }
+
+    /// Adds a constant of one number and returns its name.
+    pub fn scalar(&mut self, name: &str, value: f32) -> String {
+        self.constant(&format!("{name} as a number"), &[], &[value])
     }
 
     /// Adds an i64 vector, the form of shapes and axes, and returns its name.
     pub fn indices(&mut self, name: &str, values: &[i64]) -> String {
+        let raw = values.iter().flat_map(|value| value.to_le_bytes());
+        let dims = [values.len()];
         self.raw(
             name,
-            &[values.len()],
+            &dims,
             pb::tensor_proto::DataType::Int64,
-            |raw| {
-                raw.extend(values.iter().flat_map(|value| value.to_le_bytes()));
-            },
+            raw.collect(),
         )
     }
 
@@ -61,36 +64,71 @@ impl Graph {
         name: &str,
         dims: &[usize],
         data_type: pb::tensor_proto::DataType,
-        fill: impl FnOnce(&mut Vec<u8>),
+        raw_data: Vec<u8>,
     ) -> String {
-        let mut tensor = pb::TensorProto {
+        self.constants.push(pb::TensorProto {
             name: name.to_owned(),
             dims: dims.iter().map(|&length| length as i64).collect(),
             data_type: data_type as i32,
+            raw_data,
             ..Default::default()
-        };
-        fill(&mut tensor.raw_data);
-        self.constants.push(tensor);
+        });
         name.to_owned()
     }
 
     /// Adds a node with one output and returns the output's name.
-    pub fn node(
+    pub fn node(&mut self, op: &str, inputs: &[&str], output: &str) -> String {
+        self.with(op, inputs, output, Vec::new())
+    }
+
+    /// The same with attributes.
+    pub fn with(
         &mut self,
         op: &str,
         inputs: &[&str],
         output: &str,
-        attributes: Vec<pb::AttributeProto>,
+        attribute: Vec<pb::AttributeProto>,
     ) -> String {
         self.nodes.push(pb::NodeProto {
             name: format!("{op}:{output}"),
             op_type: op.to_owned(),
             input: inputs.iter().map(|&input| input.to_owned()).collect(),
             output: vec![output.to_owned()],
-            attribute: attributes,
+            attribute,
             ..Default::default()
         });
         output.to_owned()
+    }
+
+    /// Adds the nodes of `x` in another shape.
+    pub fn reshaped(&mut self, x: &str, dims: &[usize], output: &str) -> String {
+        let dims: Vec<i64> = dims.iter().map(|&length| length as i64).collect();
+        let shape = self.indices(&format!("shape of {output}"), &dims);
+        self.node("Reshape", &[x, &shape], output)
+    }
+
+    /// Adds the nodes of log(1 + x).
+    pub fn logarithm_of(&mut self, x: &str) -> String {
+        let one = self.scalar(&format!("added to {x}"), 1.0);
+        let raised = self.node("Add", &[x, &one], &format!("{x} raised"));
+        self.node("Log", &[&raised], &format!("log of {x}"))
+    }
+
+    /// Adds the node that joins values along their columns.
+    pub fn joined(&mut self, parts: &[&str], output: &str) -> String {
+        self.with("Concat", parts, output, vec![integer("axis", 1)])
+    }
+
+    /// Adds the weight `name` as a constant.
+    pub fn weight(&mut self, weights: &Weights, name: &str) -> String {
+        self.constant(name, weights.dims(name), &weights.numbers(name))
+    }
+
+    /// Passes `x` `[rows, inputs]` through the layer `name`.
+    pub fn dense(&mut self, weights: &Weights, name: &str, x: &str) -> String {
+        let matrix = self.weight(weights, &format!("{name}.matrix"));
+        let bias = self.weight(weights, &format!("{name}.bias"));
+        self.node("Gemm", &[x, &matrix, &bias], &format!("{name}.sum"))
     }
 }
 
@@ -124,69 +162,6 @@ pub fn number(name: &str, value: f32) -> pb::AttributeProto {
     }
 }
 
-/// A graph that runs in this process, for values that training itself needs.
-#[derive(Debug)]
-pub struct Plan {
-    plan: Arc<TypedRunnableModel>,
-    shape: Vec<usize>,
-}
-
-impl Plan {
-    /// Prepares `graph` to compute `output`, an f32 of shape `dims`.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the inference library cannot run the graph.
-    pub fn new(graph: Graph, output: &str, dims: &[usize]) -> anyhow::Result<Self> {
-        let input = (INPUT, vec![1, 1, ROWS, COLS]);
-        Self::over(graph, &input, &(output, dims.to_vec()))
-    }
-
-    /// Prepares a graph whose input is not a frame. `input` and `output` are a name and a shape.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the inference library cannot run the graph.
-    pub fn over(
-        graph: Graph,
-        input: &(&str, Vec<usize>),
-        output: &(&str, Vec<usize>),
-    ) -> anyhow::Result<Self> {
-        let [inputs, outputs] = [input, output].map(|(name, dims)| vec![value_info(name, dims)]);
-        let proto = model(graph, inputs, outputs, Vec::new());
-        let plan = tract_onnx::onnx()
-            .model_for_proto_model(&proto)?
-            .with_input_fact(0, f32::fact(&input.1).into())?
-            .into_optimized()?
-            .into_runnable()?;
-        Ok(Self {
-            plan,
-            shape: input.1.clone(),
-        })
-    }
-
-    /// The output for one frame, row-major.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the inference library fails.
-    pub fn run(&self, frame: &ModelFrame) -> anyhow::Result<Vec<f32>> {
-        self.run_on(&frame.newtons)
-    }
-
-    /// The output for the input's numbers, both row-major.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if the numbers are not as many as the input's shape says, or the inference
-    /// library fails.
-    pub fn run_on(&self, numbers: &[f32]) -> anyhow::Result<Vec<f32>> {
-        let input = Tensor::from_shape(&self.shape, numbers)?;
-        let outputs = self.plan.run(tvec!(input.into()))?;
-        Ok(outputs[0].try_as_plain_ram()?.as_slice::<f32>()?.to_vec())
-    }
-}
-
 /// The graph as an ONNX model.
 pub(crate) fn model(
     graph: Graph,
@@ -213,11 +188,6 @@ pub(crate) fn model(
         metadata_props,
         ..Default::default()
     }
-}
-
-/// The input of a model that judges one frame.
-pub(crate) fn frame_input() -> pb::ValueInfoProto {
-    value_info(INPUT, &[1, 1, ROWS, COLS])
 }
 
 /// The type of an f32 tensor in a model.

@@ -65,16 +65,14 @@ impl PixelScale {
     /// that value's name.
     pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {
         if self.log_above_n == 0.0 {
-            let scale = graph.constant("scale", &[], &[(2.0 / self.full_scale_n) as f32]);
-            return graph.node("Mul", &[newtons, &scale], "image", Vec::new());
+            let scale = graph.scalar("scale", (2.0 / self.full_scale_n) as f32);
+            return graph.node("Mul", &[newtons, &scale], "image");
         }
-        let scale = graph.constant("scale", &[], &[(1.0 / self.log_above_n) as f32]);
-        let one = graph.constant("one", &[], &[1.0]);
-        let factor = graph.constant("log factor", &[], &[self.log_factor()]);
-        let scaled = graph.node("Mul", &[newtons, &scale], "scaled", Vec::new());
-        let raised = graph.node("Add", &[&scaled, &one], "raised", Vec::new());
-        let log = graph.node("Log", &[&raised], "log", Vec::new());
-        graph.node("Mul", &[&log, &factor], "image", Vec::new())
+        let scale = graph.scalar("scale", (1.0 / self.log_above_n) as f32);
+        let scaled = graph.node("Mul", &[newtons, &scale], "scaled");
+        let log = graph.logarithm_of(&scaled);
+        let factor = graph.scalar("log factor", self.log_factor());
+        graph.node("Mul", &[&log, &factor], "image")
     }
 }
 

@@ -11,20 +11,20 @@
 //! [`patches`] and [`from_patches`] are each other's adjoint, so the transposed convolution is the
 //! same two steps in the other order, and so are all gradients.
 
-mod cpu;
+use std::fmt::{self, Debug, Formatter};
+use std::sync::Arc;
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
+use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::flex::FlexTensor;
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, backend_extension};
 use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
-use burn::tensor::{DType, Device, Tensor, activation, module};
-
-use cpu::Rows;
+use burn::tensor::{DType, Device, Tensor, TensorData, activation, module};
+use rayon::prelude::*;
 
 /// Stride of every convolution here.
 pub const STRIDE: usize = 2;
@@ -197,138 +197,81 @@ trait Layers: Backend {
     fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self>;
 }
 
-/// The matrix product. It differs from burn's own only in the kernels' gradient, which is the
-/// product of patches and transposed gradient, transposed. burn's product of gradient and
-/// transposed patches would first copy the many patches into another order, on one thread. Here
-/// only the gradient is copied, which is smaller.
-#[derive(Debug)]
-struct ProductStep;
+/// How the gradients of an operation's inputs follow from that of its output, and which of them are wanted.
+#[derive(Clone)]
+struct Adjoint<const N: usize>(Arc<Pull<N>>);
 
-impl Backward<Flex, 2> for ProductStep {
-    type State = [FlexTensor; 2];
+type Pull<const N: usize> = dyn Fn(FlexTensor, [bool; N]) -> [Option<FlexTensor>; N] + Send + Sync;
+
+impl<const N: usize> Debug for Adjoint<N> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.write_str("Adjoint")
+    }
+}
+
+#[derive(Debug)]
+struct Step;
+
+impl<const N: usize> Backward<Flex, N> for Step {
+    type State = Adjoint<N>;
 
     fn backward(
         self,
-        ops: Ops<Self::State, 2>,
+        ops: Ops<Self::State, N>,
         gradients: &mut Gradients,
         _checkpointer: &mut Checkpointer,
     ) {
         let gradient = gradients.consume::<Flex>(&ops.node);
-        let [kernels, patches] = ops.state;
-        let [of_kernels, of_patches] = ops.parents;
-        if let Some(parent) = of_kernels {
-            let transposed = Flex::float_transpose(gradient.clone());
-            let product = Flex::float_matmul(patches, transposed);
-            gradients.register::<Flex>(parent.id, Flex::float_transpose(product));
-        }
-        if let Some(parent) = of_patches {
-            let product = Flex::float_matmul(Flex::float_transpose(kernels), gradient);
-            gradients.register::<Flex>(parent.id, product);
-        }
-    }
-}
-
-#[derive(Debug)]
-struct PatchesStep;
-
-impl Backward<Flex, 1> for PatchesStep {
-    type State = (Geometry, usize);
-
-    fn backward(
-        self,
-        ops: Ops<Self::State, 1>,
-        gradients: &mut Gradients,
-        _checkpointer: &mut Checkpointer,
-    ) {
-        let (geometry, batch) = ops.state;
-        unary::<Flex, _>(ops.parents, ops.node, gradients, |gradient| {
-            Flex::from_patches(gradient, geometry, batch)
-        });
-    }
-}
-
-#[derive(Debug)]
-struct FromPatchesStep;
-
-impl Backward<Flex, 1> for FromPatchesStep {
-    type State = Geometry;
-
-    fn backward(
-        self,
-        ops: Ops<Self::State, 1>,
-        gradients: &mut Gradients,
-        _checkpointer: &mut Checkpointer,
-    ) {
-        unary::<Flex, _>(ops.parents, ops.node, gradients, |gradient| {
-            Flex::patches(gradient, ops.state)
-        });
-    }
-}
-
-#[derive(Debug)]
-struct NormalisedStep;
-
-impl Backward<Flex, 3> for NormalisedStep {
-    /// x, gamma and beta; epsilon and slope.
-    type State = ([FlexTensor; 3], [f32; 2]);
-
-    fn backward(
-        self,
-        ops: Ops<Self::State, 3>,
-        gradients: &mut Gradients,
-        _checkpointer: &mut Checkpointer,
-    ) {
-        let gradient = gradients.consume::<Flex>(&ops.node);
-        let ([x, gamma, beta], [epsilon, slope]) = ops.state;
-        let all = Rows::new(x, gamma, beta, epsilon, slope).backward(gradient);
-        for (parent, gradient) in ops.parents.into_iter().zip(all) {
-            if let Some(parent) = parent {
+        let wanted = ops.parents.each_ref().map(Option::is_some);
+        let found = (ops.state.0)(gradient, wanted);
+        for (parent, gradient) in ops.parents.into_iter().zip(found) {
+            if let (Some(parent), Some(gradient)) = (parent, gradient) {
                 gradients.register::<Flex>(parent.id, gradient);
             }
         }
     }
 }
 
-#[derive(Debug)]
-struct LeakyReluStep;
-
-impl Backward<Flex, 1> for LeakyReluStep {
-    type State = (FlexTensor, f32);
-
-    fn backward(
-        self,
-        ops: Ops<Self::State, 1>,
-        gradients: &mut Gradients,
-        _checkpointer: &mut Checkpointer,
-    ) {
-        let (x, slope) = ops.state;
-        unary::<Flex, _>(ops.parents, ops.node, gradients, |gradient| {
-            cpu::leaky(gradient, x, slope)
-        });
+/// The output of an operation on `nodes`, with its adjoint.
+fn tracked<C: CheckpointStrategy, const N: usize>(
+    nodes: [NodeGuard; N],
+    output: FlexTensor,
+    pull: impl Fn(FlexTensor, [bool; N]) -> [Option<FlexTensor>; N] + Send + Sync + 'static,
+) -> FloatTensor<Autodiff<Flex, C>> {
+    match Step.prepare::<C>(nodes).compute_bound().stateful() {
+        OpsKind::Tracked(step) => step.finish(Adjoint(Arc::new(pull)), output),
+        OpsKind::UnTracked(step) => step.finish(output),
     }
 }
 
 impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
+    /// The matrix product. It differs from burn's own only in the kernels' gradient, which is the
+    /// product of patches and transposed gradient, transposed. burn's product of gradient and
+    /// transposed patches would first copy the many patches into another order, on one thread. Here
+    /// only the gradient is copied, which is smaller.
     fn product(kernels: FloatTensor<Self>, patches: FloatTensor<Self>) -> FloatTensor<Self> {
-        let (kernels, kernels_node) = kernels.into_parts();
-        let (patches, patches_node) = patches.into_parts();
-        let state = [kernels.clone(), patches.clone()];
-        let output = Flex::product(kernels, patches);
-        let prepared = ProductStep.prepare::<C>([kernels_node, patches_node]);
-        match prepared.compute_bound().stateful() {
-            OpsKind::Tracked(step) => step.finish(state, output),
-            OpsKind::UnTracked(step) => step.finish(output),
-        }
+        let (kernels, of_kernels) = kernels.into_parts();
+        let (patches, of_patches) = patches.into_parts();
+        let output = Flex::product(kernels.clone(), patches.clone());
+        let nodes = [of_kernels, of_patches];
+        tracked::<C, 2>(nodes, output, move |gradient, [of_kernels, of_patches]| {
+            let of_kernels = of_kernels.then(|| {
+                let transposed = Flex::float_transpose(gradient.clone());
+                Flex::float_transpose(Flex::float_matmul(patches.clone(), transposed))
+            });
+            let transposed = || Flex::float_transpose(kernels.clone());
+            let of_patches = of_patches.then(|| Flex::float_matmul(transposed(), gradient));
+            [of_kernels, of_patches]
+        })
     }
 
     fn patches(x: FloatTensor<Self>, geometry: Geometry) -> FloatTensor<Self> {
         let (x, node) = x.into_parts();
         let batch = x.layout().shape()[3];
         let output = Flex::patches(x, geometry);
-        match PatchesStep.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(step) => step.finish((geometry, batch), output),
-            OpsKind::UnTracked(step) => step.finish(output),
-        }
+        tracked::<C, 1>([node], output, move |gradient, _| {
+            [Some(Flex::from_patches(gradient, geometry, batch))]
+        })
     }
 
     fn from_patches(
@@ -338,11 +281,9 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
     ) -> FloatTensor<Self> {
         let (patches, node) = patches.into_parts();
         let output = Flex::from_patches(patches, geometry, batch);
-        let prepared = FromPatchesStep.prepare::<C>([node]);
-        match prepared.compute_bound().stateful() {
-            OpsKind::Tracked(step) => step.finish(geometry, output),
-            OpsKind::UnTracked(step) => step.finish(output),
-        }
+        tracked::<C, 1>([node], output, move |gradient, _| {
+            [Some(Flex::patches(gradient, geometry))]
+        })
     }
 
     fn normalised(
@@ -352,30 +293,254 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
         epsilon: f32,
         slope: f32,
     ) -> FloatTensor<Self> {
-        let (x, x_node) = x.into_parts();
-        let (gamma, gamma_node) = gamma.into_parts();
-        let (beta, beta_node) = beta.into_parts();
-        let state = ([x.clone(), gamma.clone(), beta.clone()], [epsilon, slope]);
-        let output = Flex::normalised(x, gamma, beta, epsilon, slope);
-        let prepared = NormalisedStep.prepare::<C>([x_node, gamma_node, beta_node]);
-        match prepared.compute_bound().stateful() {
-            OpsKind::Tracked(step) => step.finish(state, output),
-            OpsKind::UnTracked(step) => step.finish(output),
-        }
+        let (x, of_x) = x.into_parts();
+        let (gamma, of_gamma) = gamma.into_parts();
+        let (beta, of_beta) = beta.into_parts();
+        let rows = Rows::new(x, gamma, beta, epsilon, slope);
+        let output = rows.forward();
+        tracked::<C, 3>([of_x, of_gamma, of_beta], output, move |gradient, _| {
+            rows.backward(gradient).map(Some)
+        })
     }
 
     fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self> {
         let (x, node) = x.into_parts();
         let output = Flex::leaky_relu(x.clone(), slope);
-        match LeakyReluStep
-            .prepare::<C>([node])
-            .compute_bound()
-            .stateful()
-        {
-            OpsKind::Tracked(step) => step.finish((x, slope), output),
-            OpsKind::UnTracked(step) => step.finish(output),
+        tracked::<C, 1>([node], output, move |gradient, _| {
+            [Some(leaky(gradient, x.clone(), slope))]
+        })
+    }
+}
+
+/// The same tensor with its numbers in row-major order, whatever its strides.
+fn contiguous(tensor: FlexTensor) -> FlexTensor {
+    if tensor.as_slice::<f32>().is_some() {
+        tensor
+    } else {
+        tensor.to_contiguous()
+    }
+}
+
+fn numbers(tensor: &FlexTensor) -> &[f32] {
+    tensor
+        .as_slice()
+        .expect("contiguous, and all our tensors are of f32")
+}
+
+fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> FlexTensor {
+    FlexTensor::from_data(TensorData::new(values, shape))
+}
+
+impl Layers for Flex {
+    fn product(kernels: FlexTensor, patches: FlexTensor) -> FlexTensor {
+        Flex::float_matmul(kernels, patches)
+    }
+
+    fn patches(x: FlexTensor, geometry: Geometry) -> FlexTensor {
+        let x = contiguous(x);
+        let image = numbers(&x).len() / geometry.channels;
+        let batch = image / (geometry.size * geometry.size);
+        let row = geometry.small() * geometry.small() * batch;
+        let taps = geometry.kernel * geometry.kernel;
+        let mut values = vec![0.0; geometry.taps() * row];
+        let rows = values.par_chunks_exact_mut(row).enumerate();
+        rows.for_each(|(index, patches)| {
+            let image = &numbers(&x)[index / taps * image..][..image];
+            let runs = geometry.runs(index % taps, batch);
+            for (run, patch) in runs.zip(patches.chunks_exact_mut(batch)) {
+                let Some(run) = run else { continue };
+                patch.copy_from_slice(&image[run..run + batch]);
+            }
+        });
+        tensor(values, [geometry.taps(), row])
+    }
+
+    fn from_patches(patches: FlexTensor, geometry: Geometry, batch: usize) -> FlexTensor {
+        let patches = contiguous(patches);
+        let Geometry { channels, size, .. } = geometry;
+        let of_channel = numbers(&patches).len() / channels;
+        let taps = geometry.kernel * geometry.kernel;
+        let mut values = vec![0.0; channels * size * size * batch];
+        let images = values.par_chunks_exact_mut(size * size * batch);
+        images
+            .zip(numbers(&patches).par_chunks_exact(of_channel))
+            .for_each(|(image, patches)| {
+                let runs = (0..taps).flat_map(|tap| geometry.runs(tap, batch));
+                for (run, patch) in runs.zip(patches.chunks_exact(batch)) {
+                    let Some(run) = run else { continue };
+                    for (sum, value) in image[run..run + batch].iter_mut().zip(patch) {
+                        *sum += value;
+                    }
+                }
+            });
+        tensor(values, [channels, size, size, batch])
+    }
+
+    fn normalised(
+        x: FlexTensor,
+        gamma: FlexTensor,
+        beta: FlexTensor,
+        epsilon: f32,
+        slope: f32,
+    ) -> FlexTensor {
+        Rows::new(x, gamma, beta, epsilon, slope).forward()
+    }
+
+    fn leaky_relu(x: FlexTensor, slope: f32) -> FlexTensor {
+        leaky(x.clone(), x, slope)
+    }
+}
+
+/// `values`, times `slope` where `x` is below 0, and times the mean of 1 and `slope` where `x`
+/// is 0.
+fn leaky(values: FlexTensor, x: FlexTensor, slope: f32) -> FlexTensor {
+    let shape = values.layout().shape().clone();
+    let (values, x) = (contiguous(values), contiguous(x));
+    let half = (1.0 - slope) / 2.0;
+    let factor = |x: f32| {
+        let sign = f32::from(x > 0.0) - f32::from(x < 0.0);
+        sign * half + (1.0 - half)
+    };
+    let numbers = numbers(&values).par_iter().zip(numbers(&x));
+    let scaled = numbers.with_min_len(NUMBERS).map(|(y, &x)| y * factor(x));
+    FlexTensor::from_data(TensorData::new(scaled.collect::<Vec<f32>>(), shape))
+}
+
+/// With fewer numbers, another thread does not pay.
+const NUMBERS: usize = 1 << 14;
+
+/// The input of batch normalisation, with a row per channel.
+struct Rows {
+    x: FlexTensor,
+    gamma: FlexTensor,
+    beta: FlexTensor,
+    epsilon: f32,
+    slope: f32,
+}
+
+/// `y = leaky(scale (x - mean) + beta)` of one row.
+#[derive(Clone, Copy)]
+struct Row {
+    mean: f32,
+    /// `1 / sqrt(variance + epsilon)`
+    rate: f32,
+    gamma: f32,
+    beta: f32,
+}
+
+impl Rows {
+    fn new(x: FlexTensor, gamma: FlexTensor, beta: FlexTensor, epsilon: f32, slope: f32) -> Self {
+        let [x, gamma, beta] = [x, gamma, beta].map(contiguous);
+        Self {
+            x,
+            gamma,
+            beta,
+            epsilon,
+            slope,
         }
     }
+
+    fn shape(&self) -> [usize; 2] {
+        let channels = numbers(&self.gamma).len();
+        [channels, numbers(&self.x).len() / channels]
+    }
+
+    /// Every row of `x` with its constants.
+    fn rows(&self) -> impl IndexedParallelIterator<Item = (&[f32], Row)> {
+        let parameters = (numbers(&self.gamma).par_iter()).zip(numbers(&self.beta));
+        let rows = numbers(&self.x).par_chunks_exact(self.shape()[1]);
+        rows.zip(parameters).map(|(x, (&gamma, &beta))| {
+            let count = x.len() as f32;
+            let mean = sum(x, |x| x) / count;
+            let variance = sum(x, |x| (x - mean) * (x - mean)) / count;
+            let rate = 1.0 / (variance + self.epsilon).sqrt();
+            let row = Row {
+                mean,
+                rate,
+                gamma,
+                beta,
+            };
+            (x, row)
+        })
+    }
+
+    fn forward(&self) -> FlexTensor {
+        let [channels, count] = self.shape();
+        let mut values = vec![0.0; channels * count];
+        values
+            .par_chunks_exact_mut(count)
+            .zip(self.rows())
+            .for_each(|(values, (x, row))| {
+                let (scale, slope) = (row.gamma * row.rate, self.slope);
+                for (y, x) in values.iter_mut().zip(x) {
+                    let z = scale * (x - row.mean) + row.beta;
+                    *y = z.max(slope * z);
+                }
+            });
+        tensor(values, [channels, count])
+    }
+
+    /// Gradients of x, gamma and beta from that of y. With `u = (x - mean) rate` and `g` the
+    /// gradient before the LeakyReLU, `dx = gamma rate (g - mean(g) - u mean(g u))`.
+    fn backward(&self, gradient: FlexTensor) -> [FlexTensor; 3] {
+        let gradient = contiguous(gradient);
+        let [channels, count] = self.shape();
+        let mut of_x = vec![0.0; channels * count];
+        let (of_gamma, of_beta) = of_x
+            .par_chunks_exact_mut(count)
+            .zip(numbers(&gradient).par_chunks_exact(count))
+            .zip(self.rows())
+            .map(|((of_x, gradient), (x, row))| {
+                let (scale, slope) = (row.gamma * row.rate, self.slope);
+                // `of_x` first holds the gradient before the LeakyReLU, and then the gradient of x.
+                for ((before, x), gradient) in of_x.iter_mut().zip(x).zip(gradient) {
+                    let z = scale * (x - row.mean) + row.beta;
+                    *before = gradient * if z > 0.0 { 1.0 } else { slope };
+                }
+                let total = sum(of_x, |g| g);
+                let product = row.rate * sum_of_products(of_x, x, row.mean);
+                let (mean, share) = (total / count as f32, product / count as f32);
+                for (g, x) in of_x.iter_mut().zip(x) {
+                    *g = scale * (*g - mean - (x - row.mean) * row.rate * share);
+                }
+                (product, total)
+            })
+            .unzip();
+        [
+            tensor(of_x, [channels, count]),
+            tensor(of_gamma, [channels]),
+            tensor(of_beta, [channels]),
+        ]
+    }
+}
+
+/// Numbers added side by side: enough for the widest registers, and a fixed order of summing.
+const LANES: usize = 16;
+
+fn sum(values: &[f32], term: impl Fn(f32) -> f32) -> f32 {
+    let mut lanes = [0.0_f32; LANES];
+    let parts = values.chunks_exact(LANES);
+    let rest: f32 = parts.remainder().iter().map(|&value| term(value)).sum();
+    for part in parts {
+        for (lane, &value) in lanes.iter_mut().zip(part) {
+            *lane += term(value);
+        }
+    }
+    lanes.iter().sum::<f32>() + rest
+}
+
+/// `sum g (x - mean)`
+fn sum_of_products(g: &[f32], x: &[f32], mean: f32) -> f32 {
+    let mut lanes = [0.0_f32; LANES];
+    let (g_parts, x_parts) = (g.chunks_exact(LANES), x.chunks_exact(LANES));
+    let rest = g_parts.remainder().iter().zip(x_parts.remainder());
+    let rest: f32 = rest.map(|(g, x)| g * (x - mean)).sum();
+    for (g, x) in g_parts.zip(x_parts) {
+        for (lane, (g, x)) in lanes.iter_mut().zip(g.iter().zip(x)) {
+            *lane += g * (x - mean);
+        }
+    }
+    lanes.iter().sum::<f32>() + rest
 }
 
 #[cfg(test)]

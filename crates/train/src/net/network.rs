@@ -128,11 +128,6 @@ impl Weights {
         weight.values.clone().reshape(dims)
     }
 
-    /// The weight called `name`, row-major.
-    pub fn values(&self, name: &str) -> Tensor<1> {
-        self.entry(name).values.clone()
-    }
-
     /// The weight called `name` as numbers, row-major.
     pub fn numbers(&self, name: &str) -> Vec<f32> {
         numbers(&self.entry(name).values)
@@ -167,33 +162,6 @@ impl Weights {
             entries: self.entries.iter().map(track).collect(),
         }
     }
-
-    /// The weights with every gamma, beta and bias moved. In an untrained network they are 1 and 0,
-    /// which hides an omission.
-    #[cfg(test)]
-    pub(super) fn moved(mut self, seed: u64, device: &Device) -> Self {
-        for weight in &mut self.entries {
-            if weight.dims.len() == 1 {
-                let mut stream = Stream::new(seed, &weight.name);
-                let moved = numbers(&weight.values)
-                    .iter()
-                    .map(|value| value + 0.3 * stream.normal() as f32)
-                    .collect();
-                let length = weight.dims[0];
-                weight.values = Tensor::from_data(TensorData::new(moved, [length]), device);
-            }
-        }
-        self
-    }
-
-    /// The number of parameters in all weights.
-    #[cfg(test)]
-    pub(super) fn count(&self) -> usize {
-        self.entries
-            .iter()
-            .map(|weight| weight.dims.iter().product::<usize>())
-            .sum()
-    }
 }
 
 /// A tensor as numbers, row-major.
@@ -225,29 +193,17 @@ pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
             kernel,
             ..
         } = *layer;
+        let mut add = |part: &str, dims: &[usize], values: Vec<f32>| {
+            weights.add(&format!("{name}.{part}"), dims, values, device);
+        };
         let dims = [outputs, inputs, kernel, kernel];
         let values = truncated_normal(dims.iter().product(), &mut stream.child(index));
-        weights.add(&format!("{name}.kernel"), &dims, values, device);
+        add("kernel", &dims, values);
         if layer.normalised {
-            weights.add(
-                &format!("{name}.gamma"),
-                &[outputs],
-                vec![1.0; outputs],
-                device,
-            );
-            weights.add(
-                &format!("{name}.beta"),
-                &[outputs],
-                vec![0.0; outputs],
-                device,
-            );
+            add("gamma", &[outputs], vec![1.0; outputs]);
+            add("beta", &[outputs], vec![0.0; outputs]);
         }
-        weights.add(
-            &format!("{name}.bias"),
-            &[outputs],
-            vec![0.0; outputs],
-            device,
-        );
+        add("bias", &[outputs], vec![0.0; outputs]);
     }
 }
 
@@ -275,12 +231,10 @@ impl Statistics {
         (mean.div_scalar(batches), variance.div_scalar(batches))
     }
 
-    /// Counts a batch whose layers were all collected.
-    pub(super) fn batch_collected(&mut self) {
-        self.batches += 1;
-    }
-
     fn collect(&mut self, index: usize, mean: Tensor<1>, variance: Tensor<1>) {
+        if index == 0 {
+            self.batches += 1;
+        }
         match self.layers.get_mut(index) {
             None => self.layers.push((mean, variance)),
             Some(sums) => {
@@ -321,56 +275,35 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     let mut normalised_index = 0;
     for layer in &TRUNK {
         let part = |part: &str| format!("{}.{part}", layer.name);
-        let sums = sums(weights, layer, x);
+        let vector = |name: &str| weights.tensor::<1>(&part(name));
+        let geometry = layer.geometry(x.dims()[1]);
+        let (outputs, small) = (layer.outputs, geometry.small());
+        let taps = layer.inputs * layer.kernel * layer.kernel;
+        let kernels = weights.tensor::<4>(&part("kernel"));
+        let sums = convolution(x, kernels.reshape([outputs, taps]), geometry)
+            .reshape([outputs, small * small * batch])
+            .add(vector("bias").reshape([outputs, 1]));
         let rows = if layer.normalised {
-            let gamma = weights.tensor::<1>(&part("gamma"));
-            let beta = weights.tensor::<1>(&part("beta"));
+            let (gamma, beta) = (vector("gamma"), vector("beta"));
+            let leaky = (BATCH_NORM_EPSILON, LEAKY_SLOPE);
             normalised_index += 1;
             batch_norm(
                 sums,
                 gamma,
                 beta,
-                (BATCH_NORM_EPSILON, LEAKY_SLOPE),
+                leaky,
                 normalised_index - 1,
                 normalisation,
             )
         } else {
             leaky_relu(sums, LEAKY_SLOPE)
         };
-        x = as_images(rows, batch);
+        x = rows.reshape([outputs, small, small, batch]);
     }
-    if let Normalisation::Collect(statistics) = normalisation {
-        statistics.batch_collected();
-    }
-    pooled(x, takes_means(weights))
-}
-
-/// A layer's convolution with its bias: `x` `[inputs, size, size, batch]` to `[outputs, numbers]`.
-pub(super) fn sums(weights: &Weights, layer: &Convolution, x: Tensor<4>) -> Tensor<2> {
-    let geometry = layer.geometry(x.dims()[1]);
-    let numbers = geometry.small() * geometry.small() * x.dims()[3];
-    let taps = layer.inputs * layer.kernel * layer.kernel;
-    let kernels = weights.tensor::<4>(&format!("{}.kernel", layer.name));
-    let bias = weights.tensor::<1>(&format!("{}.bias", layer.name));
-    convolution(x, kernels.reshape([layer.outputs, taps]), geometry)
-        .reshape([layer.outputs, numbers])
-        .add(bias.reshape([layer.outputs, 1]))
-}
-
-/// `[outputs, numbers]` as `[outputs, size, size, batch]`.
-pub(super) fn as_images(rows: Tensor<2>, batch: usize) -> Tensor<4> {
-    let [outputs, numbers] = rows.dims();
-    let size = (numbers / batch).isqrt();
-    rows.reshape([outputs, size, size, batch])
-}
-
-/// Pools the last layer's images `[64, 4, 4, batch]` to each channel's greatest value,
-/// `[batch, 64]`, or with the means after them, `[batch, 128]`.
-pub(super) fn pooled(x: Tensor<4>, with_means: bool) -> Tensor<2> {
-    let [_, rows, columns, batch] = x.dims();
+    let [_, rows, columns, _] = x.dims();
     let x = x.reshape([FEATURES, rows * columns, batch]);
     let greatest = x.clone().max_dim(1).reshape([FEATURES, batch]).transpose();
-    if !with_means {
+    if !takes_means(weights) {
         return greatest;
     }
     let means = x.mean_dim(1).reshape([FEATURES, batch]).transpose();
@@ -412,17 +345,10 @@ pub(super) fn batch_norm(
     }
 }
 
-/// The linear layer after the trunk: features `[batch, features]` to `[batch, outputs]`.
-pub fn head(weights: &Weights, features: Tensor<2>) -> Tensor<2> {
-    dense(weights, "head", features)
-}
-
 /// Passes `x` `[rows, inputs]` through the layer `name`.
-pub(super) fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
+pub fn dense(weights: &Weights, name: &str, x: Tensor<2>) -> Tensor<2> {
     let bias = weights.tensor::<1>(&format!("{name}.bias"));
-    let (inputs, outputs) = (x.dims()[1], bias.dims()[0]);
-    let matrix = weights
-        .values(&format!("{name}.matrix"))
-        .reshape([inputs, outputs]);
+    let outputs = bias.dims()[0];
+    let matrix = weights.tensor::<2>(&format!("{name}.matrix"));
     x.matmul(matrix).add(bias.reshape([1, outputs]))
 }

@@ -1,6 +1,6 @@
 //! Columns of numbers brought to one scale before a network sees them.
 
-use crate::net::builder::Builder;
+use crate::net::graph::Graph;
 
 /// The number of standard deviations from the mean at which a column is clipped, because a network
 /// extrapolates beyond its training data.
@@ -54,12 +54,14 @@ impl Standard {
     }
 
     /// Adds the nodes that bring `columns` to the scale, and returns their output's name.
-    pub(crate) fn scaled(&self, b: &mut Builder, columns: &str) -> String {
+    pub fn scaled(&self, graph: &mut Graph, columns: &str) -> String {
         let dims = [1, self.mean.len()];
-        let mean = b.0.constant("column means", &dims, &self.mean);
-        let deviation = b.0.constant("column deviations", &dims, &self.deviation);
-        let centred = b.node("Sub", &[columns, &mean], "centred");
-        let scaled = b.node("Div", &[&centred, &deviation], "standardised");
-        b.clipped(&scaled, -CLIP, CLIP)
+        let mean = graph.constant("column means", &dims, &self.mean);
+        let deviation = graph.constant("column deviations", &dims, &self.deviation);
+        let centred = graph.node("Sub", &[columns, &mean], "centred");
+        let scaled = graph.node("Div", &[&centred, &deviation], "standardised");
+        let low = graph.scalar("least", -CLIP);
+        let high = graph.scalar("most", CLIP);
+        graph.node("Clip", &[&scaled, &low, &high], "standardised and clipped")
     }
 }

@@ -1,9 +1,7 @@
 //! Compares gradients of a whole step with finite differences.
 
-use super::step::{discriminator_loss, generator_loss, penalty};
 use super::*;
-use crate::net::network::{Normalisation, numbers};
-use burn::tensor::{DType, FloatDType, Tensor, TensorData};
+use burn::tensor::{DType, FloatDType, TensorData};
 use hardnessd_core::verdict::{COLS, ROWS};
 
 const GAMES: [Game; 3] = [Game::RealOrFake, Game::FakeLevel, Game::FeatureMatching];
