@@ -22,10 +22,11 @@ class Trainer:
         print("$", *command, flush=True)
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
-    def simulated(self, path, options):
-        """The data set at `path`, simulated with `options` unless it is there."""
+    def simulated(self, path, options, settings):
+        """The data set at `path`, simulated with `options` and settings in TOML unless it is there."""
         if not path.exists():
-            self.run("simulate", *options.split(), "--out", path)
+            path.with_suffix(".toml").write_text(settings)
+            self.run("simulate", *options.split(), "--config", path.with_suffix(".toml"), "--out", path)
         return path
 
     def learnt(self, out, *command):

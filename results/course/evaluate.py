@@ -23,7 +23,10 @@ import trainer as training  # noqa: E402
 from wrong_newtons import wrong_newtons  # noqa: E402
 
 MODEL = HERE.parent.parent / "models/course.onnx"
-COMMON = "--sequences --objects 0 --test-objects 100 --test-covers 25 --electronics 4 --presses 4"
+COMMON = "--sequences --objects 0 --test-objects 100 --presses 4"
+SETTINGS = "[sensors]\ntest_covers = 25\nelectronics = 4\n"
+# Of named materials.
+ALL_TEST = "[objects]\nall_test = true\n"
 ELECTRONICS = 4
 SETS = {
     "Unseen sensors, `matched` shapes": "--sensors broad --materials broad --shapes matched --seed 5101",
@@ -32,8 +35,8 @@ SETS = {
     "The simulated JX255N, `matched`": "--sensors jx255n --materials broad --shapes matched --seed 5104",
     "The simulated JX255N, `wide`": "--sensors jx255n --materials broad --shapes wide --seed 5105",
     "The simulated JX255N, `flat`": "--sensors jx255n --materials broad --shapes flat --seed 5106",
-    "Unseen sensors, the eight named materials, `matched`": "--sensors broad --all-test --shapes matched --seed 5107",
-    "Unseen sensors, the eight named materials, `wide`": "--sensors broad --all-test --shapes wide --seed 5108",
+    "Unseen sensors, the eight named materials, `matched`": "--sensors broad --shapes matched --seed 5107",
+    "Unseen sensors, the eight named materials, `wide`": "--sensors broad --shapes wide --seed 5108",
 }
 TOLD = {
     "nothing known": (),
@@ -159,7 +162,7 @@ def without_positions(path, out):
 def measure(trainer, work):
     import numpy
 
-    found = {"common": COMMON, "model": MODEL.name, "sets": {}}
+    found = {"common": COMMON, "settings": SETTINGS, "model": MODEL.name, "sets": {}}
     verdicts = work / "verdicts.csv"
 
     def judged(path, told):
@@ -167,7 +170,8 @@ def measure(trainer, work):
         return figures(evaluated, verdicts, numpy.load(path))
 
     for number, (name, options) in enumerate(SETS.items()):
-        path = trainer.simulated(work / f"set-{number}.npz", f"{COMMON} {options}")
+        settings = SETTINGS if "--materials" in options else SETTINGS + ALL_TEST
+        path = trainer.simulated(work / f"set-{number}.npz", f"{COMMON} {options}", settings)
         ways = {told: judged(path, told) for told in TOLD}
         if number < UNSEEN:
             # The same presses of a robot that does not say where its arm is.

@@ -41,11 +41,13 @@ def judged(binaries, directory, name, *options):
 
 def rates_agree(binaries, directory, objects):
     """The same seed presses the same objects with the same forces, whatever the frame rate."""
-    for name, materials in [("broad", ["--materials", "broad", "--gaps"]), ("named", ["--all-test"])]:
-        options = [*materials, "--shapes", "wide", "--test-objects", objects, "--presses", "3", "--seed", "78"]
+    for name, materials in [("broad", 'borders = "gaps"'), ("named", "all_test = true")]:
+        options = ["--materials", name, "--config", "own.toml", "--shapes", "wide", "--test-objects", objects, "--presses", "3", "--seed", "78"]
         levels = []
         for rate in ["5", "20", "100"]:
-            data = simulated(binaries, directory, f"{name}-{rate}", *options, "--fps", f"{rate}..{rate}")
+            settings = f"frame_rate_hz = [{rate}, {rate}]\n[objects]\n{materials}\n"
+            pathlib.Path(directory, "own.toml").write_text(settings)
+            data = simulated(binaries, directory, f"{name}-{rate}", *options)
             verdicts = judged(binaries, directory, f"{name}-{rate}")
             levels.append({
                 (verdict["object"], float(force)): verdict["judged"]

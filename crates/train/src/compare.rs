@@ -3,57 +3,74 @@
 //! In: data. Out, in a directory: `data/` with the test sets, `runs/` with a run's directory for each method,
 //! number of labels and seed, `logs/`, `results.json`, `objects.csv` and `tables.md`. This process trains
 //! nothing: each run is a call of `hrn-train train`, so that runs can be stopped, resumed and spread over
-//! machines. A run that has its model is not done again.
+//! machines. A run that has its model is not done again, and one that has its `compared.json` is not judged again.
 
 mod sets;
 pub mod tables;
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::fs::File;
+use std::fs::{self, File};
+use std::io::ErrorKind;
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::Mutex;
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{Context as _, ensure};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::data::presses::Presses;
 use crate::model::evaluated::{Case, Evaluated, cases};
 use crate::model::verdicts::{self, Given};
-use crate::recipe::{self, Kind};
+use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
 use crate::run::disk::{lock, refuse_foreign, write_whole};
 use crate::run::history::MetricsFile;
 use crate::settings::Profile;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::sha256_hex;
 use sets::{FRESH_OBJECTS, TestSet};
 
-/// Methods whose first stage is that of another method.
-const SHARES: [(&str, &str); 2] = [("nahrn", "ours"), ("nihrn", "ours")];
 /// A recipe that is no row of the tables.
 const NOT_COMPARED: &str = "hrn";
 
 /// The request for a comparison.
-#[derive(Debug, Clone)]
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = HELP)]
 pub struct Plan {
-    /// The data to learn from.
-    pub data: Vec<PathBuf>,
-    /// The directory of the comparison.
-    pub out: PathBuf,
-    /// The methods to run. If there are none, all that the data suit.
-    pub methods: Vec<String>,
-    /// Numbers of labels to run each method with, besides its own share.
-    pub labels: Vec<usize>,
-    /// Runs use the seeds from 1 to this one.
-    pub seeds: u64,
-    /// The profile of each run.
-    pub profile: Profile,
-    /// The number of runs at a time.
-    pub jobs: usize,
+    /// Data to learn from; several files may be named [default: none, only make the tables of DIR again]
+    #[arg(long, value_name = "D.npz", num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// Directory of the comparison
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Methods to run [default: all but hrn; course only on whole presses]
+    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1.., hide_possible_values = true,
+          value_parser = recipe::parser())]
+    methods: Vec<&'static Recipe>,
+    /// Also run every method with each of these numbers of labels
+    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
+    labels: Vec<usize>,
+    /// Train with the seeds 1 to N
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    seeds: u64,
+    /// Length of each training run
+    #[arg(long, default_value = "paper")]
+    profile: Profile,
+    /// Run nothing: print a command line for each run that is not done, for GNU parallel, Slurm or Ray
+    #[arg(long, requires = "data")]
+    plan: bool,
+    /// Runs at a time, each on one thread [default: as many as there are cores]
+    #[arg(long, value_name = "J")]
+    jobs: Option<NonZeroUsize>,
 }
+
+/// What `compare --help` says below the options.
+const HELP: &str = "\
+    It calls `train` once for each method, number of labels and seed, and leaves out the runs that \
+    have their model. Models that take references get two presses of each rigid piece.";
 
 /// A run of the plan.
 #[derive(Debug, Clone)]
@@ -70,36 +87,25 @@ impl Planned {
             .map_or(String::new(), |labels| format!("-{labels}"));
         format!("{}{labels}-{}", self.method, self.seed)
     }
-
-    /// The run whose first stage this one has, too.
-    fn shares_with(&self) -> Option<Self> {
-        let (_, other) = SHARES.iter().find(|(method, _)| *method == self.method)?;
-        Some(Self {
-            method: (*other).to_owned(),
-            ..self.clone()
-        })
-    }
 }
 
 impl Plan {
     fn runs(&self, are_over_time: bool) -> Vec<Planned> {
-        let suits = |recipe: &&recipe::Recipe| {
+        let suits = |recipe: &&Recipe| {
             recipe.name != NOT_COMPARED && (recipe.learning != Kind::Course || are_over_time)
         };
-        let all = recipe::all().iter().filter(suits);
-        let methods = match self.methods.is_empty() {
-            true => all.map(|recipe| recipe.name.clone()).collect(),
+        let methods: Vec<&Recipe> = match self.methods.is_empty() {
+            true => recipe::all().iter().filter(suits).collect(),
             false => self.methods.clone(),
         };
-        let numbers: Vec<Option<usize>> = [None]
-            .into_iter()
-            .chain(self.labels.iter().copied().map(Some))
-            .collect();
         let mut runs = Vec::new();
-        for method in &methods {
-            for &labels in &numbers {
+        for recipe in methods {
+            for labels in [None]
+                .into_iter()
+                .chain(self.labels.iter().copied().map(Some))
+            {
                 runs.extend((1..=self.seeds).map(|seed| Planned {
-                    method: method.clone(),
+                    method: recipe.name.clone(),
                     labels,
                     seed,
                 }));
@@ -131,63 +137,11 @@ impl Plan {
         }
         words
     }
-
-    /// The runs that are not done, in groups that each do one after the other: a run that shares a stage
-    /// with another comes after it, and takes the stage.
-    fn open(&self, runs: &[Planned]) -> Vec<Vec<Vec<String>>> {
-        let open = |run: &&Planned| !self.is_done(run);
-        let mut groups: Vec<(String, Vec<Vec<String>>)> = Vec::new();
-        let mut ordered: Vec<&Planned> = runs.iter().filter(open).collect();
-        ordered.sort_by_key(|run| run.shares_with().is_some());
-        for run in ordered {
-            let mut words = self.words(run);
-            let other = run.shares_with().filter(|other| {
-                let name = other.name();
-                runs.iter().any(|run| run.name() == name) || self.is_done(other)
-            });
-            let group = other.as_ref().unwrap_or(run).name();
-            if let Some(other) = other {
-                words.extend([
-                    "--from".to_owned(),
-                    self.directory(&other).display().to_string(),
-                ]);
-            }
-            match groups.iter_mut().find(|(name, _)| *name == group) {
-                Some((_, of_group)) => of_group.push(words),
-                None => groups.push((group, vec![words])),
-            }
-        }
-        groups.into_iter().map(|(_, group)| group).collect()
-    }
-}
-
-/// The command lines of the runs that are not done, for GNU parallel, Slurm or Ray: each line is
-/// independent of the others.
-///
-/// # Errors
-///
-/// Fails if the data cannot be read, or the directory is of something else.
-pub fn plan(plan: &Plan) -> anyhow::Result<String> {
-    let presses = checked(plan)?;
-    let mut lines = String::new();
-    for group in plan.open(&plan.runs(presses.are_over_time())) {
-        let commands = group.iter().map(|words| {
-            let words = std::iter::once("hrn-train").chain(words.iter().map(String::as_str));
-            Ok(format!("RAYON_NUM_THREADS=1 {}", shlex::try_join(words)?))
-        });
-        let commands: anyhow::Result<Vec<String>> = commands.collect();
-        let _ = writeln!(lines, "{}", commands?.join(" && "));
-    }
-    Ok(lines)
-}
-
-fn checked(plan: &Plan) -> anyhow::Result<Presses> {
-    refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
-    Ok(Presses::read(&plan.data)?)
 }
 
 /// Does the runs that are not done, judges all runs of the plan on all sets, and writes results and tables.
-/// Without data, only writes the tables of the results that are there. Returns the tables.
+/// Without data, only writes the tables of the results that are there. Returns the tables, or the command lines
+/// of the runs if only these are asked for.
 ///
 /// # Errors
 ///
@@ -197,76 +151,44 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     if plan.data.is_empty() {
         return write_tables(&plan.out);
     }
-    let presses = checked(plan)?;
+    refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
+    let presses = Presses::read(&plan.data)?;
     let runs = plan.runs(presses.are_over_time());
+    let open = runs.iter().filter(|run| !plan.is_done(run));
+    let open: Vec<Vec<String>> = open.map(|run| plan.words(run)).collect();
+    if plan.plan {
+        let line = |words: &Vec<String>| {
+            let words = shlex::try_join(words.iter().map(String::as_str))?;
+            Ok(format!("RAYON_NUM_THREADS=1 hrn-train {words}\n"))
+        };
+        return open.iter().map(line).collect();
+    }
     for part in ["data", "runs", "logs"] {
         let part = plan.out.join(part);
-        std::fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+        fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
     }
     let _lock = lock(&plan.out)?;
     let sets = sets::all(presses, plan.profile, &plan.out.join("data"))?;
-    let results = Mutex::new(());
-    let judged = || {
-        let _one = results.lock().expect("nobody panics with it");
-        judge(plan, &runs, &sets)
-    };
-    judged()?;
-    let failures = do_groups(plan, plan.open(&runs), &judged)?;
-    let text = write_tables(&plan.out)?;
+    // Without a number, as many threads as cores.
+    let jobs = plan.jobs.map_or(0, NonZeroUsize::get);
+    let jobs = rayon::ThreadPoolBuilder::new().num_threads(jobs).build()?;
+    let failures: Vec<Option<String>> = jobs.install(|| {
+        let runs = open.par_iter().with_max_len(1);
+        runs.map(|words| do_run(plan, words))
+            .collect::<anyhow::Result<_>>()
+    })?;
+    let done = runs.par_iter().filter(|run| plan.is_done(run));
+    done.try_for_each(|run| judge(plan, run, &sets))?;
+    write_results(&plan.out)?;
+    let text = write_tables(&plan.out);
+    let failures: Vec<String> = failures.into_iter().flatten().collect();
     ensure!(
         failures.is_empty(),
-        "{} failed (logs in {}): {}",
-        if failures.len() == 1 { "a run" } else { "runs" },
+        "runs failed (logs in {}): {}",
         plan.out.join("logs").display(),
         failures.join("; ")
     );
-    Ok(text)
-}
-
-/// Does groups of runs, some at a time. Returns the names of those that failed, with the reason. After each
-/// run, `done` is called.
-fn do_groups(
-    plan: &Plan,
-    groups: Vec<Vec<Vec<String>>>,
-    done: &(impl Fn() -> anyhow::Result<()> + Sync),
-) -> anyhow::Result<Vec<String>> {
-    let open = Mutex::new(groups.into_iter());
-    let (failures, errors) = (Mutex::new(Vec::new()), Mutex::new(Vec::new()));
-    let next = || open.lock().expect("nobody panics with it").next();
-    let work = || {
-        while let Some(group) = next() {
-            for words in group {
-                let outcome = do_run(plan, &words).map(|failure| match failure {
-                    Some(failure) => failures
-                        .lock()
-                        .expect("nobody panics with it")
-                        .push(failure),
-                    None => {
-                        let noted = done().err();
-                        errors.lock().expect("nobody panics with it").extend(noted);
-                    }
-                });
-                errors
-                    .lock()
-                    .expect("nobody panics with it")
-                    .extend(outcome.err());
-            }
-        }
-    };
-    std::thread::scope(|scope| {
-        for _ in 0..plan.jobs {
-            scope.spawn(work);
-        }
-    });
-    match errors
-        .into_inner()
-        .expect("nobody panics with it")
-        .into_iter()
-        .next()
-    {
-        Some(error) => Err(error),
-        None => Ok(failures.into_inner().expect("nobody panics with it")),
-    }
+    text
 }
 
 /// Does a run. Returns its name and the last line of its log, if it fails.
@@ -293,73 +215,40 @@ fn do_run(plan: &Plan, words: &[String]) -> anyhow::Result<Option<String>> {
         hardnessd_core::stderr_line!("{name}: done");
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path).unwrap_or_default();
-    let reason = text.lines().last().unwrap_or("no word").to_owned();
+    let text = fs::read_to_string(&path).unwrap_or_default();
+    let reason = text.lines().last().unwrap_or("no word");
     Ok(Some(format!("{name}: {reason}")))
 }
 
-/// What a run's model reached on a set, in the run's `compared.json`.
+/// What a run's model reached, in the run's `compared.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Compared {
-    model_sha256: String,
-    data_sha256: String,
-    evaluation: Value,
-    /// Level, object, right presses and presses.
-    objects: Vec<(u8, u32, u64, u64)>,
+    /// The SHA-256 of each set.
+    data: Vec<String>,
+    /// The entry of the run in `results.json`.
+    entry: Value,
+    /// For each set the level, object, right presses and presses of each object.
+    objects: BTreeMap<String, Vec<(u8, u32, u64, u64)>>,
 }
 
-/// Judges every run of the plan that is done on every set, and writes `results.json` and `objects.csv`.
-/// Entries of other runs stay.
-fn judge(plan: &Plan, runs: &[Planned], sets: &[TestSet]) -> anyhow::Result<()> {
-    let mut entries = entries(&plan.out)?;
-    for run in runs.iter().filter(|run| plan.is_done(run)) {
-        let entry = judged(plan, run, sets)?;
-        let same = |other: &&mut Value| other["run"] == entry["run"];
-        match entries.iter_mut().find(same) {
-            Some(other) => *other = entry,
-            None => entries.push(entry),
-        }
-    }
-    // Runs end in any order, and those of an earlier plan stay last.
-    let place = |entry: &Value| runs.iter().position(|run| entry["run"] == run.name());
-    entries.sort_by_key(|entry| place(entry).unwrap_or(usize::MAX));
-    let json = serde_json::to_vec_pretty(&entries)?;
-    write_whole(&plan.out.join("results.json"), &json)?;
-    write_objects(&plan.out, &entries)
+/// The file of a run, which is `None` if it is not there or of another version.
+fn compared(run: &Path) -> Option<Compared> {
+    let bytes = fs::read(run.join("compared.json")).ok()?;
+    serde_json::from_slice(&bytes).ok()
 }
 
-/// The entry of a run in `results.json`.
-fn judged(plan: &Plan, run: &Planned, sets: &[TestSet]) -> anyhow::Result<Value> {
+/// Judges a run that is done on every set, unless it was.
+fn judge(plan: &Plan, run: &Planned, sets: &[TestSet]) -> anyhow::Result<()> {
     let directory = plan.directory(run);
+    let data: Vec<String> = sets.iter().map(|set| set.sha256().to_owned()).collect();
+    if compared(&directory).is_some_and(|known| known.data == data) {
+        return Ok(());
+    }
     let path = directory.join("hrn.onnx");
     let description = Run::description_at(&directory)?;
     let description = description.with_context(|| format!("{}: no run", directory.display()))?;
-    let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-    let model_sha256 = sha256_hex(&bytes);
-    let mut known = compared(&directory)?;
-    let is_known = |known: &BTreeMap<String, Compared>, set: &TestSet| {
-        known.get(set.name).is_some_and(|found| {
-            (found.model_sha256.as_str(), found.data_sha256.as_str())
-                == (model_sha256.as_str(), set.sha256())
-        })
-    };
-    if !sets.iter().all(|set| is_known(&known, set)) {
-        let hrn = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
-        for set in sets {
-            let verdicts = verdicts::of(&hrn, &set.presses, &set.places, Given::USUAL)?;
-            let cases = cases(&set.presses, &verdicts);
-            let evaluation = Evaluated::of(&cases, &hrn.card().levels);
-            let found = Compared {
-                model_sha256: model_sha256.clone(),
-                data_sha256: set.sha256().to_owned(),
-                evaluation: serde_json::to_value(evaluation)?,
-                objects: by_object(&cases),
-            };
-            known.insert(set.name.to_owned(), found);
-        }
-        let json = serde_json::to_vec(&known)?;
-        write_whole(&directory.join("compared.json"), &json)?;
-    }
+    let bytes = fs::read(&path).with_context(|| path.display().to_string())?;
+    let hrn = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
     let (steps, seconds) = MetricsFile::of(&directory).cost()?;
     let mut entry = json!({
         "method": run.method,
@@ -371,20 +260,22 @@ fn judged(plan: &Plan, run: &Planned, sets: &[TestSet]) -> anyhow::Result<Value>
         "run": run.name(),
         sets::PAPER_SPLIT: null,
     });
+    let mut objects = BTreeMap::new();
     for set in sets {
-        entry[set.name] = known[set.name].evaluation.clone();
+        let verdicts = verdicts::of(&hrn, &set.presses, &set.places, Given::USUAL)?;
+        let cases = cases(&set.presses, &verdicts);
+        entry[set.name] = serde_json::to_value(Evaluated::of(&cases, &hrn.card().levels))?;
+        objects.insert(set.name.to_owned(), by_object(&cases));
     }
-    Ok(entry)
-}
-
-fn compared(run: &Path) -> anyhow::Result<BTreeMap<String, Compared>> {
-    let path = run.join("compared.json");
-    match std::fs::read(&path) {
-        // What cannot be read is measured again.
-        Ok(bytes) => Ok(serde_json::from_slice(&bytes).unwrap_or_default()),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(BTreeMap::new()),
-        Err(error) => Err(error).with_context(|| path.display().to_string()),
-    }
+    let found = Compared {
+        data,
+        entry,
+        objects,
+    };
+    write_whole(
+        &directory.join("compared.json"),
+        &serde_json::to_vec(&found)?,
+    )
 }
 
 fn by_object(cases: &[Case]) -> Vec<(u8, u32, u64, u64)> {
@@ -401,23 +292,27 @@ fn by_object(cases: &[Case]) -> Vec<(u8, u32, u64, u64)> {
     objects.into_iter().map(count).collect()
 }
 
-/// The entries of `results.json`; none if there is no such file.
-fn entries(out: &Path) -> anyhow::Result<Vec<Value>> {
-    let path = out.join("results.json");
-    match std::fs::read(&path) {
-        Ok(bytes) => serde_json::from_slice(&bytes).with_context(|| path.display().to_string()),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Vec::new()),
-        Err(error) => Err(error).with_context(|| path.display().to_string()),
-    }
-}
-
-/// Writes the right verdicts of every run on each object. `geometry` is there where the objects of one number
-/// are pressed alike in all materials.
-fn write_objects(out: &Path, entries: &[Value]) -> anyhow::Result<()> {
+/// Writes `results.json` and `objects.csv`, with every run of the directory that was judged. `geometry` is there
+/// where the objects of one number are pressed alike in all materials.
+fn write_results(out: &Path) -> anyhow::Result<()> {
+    let runs = out.join("runs");
+    let of_runs = fs::read_dir(&runs).with_context(|| runs.display().to_string())?;
+    let paths: Result<Vec<PathBuf>, _> = of_runs
+        .map(|run| Ok::<_, anyhow::Error>(run?.path()))
+        .collect();
+    let mut all: Vec<Compared> = paths?.iter().filter_map(|run| compared(run)).collect();
+    all.sort_by_key(|Compared { entry, .. }| {
+        let method = recipe::all()
+            .iter()
+            .position(|recipe| entry["method"] == recipe.name);
+        let [labels, seed] = ["labels", "seed"].map(|key| entry[key].as_u64());
+        (method, Reverse(labels), seed)
+    });
     let mut csv = "run,set,level,object,geometry,right,samples\n".to_owned();
-    for run in entries.iter().filter_map(|entry| entry["run"].as_str()) {
-        for (set, found) in compared(&out.join("runs").join(run))? {
-            for (level, object, right, all) in found.objects {
+    for Compared { entry, objects, .. } in &all {
+        let run = entry["run"].as_str().unwrap_or_default();
+        for (set, objects) in objects {
+            for &(level, object, right, all) in objects {
                 let geometry = match set.as_str() {
                     "matched" => (object % FRESH_OBJECTS).to_string(),
                     _ => String::new(),
@@ -426,23 +321,28 @@ fn write_objects(out: &Path, entries: &[Value]) -> anyhow::Result<()> {
             }
         }
     }
+    let entries: Vec<&Value> = all.iter().map(|compared| &compared.entry).collect();
+    write_whole(
+        &out.join("results.json"),
+        &serde_json::to_vec_pretty(&entries)?,
+    )?;
     write_whole(&out.join("objects.csv"), csv.as_bytes())
 }
 
 /// Writes `tables.md` from `results.json`, and returns it.
 fn write_tables(out: &Path) -> anyhow::Result<String> {
     let path = out.join("results.json");
-    let entries: Vec<tables::Entry> = entries(out)?
-        .into_iter()
-        .map(serde_json::from_value)
-        .collect::<Result<_, _>>()
-        .with_context(|| path.display().to_string())?;
-    if entries.is_empty() {
-        bail!(
-            "{}: has no finished run: give --data, to train some",
-            path.display()
-        );
-    }
+    let shown = || path.display().to_string();
+    let entries: Vec<tables::Entry> = match fs::read(&path) {
+        Ok(bytes) => serde_json::from_slice(&bytes).with_context(shown)?,
+        Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
+        Err(error) => return Err(error).with_context(shown),
+    };
+    ensure!(
+        !entries.is_empty(),
+        "{}: has no finished run: give --data, to train some",
+        shown()
+    );
     let text = tables::markdown(&entries);
     write_whole(&out.join("tables.md"), text.as_bytes())?;
     Ok(text)

@@ -23,8 +23,7 @@ use self::comparison::{Compared, Comparison, Division, Outcome, What};
 pub use self::comparison::{Estimate, OfLevel};
 use self::folds::Fold;
 pub use self::report::{Report, Row, Wrong};
-use crate::data::collect::{self, Labelling, Settings, Unnumbered};
-use crate::data::presses::file::layout_of;
+use crate::data::collect::{self, Settings, Unnumbered};
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
 use crate::model::export::{Exported, Learnt, validation};
@@ -149,7 +148,7 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
                 exported.card.validation = format!(
                     "{} of {}",
                     choice.division.words(),
-                    validation(&presses.kinds(&places))
+                    validation(&presses.of(&places).map(|press| press.kind).collect())
                 );
                 exported.card.metrics["fit"] = json!(report.candidates);
                 exported.bytes()
@@ -185,33 +184,38 @@ fn write_references(
 /// Reads the labelled presses.
 fn read(request: &Request) -> anyhow::Result<Presses> {
     let paths = collect::captures(&request.data)?;
-    let mut layout = Layout::OverTime;
-    for path in &paths {
-        let is_data_set = path.extension().is_some_and(|extension| extension == "npz");
-        if is_data_set && layout_of(path)? == Layout::Frames {
-            layout = Layout::Frames;
-        }
-    }
-    let labels = collect::labels(&paths);
-    let stated = paths.iter().find_map(|path| collect::levels(path));
+    let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths
+        .into_iter()
+        .partition(|path| collect::is_data_set(path));
+    let mut sets = Presses::read(&sets)?;
+    let stated = sets.sources.iter().find_map(|source| source.levels.clone());
     let levels = match request.levels.clone().or(stated) {
         Some(levels) => levels,
-        None => levels::of_labels(&labels)?,
+        None => levels::of_labels(&collect::labels(&recordings))?,
     };
+    for source in &mut sets.sources {
+        source.levels = Some(levels.clone());
+    }
+    if recordings.is_empty() {
+        return Ok(sets);
+    }
     let settings = Settings {
         sensor: request.sensor.clone(),
         hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
-        unnumbered: Unnumbered::Each,
         levels: levels.clone(),
-        labelling: Labelling {
-            level: None,
-            object: None,
-            split: Split::Train,
+        level: None,
+        object: None,
+        unnumbered: Unnumbered::Each,
+        split: Split::Train,
+        layout: match sets.all.is_empty() || sets.are_over_time() {
+            true => Layout::OverTime,
+            false => Layout::Frames,
         },
-        layout,
         skip_unusable: false,
     };
-    Ok(collect::collect(&paths, None, &settings)?.into_presses(levels))
+    let mut all = collect::collect(&recordings, None, &settings)?.into_presses(levels);
+    all.join(sets)?;
+    Ok(all)
 }
 
 /// Refuses data with too little to learn from.

@@ -341,7 +341,7 @@ fn begin(
     let lists: Vec<_> = pairs()
         .flat_map(|(side, fresh)| fresh.lists(side.prefix))
         .collect();
-    let Some(kept) = run.latest(stage, &origin.hash, origin.epochs, &lists, device)? else {
+    let Some(kept) = run.checkpoints.newest(stage, &lists, device)? else {
         return Ok((Progress::default(), fresh));
     };
     if !origin.is_generated {

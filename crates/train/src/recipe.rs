@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use serde::Deserialize;
 
 use crate::net::losses::Game;
-use crate::settings::{Profile, Settings, SettingsError};
+use crate::settings::{Profile, Settings};
 
 /// What learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -81,16 +82,26 @@ pub struct Recipe {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
+    /// What profiles change for all methods.
+    profiles: BTreeMap<Profile, toml::Table>,
     recipe: Vec<Recipe>,
 }
 
+static ALL: LazyLock<File> = LazyLock::new(|| {
+    let text = include_str!("../recipes.toml");
+    toml::from_str(text).expect("a test reads the built-in recipes")
+});
+
 /// All methods, in the order of the tables.
 pub fn all() -> &'static [Recipe] {
-    static ALL: LazyLock<File> = LazyLock::new(|| {
-        let text = include_str!("../recipes.toml");
-        toml::from_str(text).expect("a test reads the built-in recipes")
-    });
     &ALL.recipe
+}
+
+/// The parser of a method's name, which lists all methods.
+pub fn parser() -> impl TypedValueParser<Value = &'static Recipe> {
+    let value = |recipe: &'static Recipe| PossibleValue::new(&*recipe.name).help(&*recipe.about);
+    PossibleValuesParser::new(all().iter().map(value))
+        .map(|name| named(&name).expect("clap lets only these names pass"))
 }
 
 /// The method called `name`.
@@ -120,13 +131,15 @@ impl Recipe {
         profile: Profile,
         samples: usize,
         given: &toml::Table,
-    ) -> Result<Settings, SettingsError> {
+    ) -> anyhow::Result<Settings> {
         let of_profile = match profile {
             Profile::Paper => &self.paper,
             Profile::Quick => &self.quick,
             Profile::Smoke => &self.smoke,
         };
-        let mut settings = Settings::of(profile)
+        let for_all = ALL.profiles.get(&profile).cloned();
+        let mut settings = Settings::default()
+            .with(for_all.unwrap_or_default())?
             .with(self.settings.clone())?
             .with(of_profile.clone())?;
         if let Some(&steps) = self.steps.as_ref().and_then(|steps| steps.get(&profile)) {

@@ -9,20 +9,19 @@ pub mod disk;
 pub mod history;
 pub mod progress;
 
-use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
-use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use crate::data::source::Source;
-use crate::net::network::Weights;
-use crate::settings::{Profile, Settings, SettingsError};
+use crate::exit::coded;
+use crate::settings::{Profile, Settings};
 use checkpoint::Checkpoint;
 use checkpoints::Checkpoints;
 use disk::{lock, refuse_foreign, write_whole};
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
 use history::MetricsFile;
 
@@ -45,55 +44,22 @@ pub struct Description {
 }
 
 impl Description {
-    /// Reads `settings.toml`.
-    fn read(text: &str) -> Result<Self, SettingsError> {
-        toml::from_str(text).map_err(|error| SettingsError::Syntax(wording::of_toml(text, &error)))
-    }
-
-    /// The first key whose value differs from `expected`, with both values. `None` if there is
-    /// none. Data are the same if their bytes are, because a file may have been renamed.
-    pub fn difference(&self, expected: &Self) -> Option<String> {
-        let hashes = |sources: &[Source]| -> Vec<String> {
-            sources.iter().map(|source| source.sha256.clone()).collect()
-        };
-        let (found, wanted) = (hashes(&self.data), hashes(&expected.data));
-        if found != wanted {
-            let (found, wanted) = (found.join(", "), wanted.join(", "));
-            return Some(format!(
-                "sha256 of the data: found {found}, expected {wanted}"
-            ));
+    /// The first line of `settings.toml` that differs from that of `expected`, with both. Data are the same if
+    /// their bytes are, because a file may have been renamed.
+    fn difference(&self, expected: &Self) -> anyhow::Result<Option<String>> {
+        let mut found = self.clone();
+        for (own, other) in found.data.iter_mut().zip(&expected.data) {
+            own.name.clone_from(&other.name);
         }
-        let data = self.data.clone();
-        let expected = &Self {
-            data,
-            ..expected.clone()
-        };
-        if self == expected {
-            return None;
-        }
-        // A `toml::Table` cannot hold a seed above i64::MAX, although a file can.
-        let tables = (toml::Table::try_from(self), toml::Table::try_from(expected));
-        let named = match tables {
-            (Ok(found), Ok(expected)) => difference("", &found, &expected),
-            _ => None,
-        };
-        named.or_else(|| Some("a setting differs".to_owned()))
-    }
-}
-
-fn difference(table: &str, found: &toml::Table, expected: &toml::Table) -> Option<String> {
-    let shown = |value: Option<&toml::Value>| value.map_or("none".to_owned(), ToString::to_string);
-    let keys: BTreeSet<&String> = found.keys().chain(expected.keys()).collect();
-    keys.into_iter()
-        .find_map(|key| match (found.get(key), expected.get(key)) {
-            (Some(toml::Value::Table(found)), Some(toml::Value::Table(expected))) => {
-                difference(&format!("{table}{key}."), found, expected)
-            }
-            (found, expected) => (found != expected).then(|| {
-                let (found, expected) = (shown(found), shown(expected));
-                format!("`{table}{key}`: found {found}, expected {expected}")
-            }),
+        let (found, expected) = (toml::to_string(&found)?, toml::to_string(expected)?);
+        let mut pairs = found.lines().zip(expected.lines());
+        let differing = pairs.find(|(found, expected)| found != expected);
+        Ok(match differing {
+            Some((found, expected)) => Some(format!("found `{found}`, expected `{expected}`")),
+            None if found != expected => Some("the one has more files than the other".to_owned()),
+            None => None,
         })
+    }
 }
 
 /// Files that a run writes after its `settings.toml`.
@@ -113,8 +79,6 @@ pub struct Run {
     pub checkpoints: Checkpoints,
     /// Its `metrics.csv`.
     pub metrics: MetricsFile,
-    /// Directories of other runs, from which finished stages may be taken.
-    others: Vec<PathBuf>,
 }
 
 impl Run {
@@ -127,10 +91,12 @@ impl Run {
         let path = directory.join("settings.toml");
         match fs::read(&path) {
             Ok(bytes) => {
-                let description = Description::read(&String::from_utf8_lossy(&bytes));
-                Ok(Some(
-                    description.with_context(|| path.display().to_string())?,
-                ))
+                let text = String::from_utf8_lossy(&bytes);
+                let description = toml::from_str(&text).map_err(|error| {
+                    let problem = wording::of_toml(&text, &error);
+                    coded(CONFIG, format_args!("{}: {problem}", path.display()))
+                });
+                description.map(Some)
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error).with_context(|| path.display().to_string()),
@@ -152,44 +118,32 @@ impl Run {
             _lock: lock(directory)?,
             checkpoints: Checkpoints::of(directory),
             metrics: MetricsFile::of(directory),
-            others: Vec::new(),
         };
         let before = Self::description_at(directory)?;
         refuse_foreign(directory, "settings.toml", &OF_A_RUN)?;
-        if before.is_none() || resume {
-            for part in ["checkpoints", "samples"] {
-                let part = run.path(part);
-                fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
-            }
+        ensure!(
+            before.is_none() || resume,
+            "{}: has a run already: continue it with --resume, or choose another --out",
+            directory.display()
+        );
+        for part in ["checkpoints", "samples"] {
+            let part = run.path(part);
+            fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
         }
+        run.add_revision()?;
         match before {
-            Some(before) if resume => {
-                if let Some(difference) = description.difference(&before) {
+            None => run.write("settings.toml", toml::to_string(description)?.as_bytes())?,
+            Some(before) => {
+                if let Some(difference) = description.difference(&before)? {
                     bail!(
                         "{}: this run was started with other settings or data; {difference}; give \
                          --resume the same ones, or choose another --out",
                         run.path("settings.toml").display()
                     );
                 }
-                run.add_revisions(&revision())?;
-                return Ok(run);
             }
-            Some(_) => bail!(
-                "{}: has a run already: continue it with --resume, or choose another --out",
-                directory.display()
-            ),
-            None => {}
         }
-        run.write("revision", format!("{}\n", revision()).as_bytes())?;
-        run.write("settings.toml", toml::to_string(description)?.as_bytes())?;
         Ok(run)
-    }
-
-    /// The same run, which takes a stage that it has not begun from one of `others`, if that run
-    /// has finished a stage of the same origin.
-    #[must_use]
-    pub fn taking_from(self, others: Vec<PathBuf>) -> Self {
-        Self { others, ..self }
     }
 
     /// The path of a file in the directory.
@@ -204,47 +158,6 @@ impl Run {
     /// Returns the errors of writing. A file that existed before is then unchanged.
     pub fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
         write_whole(&self.path(name), bytes)
-    }
-
-    /// A stage's newest checkpoint that can be read. Without any checkpoint, that of another run
-    /// which did all `epochs` of a stage of the same `origin`; it then becomes this run's too. A
-    /// checkpoint must have the lists of `fresh`, the stage before its first step.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if there are checkpoints but none can be read, or if a stage that was taken
-    /// from another run cannot be written.
-    pub fn latest(
-        &self,
-        stage: &str,
-        origin: &str,
-        epochs: u32,
-        fresh: &[(String, Weights)],
-        device: &Device,
-    ) -> anyhow::Result<Option<Checkpoint>> {
-        if let Some(own) = self.checkpoints.newest(stage, fresh, device)? {
-            return Ok(Some(own));
-        }
-        for other in &self.others {
-            // A file of another run that cannot be read is no error, because this run can do the
-            // stage itself.
-            let Ok(Some(checkpoint)) = Checkpoints::of(other).newest(stage, fresh, device) else {
-                continue;
-            };
-            let Ok(metrics) = MetricsFile::of(other).read() else {
-                continue;
-            };
-            let Ok(revisions) = fs::read_to_string(other.join("revision")) else {
-                continue;
-            };
-            if checkpoint.origin == origin && checkpoint.progress.epoch == epochs {
-                self.add_revisions(&revisions)?;
-                self.metrics.take(stage, &metrics)?;
-                self.checkpoints.save(stage, &checkpoint)?;
-                return Ok(Some(checkpoint));
-            }
-        }
-        Ok(None)
     }
 
     /// Checks that a stage's checkpoint was made from the stage's present settings and inputs.
@@ -269,31 +182,16 @@ impl Run {
         Ok(())
     }
 
-    /// Adds the lines of `revisions` that the run's file lacks, because other programs had a part
-    /// in the run.
-    fn add_revisions(&self, revisions: &str) -> anyhow::Result<()> {
-        let path = self.path("revision");
-        let before = match fs::read_to_string(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
-            read => read.with_context(|| path.display().to_string())?,
-        };
-        let mut all = before.clone();
-        for revision in revisions.lines() {
-            if !all.lines().any(|known| known == revision) {
-                all += &format!("{revision}\n");
-            }
+    /// Adds this package's version and the commit it was built from, if they are not the last ones.
+    fn add_revision(&self) -> anyhow::Result<()> {
+        let commit = env!("HARDNESSD_REVISION");
+        let own = format!("hardnessd {} ({commit})\n", env!("CARGO_PKG_VERSION"));
+        let before = fs::read_to_string(self.path("revision")).unwrap_or_default();
+        match before.ends_with(&own) {
+            true => Ok(()),
+            false => self.write("revision", (before + &own).as_bytes()),
         }
-        if all == before {
-            return Ok(());
-        }
-        self.write("revision", all.as_bytes())
     }
-}
-
-/// This package's version, and the commit it was built from.
-fn revision() -> String {
-    let commit = env!("HARDNESSD_REVISION");
-    format!("hardnessd {} ({commit})", env!("CARGO_PKG_VERSION"))
 }
 
 #[cfg(test)]

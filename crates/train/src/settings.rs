@@ -3,6 +3,7 @@
 //! `config/hrn-train.toml` shows every key with its default and unit. A run keeps the settings that
 //! it used as `settings.toml` in its directory.
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 mod bounds;
@@ -10,9 +11,10 @@ pub mod network;
 pub mod optimiser;
 pub mod reports;
 
+use crate::exit::coded;
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
 
-pub use bounds::SettingsError;
 pub use network::NetworkSettings;
 pub use optimiser::OptimiserSettings;
 pub use reports::ArmReports;
@@ -218,66 +220,45 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The default settings of a profile. A recipe may have others.
-    pub fn of(profile: Profile) -> Self {
-        let paper = Self::default();
-        match profile {
-            Profile::Paper => paper,
-            // A tenth of the paper's steps in every stage. All methods take about an hour of one
-            // core per seed.
-            Profile::Quick => paper.with_epochs(50, 20),
-            Profile::Smoke => Self {
-                generation: Generation {
-                    samples_a_component: 2,
-                },
-                ..paper.with_epochs(2, 2)
-            },
-        }
-    }
-
-    fn with_epochs(self, gan_epochs: u32, training_epochs: u32) -> Self {
-        let gan = |settings: GanSettings| GanSettings {
-            epochs: gan_epochs,
-            checkpoint_every_epochs: settings.checkpoint_every_epochs.min(gan_epochs / 2),
-            ..settings
-        };
-        let training = |settings: Training| Training {
-            epochs: training_epochs,
-            ..settings
-        };
-        Self {
-            ustgan: gan(self.ustgan),
-            stgan: gan(self.stgan),
-            pretraining: training(self.pretraining),
-            training: training(self.training),
-            ..self
-        }
-    }
-
     /// Gives these settings, with the values in `given` in place of their own.
     ///
     /// # Errors
     ///
     /// Returns an error if a key is unknown, or a value lies outside its range.
-    pub fn with(&self, given: toml::Table) -> Result<Self, SettingsError> {
-        let own = toml::Table::try_from(self).expect("settings are plain tables of numbers");
-        let merged: Result<Self, _> = merged(own, given).try_into();
-        let settings = merged.map_err(|error| SettingsError::Syntax(error.message().to_owned()))?;
-        bounds::check(&settings)?;
-        Ok(settings)
+    pub fn with(&self, given: toml::Table) -> anyhow::Result<Self> {
+        overridden(self, given)
     }
+}
+
+/// Settings with the values in `given` in place of their own.
+///
+/// # Errors
+///
+/// Returns an error if a key is unknown, or a value lies outside its range.
+pub(crate) fn overridden<T: Serialize + DeserializeOwned>(
+    settings: &T,
+    given: toml::Table,
+) -> anyhow::Result<T> {
+    let own = toml::Table::try_from(settings).expect("settings are plain tables");
+    let merged = merged(own, given);
+    bounds::check(&merged)?;
+    merged
+        .try_into()
+        .map_err(|error| coded(CONFIG, error.message()))
 }
 
 /// Reads a file of settings, whose values take the place of others.
 ///
 /// # Errors
 ///
-/// Returns an error if the text is not TOML with known keys.
-pub fn parse(text: &str) -> Result<toml::Table, SettingsError> {
-    let syntax = |error| SettingsError::Syntax(wording::of_toml(text, &error));
+/// Returns an error if the text is not TOML with known keys, or a value lies outside its range.
+pub fn parse(text: &str) -> anyhow::Result<toml::Table> {
+    let syntax = |error| coded(CONFIG, wording::of_toml(text, &error));
     // The settings are read only so that an error can show the line.
     let _: Settings = toml::from_str(text).map_err(syntax)?;
-    toml::from_str(text).map_err(syntax)
+    let given = toml::from_str(text).map_err(syntax)?;
+    bounds::check(&given)?;
+    Ok(given)
 }
 
 /// The values of `under`, with those of `over` in place of its own.
@@ -307,12 +288,11 @@ mod tests {
 
     #[test]
     fn a_file_overrides_only_what_it_names() {
-        let smoke = Settings::of(Profile::Smoke);
         let given = parse("[training]\nbatch = 50\noptimiser.rule = \"adam\"").unwrap();
-        let mut expected = smoke;
+        let mut expected = Settings::default();
         expected.training.batch = 50;
         expected.training.optimiser.rule = Rule::Adam;
-        assert_eq!(smoke.with(given).unwrap(), expected);
+        assert_eq!(Settings::default().with(given).unwrap(), expected);
     }
 
     #[test]

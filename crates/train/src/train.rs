@@ -1,61 +1,93 @@
 //! One training, from data to a model file: read, split once, learn, calibrate, export.
 
+use std::fs;
 use std::path::PathBuf;
 
-use anyhow::{bail, ensure};
+use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 
 use crate::data::findings::Findings;
 use crate::data::presses::Presses;
-use crate::data::source::warn_of_other_levels;
 use crate::data::split::Parts;
+use crate::exit::{coded, unreadable};
 use crate::learn;
 use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
 use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Learnt};
-use crate::recipe::{Kind, Recipe};
+use crate::recipe::{self, Kind, Recipe};
 use crate::run::progress::ensure_finite;
 use crate::run::{Description, Run};
-use crate::settings::{Profile, Settings};
+use crate::settings::{self, Profile};
+use hardnessd_core::exit::{UNAVAILABLE, USAGE};
 use hardnessd_core::wording;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
 /// What to train, on what, and where to.
-#[derive(Debug)]
-pub struct Request {
-    /// The method.
-    pub recipe: &'static Recipe,
-    /// The files to learn from.
-    pub data: Vec<PathBuf>,
-    /// The run's directory.
+#[derive(Debug, clap::Args)]
+pub struct Train {
+    /// What to train
+    #[arg(long, value_parser = recipe::parser())]
+    method: &'static Recipe,
+    /// Data to learn from; several files may be named. All presses of an object must be in one file
+    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// Directory of the run
+    #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
-    /// How long the run may take.
+    /// Seed of everything random
+    // TOML, which keeps it, has no larger numbers.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    seed: u64,
+    /// Length of the training
+    #[arg(long, default_value = "paper")]
     pub profile: Profile,
-    /// Seed of everything random.
-    pub seed: u64,
-    /// The number of labels to use instead of the method's share.
-    pub labels: Option<usize>,
-    /// Settings that count more than the method's.
-    pub given: toml::Table,
-    /// Whether to continue the run that the directory has.
-    pub resume: bool,
-    /// Other runs, whose finished stages are taken where they are the same.
-    pub from: Vec<PathBuf>,
-    /// The device that computes.
-    pub device: Device,
+    /// Settings that override the method's; config/hrn-train.toml has every key
+    #[arg(long, value_name = "F.toml")]
+    config: Option<PathBuf>,
+    /// Continue a run that was stopped
+    #[arg(long)]
+    resume: bool,
+    /// Number of labels to use, of whole objects [default: the method's share]
+    #[arg(long, value_name = "N")]
+    labels: Option<usize>,
+    /// Where to compute
+    #[arg(long, default_value = "cpu")]
+    device: DeviceName,
+    /// End when this process ends, the one that started this one
+    #[arg(long, hide = true, value_name = "PID")]
+    pub parent: Option<i32>,
 }
 
-/// A requested number of labels that the data cannot give.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "--labels: found {asked}, expected at least {least} (one of each level and file) and at most the data's {labelled}"
-)]
-pub struct LabelsError {
-    asked: usize,
-    least: usize,
-    labelled: usize,
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum DeviceName {
+    Cpu,
+    /// The first CUDA device; needs a build with `--features cuda`
+    Cuda,
+}
+
+impl DeviceName {
+    fn device(self) -> anyhow::Result<Device> {
+        #[cfg(feature = "cuda")]
+        let (cuda, remedy) = (
+            Device::enumerate(burn::tensor::DeviceType::Cuda)
+                .into_iter()
+                .next(),
+            "no CUDA device found: check the device and its driver with nvidia-smi",
+        );
+        #[cfg(not(feature = "cuda"))]
+        let (cuda, remedy) = (None, "this build has no CUDA: build with --features cuda");
+        match self {
+            Self::Cpu => Ok(Device::flex()),
+            Self::Cuda => cuda.ok_or_else(|| {
+                coded(
+                    UNAVAILABLE,
+                    format_args!("--device cuda: {remedy}, or use --device cpu"),
+                )
+            }),
+        }
+    }
 }
 
 /// Trains, and gives the evaluation on the test split, if the data has one. `say` is told what the data are
@@ -65,22 +97,27 @@ pub struct LabelsError {
 ///
 /// Fails if the data do not have what the method needs, the directory has another run or cannot be written,
 /// or the training diverges.
-pub fn train(request: &Request, say: impl FnOnce(&Presses)) -> anyhow::Result<Option<Evaluated>> {
-    let Request {
-        recipe,
+pub fn train(asked: &Train, say: impl FnOnce(&Presses)) -> anyhow::Result<Option<Evaluated>> {
+    let &Train {
+        method: recipe,
         profile,
         seed,
-        given,
-        device,
         ..
-    } = request;
-    recipe.settings(*profile, 1, given)?;
-    let presses = Presses::read(&request.data)?;
-    let labels = request.labels(&presses)?;
-    let share = recipe.settings(*profile, labels, given)?.validation.share;
-    let parts = Parts::of(&presses, labels, share, *seed);
-    let settings = recipe.settings(*profile, parts.train.len(), given)?;
-    check(recipe, &presses, &parts, &settings)?;
+    } = asked;
+    let given = match &asked.config {
+        Some(path) => {
+            let text = fs::read_to_string(path).map_err(|error| unreadable(path, &error))?;
+            settings::parse(&text).with_context(|| path.display().to_string())?
+        }
+        None => toml::Table::new(),
+    };
+    let device = &asked.device.device()?;
+    let presses = Presses::read(&asked.data)?;
+    let labels = asked.labels(&presses)?;
+    let share = recipe.settings(profile, labels, &given)?.validation.share;
+    let parts = Parts::of(&presses, labels, share, seed);
+    let settings = recipe.settings(profile, parts.train.len(), &given)?;
+    check(recipe, &presses, &parts)?;
     let findings = Findings::of(&presses, Some(labels));
     hardnessd_core::stderr_part!("{}", wording::lines(&findings.to_string()));
     let findings = findings.usable()?;
@@ -88,25 +125,24 @@ pub fn train(request: &Request, say: impl FnOnce(&Presses)) -> anyhow::Result<Op
 
     let description = Description {
         method: recipe.name.clone(),
-        profile: *profile,
-        seed: *seed,
+        profile,
+        seed,
         labels,
         settings,
         data: presses.sources.clone(),
     };
-    let run = Run::open(&request.out, &description, request.resume)?;
-    let run = run.taking_from(request.from.clone());
-    if !findings.0.is_empty() {
+    let run = Run::open(&asked.out, &description, asked.resume)?;
+    if !findings.warnings.is_empty() {
         run.write("findings.txt", findings.to_string().as_bytes())?;
     }
-    warn_of_other_levels(&presses.sources);
+    presses.warn_of_other_levels();
     say(&presses);
 
     let stages = Stages {
         presses: &presses,
         parts: &parts,
         settings: &settings,
-        seed: *seed,
+        seed,
         run: &run,
         device,
     };
@@ -125,7 +161,7 @@ pub fn train(request: &Request, say: impl FnOnce(&Presses)) -> anyhow::Result<Op
             logit.into(),
         )?;
     }
-    let mut stream = Stream::new(*seed, &format!("{} calibration", learning.stage()));
+    let mut stream = Stream::new(seed, &format!("{} calibration", learning.stage()));
     let held_out = &parts.held_out;
     let calibration = Calibration::of(learning, &presses, held_out, &weights, &mut stream);
     if recipe.learning == Kind::Course {
@@ -141,22 +177,23 @@ pub fn train(request: &Request, say: impl FnOnce(&Presses)) -> anyhow::Result<Op
     export::finish(&learnt, &run, &description)
 }
 
-impl Request {
+impl Train {
     /// The number of labels that the run uses: the requested one, or else the method's share.
     fn labels(&self, presses: &Presses) -> anyhow::Result<usize> {
         let labelled = presses.some_labelled(Split::Train)?.len();
         let least = presses.levels().len() * presses.sources.len();
         match self.labels {
-            Some(asked) if !(least..=labelled).contains(&asked) => Err(LabelsError {
-                asked,
-                least,
-                labelled,
-            }
-            .into()),
+            Some(asked) if !(least..=labelled).contains(&asked) => Err(coded(
+                USAGE,
+                format_args!(
+                    "--labels: found {asked}, expected at least {least} (one of each level and file) and at most the \
+                     data's {labelled}"
+                ),
+            )),
             Some(asked) => Ok(asked),
             None => {
                 // Hundredths, because 0.15 is not exactly 15 %.
-                let percent = (100.0 * self.recipe.labels).round() as usize;
+                let percent = (100.0 * self.method.labels).round() as usize;
                 Ok((labelled * percent).div_ceil(100).max(least).min(labelled))
             }
         }
@@ -164,17 +201,12 @@ impl Request {
 }
 
 /// Checks, before anything is written, that the data has what all stages of a method need.
-fn check(
-    recipe: &Recipe,
-    presses: &Presses,
-    parts: &Parts,
-    settings: &Settings,
-) -> anyhow::Result<()> {
+fn check(recipe: &Recipe, presses: &Presses, parts: &Parts) -> anyhow::Result<()> {
     if recipe.learning == Kind::Course && !presses.are_over_time() {
         bail!(
             "{}: has single frames, not whole presses: make it with `simulate --sequences` or `collect \
              --sequences`",
-            presses.path().display()
+            presses.shown_paths()
         );
     }
     ensure!(
@@ -193,13 +225,6 @@ fn check(
             "no labelled training presses of level {} for its STGAN: label some, or choose a method \
              without STGANs",
             level.level
-        );
-    }
-    let share = settings.validation.share;
-    if share > 0.0 && parts.held_out.is_empty() {
-        hardnessd_core::stderr_line!(
-            "`validation.share`: {share} of the labelled objects of each level rounds to none: \
-             nothing is held out, and no temperature is fitted"
         );
     }
     Ok(())

@@ -4,11 +4,11 @@
 //! material, in the paper's shapes and in shapes that are the same for all materials. The fresh objects are
 //! simulated once and kept. No model may ever learn from their seeds.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{Context as _, ensure};
+use anyhow::ensure;
 
-use crate::data::presses::{Presses, read_one};
+use crate::data::presses::{Layout, Presses, read_one};
 use crate::data::simulated;
 use crate::data::source::PITCH_MM;
 use crate::run::disk::write_whole;
@@ -69,77 +69,74 @@ pub(super) fn all(
         ensure!(
             !FRESH.iter().any(|&(_, fresh, _)| fresh == seed),
             "{}: found seed {seed}, expected another than the fresh test objects'",
-            presses.path().display()
+            presses.shown_paths()
         );
     }
     if presses.pitch_mm() != PITCH_MM {
         hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {} mm, expected {PITCH_MM} mm, that of the simulated test objects",
-            presses.path().display(),
+            presses.shown_paths(),
             presses.pitch_mm()
         );
     }
-    let are_over_time = presses.are_over_time();
+    let layout = match presses.are_over_time() {
+        true => Layout::OverTime,
+        false => Layout::Frames,
+    };
     let own = TestSet::of(PAPER_SPLIT, presses);
     let mut sets: Vec<TestSet> = [own]
         .into_iter()
         .filter(|own| !own.places.is_empty())
         .collect();
     for (name, seed, shapes) in FRESH {
+        let usual = CourseSettings::default();
         let objects = DatasetSettings {
             seed,
             shapes,
             objects: 0,
             test_objects: FRESH_OBJECTS,
-            presses: match (profile, are_over_time) {
+            presses: match (profile, layout) {
                 (Profile::Smoke, _) => 1,
-                (_, true) => CourseSettings::default().objects.presses,
-                (_, false) => DatasetSettings::default().presses,
+                (_, Layout::OverTime) => usual.objects.presses,
+                (_, Layout::Frames) => DatasetSettings::default().presses,
             },
-            ..DatasetSettings::default()
+            ..usual.objects
         };
-        let path = simulated(directory, name, objects, are_over_time)?;
-        sets.push(TestSet::of(name, read_one(&path)?));
+        // Whole presses are made on many sensors, with presses of rigid pieces, which are the references of a model
+        // that takes some.
+        let sensors = BroadSensors {
+            designs: SensorDesigns::Jx255n,
+            ..BroadSensors::default()
+        };
+        let settings = CourseSettings {
+            objects,
+            sensors: Some(sensors).filter(|_| layout == Layout::OverTime),
+            ..usual
+        };
+        sets.push(TestSet::of(
+            name,
+            simulated(directory, name, &settings, layout)?,
+        ));
     }
     Ok(sets)
 }
 
-/// The file of fresh objects, which is simulated unless it exists. Its name has a hash of the settings and of
-/// the simulator's version, so others make another file. Presses over time are made on many sensors, with
-/// presses of rigid pieces, which are the references of a model that takes some.
+/// Fresh objects, which are simulated unless their file exists. Its name has a hash of the settings and of the
+/// simulator's version, so others make another file.
 fn simulated(
     directory: &Path,
     name: &str,
-    objects: DatasetSettings,
-    over_time: bool,
-) -> anyhow::Result<PathBuf> {
-    let courses = over_time.then(|| CourseSettings {
-        objects,
-        sensors: Some(BroadSensors {
-            designs: SensorDesigns::Jx255n,
-            ..BroadSensors::default()
-        }),
-        ..CourseSettings::default()
-    });
-    let settings = match &courses {
-        Some(settings) => serde_json::to_string(settings),
-        None => serde_json::to_string(&objects),
-    };
-    let settings = settings.context("the simulator's settings")?;
-    let hash = sha256_hex(format!("{} {settings}", hardnessd_simulator::VERSION).as_bytes());
+    settings: &CourseSettings,
+    layout: Layout,
+) -> anyhow::Result<Presses> {
+    let version = hardnessd_simulator::VERSION;
+    let of = format!("{version} {layout:?} {}", serde_json::to_string(settings)?);
+    let hash = sha256_hex(of.as_bytes());
     let path = directory.join(format!("{name}-{}.npz", &hash[..8]));
-    if path.exists() {
-        return Ok(path);
+    if !path.exists() {
+        hardnessd_core::stderr_line!("simulating {}", path.display());
+        let presses = simulated::simulate(settings, layout);
+        write_whole(&path, &simulated::to_bytes(settings, layout, &presses)?)?;
     }
-    hardnessd_core::stderr_line!("simulating {}", path.display());
-    let cores = simulated::all_cores();
-    let bytes = match &courses {
-        Some(settings) => {
-            let presses = simulated::simulate_courses(settings, cores);
-            simulated::courses_to_bytes(settings, &presses)?
-        }
-        None => simulated::to_bytes(&objects, simulated::simulate(&objects, cores))?,
-    };
-    write_whole(&path, &bytes)?;
-    Ok(path)
+    read_one(&path)
 }

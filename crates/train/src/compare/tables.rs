@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 
 use serde::Deserialize;
 
-use crate::judge::metrics;
+use crate::judge::metrics::{accuracy, category_accuracy, kappa, kappa_quadratic};
 use crate::judge::paper;
 
 /// A run, as `results.json` has it.
@@ -21,27 +21,22 @@ pub struct Entry {
     matched: Option<Figures>,
 }
 
-/// The figures of a run on one set that the tables show.
+/// The figures of a run on one set. The others follow from these.
 #[derive(Debug, Clone, Deserialize)]
 struct Figures {
-    accuracy: f64,
-    category_accuracy: Vec<Option<f64>>,
     confusion: Vec<Vec<u64>>,
-    kappa: Option<f64>,
-    kappa_quadratic: Option<f64>,
 }
 
-/// A test set: what of an entry it is.
-type Set = fn(&Entry) -> Option<&Figures>;
+/// A figure that follows from a confusion matrix.
+type Figure<'a> = &'a dyn Fn(&[Vec<u64>]) -> Option<f64>;
 
-const PAPER_SPLIT: Set = |entry| entry.paper_split.as_ref();
-const FRESH: Set = |entry| entry.fresh.as_ref();
-const MATCHED: Set = |entry| entry.matched.as_ref();
-
-/// The runs of one method with the same number of labels, under all seeds.
+/// The confusion matrices of the runs of one method with the same number of labels, under all seeds.
 struct Row<'a> {
+    method: &'a str,
+    labels: usize,
     title: String,
-    runs: Vec<&'a Entry>,
+    /// On the test split, and on fresh objects in the paper's and in matched shapes.
+    sets: [Vec<&'a [Vec<u64>]>; 3],
 }
 
 /// The content of `tables.md`.
@@ -49,131 +44,119 @@ pub fn markdown(entries: &[Entry]) -> String {
     let rows = rows(entries);
     let profiles: BTreeSet<&str> = entries.iter().map(|entry| entry.profile.as_str()).collect();
     let profiles = profiles.into_iter().collect::<Vec<_>>().join(", ");
-    let mut text = format!(
+    let levels = rows.iter().flat_map(|row| &row.sets[0]).map(|of| of.len());
+    let levels = levels.max().unwrap_or(4);
+    format!(
         "# Comparison\n\nMade by hrn-train compare, profile {profiles}. Simulated data, unless you gave your own. ± is \
-         the standard deviation over seeds; `results/intervals.py` computes intervals over seeds and objects.\n"
-    );
-    for table in [accuracies(&rows), kappas(&rows), confusions(&rows)] {
-        text += &table.markdown();
-    }
-    text
+         the standard deviation over seeds; `results/intervals.py` computes intervals over seeds and objects.\n{}{}{}",
+        accuracies(&rows, levels),
+        kappas(&rows),
+        confusions(&rows, levels)
+    )
 }
 
 fn rows(entries: &[Entry]) -> Vec<Row<'_>> {
     let mut rows: Vec<Row> = Vec::new();
     for entry in entries {
-        let same = |row: &&mut Row| {
-            (&row.runs[0].method, row.runs[0].labels) == (&entry.method, entry.labels)
-        };
-        match rows.iter_mut().find(same) {
-            Some(row) => row.runs.push(entry),
-            None => rows.push(Row {
-                title: String::new(),
-                runs: vec![entry],
-            }),
-        }
-    }
-    for row in &mut rows {
-        let Entry { method, labels, .. } = row.runs[0];
-        row.title.clone_from(method);
-        let of_method = entries.iter().filter(|entry| entry.method == *method);
-        let numbers: BTreeSet<usize> = of_method.map(|entry| entry.labels).collect();
-        if numbers.len() > 1 {
-            row.title += &format!(", {} labels", thousands(*labels));
+        let (method, labels) = (entry.method.as_str(), entry.labels);
+        let same = |row: &Row| (row.method, row.labels) == (method, labels);
+        let place = rows.iter().position(same).unwrap_or_else(|| {
+            let of_method = entries.iter().filter(|other| other.method == method);
+            let title = match of_method.clone().all(|other| other.labels == labels) {
+                true => method.to_owned(),
+                false => format!("{method}, {} labels", thousands(labels)),
+            };
+            rows.push(Row {
+                method,
+                labels,
+                title,
+                sets: Default::default(),
+            });
+            rows.len() - 1
+        });
+        let sets = [&entry.paper_split, &entry.fresh, &entry.matched];
+        for (own, figures) in rows[place].sets.iter_mut().zip(sets) {
+            own.extend(figures.iter().map(|figures| figures.confusion.as_slice()));
         }
     }
     rows
 }
 
-impl<'a> Row<'a> {
-    fn figures(&self, set: Set) -> Vec<&'a Figures> {
-        self.runs.iter().filter_map(|entry| set(entry)).collect()
-    }
-
-    fn paper(&self) -> Option<&'static paper::Row> {
-        paper::row(&self.runs[0].method)
-    }
-
-    /// The mean over the seeds; a dash without any.
-    fn mean(&self, set: Set, value: impl Fn(&Figures) -> Option<f64>, decimals: usize) -> String {
-        let values: Vec<f64> = self.figures(set).into_iter().filter_map(value).collect();
-        match values.is_empty() {
-            true => "-".to_owned(),
-            false => rounded(mean(&values), decimals),
-        }
+impl Row<'_> {
+    /// The mean of a figure over the seeds, or a dash, with the paper's behind it.
+    fn mean(&self, set: usize, figure: Figure, decimals: usize) -> String {
+        self.cell(set, figure, decimals, |_| None)
     }
 
     /// The same with the standard deviation, if there are several seeds.
-    fn spread(&self, set: Set, value: impl Fn(&Figures) -> Option<f64>, decimals: usize) -> String {
-        let values: Vec<f64> = self.figures(set).into_iter().filter_map(&value).collect();
-        let mean = self.mean(set, value, decimals);
-        match deviation(&values) {
-            Some(deviation) => format!("{mean} ± {deviation:.decimals$}"),
-            None => mean,
+    fn spread(&self, set: usize, figure: Figure, decimals: usize) -> String {
+        self.cell(set, figure, decimals, deviation)
+    }
+
+    fn cell(
+        &self,
+        set: usize,
+        figure: Figure,
+        decimals: usize,
+        spread: impl Fn(&[f64]) -> Option<f64>,
+    ) -> String {
+        let values = self.sets[set]
+            .iter()
+            .filter_map(|confusion| figure(confusion));
+        let values: Vec<f64> = values.collect();
+        let mut cell = match values.is_empty() {
+            true => "-".to_owned(),
+            false => rounded(mean(&values), decimals),
+        };
+        if let Some(deviation) = spread(&values) {
+            cell += &format!(" ± {deviation:.decimals$}");
         }
+        // The paper has results on its own test split only.
+        let papers = paper::confusion(self.method).filter(|_| set == 0);
+        if let Some(papers) = papers.and_then(|papers| figure(&papers)) {
+            cell += &format!(" ({papers:.decimals$})");
+        }
+        cell
     }
 }
 
-/// A table of text.
-struct Table {
-    title: &'static str,
-    note: &'static str,
-    head: Vec<String>,
-    rows: Vec<Vec<String>>,
+/// A table with a title and a note.
+fn table(title: &str, note: &str, head: &[String], rows: &[Vec<String>]) -> String {
+    let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+    let rule = format!("| ---{} |\n", " | ---:".repeat(head.len() - 1));
+    let rows: String = rows.iter().map(|row| line(row)).collect();
+    format!("\n## {title}\n\n{note}\n\n{}{rule}{rows}", line(head))
 }
 
-impl Table {
-    fn new(title: &'static str, note: &'static str, head: &[&str]) -> Self {
-        Self {
-            title,
-            note,
-            head: head.iter().map(|&name| name.to_owned()).collect(),
-            rows: Vec::new(),
-        }
-    }
-
-    fn markdown(&self) -> String {
-        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
-        let rule: Vec<String> = (0..self.head.len())
-            .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
-            .collect();
-        let rows: String = self.rows.iter().map(|row| line(row)).collect();
-        let (head, rule) = (line(&self.head), line(&rule));
-        format!("\n## {}\n\n{}\n\n{head}{rule}{rows}", self.title, self.note)
-    }
+fn owned(head: &[&str]) -> Vec<String> {
+    head.iter().map(|&name| name.to_owned()).collect()
 }
 
 /// Table 2, with the paper's figures in brackets.
-fn accuracies(rows: &[Row]) -> Table {
-    let levels = levels(rows);
-    let of_levels: Vec<String> = (1..=levels).map(|level| format!("level {level}")).collect();
-    let mut head = vec!["method", "labels"];
-    head.extend(of_levels.iter().map(String::as_str));
-    head.push("overall");
+fn accuracies(rows: &[Row], levels: usize) -> String {
     let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
                 split, of the paper's size; in brackets the paper's.";
-    let mut table = Table::new("Table 2: accuracy", note, &head);
-    for row in rows {
-        let paper = row.paper();
-        let mut cells = vec![row.title.clone(), thousands(row.runs[0].labels)];
-        for level in 0..levels {
-            let percent =
-                |figures: &Figures| Some(100.0 * (*figures.category_accuracy.get(level)?)?);
-            let there = paper.and_then(|paper| paper.category_accuracy_percent.get(level).copied());
-            cells.push(beside(row.mean(PAPER_SPLIT, percent, 1), there, 1));
-        }
-        let here = row.spread(PAPER_SPLIT, |figures| Some(100.0 * figures.accuracy), 1);
-        cells.push(beside(here, paper.map(|paper| paper.accuracy_percent), 1));
-        table.rows.push(cells);
-    }
-    table
+    let mut head = owned(&["method", "labels"]);
+    head.extend((1..=levels).map(|level| format!("level {level}")));
+    head.push("overall".to_owned());
+    let cells = |row: &Row| {
+        let mut cells = vec![row.title.clone(), thousands(row.labels)];
+        cells.extend((0..levels).map(|level| {
+            let of = |counts: &[Vec<u64>]| Some(100.0 * (*category_accuracy(counts).get(level)?)?);
+            row.mean(0, &of, 1)
+        }));
+        cells.push(row.spread(0, &|counts| Some(100.0 * accuracy(counts)), 1));
+        cells
+    };
+    let cells: Vec<_> = rows.iter().map(cells).collect();
+    table("Table 2: accuracy", note, &head, &cells)
 }
 
 /// Table 3's kappas, with the paper's in brackets.
-fn kappas(rows: &[Row]) -> Table {
+fn kappas(rows: &[Row]) -> String {
     let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
                 are ordinal; in brackets what the paper's counts give.";
-    let head = [
+    let head = owned(&[
         "method",
         "test split: kappa",
         "quadratic",
@@ -181,78 +164,51 @@ fn kappas(rows: &[Row]) -> Table {
         "quadratic",
         "fresh, matched shapes: kappa",
         "quadratic",
-    ];
-    let mut table = Table::new("Table 3: kappa", note, &head);
-    for row in rows {
-        let paper = row.paper();
-        let quadratic = paper.and_then(|paper| metrics::kappa_quadratic(&paper.counts()));
+    ]);
+    let cells = |row: &Row| {
+        let of_set = |set| {
+            [
+                row.spread(set, &kappa, 4),
+                row.spread(set, &kappa_quadratic, 4),
+            ]
+        };
         let mut cells = vec![row.title.clone()];
-        let known = [paper.map(|paper| paper.kappa), quadratic];
-        for (set, [kappa, quadratic]) in [
-            (PAPER_SPLIT, known),
-            (FRESH, [None; 2]),
-            (MATCHED, [None; 2]),
-        ] {
-            let here = row.spread(set, |figures| figures.kappa, 4);
-            cells.push(beside(here, kappa, 4));
-            let here = row.spread(set, |figures| figures.kappa_quadratic, 4);
-            cells.push(beside(here, quadratic, 4));
-        }
-        table.rows.push(cells);
-    }
-    table
+        cells.extend([0, 1, 2].into_iter().flat_map(of_set));
+        cells
+    };
+    let cells: Vec<_> = rows.iter().map(cells).collect();
+    table("Table 3: kappa", note, &head, &cells)
 }
 
 /// Table 3's confusion matrices as counts, with the paper's to the right.
-fn confusions(rows: &[Row]) -> Table {
-    let levels = levels(rows);
-    let numbers: Vec<String> = (1..=levels).map(|level| level.to_string()).collect();
-    let mut head = vec!["method", "truth"];
-    head.extend(numbers.iter().map(String::as_str));
-    head.extend(["paper: 1", "2", "3", "4"]);
+fn confusions(rows: &[Row], levels: usize) -> String {
     let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
                 are the truth, columns are the verdicts.";
-    let mut table = Table::new("Table 3: confusion", note, &head);
-    for row in rows {
-        let all = row.figures(PAPER_SPLIT);
-        for truth in 0..if all.is_empty() { 0 } else { levels } {
+    let mut head = owned(&["method", "truth"]);
+    head.extend((1..=levels).map(|level| level.to_string()));
+    head.extend(owned(&["paper: 1", "2", "3", "4"]));
+    let mut all = Vec::new();
+    for row in rows.iter().filter(|row| !row.sets[0].is_empty()) {
+        let papers = paper::confusion(row.method);
+        for truth in 0..levels {
             let title = if truth == 0 { row.title.as_str() } else { "" };
             let mut cells = vec![title.to_owned(), format!("level {}", truth + 1)];
             cells.extend((0..levels).map(|said| {
-                let counts = all
-                    .iter()
-                    .map(|figures| figures.confusion[truth][said] as f64);
+                let counts = row.sets[0].iter().map(|counts| counts[truth][said] as f64);
                 number(mean(&counts.collect::<Vec<_>>()))
             }));
-            let paper = row.paper().and_then(|paper| paper.confusion.get(truth));
-            cells.extend((0..4).map(|said| match paper {
-                Some(counts) => counts[said].to_string(),
-                None => "-".to_owned(),
+            let papers = papers.as_ref().and_then(|counts| counts.get(truth));
+            cells.extend((0..4).map(|said| {
+                papers.map_or_else(|| "-".to_owned(), |counts| counts[said].to_string())
             }));
-            table.rows.push(cells);
+            all.push(cells);
         }
     }
-    table
+    table("Table 3: confusion", note, &head, &all)
 }
 
-/// The number of levels of the test split.
-fn levels(rows: &[Row]) -> usize {
-    let all = rows.iter().flat_map(|row| row.figures(PAPER_SPLIT));
-    all.map(|figures| figures.confusion.len())
-        .max()
-        .unwrap_or(4)
-}
-
-fn beside(here: String, there: Option<f64>, decimals: usize) -> String {
-    match there {
-        Some(there) => format!("{here} ({there:.decimals$})"),
-        None => here,
-    }
-}
-
-/// The mean; 0 without values.
 fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len().max(1) as f64
+    values.iter().sum::<f64>() / values.len() as f64
 }
 
 /// The standard deviation of a sample; `None` for fewer than two values.
@@ -278,15 +234,10 @@ fn rounded(value: f64, decimals: usize) -> String {
 
 /// An integer with commas between thousands.
 pub fn thousands(value: usize) -> String {
-    let digits = value.to_string();
-    let mut text = String::new();
-    for (place, digit) in digits.chars().enumerate() {
-        if place > 0 && (digits.len() - place).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
+    match value {
+        0..1000 => value.to_string(),
+        _ => format!("{},{:03}", thousands(value / 1000), value % 1000),
     }
-    text
 }
 
 #[cfg(test)]
@@ -295,7 +246,7 @@ mod tests {
 
     #[test]
     fn numbers_are_readable() {
-        assert_eq!(thousands(93_000), "93,000");
+        assert_eq!(thousands(1_093_000), "1,093,000");
         assert_eq!(thousands(7), "7");
         assert_eq!((number(12.0), number(12.25)), ("12".into(), "12.2".into()));
         for (value, expected) in [(-4e-5, "0.0000"), (-6e-5, "-0.0001"), (4e-5, "0.0000")] {

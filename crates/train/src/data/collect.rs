@@ -1,49 +1,38 @@
-//! Recordings of known objects as samples of a data set.
+//! Recordings of known objects as presses of a data set.
 //!
-//! In: recordings (`.mcap` or `.bin`), and data sets that are put together. Out: the chosen frame of
-//! every press that was judged, or all its frames with the arm's approach. The daemon's own pipeline
-//! decodes, tares and selects, so a model learns from the same frames that it will judge.
+//! In: recordings (`.mcap` or `.bin`). Out: the chosen frame of every press that was judged, or all its frames
+//! with the arm's approach. The daemon's own pipeline decodes, tares and selects, so a model learns from the
+//! same frames that it will judge.
 //!
 //! All presses of a call are in memory.
 
 mod capture;
-mod error;
-mod part;
 mod selection;
-mod walk;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::io::{Seek, Write};
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{ErrorKind, Read as _, Seek, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Map, Value, json};
 
-pub use self::error::{CollectError, Problem};
-pub use self::part::Part;
-use self::part::Shape;
-pub use self::walk::captures;
-use crate::data::presses::{self, Layout, Presses, file};
-use crate::data::source::{MOST_LEVELS, Object, Source, papers_levels};
-use hardnessd_core::frame::Array;
-use hardnessd_core::recording::Labels;
+use self::capture::{Pressed, Said};
+use crate::data::presses::{self, Layout, Press, Presses, file, read_one};
+use crate::data::source::{COLLECTOR, Kind, MOST_LEVELS, Source};
+use crate::exit::unreadable;
+use hardnessd_core::recording::{FileKind, Labels, MAGIC};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{Hrn, Level, sha256_hex};
 use hardnessd_simulator::Split;
 
-/// The labels of the samples. A field that is `None` is taken from the recording's labels.
-#[derive(Debug, Clone, Copy)]
-pub struct Labelling {
-    /// The hardness level, from 1, or 0 for unlabelled.
-    pub level: Option<u8>,
-    /// The number of the pressed object. The same number in another data set is another object. Of recordings
-    /// without a number, [`Settings::unnumbered`] says which objects they are. If
-    /// neither this field nor a label gives a number, all recordings of one call are one new object.
-    pub object: Option<u32>,
-    /// The split: training or test.
-    pub split: Split,
-}
+/// How an `.npz` file begins: it is a zip archive.
+const ARCHIVE: &[u8] = b"PK\x03\x04";
+/// The material of presses whose recording does not name one.
+const NO_MATERIAL: &str = "unknown";
 
 /// The objects of recordings that no label and no option gives a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,162 +43,199 @@ pub enum Unnumbered {
     Each,
 }
 
-/// How recordings become samples.
+/// How recordings become presses.
 #[derive(Debug)]
 pub struct Settings {
     /// The sensor of recordings that do not describe their own.
     pub sensor: Sensor,
     /// The model that judges the presses.
     pub hrn: Arc<Hrn>,
-    /// The objects of recordings without a number.
-    pub unnumbered: Unnumbered,
     /// The levels that labels may name, or the Shore hardness of a label may be of.
     pub levels: Vec<Level>,
-    /// The labels of the samples.
-    pub labelling: Labelling,
+    /// The hardness level, from 1, or 0 for unlabelled. `None` takes it from the recording's labels.
+    pub level: Option<u8>,
+    /// The number of the pressed object. `None` takes it from the recording's labels.
+    pub object: Option<u32>,
+    /// The objects of recordings without a number.
+    pub unnumbered: Unnumbered,
+    /// The split: training or test.
+    pub split: Split,
     /// Whether all frames of a press are wanted, or only the chosen one.
     pub layout: Layout,
-    /// Whether files that cannot be used are left out and listed. Otherwise the first one ends the
-    /// collection.
+    /// Whether recordings that cannot be used are left out. Otherwise the first one ends the collection.
     pub skip_unusable: bool,
 }
 
-/// Collects `paths`, recordings and data sets, after the samples of `earlier` if there are any. The
-/// samples are in the order of the paths. The data set has the array `material`, and the array
-/// `shore`, if the recordings have that label.
-///
-/// Presses over time whose begin is not in the recording are left out. They may lack a material or
-/// a measured hardness.
+/// Collects recordings, after the presses of the data set `earlier` if there is one. The presses are in the order
+/// of the paths.
 ///
 /// # Errors
 ///
-/// Returns the [`CollectError`] of the first file that cannot be used, unless such files are left
-/// out.
+/// Returns the error of the first file that cannot be used, unless such files are left out; and an error if
+/// `earlier` is no data set of this layout, or has no numbers of objects.
 pub fn collect(
     paths: &[PathBuf],
-    mut earlier: Option<Part>,
+    earlier: Option<&Path>,
     settings: &Settings,
-) -> Result<Collection, CollectError> {
-    if let Some(earlier) = &mut earlier {
-        // The objects of the data set keep their numbers.
-        earlier.new_objects.clear();
-    }
+) -> anyhow::Result<Collection> {
+    let mut collection = match earlier {
+        Some(path) => Collection::of(path, settings.layout)?,
+        None => Collection::default(),
+    };
+    collection.earlier = collection.presses.all.len();
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
     let bar = ProgressBar::new(paths.len() as u64);
     let bar = bar.with_style(style.expect("the template is right"));
-    let mut parts = Vec::new();
     for path in paths {
-        let part = Part::read(path, settings);
-        bar.inc(1);
-        match part {
-            Err(error) if !settings.skip_unusable => return Err(error),
-            part => parts.push(part),
-        }
-    }
-    bar.finish_and_clear();
-
-    let read = || parts.iter().flatten();
-    // The most frequent shape, so that a stray recording does not decide what the data set has.
-    let shape = |part: &Part| part.shape(settings.layout);
-    let frequency = |part: &&Part| read().filter(|other| shape(other) == shape(part)).count();
-    let first = read().rev().max_by_key(frequency);
-    let first = earlier.as_ref().or(first);
-    let (first, shape) =
-        first.map_or_else(Default::default, |part| (part.path.clone(), shape(part)));
-    let mut collection = Collection::new(settings, first, shape);
-    let mut grids: Vec<_> = read().chain(&earlier).map(|part| part.grid).collect();
-    grids.dedup();
-    collection.grid = if let [grid] = grids[..] { grid } else { None };
-    // A recording without a label must not share the number of one with a label.
-    let parts_and_earlier = read().chain(&earlier);
-    let last = parts_and_earlier.flat_map(Part::numbered_objects).max();
-    collection.free_object = last.map_or(Some(0), |last| last.checked_add(1));
-    if let Some(earlier) = earlier {
-        collection.meta = earlier.meta.clone();
-        collection.add(earlier)?;
-        (collection.added, collection.known) = (0, 0);
-    }
-    for (path, part) in paths.iter().zip(parts) {
-        match part.and_then(|part| collection.add(part)) {
-            Err(error) if settings.skip_unusable => {
-                collection.left_out.push((path.clone(), error.reason(path)));
-            }
+        match collection.add(path, settings) {
+            Err(error) if settings.skip_unusable => collection.left_out.push(error),
             added => added?,
         }
+        bar.inc(1);
     }
+    bar.finish_and_clear();
+    collection.number_objects(settings.unnumbered)?;
+    collection.presses.warn_of_object_in_both_splits();
     Ok(collection)
 }
 
-/// The labels of each recording that can be read. Raw bytes and data sets have none.
+/// The files that `paths` name. In place of a directory come all recordings below it, sorted by
+/// their paths. A recording is known by its first bytes. Links to directories are not followed.
+///
+/// # Errors
+///
+/// Returns an error if a directory cannot be read, or has no recording.
+pub fn captures(paths: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
+    let mut all = Vec::new();
+    for path in paths {
+        if !path.is_dir() {
+            all.push(path.clone());
+            continue;
+        }
+        let mut found = Vec::new();
+        find_below(path, &mut found)?;
+        ensure!(
+            !found.is_empty(),
+            "{}: no recording is in this directory",
+            path.display()
+        );
+        found.sort();
+        all.append(&mut found);
+    }
+    Ok(all)
+}
+
+fn find_below(directory: &Path, found: &mut Vec<PathBuf>) -> anyhow::Result<()> {
+    let failed = |error| unreadable(directory, &error);
+    for entry in fs::read_dir(directory).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let path = entry.path();
+        if entry.file_type().map_err(failed)?.is_dir() {
+            find_below(&path, found)?;
+        } else if path.is_file() && begins(&path, MAGIC) {
+            found.push(path);
+        }
+    }
+    Ok(())
+}
+
+/// Whether a file is a data set, which its first bytes say.
+pub fn is_data_set(path: &Path) -> bool {
+    path.is_file() && begins(path, ARCHIVE)
+}
+
+/// Whether a file begins with these bytes. An unreadable file counts as such, so that it is named later.
+fn begins(path: &Path, with: &[u8]) -> bool {
+    let mut start = vec![0; with.len()];
+    match File::open(path).and_then(|mut file| file.read_exact(&mut start)) {
+        Ok(()) => start == with,
+        Err(error) => error.kind() != ErrorKind::UnexpectedEof,
+    }
+}
+
+/// The labels of each recording that can be read. Raw bytes have none.
 pub fn labels(paths: &[PathBuf]) -> Vec<Labels> {
     let bytes = paths.iter().filter_map(|path| file::whole(path).ok());
     bytes.map(|bytes| capture::labels(&bytes)).collect()
 }
 
-/// The levels that a data set states. `None` for a recording.
-pub fn levels(path: &Path) -> Option<Vec<Level>> {
-    let meta = presses::meta(path).ok()?;
-    serde_json::from_value(meta["levels"].clone()).ok()
-}
-
 /// A data set under construction.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Collection {
     presses: Presses,
-    layout: Layout,
-    unnumbered: Unnumbered,
-    /// What all samples have in common.
-    shape: Shape,
-    /// The one array whose frames all samples have as they are.
-    grid: Option<Array>,
-    /// The file that first had this shape.
-    first: PathBuf,
+    /// The number of presses that were there before.
+    earlier: usize,
     /// What an earlier data set says of itself.
     meta: Map<String, Value>,
+    /// The names of the materials and of the sensors, by number.
     materials: Vec<String>,
-    sensors: Vec<Option<String>>,
+    sensors: Vec<String>,
+    /// The elements of `meta.captures`.
     captures: Vec<Value>,
-    generators: Vec<String>,
-    /// The names of recordings by what makes two of them the same presses of the same object.
-    names: BTreeMap<String, String>,
-    objects: BTreeSet<(Object, Split)>,
-    /// The least number that no object has. `None` if all numbers are taken.
-    free_object: Option<u32>,
-    /// The number of the object of this call's recordings without a number, once there is one.
-    new_object: Option<u32>,
-    /// The files that give no samples, with the reason.
-    pub left_out: Vec<(PathBuf, String)>,
-    /// The number of presses that were added.
-    pub added: usize,
-    /// The number of these whose approach is known.
-    pub known: usize,
-    /// The number of presses that were left out because their begin is not in the recording.
-    pub partial: usize,
+    /// The recordings of this call.
+    recordings: Vec<Recording>,
+    /// Why recordings were left out.
+    pub left_out: Vec<anyhow::Error>,
+}
+
+/// A recording whose presses were taken.
+#[derive(Debug)]
+struct Recording {
+    /// What `meta.captures` says of it, except for its objects.
+    capture: Value,
+    presses: Range<usize>,
 }
 
 impl Collection {
-    fn new(settings: &Settings, first: PathBuf, shape: Shape) -> Self {
-        Self {
-            presses: Presses::default(),
-            layout: settings.layout,
-            unnumbered: settings.unnumbered,
-            shape,
-            grid: None,
-            first,
-            meta: Map::from_iter([("seed".to_owned(), Value::Null)]),
-            materials: Vec::new(),
-            sensors: Vec::new(),
-            captures: Vec::new(),
-            generators: Vec::new(),
-            names: BTreeMap::new(),
-            objects: BTreeSet::new(),
-            free_object: None,
-            new_object: None,
-            left_out: Vec::new(),
-            added: 0,
-            known: 0,
-            partial: 0,
+    /// The data set in a file, to add to it.
+    fn of(path: &Path, layout: Layout) -> anyhow::Result<Self> {
+        let shown = path.display();
+        match (file::layout_of(path)?, layout) {
+            (Layout::OverTime, Layout::Frames) => {
+                bail!("{shown}: has whole presses, not single frames: collect with --sequences")
+            }
+            (Layout::Frames, Layout::OverTime) => {
+                bail!("{shown}: has single frames, not whole presses: collect without --sequences")
+            }
+            _ => {}
         }
+        let mut presses = read_one(path)?;
+        ensure!(
+            presses.all.iter().all(|press| press.object.is_some()),
+            "{shown}: has no array `object`: nothing can be added to it, but train takes several --data"
+        );
+        let meta = match presses::meta(path)? {
+            Value::Object(meta) => meta,
+            _ => Map::new(),
+        };
+        let list = |key: &str| meta.get(key).and_then(Value::as_array);
+        let names = |key: &str, last: Option<u32>| -> Vec<String> {
+            let named = list(key).into_iter().flatten();
+            let named = named.map(|name| name.as_str().unwrap_or_default().to_owned());
+            let all = last.map_or(0, |last| last as usize + 1);
+            let mut names: Vec<String> = named.collect();
+            names.resize(all.max(names.len()), String::new());
+            names
+        };
+        let last = presses.all.iter().filter_map(|press| press.material).max();
+        let mut materials = names("materials", last.map(u32::from));
+        for press in presses
+            .all
+            .iter_mut()
+            .filter(|press| press.material.is_none())
+        {
+            let unknown = number_of(&mut materials, NO_MATERIAL);
+            press.material = u8::try_from(unknown).ok();
+        }
+        let last = presses.all.iter().map(|press| press.sensor).max();
+        Ok(Self {
+            sensors: names("sensors", last),
+            materials,
+            captures: list("captures").cloned().unwrap_or_default(),
+            presses,
+            meta,
+            ..Self::default()
+        })
     }
 
     /// The number of presses.
@@ -217,121 +243,165 @@ impl Collection {
         self.presses.all.len()
     }
 
-    fn add(&mut self, mut part: Part) -> Result<(), CollectError> {
-        let fits = self.fit(&mut part);
-        fits.map_err(|problem| problem.of(&part.path))?;
-        self.objects.extend(part.objects());
-        self.names.extend(part.captures.iter().filter_map(identity));
-        self.captures.extend(part.captures);
-        for generator in part.generators {
-            if !self.generators.contains(&generator) {
-                self.generators.push(generator);
-            }
-        }
-        self.added += part.presses.all.len();
-        self.known += part.presses.known();
-        self.partial += part.partial;
-        self.presses.append(part.presses, 0);
-        Ok(())
+    /// The number of presses that were added, and of those whose approach is known.
+    pub fn added(&self) -> [usize; 2] {
+        let added = self.earlier..self.presses.all.len();
+        [
+            added.len(),
+            added.filter(|&press| self.presses.is_known(press)).count(),
+        ]
     }
 
-    /// Gives the objects and the materials of a part their numbers in this data set, and returns an
-    /// error if the part does not go with the rest.
-    fn fit(&mut self, part: &mut Part) -> Result<(), Problem> {
-        part.shape(self.layout).check(&self.shape, &self.first)?;
-        let mut materials = Vec::new();
-        for name in &part.materials {
-            let known = self.materials.iter().position(|material| material == name);
-            let number = known.unwrap_or(self.materials.len());
-            let number = u8::try_from(number);
-            materials.push(number.map_err(|_| Problem::Materials(name.clone()))?);
-            if known.is_none() {
-                self.materials.push(name.clone());
-            }
-        }
-        let mut objects = BTreeMap::new();
-        for &number in &part.new_objects {
-            objects.insert(number, self.new_object(part.is_recording)?);
-        }
-        let renumbered = |number: u32| objects.get(&number).copied().unwrap_or(number);
-        let sensors: Vec<u32> = part.sensors.iter().map(|name| self.sensor(name)).collect();
-        for press in &mut part.presses.all {
-            press.object = press.object.map(renumbered);
-            press.material = press.material.map(|number| materials[usize::from(number)]);
-            press.sensor = sensors[press.sensor as usize];
-        }
-        for capture in &mut part.captures {
-            let number = capture["object"].as_u64();
-            let number = number.and_then(|number| u32::try_from(number).ok());
-            if let Some(number) = number.filter(|_| capture["new_object"] == true) {
-                capture["object"] = json!(renumbered(number));
-            }
-        }
-        for (identity, _) in part.captures.iter().filter_map(identity) {
-            if let Some(name) = self.names.get(&identity) {
-                return Err(Problem::Twice(name.clone()));
-            }
-        }
-        for (added, split) in part.objects() {
-            let other = |(object, of): &&(Object, Split)| object.is_same_as(&added) && *of != split;
-            if let Some((object, expected)) = self.objects.iter().find(other) {
-                return Err(Problem::Splits {
-                    object: object.number,
-                    found: split.name(),
-                    expected: expected.name(),
-                });
-            }
-        }
-        Ok(())
+    /// Adds the presses of a recording, or nothing.
+    fn add(&mut self, path: &Path, settings: &Settings) -> anyhow::Result<()> {
+        let bytes = file::whole(path)?;
+        self.add_bytes(path, &bytes, settings)
+            .with_context(|| path.display().to_string())
     }
 
-    /// The number of the sensor of this name. One without a name is a sensor of its own.
-    fn sensor(&mut self, name: &Option<String>) -> u32 {
-        let known = self
-            .sensors
+    fn add_bytes(&mut self, path: &Path, bytes: &[u8], settings: &Settings) -> anyhow::Result<()> {
+        ensure!(
+            !bytes.starts_with(ARCHIVE),
+            "is a data set, not a recording: train and fit take several data sets"
+        );
+        let sha256 = sha256_hex(bytes);
+        let before = self.recordings.iter().map(|recording| &recording.capture);
+        if let Some(same) = self
+            .captures
             .iter()
-            .position(|known| known.is_some() && known == name);
-        let number = known.unwrap_or(self.sensors.len());
-        if known.is_none() {
-            self.sensors.push(name.clone());
+            .chain(before)
+            .find(|of| of["sha256"] == sha256)
+        {
+            let name = same["name"].as_str().unwrap_or_default();
+            bail!("the same recording as {name}, whose presses are in the data set already");
         }
-        number as u32
+        let Pressed {
+            judged,
+            labels,
+            pitch_mm,
+            grid,
+        } = Pressed::of(bytes, &settings.sensor, &settings.hrn)?;
+        let is_said = judged.iter().any(|press| press.level.is_some());
+        let said = Said::of(&labels, settings, is_said)?;
+        match self.presses.sources.first_mut() {
+            None => self.presses.sources.push(Source {
+                path: path.to_owned(),
+                pitch_mm: Some(pitch_mm),
+                grid,
+                ..Source::default()
+            }),
+            Some(source) => {
+                let expected = source.pitch();
+                ensure!(
+                    pitch_mm == expected,
+                    "taxel pitch: found {pitch_mm} mm, expected {expected} mm, that of {}",
+                    source.path.display()
+                );
+                source.grid = source.grid.filter(|_| source.grid == grid);
+            }
+        }
+        let material = number_of(&mut self.materials, said.material);
+        let material = u8::try_from(material);
+        let material = material.context("a data set has at most 256 materials")?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let is_raw = FileKind::of(bytes) == FileKind::Raw;
+        let is_simulated = labels.get("simulated").is_some_and(|label| label == "true");
+        let first = self.presses.all.len();
+        for judged in judged {
+            let named = judged
+                .object
+                .as_deref()
+                .filter(|_| settings.object.is_none());
+            let named = named.filter(|_| said.reference.is_none());
+            let mut press = Press {
+                level: judged.level.filter(|_| said.by_press).unwrap_or(said.level),
+                object: named.map(capture::object_of).or(said.object),
+                material: Some(material),
+                force_n: Some(judged.force_n),
+                split: settings.split,
+                shore: said.shore,
+                arm_n_per_mm: judged.arm_n_per_mm,
+                sensor: number_of(&mut self.sensors, &judged.sensor) as u32,
+                reference: said.reference,
+                name: Some(format!("{name} press {}", judged.press)),
+                unloaded: Some(judged.unloaded),
+                kind: Kind::of_recording(is_simulated, is_raw),
+                best: judged.best,
+                ..Press::default()
+            };
+            match settings.layout {
+                Layout::OverTime => self.presses.push(press, judged.moments.into_iter()),
+                Layout::Frames => {
+                    let (.., frame) = judged.moments[judged.best];
+                    press.best = 0;
+                    self.presses.push(press, [(0.0, None, frame)].into_iter());
+                }
+            }
+        }
+        let mut capture = json!({
+            "name": name,
+            "sha256": sha256,
+            "split": settings.split.name(),
+            "labels": labels,
+        });
+        if is_raw {
+            capture["raw"] = Value::Bool(true);
+        }
+        self.recordings.push(Recording {
+            capture,
+            presses: first..self.presses.all.len(),
+        });
+        Ok(())
     }
 
-    /// A number for an object that has none.
-    fn new_object(&mut self, is_recording: bool) -> Result<u32, Problem> {
-        let is_shared = is_recording && self.unnumbered == Unnumbered::One;
-        if is_shared && let Some(number) = self.new_object {
-            return Ok(number);
+    /// Gives the objects without a number one that no other object has, and says of each recording which objects
+    /// it has.
+    fn number_objects(&mut self, unnumbered: Unnumbered) -> anyhow::Result<()> {
+        let last = self
+            .presses
+            .all
+            .iter()
+            .filter_map(|press| press.object)
+            .max();
+        let mut next = last.map_or(Some(0), |last| last.checked_add(1));
+        for Recording { capture, presses } in std::mem::take(&mut self.recordings) {
+            let all = &mut self.presses.all[presses];
+            let mut counts = BTreeMap::<(u32, u8), usize>::new();
+            let mut is_numbered = true;
+            for press in all {
+                is_numbered &= press.object.is_some();
+                let number = press.object.or(next).with_context(|| {
+                    format!(
+                        "no number is left for a new object beyond {}: give one with --object",
+                        u32::MAX
+                    )
+                })?;
+                press.object = Some(number);
+                *counts.entry((number, press.level)).or_default() += 1;
+            }
+            if !is_numbered && unnumbered == Unnumbered::Each {
+                next = next.and_then(|next| next.checked_add(1));
+            }
+            for ((object, level), count) in counts {
+                let mut capture = capture.clone();
+                (capture["object"], capture["level"]) = (json!(object), json!(level));
+                capture["presses"] = json!(count);
+                self.captures.push(capture);
+            }
         }
-        let number = self.free_object.ok_or(Problem::NoNumber)?;
-        self.free_object = number.checked_add(1);
-        if is_shared {
-            self.new_object = Some(number);
-        }
-        Ok(number)
+        Ok(())
     }
 
     /// The presses, as those of one file with these levels.
     pub fn into_presses(self, levels: Vec<Level>) -> Presses {
-        let hashes: Vec<&str> = self
-            .captures
-            .iter()
-            .filter_map(|of| of["sha256"].as_str())
-            .collect();
-        let source = Source {
-            name: format!("{} recordings or data sets", self.captures.len().max(1)),
-            sha256: sha256_hex(hashes.concat().as_bytes()),
-            generator: Some(self.generators.join(", ")),
-            pitch_mm: Some(self.shape.pitch_mm),
-            grid: self.grid,
-            levels: Some(levels),
-            recorded: file::recorded(&json!(self.captures)),
-            ..Source::default()
-        };
+        let hashes = self.captures.iter().filter_map(|of| of["sha256"].as_str());
         let mut presses = self.presses;
-        presses.all.iter_mut().for_each(|press| press.source = 0);
-        (presses.sources, presses.paths) = (vec![source], vec![self.first]);
+        for source in &mut presses.sources {
+            source.name = format!("{} recordings", self.captures.len());
+            source.sha256 = sha256_hex(hashes.clone().collect::<String>().as_bytes());
+            source.generator = Some(collector());
+            source.levels = Some(levels.clone());
+        }
         presses
     }
 
@@ -340,39 +410,44 @@ impl Collection {
     /// # Errors
     ///
     /// Returns the errors of writing to `out`.
-    pub fn write<W: Write + Seek>(&self, out: W) -> anyhow::Result<W> {
+    pub fn write<W: Write + Seek>(&self, out: W, layout: Layout) -> anyhow::Result<W> {
         let mut meta = self.meta.clone();
+        let source = &self.presses.sources[0];
+        let before = meta.get("generator").and_then(Value::as_str);
+        let generator = match before {
+            // A data set that names no program had one too.
+            _ if self.earlier == 0 => collector(),
+            Some(before) if before.contains(&collector()) => before.to_owned(),
+            before => format!("{}, {}", before.unwrap_or("unknown"), collector()),
+        };
         for (key, value) in [
             ("captures", json!(self.captures)),
-            ("generator", json!(self.generators.join(", "))),
+            ("generator", json!(generator)),
             ("levels", json!(self.levels())),
             ("materials", json!(self.materials)),
-            ("pitch_mm", json!(self.shape.pitch_mm)),
+            ("pitch_mm", json!(source.pitch())),
             (
                 "grid",
-                json!(self.grid.map(|array| [array.rows, array.cols])),
+                json!(source.grid.map(|array| [array.rows, array.cols])),
             ),
         ] {
             meta.insert(key.to_owned(), value);
         }
-        if self.layout == Layout::OverTime {
+        meta.entry("seed").or_insert(Value::Null);
+        if layout == Layout::OverTime {
             meta.insert("sensors".to_owned(), json!(self.sensors));
         }
-        Ok(presses::write(
-            out,
-            &self.presses,
-            self.layout,
-            &meta.into(),
-        )?)
+        Ok(presses::write(out, &self.presses, layout, &meta.into())?)
     }
 
-    /// The paper's levels, or as many as the presses have, with their numbers for names.
+    /// The levels of an earlier data set or the paper's, or as many as the presses have, with their numbers for
+    /// names.
     fn levels(&self) -> Vec<Level> {
-        let papers = papers_levels();
+        let stated = self.presses.levels();
         let most = self.presses.all.iter().map(|press| press.level).max();
         let most = most.unwrap_or_default();
-        if usize::from(most) <= papers.len() {
-            return papers;
+        if usize::from(most) <= stated.len() {
+            return stated;
         }
         let level = |level: u8| Level {
             level,
@@ -383,14 +458,15 @@ impl Collection {
     }
 }
 
-/// What makes two recordings the same presses of the same object, and the name of this one. `None` if
-/// another program described the recording in another way.
-fn identity(capture: &Value) -> Option<(String, String)> {
-    let sha256 = capture["sha256"].as_str()?;
-    let [level, object, split] = ["level", "object", "split"].map(|key| &capture[key]);
-    let name = capture["name"].as_str().unwrap_or_default();
-    Some((
-        format!("{sha256} {level} {object} {split}"),
-        name.to_owned(),
-    ))
+fn collector() -> String {
+    format!("{COLLECTOR} {}", env!("CARGO_PKG_VERSION"))
+}
+
+/// The place of a name in a list, at whose end it comes if it is new.
+fn number_of(names: &mut Vec<String>, name: &str) -> usize {
+    let known = names.iter().position(|known| known == name);
+    known.unwrap_or_else(|| {
+        names.push(name.to_owned());
+        names.len() - 1
+    })
 }

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::hash::{DefaultHasher, Hasher as _};
 
+use anyhow::bail;
 use hardnessd_simulator::Split;
 
 use super::presses::{Press, Presses};
@@ -21,77 +22,41 @@ const LEAST_N: f64 = 0.005;
 /// A press of so many frames that are all the same is no press.
 const LEAST_REPEATED: usize = 4;
 
-/// What is wrong.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// A file is named twice.
-    FileTwice,
-    /// A press is in both splits.
-    InBothSplits,
-    /// A press has two levels.
-    TwoLevels,
-    /// A press is one of two objects.
-    TwoObjects,
-    /// No taxel of any press reads anything.
-    AllDead,
-    /// The forces are no newtons.
-    Units,
-    /// An object has the same press twice.
-    Twice,
-    /// No taxel of a press reads anything.
-    Dead,
-    /// All frames of a press are the same.
-    Repeated,
-    /// Some labels are not used.
-    LabelsUnused,
-}
+/// What presses can be, with whether a model may still be made of such data.
+type Kind = (bool, &'static str);
+const IN_BOTH_SPLITS: Kind = (
+    false,
+    "in training and in test, so that a test says nothing",
+);
+const TWO_LEVELS: Kind = (false, "with two levels");
+const TWO_OBJECTS: Kind = (false, "of two objects (was a recording collected twice?)");
+const TWICE: Kind = (true, "twice");
+const DEAD: Kind = (true, "in which no taxel reads anything");
+const REPEATED: Kind = (true, "of one frame, repeated");
 
-impl Kind {
-    /// Whether no model should be made of such data.
-    pub fn is_error(self) -> bool {
-        self < Self::Twice
-    }
-}
-
-/// Something that is wrong with data.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Finding {
-    /// What is wrong.
-    pub kind: Kind,
-    /// Where, and what to do.
-    pub text: String,
-}
-
-/// Everything that is wrong with data, errors first. As text, a line each.
+/// Everything that is wrong with data. As text, a line each.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Findings(pub Vec<Finding>);
-
-/// Data of which no model should be made.
-#[derive(Debug, thiserror::Error)]
-#[error("the data cannot mean what their labels say: {0}")]
-pub struct Unusable(String);
+pub struct Findings {
+    /// Of such data no model should be made.
+    pub errors: Vec<String>,
+    /// What is doubtful.
+    pub warnings: Vec<String>,
+}
 
 impl Findings {
     /// Looks through `presses`, of which a training uses `labels` labelled ones.
     pub fn of(presses: &Presses, labels: Option<usize>) -> Self {
-        let mut found = files(presses);
-        found.extend(contents(presses));
-        found.extend(units(presses));
-        if let Some(labels) = labels {
-            let labelled = presses.labelled(Split::Train).count();
-            if labels < labelled {
-                let text = format!(
-                    "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
-                );
-                found.push((Kind::LabelsUnused, text));
-            }
+        let mut found = Self::default();
+        found.files(presses);
+        found.contents(presses);
+        found.errors.extend(units(presses));
+        let labelled = presses.labelled(Split::Train).count();
+        if let Some(labels) = labels.filter(|&labels| labels < labelled) {
+            found.warnings.push(format!(
+                "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
+            ));
         }
-        let mut found: Vec<Finding> = found
-            .into_iter()
-            .map(|(kind, text)| Finding { kind, text })
-            .collect();
-        found.sort_by_key(|finding| finding.kind);
-        Self(found)
+        found
     }
 
     /// The same, if there is no error.
@@ -99,36 +64,84 @@ impl Findings {
     /// # Errors
     ///
     /// Returns the first error.
-    pub fn usable(self) -> Result<Self, Unusable> {
-        match self.0.iter().find(|finding| finding.kind.is_error()) {
-            Some(first) => Err(Unusable(first.text.clone())),
+    pub fn usable(self) -> anyhow::Result<Self> {
+        match self.errors.first() {
+            Some(first) => bail!("the data cannot mean what their labels say: {first}"),
             None => Ok(self),
+        }
+    }
+
+    fn files(&mut self, presses: &Presses) {
+        let mut first = BTreeMap::new();
+        for source in presses.sources.iter().filter(|one| !one.sha256.is_empty()) {
+            if let Some(before) = first.insert(&source.sha256, &source.name) {
+                let text = format!(
+                    "{} and {before} are the same file: name it once",
+                    source.name
+                );
+                self.errors.push(text);
+            }
+        }
+    }
+
+    /// What the frames say: copies of presses, and presses without a contact.
+    fn contents(&mut self, presses: &Presses) {
+        let mut first = HashMap::<u64, usize>::new();
+        // Of each kind the number of presses, and the first of them.
+        let mut counts = BTreeMap::<Kind, (usize, String)>::new();
+        let mut count = |kind: Kind, place: usize, other: Option<usize>| {
+            let (count, _) = counts.entry(kind).or_insert_with(|| {
+                let with = other.map(|other| format!(" and {}", named(presses, other)));
+                (0, named(presses, place) + &with.unwrap_or_default())
+            });
+            *count += 1;
+        };
+        for (place, press) in presses.all.iter().enumerate() {
+            let content = Content::of(presses, place);
+            if content.taxels == 0 {
+                count(DEAD, place, None);
+            } else if content.is_one_frame {
+                count(REPEATED, place, None);
+            }
+            if content.taxels < LEAST_TAXELS {
+                continue;
+            }
+            let other = *first.entry(content.hash).or_insert(place);
+            if other == place {
+                continue;
+            }
+            let before = &presses.all[other];
+            let kind = if press.split != before.split {
+                IN_BOTH_SPLITS
+            } else if press.level != before.level && press.level > 0 && before.level > 0 {
+                TWO_LEVELS
+            } else if press.object != before.object {
+                TWO_OBJECTS
+            } else {
+                TWICE
+            };
+            count(kind, place, Some(other));
+        }
+        for ((is_usable, what), (count, first)) in counts {
+            let presses_are = if count == 1 { "press" } else { "presses" };
+            let text = format!("{count} {presses_are} {what}, such as {first}");
+            match is_usable && count < presses.all.len() {
+                true => self.warnings.push(text),
+                false => self.errors.push(text),
+            }
         }
     }
 }
 
 impl fmt::Display for Findings {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for Finding { kind, text } in &self.0 {
-            let word = if kind.is_error() { "error" } else { "warning" };
-            writeln!(out, "{word}: {text}")?;
+        for (word, texts) in [("error", &self.errors), ("warning", &self.warnings)] {
+            for text in texts {
+                writeln!(out, "{word}: {text}")?;
+            }
         }
         Ok(())
     }
-}
-
-fn files(presses: &Presses) -> Vec<(Kind, String)> {
-    let mut first = BTreeMap::new();
-    let sources = presses.sources.iter().filter(|one| !one.sha256.is_empty());
-    let twice = sources.filter_map(|source| {
-        let before = first.insert(&source.sha256, &source.name)?;
-        let text = format!(
-            "{} and {before} are the same file: name it once",
-            source.name
-        );
-        Some((Kind::FileTwice, text))
-    });
-    twice.collect()
 }
 
 /// The press as its reader would find it.
@@ -147,72 +160,6 @@ fn named(presses: &Presses, place: usize) -> String {
         object.unwrap_or_default(),
         name.unwrap_or_default()
     )
-}
-
-/// What the frames say: copies of presses, and presses without a contact.
-fn contents(presses: &Presses) -> Vec<(Kind, String)> {
-    let mut first = HashMap::<u64, usize>::new();
-    // Of each kind the number of presses, and the first of them.
-    let mut counts = BTreeMap::<Kind, (usize, String)>::new();
-    let mut count = |kind: Kind, place: usize, other: Option<usize>| {
-        let (count, _) = counts.entry(kind).or_insert_with(|| {
-            let with = other.map(|other| format!(" and {}", named(presses, other)));
-            (0, named(presses, place) + &with.unwrap_or_default())
-        });
-        *count += 1;
-    };
-    let mut dead = 0;
-    for (place, press) in presses.all.iter().enumerate() {
-        let content = Content::of(presses, place);
-        if content.taxels == 0 {
-            dead += 1;
-            count(Kind::Dead, place, None);
-        } else if content.is_one_frame {
-            count(Kind::Repeated, place, None);
-        }
-        if content.taxels < LEAST_TAXELS {
-            continue;
-        }
-        let Some(&other) = first.get(&content.hash) else {
-            first.insert(content.hash, place);
-            continue;
-        };
-        let before = &presses.all[other];
-        let kind = if press.split != before.split {
-            Kind::InBothSplits
-        } else if press.level != before.level && press.level > 0 && before.level > 0 {
-            Kind::TwoLevels
-        } else if press.object != before.object {
-            Kind::TwoObjects
-        } else {
-            Kind::Twice
-        };
-        count(kind, place, Some(other));
-    }
-    if dead > 0 && dead == presses.all.len() {
-        counts.remove(&Kind::Dead);
-        counts.insert(Kind::AllDead, (dead, String::new()));
-    }
-    let text = |(kind, (count, first)): (Kind, (usize, String))| {
-        let presses = if count == 1 { "press" } else { "presses" };
-        let text = match kind {
-            Kind::InBothSplits => format!(
-                "{count} {presses} in training and in test, such as {first}: a test on them says nothing"
-            ),
-            Kind::TwoLevels => format!("{count} {presses} with two levels, such as {first}"),
-            Kind::TwoObjects => format!(
-                "{count} {presses} of two objects, such as {first}: was a recording collected twice?"
-            ),
-            Kind::AllDead => "no taxel of any press reads anything".to_owned(),
-            Kind::Twice => format!("{count} {presses} twice, such as {first}"),
-            Kind::Dead => {
-                format!("{count} {presses} in which no taxel reads anything, such as {first}")
-            }
-            _ => format!("{count} {presses} of one frame, repeated, such as {first}"),
-        };
-        (kind, text)
-    };
-    counts.into_iter().map(text).collect()
 }
 
 /// What identifies a press, whatever its numbers are.
@@ -247,32 +194,24 @@ impl Content {
     }
 }
 
-/// Whether the forces can be newtons.
-fn units(presses: &Presses) -> Option<(Kind, String)> {
+/// Why the forces cannot be newtons, if they cannot.
+fn units(presses: &Presses) -> Option<String> {
     let force = |place| -> f64 {
         let frame = presses.frame(place);
         frame.newtons.iter().copied().map(f64::from).sum()
     };
-    let mut forces: Vec<f64> = (0..presses.all.len())
-        .map(force)
-        .filter(|&n| n > 0.0)
-        .collect();
-    if forces.is_empty() {
-        return None;
-    }
+    let forces = (0..presses.all.len()).map(force);
+    let mut forces: Vec<f64> = forces.filter(|&n| n > 0.0).collect();
     let middle = forces.len() / 2;
-    let (_, &mut median, _) = forces.select_nth_unstable_by(middle, f64::total_cmp);
-    let text = if median > MOST_N {
+    forces.sort_unstable_by(f64::total_cmp);
+    let median = *forces.get(middle)?;
+    let is_possible = (LEAST_N..=MOST_N).contains(&median);
+    (!is_possible).then(|| {
         format!(
-            "half of the presses have {median:.0} N or more: are `frames` in millinewtons? They are newtons, or \
-             `frames_mn`"
+            "half of the presses have {median:.1e} N or {}: `frames` are newtons, and `frames_mn` millinewtons",
+            if median > MOST_N { "more" } else { "less" }
         )
-    } else if median < LEAST_N {
-        format!("half of the presses have {median:.1e} N or less: are `frames` in newtons?")
-    } else {
-        return None;
-    };
-    Some((Kind::Units, text))
+    })
 }
 
 #[cfg(test)]
@@ -309,64 +248,60 @@ mod tests {
         presses
     }
 
-    fn kinds(presses: &Presses, labels: Option<usize>) -> Vec<Kind> {
-        let Findings(found) = Findings::of(presses, labels);
-        found.iter().map(|finding| finding.kind).collect()
+    /// Asserts that the presses have this one error, or this one warning, or neither.
+    #[track_caller]
+    fn check(presses: &Presses, labels: Option<usize>, error: &str, warning: &str) {
+        let Findings { errors, warnings } = Findings::of(presses, labels);
+        for (found, expected) in [(errors, error), (warnings, warning)] {
+            let is_expected = |text: &String| !expected.is_empty() && text.contains(expected);
+            assert!(found.iter().all(is_expected), "{found:?}");
+            assert_eq!(found.len(), usize::from(!expected.is_empty()), "{expected}");
+        }
     }
 
     #[test]
     fn copies_are_found_by_their_frames_whatever_their_numbers() {
         let (train, test) = (Split::Train, Split::Test);
-        for (all, expected) in [
-            (vec![(1, 1, train, 1), (2, 2, test, 2)], vec![]),
-            (
-                vec![(1, 1, train, 1), (2, 1, test, 1)],
-                vec![Kind::InBothSplits],
-            ),
-            (
-                vec![(1, 1, train, 1), (1, 2, train, 1)],
-                vec![Kind::TwoLevels],
-            ),
-            (
-                vec![(1, 1, train, 1), (2, 0, train, 1)],
-                vec![Kind::TwoObjects],
-            ),
-            (vec![(1, 1, train, 1), (1, 1, train, 1)], vec![Kind::Twice]),
+        for (second, error, warning) in [
+            ((2, 2, test, 2), "", ""),
+            ((2, 1, test, 1), "in training and in test", ""),
+            ((1, 2, train, 1), "with two levels", ""),
+            ((2, 0, train, 1), "of two objects", ""),
+            ((1, 1, train, 1), "", "1 press twice"),
         ] {
-            let presses = presses(&all, 0.01);
-            assert_eq!(kinds(&presses, None), expected, "{all:?}");
-            let is_usable = expected.iter().all(|kind| !kind.is_error());
-            assert_eq!(Findings::of(&presses, None).usable().is_ok(), is_usable);
+            check(
+                &presses(&[(1, 1, train, 1), second], 0.01),
+                None,
+                error,
+                warning,
+            );
         }
         let both = presses(&[(1, 1, train, 1), (2, 1, test, 1)], 0.01);
-        assert_eq!(
-            Findings::of(&both, None).to_string(),
-            "error: 1 press in training and in test, such as press 1 of d.npz of object 2 and press 0 of d.npz of \
-             object 1: a test on them says nothing\n"
-        );
+        let expected = "such as press 1 of d.npz of object 2 and press 0 of d.npz of object 1";
+        check(&both, None, expected, "");
     }
 
     #[test]
     fn units_dead_presses_labels_and_files_are_looked_at() {
         let train = Split::Train;
         let all = [(1, 1, train, 1), (2, 2, train, 2), (3, 2, train, 3)];
-        assert_eq!(kinds(&presses(&all, 10.0), None), [Kind::Units]);
-        assert_eq!(kinds(&presses(&all, 0.0), None), [Kind::AllDead]);
-        assert_eq!(kinds(&presses(&all, 0.01), Some(3)), []);
-        assert_eq!(kinds(&presses(&all, 0.01), Some(2)), [Kind::LabelsUnused]);
+        check(&presses(&all, 10.0), None, "`frames` are newtons", "");
+        check(&presses(&all, 0.0), None, "3 presses in which no taxel", "");
+        check(&presses(&all, 0.01), Some(3), "", "");
+        check(&presses(&all, 0.01), Some(2), "", "2 of 3 labelled");
         let mut twice = presses(&all, 0.01);
         let source = Source {
             sha256: "5e".to_owned(),
             ..twice.sources[0].clone()
         };
         twice.sources = vec![source.clone(), source];
-        assert_eq!(kinds(&twice, None), [Kind::FileTwice]);
+        check(&twice, None, "are the same file", "");
         // One frame again and again.
         let mut still = presses(&all, 0.01);
         let mut frame = ModelFrame::default();
         frame.newtons[..40].fill(0.1);
         let moments = (0..5).map(|moment| (moment as f32, None, frame));
         still.push(Press::default(), moments);
-        assert_eq!(kinds(&still, None), [Kind::Repeated]);
+        check(&still, None, "", "of one frame, repeated");
     }
 }

@@ -9,18 +9,18 @@ mod frames;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
-use std::path::PathBuf;
-use std::slice;
+use std::path::Path;
 
+use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
     COLS, COURSE_FRAMES, Course, Level, ModelFrame, ROWS, Resampling, Sample, parts,
 };
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Reference, Split};
 
-pub use self::file::{DatasetError, Layout, meta, write};
+pub use self::file::{Layout, meta, write};
 use self::frames::Frames;
-use super::source::{self, Kind, Object, PITCH_MM, Source};
+use super::source::{Kind, Object, PITCH_MM, Source, papers_levels};
 
 /// Newtons per unit of a file's `frames_mn`, and of the simulator's presses.
 const MILLINEWTON: f32 = 1e-3;
@@ -56,6 +56,8 @@ pub struct Press {
     /// The newtons of the array before the touch, without a zero taken: the sensor's own unloaded state. Only
     /// recordings have it.
     pub unloaded: Option<Vec<f32>>,
+    /// What felt the press.
+    pub kind: Kind,
     /// Index of the press's file in [`Presses::sources`].
     pub source: usize,
     /// The frame with the largest contact area, counted from the press's first one.
@@ -80,6 +82,7 @@ impl Default for Press {
             layered: None,
             name: None,
             unloaded: None,
+            kind: Kind::Unknown,
             source: 0,
             best: 0,
             moments: 0..0,
@@ -125,8 +128,6 @@ pub struct Presses {
     approach_mm: Vec<Option<f32>>,
     /// The files.
     pub sources: Vec<Source>,
-    /// The paths of the files.
-    pub paths: Vec<PathBuf>,
 }
 
 impl Presses {
@@ -136,18 +137,13 @@ impl Presses {
     /// # Errors
     ///
     /// Returns an error if a file cannot be read, or an array is missing or has another type, shape or
-    /// content than `docs/formats.md` says; if the sensors of the files have different pitches; or if the
-    /// files have more objects than a u32 can number.
-    pub fn read(paths: &[PathBuf]) -> Result<Self, DatasetError> {
+    /// content than `docs/formats.md` says; or if the sensors of the files have different pitches.
+    pub fn read(paths: &[impl AsRef<Path>]) -> anyhow::Result<Self> {
         let mut all = Self::default();
         for path in paths {
-            let part = file::read(path)?;
+            let part = file::read(path.as_ref())?;
             part.warn_of_object_in_both_splits();
-            if all.sources.is_empty() {
-                all = part;
-            } else {
-                all.join(part)?;
-            }
+            all.join(part)?;
         }
         Ok(all)
     }
@@ -225,86 +221,84 @@ impl Presses {
         self.all.push(press);
     }
 
-    /// Adds the presses of another file.
-    fn join(&mut self, mut other: Self) -> Result<(), DatasetError> {
+    /// Adds the presses of other files. Their objects and sensors are others than those that are there.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the sensors of the files have different pitches.
+    pub fn join(&mut self, other: Self) -> anyhow::Result<()> {
+        if self.all.is_empty() {
+            *self = other;
+            return Ok(());
+        }
         let (found, expected) = (other.pitch_mm(), self.pitch_mm());
-        let path = other.paths[0].clone();
-        if found != expected {
-            return Err(DatasetError::Pitch {
-                path,
-                found,
-                expected,
-                first: self.paths[0].clone(),
-            });
-        }
-        let next = |presses: &[Press], of: fn(&Press) -> Option<u32>| {
-            let last = presses.iter().filter_map(of).max();
-            last.map_or(0, |last| u64::from(last) + 1)
-        };
-        let (first, more) = (
-            next(&self.all, |p| p.object),
-            next(&other.all, |p| p.object),
+        ensure!(
+            found == expected,
+            "{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}",
+            other.shown_paths(),
+            self.shown_paths()
         );
-        let before = match u32::try_from(first) {
-            Ok(before) if first + more <= u64::from(u32::MAX) + 1 => before,
-            _ => {
-                return Err(DatasetError::Array {
-                    path,
-                    array: "object",
-                    found: more.saturating_sub(1).to_string(),
-                    expected: format!(
-                        "no number that, after {first} of other files, is beyond {}",
-                        u32::MAX
-                    ),
-                });
-            }
+        let next = |of: fn(&Press) -> Option<u32>| {
+            let last = self.all.iter().filter_map(of).max();
+            last.map_or(0, |last| last.saturating_add(1))
         };
-        // Sensors of different files are different ones.
-        let sensors = next(&self.all, |press| Some(press.sensor));
-        for press in &mut other.all {
-            let sensor = sensors.saturating_add(press.sensor.into());
-            press.sensor = u32::try_from(sensor).unwrap_or(u32::MAX);
-        }
-        other.sources[0].shift_objects(before);
-        self.append(other, before);
-        Ok(())
-    }
-
-    /// Adds the presses of another file as they are. `objects` is added to their numbers of objects.
-    pub(super) fn append(&mut self, other: Self, objects: u32) {
+        let (object, sensor) = (next(|press| press.object), next(|press| Some(press.sensor)));
+        let objects: BTreeSet<u32> = other.all.iter().filter_map(|press| press.object).collect();
+        ensure!(
+            objects.len() <= (u32::MAX - object) as usize,
+            "{}: no numbers are left for its objects beyond {object}",
+            other.shown_paths()
+        );
+        let objects: BTreeMap<u32, u32> = objects.into_iter().zip(object..).collect();
         let (frames, sources) = (self.frames.len(), self.sources.len());
         self.frames.append(&other.frames);
         self.time_s.extend(other.time_s);
         self.approach_mm.extend(other.approach_mm);
         self.all.extend(other.all.into_iter().map(|press| Press {
-            object: press.object.map(|object| object + objects),
+            object: press.object.map(|own| objects[&own]),
+            sensor: press.sensor.saturating_add(sensor),
             source: press.source + sources,
             moments: press.moments.start + frames..press.moments.end + frames,
             ..press
         }));
         self.sources.extend(other.sources);
-        self.paths.extend(other.paths);
-    }
-
-    /// The path of the first file.
-    pub fn path(&self) -> PathBuf {
-        self.paths.first().cloned().unwrap_or_default()
+        Ok(())
     }
 
     /// The files, for an error.
-    fn shown_paths(&self) -> String {
-        let paths = self.paths.iter().map(|path| path.display().to_string());
+    pub fn shown_paths(&self) -> String {
+        let paths = self
+            .sources
+            .iter()
+            .map(|one| one.path.display().to_string());
         paths.collect::<Vec<_>>().join(", ")
     }
 
-    /// The levels that a model of these presses states.
+    /// The levels that a model of these presses states: those of the first file that states some, otherwise
+    /// the paper's.
     pub fn levels(&self) -> Vec<Level> {
-        source::levels_of(&self.sources)
+        let mut stated = self
+            .sources
+            .iter()
+            .filter_map(|source| source.levels.clone());
+        stated.next().unwrap_or_else(papers_levels)
+    }
+
+    /// Prints a warning for each file that states other levels than a model of these presses.
+    pub fn warn_of_other_levels(&self) {
+        let ours = self.levels();
+        for Source { name, levels, .. } in &self.sources {
+            if levels.as_ref().is_some_and(|others| *others != ours) {
+                hardnessd_core::stderr_line!(
+                    "warning: {name}: states other levels than the first file, whose levels the model will state"
+                );
+            }
+        }
     }
 
     /// Distance between the taxels of the sensors that were pressed, in mm.
     pub fn pitch_mm(&self) -> f64 {
-        source::pitch_mm(&self.sources)
+        self.sources.first().map_or(PITCH_MM, Source::pitch)
     }
 
     /// The least and the greatest distance between the taxels of the sensors of some presses, if these
@@ -316,10 +310,7 @@ impl Presses {
             .collect();
         let used: Vec<&Source> = used.into_iter().map(|place| &self.sources[place]).collect();
         used.iter().find(|source| source.pitches_mm.is_some())?;
-        let of = |source: &Source| {
-            let own = source.pitch_mm.unwrap_or(PITCH_MM);
-            source.pitches_mm.unwrap_or([own; 2])
-        };
+        let of = |source: &Source| source.pitches_mm.unwrap_or([source.pitch(); 2]);
         let both = |[a, b]: [f64; 2], [low, high]: [f64; 2]| [a.min(low), b.max(high)];
         used.into_iter().map(of).reduce(both)
     }
@@ -341,15 +332,15 @@ impl Presses {
     /// # Errors
     ///
     /// Returns an error if the split has no labelled press.
-    pub fn some_labelled(&self, split: Split) -> Result<Vec<usize>, DatasetError> {
+    pub fn some_labelled(&self, split: Split) -> anyhow::Result<Vec<usize>> {
         let found: Vec<usize> = self.labelled(split).collect();
-        match found.is_empty() {
-            false => Ok(found),
-            true => Err(DatasetError::EmptySplit {
-                paths: self.shown_paths(),
-                split: split.name(),
-            }),
-        }
+        let name = split.name();
+        ensure!(
+            !found.is_empty(),
+            "{}: no press of the {name} split has a level: add some with `collect --append --split {name} --level L`",
+            self.shown_paths()
+        );
+        Ok(found)
     }
 
     /// The frame of a press with the largest contact area.
@@ -418,40 +409,45 @@ impl Presses {
         pressed.take(COURSE_FRAMES.1)
     }
 
-    /// The number of presses whose approach is known.
-    pub fn known(&self) -> usize {
-        let knows = |press: &&Press| {
-            let approach = &self.approach_mm[press.moments.clone()];
-            approach.iter().any(Option::is_some)
-        };
-        self.all.iter().filter(knows).count()
+    /// Whether the approach of a press is known.
+    pub fn is_known(&self, press: usize) -> bool {
+        let moments = self.all[press].moments.clone();
+        self.approach_mm[moments].iter().any(Option::is_some)
     }
 
     /// The kinds of the labelled test presses whose objects were not learnt.
     pub fn validated(&self) -> BTreeSet<Kind> {
-        let presses = self.all.iter().filter(|press| press.reference.is_none());
-        source::validated(presses.map(|press| {
-            let source = &self.sources[press.source];
-            (source, press.pressed(), press.level, press.split)
-        }))
+        let learnt = self.objects(Split::Train);
+        let tested = self.labelled(Split::Test);
+        let tested: BTreeSet<(Option<Object>, Kind)> = tested
+            .map(|place| (self.all[place].pressed(), self.all[place].kind))
+            .collect();
+        let is_learnt = |object: &Object| learnt.iter().any(|other| other.is_same_as(object));
+        let new = tested.into_iter();
+        let new = new.filter(|(object, _)| !object.as_ref().is_some_and(is_learnt));
+        new.map(|(_, kind)| kind).collect()
     }
 
-    /// The kinds of some presses.
-    pub fn kinds(&self, presses: &[usize]) -> BTreeSet<Kind> {
-        let presses = self.of(presses);
-        presses
-            .flat_map(|press| self.sources[press.source].kinds_of(press.pressed()))
-            .collect()
-    }
-
-    fn warn_of_object_in_both_splits(&self) {
+    /// The objects of a split that are known and are no rigid pieces.
+    fn objects(&self, split: Split) -> BTreeSet<Object> {
         let presses = self.all.iter();
-        let presses = presses.filter_map(|press| Some((press.pressed()?, press.split)));
-        if let Some(object) = source::object_in_both_splits(presses) {
+        let presses = presses.filter(|press| press.split == split && press.reference.is_none());
+        presses.filter_map(Press::pressed).collect()
+    }
+
+    /// The number of an object that has presses in both splits, if there is one.
+    fn object_in_both_splits(&self) -> Option<u32> {
+        let (trained, tested) = (self.objects(Split::Train), self.objects(Split::Test));
+        let is_tested = |object: &&Object| tested.iter().any(|other| other.is_same_as(object));
+        trained.iter().find(is_tested).map(|object| object.number)
+    }
+
+    pub(super) fn warn_of_object_in_both_splits(&self) {
+        if let Some(object) = self.object_in_both_splits() {
             hardnessd_core::stderr_line!(
                 "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
                  of them overrates a model that learnt from the others",
-                self.path().display()
+                self.shown_paths()
             );
         }
     }
@@ -504,8 +500,8 @@ pub enum Unit {
 /// # Errors
 ///
 /// Returns the errors of [`Presses::read`].
-pub fn read_one(path: &std::path::Path) -> Result<Presses, DatasetError> {
-    Presses::read(slice::from_ref(&path.to_owned()))
+pub fn read_one(path: &Path) -> anyhow::Result<Presses> {
+    Presses::read(&[path])
 }
 
 #[cfg(test)]

@@ -1,12 +1,12 @@
 //! The files that presses are from: what they say of themselves, and whose levels a model states.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use hardnessd_core::frame::{Array, Pitch};
 use hardnessd_core::verdict::Level;
-use hardnessd_simulator::{LEVELS, LevelRange, Split};
+use hardnessd_simulator::{LEVELS, LevelRange};
 
 /// The distance between taxels, unless a file names another one.
 pub const PITCH_MM: f64 = Pitch::JX255N.rows_mm;
@@ -32,15 +32,27 @@ pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
     }
 }
 
-/// The kind of the presses in a file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+/// The kind of a press.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// Presses of our simulator.
+    /// A press of our simulator.
     Simulated,
-    /// Presses of `hrn-train collect`.
+    /// A press that a sensor felt.
     Recorded,
-    /// Presses of another program, or of one that the file does not name.
+    /// A press of another program, or of one that the file does not name.
+    #[default]
     Unknown,
+}
+
+impl Kind {
+    /// The kind of the presses of a recording, of a simulated sensor or of raw bytes.
+    pub(super) fn of_recording(is_simulated: bool, is_raw: bool) -> Self {
+        match (is_simulated, is_raw) {
+            (true, _) => Self::Simulated,
+            (false, true) => Self::Unknown,
+            (false, false) => Self::Recorded,
+        }
+    }
 }
 
 /// A file that presses came from.
@@ -56,6 +68,9 @@ pub struct Source {
     pub generator: Option<String>,
     /// Distance between the sensor's taxels, if the file names one.
     pub pitch_mm: Option<f64>,
+    /// The file.
+    #[serde(skip)]
+    pub path: PathBuf,
     /// The least and the greatest distance between the taxels of the file's sensors, if they differ.
     #[serde(skip)]
     pub pitches_mm: Option<[f64; 2]>,
@@ -65,42 +80,21 @@ pub struct Source {
     /// The levels that the file states.
     #[serde(skip)]
     pub levels: Option<Vec<Level>>,
-    /// The kind of the presses of recorded objects, by number and level.
-    #[serde(skip)]
-    pub recorded: BTreeMap<(u32, u8), Kind>,
 }
 
 impl Source {
-    /// The kinds of the presses, in the order of the programs that made them.
-    pub fn kinds(&self) -> Vec<Kind> {
-        let kind = |generator: &str| match generator {
-            _ if generator.starts_with(SIMULATOR) => Kind::Simulated,
-            _ if generator.starts_with(COLLECTOR) => Kind::Recorded,
+    /// Distance between the sensor's taxels, in mm.
+    pub fn pitch(&self) -> f64 {
+        self.pitch_mm.unwrap_or(PITCH_MM)
+    }
+
+    /// The kind of the file's presses, if it says nothing else of one: that of the program that began the file.
+    pub(super) fn kind(&self) -> Kind {
+        match self.generator.as_deref().unwrap_or_default() {
+            generator if generator.starts_with(SIMULATOR) => Kind::Simulated,
+            generator if generator.starts_with(COLLECTOR) => Kind::Recorded,
             _ => Kind::Unknown,
-        };
-        let generators = self.generator.as_deref().unwrap_or_default().split(", ");
-        generators.map(kind).collect()
-    }
-
-    /// The possible kinds of a press of an object in the file.
-    pub(super) fn kinds_of(&self, object: Option<Object>) -> Vec<Kind> {
-        let known = object.and_then(|of| self.recorded.get(&(of.number, of.level)));
-        if let Some(kind) = known {
-            return vec![*kind];
         }
-        let mut kinds = self.kinds();
-        if kinds.iter().any(|&kind| kind != Kind::Recorded) {
-            kinds.retain(|&kind| kind != Kind::Recorded);
-        }
-        kinds
-    }
-
-    /// Adds `before` to the numbers of recorded objects, as to those of the file's presses.
-    pub(super) fn shift_objects(&mut self, before: u32) {
-        let recorded = std::mem::take(&mut self.recorded).into_iter();
-        self.recorded = recorded
-            .map(|((object, level), kind)| ((object + before, level), kind))
-            .collect();
     }
 }
 
@@ -122,75 +116,4 @@ impl Object {
         let same_level = self.level == other.level || self.level == 0 || other.level == 0;
         self.number == other.number && self.material == other.material && same_level
     }
-}
-
-/// The number of an object that has presses in both splits, if there is one.
-pub(super) fn object_in_both_splits(presses: impl Iterator<Item = (Object, Split)>) -> Option<u32> {
-    let (mut trained, mut tested) = (BTreeSet::new(), BTreeSet::new());
-    for (object, split) in presses {
-        match split {
-            Split::Train => trained.insert(object),
-            Split::Test => tested.insert(object),
-        };
-    }
-    let is_tested = |object: &&Object| tested.iter().any(|other| other.is_same_as(object));
-    trained.iter().find(is_tested).map(|object| object.number)
-}
-
-/// A press as far as its validation is concerned: its file, its object if that is known, its level and its
-/// split.
-pub(super) type Judged<'a> = (&'a Source, Option<Object>, u8, Split);
-
-/// The kinds of the labelled test presses whose objects were not learnt.
-pub(super) fn validated<'a>(presses: impl Iterator<Item = Judged<'a>> + Clone) -> BTreeSet<Kind> {
-    let learnt = presses.clone().filter(|press| press.3 == Split::Train);
-    let learnt: BTreeSet<Object> = learnt.filter_map(|press| press.1).collect();
-    let is_learnt = |object: &Object| learnt.iter().any(|other| other.is_same_as(object));
-    // An object has many presses.
-    let mut seen = BTreeSet::new();
-    let mut kinds = BTreeSet::new();
-    for (source, object, level, split) in presses {
-        if split == Split::Train || level == 0 {
-            continue;
-        }
-        let is_new = object.is_none_or(|object| seen.insert(object));
-        if is_new && !object.as_ref().is_some_and(is_learnt) {
-            kinds.extend(source.kinds_of(object));
-        }
-    }
-    kinds
-}
-
-/// The levels that a model of these files states: those of the first file that states some, otherwise
-/// the paper's.
-pub fn levels_of(sources: &[Source]) -> Vec<Level> {
-    let mut stated = sources.iter().filter_map(|source| source.levels.clone());
-    stated.next().unwrap_or_else(papers_levels)
-}
-
-/// Prints a warning for each file that states other levels than the model will.
-pub fn warn_of_other_levels(sources: &[Source]) {
-    let shown = |levels: &[Level]| {
-        let each = levels
-            .iter()
-            .map(|level| format!("{} {}", level.label, level.shore));
-        each.collect::<Vec<_>>().join(", ")
-    };
-    let ours = levels_of(sources);
-    for source in sources {
-        if let Some(others) = source.levels.as_ref().filter(|others| **others != ours) {
-            hardnessd_core::stderr_line!(
-                "warning: {}: levels: found {}, expected {}, which the model will state",
-                source.name,
-                shown(others),
-                shown(&ours)
-            );
-        }
-    }
-}
-
-/// Distance between the taxels of the sensor that was pressed, in mm. All sources have the same one.
-pub fn pitch_mm(sources: &[Source]) -> f64 {
-    let stated = sources.first().and_then(|source| source.pitch_mm);
-    stated.unwrap_or(PITCH_MM)
 }

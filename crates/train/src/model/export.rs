@@ -295,55 +295,40 @@ fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
     use crate::data::presses::Press;
 
     #[test]
     fn a_model_is_validated_by_what_judged_it_and_it_did_not_learn() {
-        let press = |object: Option<u32>, level, split| Press {
+        let press = |object: Option<u32>, level, kind, split| Press {
             level,
             object,
+            kind,
             split,
             ..Press::default()
         };
-        let (train, test) = (Split::Train, Split::Test);
-        let learnt = press(Some(1), 1, train);
-        let recorded = BTreeMap::from([((2, 1), Kind::Recorded), ((3, 1), Kind::Simulated)]);
-        let both = Some("hardnessd simulator 0.2.0, hrn-train collect 0.2.0");
-        for (generator, judged, expected) in [
-            (both, vec![], "not validated"),
-            (both, vec![press(Some(4), 0, test)], "not validated"),
-            (both, vec![press(Some(1), 1, test)], "not validated"),
-            (both, vec![press(Some(4), 1, test)], "simulated data only"),
-            (both, vec![press(Some(3), 1, test)], "simulated data only"),
-            (both, vec![press(Some(2), 1, test)], "recorded data"),
+        let [simulated, recorded, unknown] = [Kind::Simulated, Kind::Recorded, Kind::Unknown];
+        let test = |object, level, kind| press(object, level, kind, Split::Test);
+        let learnt = press(Some(1), 1, simulated, Split::Train);
+        for (judged, expected) in [
+            (vec![], "not validated"),
+            (vec![test(Some(4), 0, simulated)], "not validated"),
+            (vec![test(Some(1), 1, recorded)], "not validated"),
+            (vec![test(Some(4), 1, simulated)], "simulated data only"),
+            (vec![test(Some(2), 1, recorded)], "recorded data"),
             (
-                both,
-                vec![press(Some(2), 1, test), press(Some(4), 1, test)],
+                vec![test(Some(2), 1, recorded), test(Some(4), 1, simulated)],
                 "simulated and recorded data",
             ),
+            (vec![test(None, 1, unknown)], "data of unknown origin"),
             (
-                Some("hrn-train collect 0.2.0"),
-                vec![press(None, 1, test)],
-                "recorded data",
-            ),
-            (None, vec![press(None, 1, test)], "data of unknown origin"),
-            (
-                None,
-                vec![press(Some(2), 1, test), press(None, 1, test)],
+                vec![test(Some(2), 1, recorded), test(None, 1, unknown)],
                 "data partly of unknown origin",
             ),
         ] {
             let mut presses = Presses::default();
             presses.all = [vec![learnt.clone()], judged].concat();
-            presses.sources = vec![Source {
-                generator: generator.map(str::to_owned),
-                recorded: recorded.clone(),
-                ..Source::default()
-            }];
-            assert_eq!(validation(&presses.validated()), expected, "{generator:?}");
+            assert_eq!(validation(&presses.validated()), expected);
         }
     }
 }

@@ -7,7 +7,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{Context as _, ensure};
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -130,77 +130,49 @@ impl Checkpoint {
         Ok(npz.finish()?.into_inner())
     }
 
-    /// Reads a file that [`Checkpoint::to_bytes`] made.
+    /// Reads a file that [`Checkpoint::to_bytes`] made, of a stage with the lists of `fresh`.
     ///
     /// # Errors
     ///
-    /// Returns an error if the file cannot be read or is damaged.
-    pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
+    /// Returns an error if the file cannot be read, is damaged, or lacks a weight of this size.
+    pub fn read(path: &Path, fresh: &[(String, Weights)], device: &Device) -> anyhow::Result<Self> {
         let bytes = std::fs::read(path)?;
         let mut zip = ZipArchive::new(Cursor::new(bytes.as_slice()))?;
-        let (mut progress, mut origin) = (None, None);
-        let mut lists: Vec<(String, Weights)> = Vec::new();
-        for place in 0..zip.len() {
-            let mut packed = zip.by_index(place)?;
-            let name = packed.name().trim_end_matches(".npy").to_owned();
-            let header = Header::read(&mut packed)?;
-            let text = match name.as_str() {
-                "progress" => Some(&mut progress),
-                "origin" => Some(&mut origin),
-                _ => None,
-            };
-            if let Some(text) = text {
-                *text = Some(header.elements(&mut packed, u8::of)?);
-                continue;
+        let mut text = |name: &str| {
+            let mut packed = zip
+                .by_name(&format!("{name}.npy"))
+                .context(name.to_owned())?;
+            let text = Header::read(&mut packed)?.elements(&mut packed, u8::of)?;
+            anyhow::Ok(String::from_utf8(text)?)
+        };
+        let (progress, origin) = (text("progress")?, text("origin")?);
+        let mut lists = Vec::new();
+        for (list, like) in fresh {
+            let mut weights = Weights::default();
+            for Weight { name, dims, .. } in &like.entries {
+                let array = format!("{list}/{name}");
+                let packed = zip.by_name(&format!("{array}.npy"));
+                let mut packed = packed.with_context(|| format!("array `{array}`"))?;
+                let header = Header::read(&mut packed)?;
+                ensure!(
+                    header.shape == *dims && !header.fortran_order,
+                    "array `{array}`: found shape {:?}, expected {dims:?} in C order",
+                    header.shape
+                );
+                let values = header.elements(&mut packed, f32::of)?;
+                weights.entries.push(Weight {
+                    name: name.clone(),
+                    dims: dims.clone(),
+                    values: flat(values, device),
+                });
             }
-            let Some((list, weight)) = name.split_once('/') else {
-                bail!("array `{name}` is no part of a checkpoint");
-            };
-            ensure!(
-                !header.fortran_order,
-                "array `{name}`: found Fortran order, expected C order"
-            );
-            let values = header.elements(&mut packed, f32::of)?;
-            if lists.last().is_none_or(|(last, _)| last != list) {
-                lists.push((list.to_owned(), Weights::default()));
-            }
-            let entries = &mut lists.last_mut().expect("pushed just now").1.entries;
-            entries.push(Weight {
-                name: weight.to_owned(),
-                dims: header.shape,
-                values: flat(values, device),
-            });
+            lists.push((list.clone(), weights));
         }
-        ensure!(!lists.is_empty(), "no weights in it");
         Ok(Self {
-            origin: String::from_utf8(origin.context("no `origin` in it")?)?,
-            progress: serde_json::from_slice(&progress.context("no `progress` in it")?)?,
+            origin,
+            progress: serde_json::from_str(&progress)?,
             lists,
         })
-    }
-
-    /// Returns an error unless the checkpoint has the lists of `fresh`, with weights of the same names and
-    /// sizes.
-    ///
-    /// # Errors
-    ///
-    /// Names the list, and the weight if there is one.
-    pub fn check_like(&self, fresh: &[(String, Weights)]) -> anyhow::Result<()> {
-        for (name, like) in fresh {
-            let shapes = |weights: &Weights| -> Vec<(String, Vec<usize>)> {
-                let shape = |weight: &Weight| (weight.name.clone(), weight.dims.clone());
-                weights.entries.iter().map(shape).collect()
-            };
-            let (found, expected) = (shapes(self.list(name)?), shapes(like));
-            if let Some((weight, dims)) = expected.iter().find(|own| !found.contains(own)) {
-                bail!("array `{name}/{weight}`: found none of shape {dims:?}");
-            }
-            ensure!(
-                found == expected,
-                "`{name}` has other weights than this network"
-            );
-        }
-        Ok(())
     }
 }
 

@@ -48,20 +48,15 @@ impl Checkpoints {
     /// # Errors
     ///
     /// Returns an error if there are checkpoints but none can be read.
-    pub(super) fn newest(
+    pub fn newest(
         &self,
         stage: &str,
         fresh: &[(String, Weights)],
         device: &Device,
     ) -> anyhow::Result<Option<Checkpoint>> {
-        let read = |path: &Path| {
-            let checkpoint = Checkpoint::read(path, device)?;
-            checkpoint.check_like(fresh)?;
-            Ok::<_, anyhow::Error>(checkpoint)
-        };
         let mut failure = None;
         for path in self.paths(stage)?.iter().rev() {
-            match read(path) {
+            match Checkpoint::read(path, fresh, device) {
                 Ok(checkpoint) => return Ok(Some(checkpoint)),
                 Err(error) => failure = Some(error.context(path.display().to_string())),
             }

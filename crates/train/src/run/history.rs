@@ -59,21 +59,8 @@ impl MetricsFile {
         })
     }
 
-    /// Adds the rows of `stage` from the text of another run's file, because they are part of the
-    /// cost of this run's model.
-    pub(super) fn take(&self, stage: &str, text: &str) -> anyhow::Result<()> {
-        let mut own = self.read()?;
-        if own.is_empty() {
-            own = columns() + "\n";
-        }
-        let of_stage = |row: &&str| row.split(',').next() == Some(stage);
-        let own = own.lines().filter(|row| !of_stage(row));
-        let rows: Vec<&str> = own.chain(text.lines().filter(of_stage)).collect();
-        write_whole(&self.path, (rows.join("\n") + "\n").as_bytes())
-    }
-
     /// The text so far. Empty if the file does not exist yet.
-    pub(super) fn read(&self) -> anyhow::Result<String> {
+    fn read(&self) -> anyhow::Result<String> {
         match std::fs::read_to_string(&self.path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(String::new()),
             Err(error) => Err(error).with_context(|| self.path.display().to_string()),
@@ -230,13 +217,5 @@ mod tests {
             metrics.add(&row).unwrap();
         }
         assert_eq!(file.cost().unwrap(), (30, 5.5));
-    }
-
-    #[test]
-    fn columns_of_another_version_are_refused() {
-        let path = Path::new("r/metrics.csv");
-        assert!(check_columns(&columns(), path).is_ok());
-        let error = check_columns("stage,step,seconds\n", path).unwrap_err();
-        assert!(error.to_string().contains("r/metrics.csv:1"), "{error}");
     }
 }

@@ -1,9 +1,8 @@
 //! The progress of a stage as a bar or lines, and the end of a stage that has diverged.
 
 use anyhow::ensure;
-use indicatif::ProgressBar;
+use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::data::simulated::with_rate;
 use crate::net::network::{Weights, numbers};
 
 /// Ends a stage with a value that is NaN or infinite, because no further step would make it finite.
@@ -41,8 +40,8 @@ pub(crate) fn ensure_finite_weights(
 
 /// A bar over a stage's steps.
 pub(crate) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
-    let template = "{prefix} {bar:30} {pos}/{len} steps, {rate} a second, {eta} left {msg}";
-    let style = with_rate(template);
+    let template = "{prefix} {bar:30} {pos}/{len} steps, {eta} left {msg}";
+    let style = ProgressStyle::with_template(template).expect("the template is right");
     // indicatif draws on a terminal only. Elsewhere `report` prints lines.
     let bar = ProgressBar::new(steps)
         .with_style(style)

@@ -1,24 +1,7 @@
 //! The range of every number, in one table, and the error for a number outside it.
 
-use super::Settings;
-
-/// The reason that settings cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum SettingsError {
-    /// The text is not TOML, or has an unknown key or a value of another type.
-    #[error("{0}")]
-    Syntax(String),
-    /// A value is outside its range.
-    #[error("`{key}`: found {found}, expected {expected}")]
-    Range {
-        /// Path of the key.
-        key: String,
-        /// The value of the key.
-        found: f64,
-        /// The accepted range.
-        expected: &'static str,
-    },
-}
+use crate::exit::coded;
+use hardnessd_core::exit::CONFIG;
 
 /// The end of a key's path, the numbers that it may have, and those in words. A path of two parts comes
 /// before one of its last part.
@@ -29,6 +12,7 @@ const DECAY: fn(f64) -> bool = |x| (0.0..1.0).contains(&x);
 const COUNT: fn(f64) -> bool = |x| x >= 1.0;
 const POSITIVE: fn(f64) -> bool = |x| x > 0.0;
 const NOT_NEGATIVE: fn(f64) -> bool = |x| x >= 0.0;
+const SOME: fn(f64) -> bool = |x| (1.0..=1e4).contains(&x);
 
 #[rustfmt::skip]
 const BOUNDS: &[Bound] = &[
@@ -59,36 +43,51 @@ const BOUNDS: &[Bound] = &[
     ("reports.arm", |x| (0.0..=0.9).contains(&x), "0 to 0.9"),
     ("reports.clock_frames", |x| (0.0..=5.0).contains(&x), "0 to 5"),
     ("validation.share", |x| (0.0..=0.5).contains(&x), "0 to 0.5"),
+    // The simulator's settings.
+    ("objects", |x| (0.0..=1e4).contains(&x), "0 to 10,000"),
+    ("test_objects", |x| (0.0..=1e4).contains(&x), "0 to 10,000"),
+    ("presses", SOME, "1 to 10,000"),
+    ("lowest_force_n", |x| (0.01..=25.0).contains(&x), "0.01 to 25"),
+    ("frame_rate_hz", |x| (1.0..=200.0).contains(&x), "1 to 200"),
+    ("covers", SOME, "1 to 10,000"),
+    ("test_covers", SOME, "1 to 10,000"),
+    ("electronics", SOME, "1 to 10,000"),
 ];
 
-/// Checks every number of the settings.
-pub(super) fn check(settings: &Settings) -> Result<(), SettingsError> {
-    let table = toml::Table::try_from(settings).expect("settings are plain tables of numbers");
-    check_table("", &table)
+/// Checks the numbers of a table, and of those in it. A list has the same bound for each of its numbers, which
+/// ascend.
+pub(crate) fn check(table: &toml::Table) -> anyhow::Result<()> {
+    check_below("", table)
 }
 
-fn check_table(above: &str, table: &toml::Table) -> Result<(), SettingsError> {
+fn check_below(above: &str, table: &toml::Table) -> anyhow::Result<()> {
     for (key, value) in table {
         let path = format!("{above}{key}");
-        let found = match value {
+        let found: Vec<f64> = match value {
             toml::Value::Table(inner) => {
-                check_table(&format!("{path}."), inner)?;
+                check_below(&format!("{path}."), inner)?;
                 continue;
             }
-            toml::Value::Integer(number) => *number as f64,
-            toml::Value::Float(number) => *number,
-            _ => continue,
+            toml::Value::Array(all) => all.iter().filter_map(number).collect(),
+            value => number(value).into_iter().collect(),
         };
-        let (_, fits, expected) = bound_of(&path).expect("a test finds each number's bound");
-        if !found.is_finite() || !fits(found) {
-            return Err(SettingsError::Range {
-                key: path,
-                found,
-                expected,
-            });
+        let Some((_, fits, expected)) = bound_of(&path) else {
+            continue;
+        };
+        for number in &found {
+            if !number.is_finite() || !fits(*number) || !found.is_sorted() {
+                let text = format!("`{path}`: found {number}, expected {expected}");
+                return Err(coded(CONFIG, text));
+            }
         }
     }
     Ok(())
+}
+
+fn number(value: &toml::Value) -> Option<f64> {
+    value
+        .as_float()
+        .or(value.as_integer().map(|number| number as f64))
 }
 
 fn bound_of(path: &str) -> Option<Bound> {
@@ -99,10 +98,25 @@ fn bound_of(path: &str) -> Option<Bound> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::settings::Settings;
+
+    fn bounded(above: &str, table: &toml::Table) {
+        for (key, value) in table {
+            let path = format!("{above}{key}");
+            match value {
+                toml::Value::Table(inner) => bounded(&format!("{path}."), inner),
+                value => assert!(
+                    number(value).is_none() || bound_of(&path).is_some(),
+                    "{path}"
+                ),
+            }
+        }
+    }
 
     #[test]
-    fn every_number_has_a_bound_and_keeps_it() {
-        // The check itself looks for each number's bound.
-        assert!(check(&Settings::default()).is_ok());
+    fn every_number_of_the_settings_has_a_bound_and_keeps_it() {
+        let table = toml::Table::try_from(Settings::default()).unwrap();
+        bounded("", &table);
+        assert!(check(&table).is_ok());
     }
 }

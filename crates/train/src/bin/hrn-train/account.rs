@@ -1,78 +1,62 @@
 //! Text about a model, about an evaluation and about a data set.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::{Hrn, Level};
 use hardnessd_simulator::Split;
 use hrn_train::compare::tables::thousands;
-use hrn_train::data::presses::Presses;
+use hrn_train::data::presses::{Press, Presses};
 use hrn_train::judge::metrics::Evaluation;
 use hrn_train::model::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
 
 /// The card of the model read from `path`.
 pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
     let card = hrn.card();
-    let levels: String = card
-        .levels
-        .iter()
-        .map(|level| {
-            format!(
-                "level {}       {}, Shore {}\n",
-                level.level, level.label, level.shore
-            )
-        })
-        .collect();
-    let temperature = card.metrics["temperature"]
-        .as_f64()
-        .map_or_else(String::new, |temperature| {
-            format!("temperature   {temperature:.3}\n")
-        });
-    let [least_n, most_n] = card.range.force_n;
-    let [least_taxels, most_taxels] = card.range.contact_area_taxels;
+    let mut text = format!("{}\n", path.display());
+    let mut row = |name: &str, value: String| {
+        let _ = writeln!(text, "{name:<14}{value}");
+    };
+    row("sha256", hrn.sha256().to_owned());
+    row("format", card.format.clone());
+    row("method", card.method.clone());
+    row("validation", card.validation.clone());
+    for level in &card.levels {
+        let name = format!("level {}", level.level);
+        row(&name, format!("{}, Shore {}", level.label, level.shore));
+    }
+    row("pitch", format!("{} mm", card.pitch_mm));
+    let [least, most] = card.range.contact_area_taxels;
+    row(
+        "contact area",
+        format!("{least} to {most} taxels in training"),
+    );
+    let of_presses = card.range.of_presses().into_iter();
     let names = [
-        ("duration     ", "s"),
-        ("frame period ", "s"),
-        ("arm's speed  ", "mm/s"),
-        ("approach     ", "mm"),
-        ("arm          ", "N/mm"),
+        ("force", "N"),
+        ("duration", "s"),
+        ("frame period", "s"),
+        ("arm's speed", "mm/s"),
+        ("approach", "mm"),
+        ("arm", "N/mm"),
     ];
-    let of_presses: String = names
-        .iter()
-        .zip(card.range.of_presses())
-        .filter_map(|((name, unit), range)| {
-            let [least, most] = range?;
-            Some(format!(
-                "{name} {least:.2} to {most:.2} {unit} in training\n"
-            ))
-        })
-        .collect();
-    format!(
-        "{}\n\
-         sha256        {}\n\
-         format        {}\n\
-         method        {}\n\
-         validation    {}\n\
-         {levels}\
-         pitch         {} mm\n\
-         force         {least_n:.2} to {most_n:.2} N in training\n\
-         contact area  {least_taxels} to {most_taxels} taxels in training\n\
-         {of_presses}\
-         {temperature}\
-         data          {}\n\
-         metrics       {}\n\
-         check frames  {}, all reproduced\n",
-        path.display(),
-        hrn.sha256(),
-        card.format,
-        card.method,
-        card.validation,
-        card.pitch_mm,
-        card.data,
-        card.metrics,
-        hrn.checks().count()
-    )
+    let ranges = [Some(card.range.force_n)].into_iter().chain(of_presses);
+    for ((name, unit), range) in names.into_iter().zip(ranges) {
+        if let Some([least, most]) = range {
+            row(name, format!("{least:.2} to {most:.2} {unit} in training"));
+        }
+    }
+    if let Some(temperature) = card.metrics["temperature"].as_f64() {
+        row("temperature", format!("{temperature:.3}"));
+    }
+    row("data", card.data.clone());
+    row("metrics", card.metrics.to_string());
+    row(
+        "check frames",
+        format!("{}, all reproduced", hrn.checks().count()),
+    );
+    text
 }
 
 /// The figures of an evaluation.
@@ -178,46 +162,24 @@ fn of_evaluation(evaluation: &Evaluation) -> String {
     )
 }
 
-/// The number of presses of each level in each split, and a warning if the levels were probably counted
-/// from 0.
+/// The number of presses of each level in each split.
 pub(super) fn of_data(presses: &Presses) -> String {
     let mut text = String::new();
-    let levels: Vec<u8> = presses.levels().iter().map(|level| level.level).collect();
-    let count = |split, level| {
-        let all = presses.all.iter();
-        all.filter(|press| {
-            press.split == split && press.level == level && press.reference.is_none()
-        })
-        .count()
-    };
     for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
-        if presses.all.iter().all(|press| press.split != split) {
+        let all = presses.all.iter();
+        let own: Vec<&Press> = all.filter(|press| press.split == split).collect();
+        if own.is_empty() {
             continue;
         }
-        let mut counts: Vec<String> = levels
-            .iter()
-            .map(|&level| format!("level {level} {}", thousands(count(split, level))))
-            .collect();
-        counts.push(format!(
-            "unlabelled (level 0) {}",
-            thousands(count(split, 0))
-        ));
-        let _ = writeln!(text, "{name} presses: {}", counts.join(", "));
-    }
-    let has = |level: u8| {
-        [Split::Train, Split::Test]
-            .iter()
-            .any(|&split| count(split, level) > 0)
-    };
-    if let Some(&highest) = levels.last()
-        && has(0)
-        && !has(highest)
-        && (1..highest).all(has)
-    {
+        let own = own.into_iter().filter(|press| press.reference.is_none());
+        let count = |level| thousands(own.clone().filter(|press| press.level == level).count());
+        let counts = presses.levels().into_iter();
+        let counts = counts.map(|of| format!("level {} {}, ", of.level, count(of.level)));
+        let counts: String = counts.collect();
         let _ = writeln!(
             text,
-            "warning: the data has level 0 and no level {highest}: were the levels counted from 0? \
-             Levels go from 1 to {highest}; 0 means unlabelled"
+            "{name} presses: {counts}unlabelled (level 0) {}",
+            count(0)
         );
     }
     text
@@ -225,45 +187,21 @@ pub(super) fn of_data(presses: &Presses) -> String {
 
 /// Warnings about levels with few labelled training presses, or none.
 pub(super) fn of_levels(presses: &Presses) -> String {
-    let mut objects: BTreeMap<u8, BTreeSet<Option<u32>>> = BTreeMap::new();
-    for place in presses.labelled(Split::Train) {
-        let press = &presses.all[place];
-        objects.entry(press.level).or_default().insert(press.object);
-    }
-    let levels = presses.levels();
-    let all = || levels.iter().map(|level| level.level);
-    let missing: Vec<u8> = all().filter(|level| !objects.contains_key(level)).collect();
-    let of_one = |level: &u8| {
-        let objects = objects.get(level);
-        objects.is_some_and(|objects| objects.len() == 1 && !objects.contains(&None))
-    };
-    let of_one: Vec<u8> = all().filter(of_one).collect();
     let mut text = String::new();
-    if !missing.is_empty() {
-        let _ = writeln!(
-            text,
-            "warning: no labelled training press is of level {}: the model never learns to say it",
-            listed(&missing)
-        );
-    }
-    if !of_one.is_empty() {
-        let _ = writeln!(
-            text,
-            "warning: all training presses of level {} are of one object: the model may learn the object and \
-             not the hardness",
-            listed(&of_one)
-        );
+    for Level { level, .. } in presses.levels() {
+        let places = presses.labelled(Split::Train);
+        let own = places.filter(|&place| presses.all[place].level == level);
+        let objects: BTreeSet<Option<u32>> = own.map(|place| presses.all[place].object).collect();
+        let warning = match (objects.len(), objects.contains(&None)) {
+            (0, _) => "no labelled training press: the model never learns to say it",
+            (1, false) => {
+                "all training presses are of one object: the model may learn the object and not the hardness"
+            }
+            _ => continue,
+        };
+        let _ = writeln!(text, "warning: level {level}: {warning}");
     }
     text
-}
-
-/// Numbers as in a sentence: 2, 3 or 4.
-fn listed(numbers: &[u8]) -> String {
-    let texts: Vec<String> = numbers.iter().map(u8::to_string).collect();
-    match texts.split_last() {
-        Some((last, rest)) if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
-        _ => texts.concat(),
-    }
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,

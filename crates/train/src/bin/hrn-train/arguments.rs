@@ -2,15 +2,14 @@
 
 use std::path::PathBuf;
 
-use clap::builder::RangedU64ValueParser;
-use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use clap::{Parser, Subcommand, ValueEnum};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Parser, Subcommand};
 use hardnessd_core::wording::named;
 use hardnessd_simulator::{
     DatasetSettings, Materials, SensorDesigns, SensorProfile, Shapes, Split,
 };
-use hrn_train::recipe::{self, Recipe};
-use hrn_train::settings::Profile;
+use hrn_train::compare::Plan;
+use hrn_train::train::Train;
 
 /// Trains and evaluates the hardness recognition network.
 #[derive(Debug, Parser)]
@@ -27,15 +26,7 @@ const EXIT_CODES: &str = "Exit codes: 0 done; 1 failed or bad data; 2 wrong usag
 /// What `collect --help` says below the options.
 const COLLECTED: &str = "\
     Of a directory it takes all recordings below it, sorted by path. The first bytes of a file, \
-    not its name, decide what it is. Presses of a data set keep their level, object and split; \
-    only objects that `collect` itself numbered get new numbers. With --skip-unusable, the most \
-    frequent combination of pitch, material and shore decides, or the data set of --append.";
-
-/// What `compare --help` says below the options.
-const COMPARED: &str = "\
-    It calls `train` once for each method, number of labels and seed, and leaves out the runs that \
-    have their model. `ours`, `nahrn` and `nihrn` share a stage, so they are one line of --plan. \
-    Models that take references get two presses of each rigid piece.";
+    not its name, decide what it is. All recordings without a number of the object are one new object.";
 
 /// What `fit --help` says below the options.
 const FITTED: &str = "\
@@ -62,7 +53,7 @@ pub(super) enum Command {
     /// Train one method
     Train(Train),
     /// Train methods under several seeds and make the paper's tables; run it again to continue
-    Compare(Compare),
+    Compare(Plan),
     /// Run an exported model on a data set
     Evaluate(Evaluate),
     /// Write the model of a finished run to a file of its own
@@ -99,15 +90,13 @@ pub(super) struct Simulate {
     #[arg(long, value_name = "D.npz")]
     pub(super) out: PathBuf,
     /// Seed of everything random
-    #[arg(long, default_value_t = DatasetSettings::default().seed, value_parser = seed())]
+    // TOML, in which a run keeps it, has no larger numbers.
+    #[arg(long, default_value_t = DatasetSettings::default().seed,
+          value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub(super) seed: u64,
     /// Materials: named (the paper's eight) or broad (each object has a random one)
     #[arg(long, default_value = "named", value_parser = named::<Materials>)]
     pub(super) materials: Materials,
-    /// Leave the gaps between the levels that the paper's table has: no broad material has a Shore
-    /// hardness of 50 to 51, 60 to 61 or 70 to 71
-    #[arg(long, hide_short_help = true)]
-    pub(super) gaps: bool,
     /// Objects of each training material; with broad materials, four times as many in all
     #[arg(long, default_value_t = DatasetSettings::default().objects,
           value_parser = clap::value_parser!(u32).range(0..=MOST))]
@@ -133,49 +122,16 @@ pub(super) struct Simulate {
     /// Spread of the sensor's taxels: clean or raw
     #[arg(long, default_value = "clean", value_parser = named::<SensorProfile>)]
     pub(super) sensor_profile: SensorProfile,
-    /// Put all eight named materials into the test split
-    #[arg(long, hide_short_help = true)]
-    pub(super) all_test: bool,
     /// Whole presses over time, with the arm's positions, in place of one frame a press
     #[arg(long)]
     pub(super) sequences: bool,
-    /// Threads that simulate [default: as many as cores]
-    #[arg(long, hide_short_help = true, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=1024))]
-    pub(super) jobs: Option<usize>,
-    #[command(flatten)]
-    pub(super) courses: Courses,
-}
-
-/// Sensors of `simulate --sequences` other than the usual ones.
-fn sensors() -> impl TypedValueParser<Value = SensorDesigns> {
-    PossibleValuesParser::new(["broad", "jx255n"]).try_map(|name| named(&name))
-}
-
-/// Options of `--sequences`.
-#[derive(Debug, clap::Args)]
-#[group(requires = "sequences")]
-pub(super) struct Courses {
-    /// With --sequences, drawn for each press: frames a second, 1 to 200 [default: 5..100]
-    #[arg(long, hide_short_help = true, value_name = "LOW..HIGH", value_parser = rates)]
-    pub(super) fps: Option<[f64; 2]>,
-    /// Sensors: broad (each has a design of its own) or jx255n (many of the JX255N), with presses of rigid pieces
-    /// too [default: eight of one design in each split]
-    #[arg(long, value_parser = sensors(), hide_possible_values = true,
-          conflicts_with = "sensor_profile")]
+    /// With --sequences: sensors that are broad (each has a design of its own) or jx255n (many of the JX255N),
+    /// with presses of rigid pieces too [default: eight of one design in each split]
+    #[arg(long, requires = "sequences", value_parser = named::<SensorDesigns>)]
     pub(super) sensors: Option<SensorDesigns>,
-    /// With --sensors: covers that training objects are pressed on, at most one for each object of a material
-    /// [default: 200]
-    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
-          value_parser = clap::value_parser!(u32).range(1..=MOST))]
-    pub(super) covers: Option<u32>,
-    /// The same for test objects [default: 20]
-    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
-          value_parser = clap::value_parser!(u32).range(1..=MOST))]
-    pub(super) test_covers: Option<u32>,
-    /// Sensors under each of these covers. All of them read each press on it [default: 8]
-    #[arg(long, hide_short_help = true, value_name = "N", requires = "sensors",
-          value_parser = clap::value_parser!(u32).range(1..=1000))]
-    pub(super) electronics: Option<u32>,
+    /// Settings that override those of the options; results/simulator.md has the keys
+    #[arg(long, value_name = "F.toml")]
+    pub(super) config: Option<PathBuf>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -220,87 +176,12 @@ pub(super) struct Collect {
     /// Configuration whose first sensor describes raw bytes [default: a JX255N with default settings]
     #[arg(long, value_name = "F")]
     pub(super) config: Option<PathBuf>,
-    /// Leave out recordings that cannot be used. D.npz.left-out.tsv names each with the reason
+    /// Leave out recordings that cannot be used, and say why of each
     #[arg(long)]
     pub(super) skip_unusable: bool,
-    /// Recordings of `record`, directories with recordings, raw bytes back to back, or data sets of
-    /// `collect` to put together
-    ///
-    /// If all have a label "material" or "shore", the data set has that array; all or none must have it.
+    /// Recordings of `record`, directories with recordings, or raw bytes back to back
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
-}
-
-fn method() -> impl TypedValueParser<Value = &'static Recipe> {
-    let value = |recipe: &'static Recipe| PossibleValue::new(&*recipe.name).help(&*recipe.about);
-    PossibleValuesParser::new(recipe::all().iter().map(value))
-        .map(|name| recipe::named(&name).expect("clap lets only these names pass"))
-}
-
-#[derive(Debug, clap::Args)]
-pub(super) struct Train {
-    /// What to train
-    #[arg(long, value_parser = method())]
-    pub(super) method: &'static Recipe,
-    /// Data to learn from; several files may be named. All presses of an object must be in one file
-    #[arg(long, value_name = "D.npz", required = true, num_args = 1..)]
-    pub(super) data: Vec<PathBuf>,
-    /// Directory of the run
-    #[arg(long, value_name = "RUN")]
-    pub(super) out: PathBuf,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 1, value_parser = seed())]
-    pub(super) seed: u64,
-    /// Length of the training
-    #[arg(long, default_value = "paper")]
-    pub(super) profile: Profile,
-    /// Settings that override the method's; config/hrn-train.toml has every key
-    #[arg(long, value_name = "F.toml")]
-    pub(super) config: Option<PathBuf>,
-    /// Continue a run that was stopped
-    #[arg(long)]
-    pub(super) resume: bool,
-    /// Reuse finished stages of another run where they are identical; may be repeated
-    #[arg(long, hide_short_help = true, value_name = "RUN")]
-    pub(super) from: Vec<PathBuf>,
-    /// Number of labels to use, of whole objects [default: the method's share]
-    #[arg(long, value_name = "N")]
-    pub(super) labels: Option<usize>,
-    /// Where to compute
-    #[arg(long, default_value = "cpu")]
-    pub(super) device: DeviceName,
-    /// End when this process ends, the one that started this one
-    #[arg(long, hide = true, value_name = "PID")]
-    pub(super) parent: Option<i32>,
-}
-
-#[derive(Debug, clap::Args)]
-#[command(after_long_help = COMPARED)]
-pub(super) struct Compare {
-    /// Data to learn from; several files may be named [default: none, only make the tables of DIR again]
-    #[arg(long, value_name = "D.npz", num_args = 1..)]
-    pub(super) data: Vec<PathBuf>,
-    /// Directory of the comparison
-    #[arg(long, value_name = "DIR")]
-    pub(super) out: PathBuf,
-    /// Methods to run [default: all but hrn; course only on whole presses]
-    #[arg(long, value_name = "M", value_delimiter = ',', num_args = 1.., hide_possible_values = true, value_parser = method())]
-    pub(super) methods: Vec<&'static Recipe>,
-    /// Also run every method with each of these numbers of labels
-    #[arg(long, value_name = "N", value_delimiter = ',', num_args = 1..)]
-    pub(super) labels: Vec<usize>,
-    /// Train with the seeds 1 to N
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MOST as u64))]
-    pub(super) seeds: u64,
-    /// Length of each training run
-    #[arg(long, default_value = "paper")]
-    pub(super) profile: Profile,
-    /// Run nothing: print a command line for each run that is not done, for GNU parallel, Slurm or Ray
-    #[arg(long, requires = "data")]
-    pub(super) plan: bool,
-    /// Runs at a time, each on one thread [default: as many as there are cores]
-    #[arg(long, value_name = "J")]
-    pub(super) jobs: Option<std::num::NonZeroUsize>,
 }
 
 /// Parses a force in newtons, from the least of `hardnessd simulate --force` to the greatest
@@ -310,30 +191,6 @@ fn lowest_force_n(text: &str) -> Result<f32, String> {
         Ok(force_n) if DatasetSettings::LOWEST_FORCES_N.contains(&force_n) => Ok(force_n),
         _ => Err("expected newtons from 0.01 to 25".to_owned()),
     }
-}
-
-/// A seed. TOML, which keeps it, has no larger numbers.
-fn seed() -> RangedU64ValueParser {
-    clap::value_parser!(u64).range(..=i64::MAX as u64)
-}
-
-/// Parses frames a second.
-fn rates(text: &str) -> Result<[f64; 2], String> {
-    let (low, high) = text.split_once("..").unwrap_or((text, text));
-    let bounds = 1.0..=200.0;
-    match (low.parse::<f64>(), high.parse::<f64>()) {
-        (Ok(low), Ok(high)) if bounds.contains(&low) && bounds.contains(&high) && low <= high => {
-            Ok([low, high])
-        }
-        _ => Err("expected a number or LOW..HIGH, from 1 to 200".to_owned()),
-    }
-}
-
-#[derive(Debug, Clone, Copy, ValueEnum)]
-pub(super) enum DeviceName {
-    Cpu,
-    /// The first CUDA device; needs a build with `--features cuda`
-    Cuda,
 }
 
 #[derive(Debug, clap::Args)]

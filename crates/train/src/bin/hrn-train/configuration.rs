@@ -1,68 +1,51 @@
-//! The sensor that a configuration of the daemon describes first.
+//! The sensor that a configuration of the daemon describes first, and its levels.
 
-use std::path::{Path, PathBuf};
-use std::{fs, io};
+use std::fs;
+use std::path::Path;
 
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::npy;
 use hardnessd_core::press;
-use hardnessd_core::range::OutOfRange;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
+use hrn_train::exit::{coded, unreadable};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
-use super::failure::Unreadable;
-
-/// The error of a configuration that describes no sensor.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum ConfigurationError {
-    #[error("{}: {problem}", path.display())]
-    Syntax { path: PathBuf, problem: String },
-    #[error("{}: has no [[sensor]] table", .0.display())]
-    NoSensor(PathBuf),
-    #[error("{}: sensor.calibration.gains: {}: {source}", path.display(), file.display())]
-    Gains {
-        path: PathBuf,
-        file: PathBuf,
-        source: io::Error,
-    },
-    #[error("{}: {source}", path.display())]
-    Sensor { path: PathBuf, source: OutOfRange },
+/// Tables of a configuration. The daemon's `check` checks the rest.
+fn tables<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+    let text = fs::read_to_string(path).map_err(|error| unreadable(path, &error))?;
+    toml::from_str(&text).map_err(|error| refused(path, wording::of_toml(&text, &error)))
 }
 
-/// The tables of a configuration that describe a sensor.
-#[derive(Deserialize)]
-struct Tables {
-    #[serde(default, rename = "sensor")]
-    sensors: Vec<sensor::Settings>,
-    #[serde(default)]
-    press: press::Settings,
+/// The error of a configuration.
+fn refused(path: &Path, problem: impl std::fmt::Display) -> anyhow::Error {
+    coded(CONFIG, format_args!("{}: {problem}", path.display()))
 }
 
-/// Reads the first `[[sensor]]` table and the `[press]` table. The daemon's `check` checks the rest.
+/// Reads the first `[[sensor]]` table and the `[press]` table.
 pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
-    let text = fs::read_to_string(path).map_err(|source| Unreadable {
-        path: path.to_owned(),
-        source,
-    })?;
-    let syntax = |error: &toml::de::Error| ConfigurationError::Syntax {
-        path: path.to_owned(),
-        problem: wording::of_toml(&text, error),
-    };
-    let tables: Tables = toml::from_str(&text).map_err(|error| syntax(&error))?;
-    let Some(mut sensor) = tables.sensors.into_iter().next() else {
-        return Err(ConfigurationError::NoSensor(path.to_owned()).into());
-    };
+    #[derive(Deserialize)]
+    struct Tables {
+        #[serde(default, rename = "sensor")]
+        sensors: Vec<sensor::Settings>,
+        #[serde(default)]
+        press: press::Settings,
+    }
+    let tables: Tables = tables(path)?;
+    let sensor = tables.sensors.into_iter().next();
+    let mut sensor = sensor.ok_or_else(|| refused(path, "has no [[sensor]] table"))?;
     if let Some(Gains::File(file)) = &sensor.calibration.gains {
         let file = path.with_file_name("").join(file);
-        let refused = |source: io::Error| ConfigurationError::Gains {
-            path: path.to_owned(),
-            file: file.clone(),
-            source,
-        };
-        let bytes = fs::read(&file).map_err(refused)?;
-        let rows = npy::table(&mut bytes.as_slice()).map_err(refused)?;
+        let rows = fs::read(&file).and_then(|bytes| npy::table(&mut bytes.as_slice()));
+        let rows = rows.map_err(|error| {
+            refused(
+                path,
+                format_args!("sensor.calibration.gains: {}: {error}", file.display()),
+            )
+        })?;
         sensor.calibration.gains = Some(Gains::Taxels(rows));
     }
     let description = Description {
@@ -70,41 +53,27 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
         press: tables.press,
         ..Description::default()
     };
-    let sensor = Sensor::new(description).map_err(|source| ConfigurationError::Sensor {
-        path: path.to_owned(),
-        source,
-    })?;
-    Ok(sensor)
+    Sensor::new(description).map_err(|error| refused(path, error))
 }
 
 /// The levels of the `[[level]]` tables. `None` without such tables.
 pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
-    #[derive(serde::Deserialize)]
+    #[derive(Deserialize)]
     struct Named {
         label: String,
         shore: [f64; 2],
     }
-    #[derive(serde::Deserialize)]
+    #[derive(Deserialize)]
     struct Tables {
         #[serde(default)]
         level: Vec<Named>,
     }
-    let text = fs::read_to_string(path)?;
-    let tables: Tables = toml::from_str(&text).map_err(|error| ConfigurationError::Syntax {
-        path: path.to_owned(),
-        problem: wording::of_toml(&text, &error),
-    })?;
-    let level = |(
+    let tables: Tables = tables(path)?;
+    let levels = tables.level.into_iter().zip(1..).map(|(of, level)| Level {
         level,
-        Named {
-            label,
-            shore: [low, high],
-        },
-    )| Level {
-        level,
-        label,
-        shore: format!("{low}-{high}"),
-    };
-    let levels: Vec<Level> = (1..).zip(tables.level).map(level).collect();
+        label: of.label,
+        shore: format!("{}-{}", of.shore[0], of.shore[1]),
+    });
+    let levels: Vec<Level> = levels.collect();
     Ok((!levels.is_empty()).then_some(levels))
 }

@@ -1,7 +1,7 @@
 //! `hrn-train fit`.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context as _, bail};
 use hardnessd_core::sensor::{Description, Sensor};
@@ -11,7 +11,7 @@ use hrn_train::fit::{self, Estimate, Fitted, Report, Request, Row, Written};
 
 use super::arguments::Fit;
 use super::configuration::{first_sensor, levels};
-use super::files::{apart, check_new, write};
+use super::files::{check_new, write};
 
 /// The most wrongly judged presses that are listed.
 const LISTED: usize = 20;
@@ -23,7 +23,6 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
     };
     let references = arguments.out.with_extension("npz");
     for out in [&arguments.out, &references] {
-        apart("--out", out, arguments.data.iter().map(PathBuf::as_path))?;
         check_new(out)?;
     }
     let request = Request {

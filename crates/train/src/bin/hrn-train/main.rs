@@ -3,9 +3,7 @@
 mod account;
 mod arguments;
 mod collect;
-mod compare;
 mod configuration;
-mod failure;
 mod files;
 mod fit;
 mod models;
@@ -13,16 +11,19 @@ mod signals;
 mod simulate;
 mod train;
 
+use std::error::Error;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use hardnessd_core::trial;
+use hardnessd_core::verdict::ModelError;
 use hardnessd_core::{exit, wording};
+use hrn_train::compare;
+use hrn_train::exit::Coded;
 
 use self::arguments::{Arguments, Command};
-use self::failure::exit_code;
 
 /// A training step frees and asks for the same large buffers over and over. The system's allocator
 /// gives them back to the kernel each time, which took 40 % of a step.
@@ -37,10 +38,9 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => return usage(&error),
     };
-    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
     let how_to_continue = match arguments.command {
-        Command::Train(_) => Some(signals::resuming(words)),
-        Command::Compare(_) => Some(signals::again(words)),
+        Command::Train(_) => signals::again(Some("--resume")),
+        Command::Compare(_) => signals::again(None),
         _ => None,
     };
     if let Err(error) = signals::end_at_signals(how_to_continue) {
@@ -54,7 +54,7 @@ fn main() -> ExitCode {
         // would first have to wake one of them.
         Command::Train(arguments) => rayon::scope(|_| train::train(&arguments)),
         Command::Fit(arguments) => fit::fit(&arguments),
-        Command::Compare(arguments) => compare::compare(arguments),
+        Command::Compare(plan) => compare::compare(&plan),
         Command::Evaluate(arguments) => models::evaluate(&arguments),
         Command::Export { run, out } => models::export_run(&run, &out),
         Command::CheckModel { model, fps } => return models::check_model(&model, fps),
@@ -66,6 +66,22 @@ fn main() -> ExitCode {
             hardnessd_core::stderr_line!("hrn-train: {}", wording::line(error.as_ref()));
             ExitCode::from(exit_code(&error))
         }
+    }
+}
+
+/// The exit code of an error: its own, 78 bad model, 74 other I/O error, 1 any other error.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    let own = error
+        .chain()
+        .find_map(|error| error.downcast_ref::<Coded>());
+    if let Some(own) = own {
+        own.code
+    } else if error.chain().any(<dyn Error>::is::<ModelError>) {
+        exit::CONFIG
+    } else if error.chain().any(<dyn Error>::is::<io::Error>) {
+        exit::IO
+    } else {
+        exit::FAILED
     }
 }
 

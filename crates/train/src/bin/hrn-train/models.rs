@@ -7,20 +7,18 @@ use hardnessd_core::trial;
 use hardnessd_core::verdict::{Hrn, Verdict};
 use hardnessd_core::{exit, wording};
 use hrn_train::data::presses::{Presses, read_one};
+use hrn_train::exit::coded;
 use hrn_train::model::evaluated::{Case, Difference, Evaluated, cases};
 use hrn_train::model::verdicts::{self, Given};
 
 use super::account;
 use super::arguments::Evaluate;
-use super::failure::{NoRun, exit_code};
-use super::files::{check_new, load, load_with_bytes, read, write};
+use super::exit_code;
+use super::files::{check_new, load, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
-    let models: Vec<Hrn> = arguments
-        .model
-        .iter()
-        .map(|path| load(path))
-        .collect::<Result<_, _>>()?;
+    let models = arguments.model.iter().map(|path| Ok(load(path)?.0));
+    let models: Vec<Hrn> = models.collect::<anyhow::Result<_>>()?;
     anyhow::ensure!(
         models.len() <= 2 && (models.len() == 1 || arguments.verdicts.is_none()),
         "--model: found {}, expected one, or two without --verdicts",
@@ -139,21 +137,22 @@ pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
         } else {
             "it has no hrn.onnx"
         };
-        return Err(NoRun(run.to_owned(), hint).into());
+        let text = format!("{}: no finished run: {hint}", run.display());
+        return Err(coded(exit::NO_INPUT, text));
     }
-    let (hrn, bytes) = load_with_bytes(&model)?;
+    let (hrn, bytes) = load(&model)?;
     write(out, &bytes)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
 
 pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
-    Ok(account::of_model(path, &load(path)?))
+    Ok(account::of_model(path, &load(path)?.0))
 }
 
 /// Checks a model file. The lines of the check are the output of the command, so they go to stdout
 /// even if the model does not pass. The time limit for a verdict follows from the frame rate.
 pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> ExitCode {
-    let checked = read(path).map_err(anyhow::Error::from).and_then(|bytes| {
+    let checked = read(path).and_then(|bytes| {
         // Try to run it as the daemon does, with its memory and time.
         let most = trial::verdict_most(frame_rate_hz);
         let problem = trial::load(&bytes, Some(most)).err();

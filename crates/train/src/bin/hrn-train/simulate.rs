@@ -2,103 +2,79 @@
 
 use std::time::Instant;
 
-use hardnessd_simulator::{Borders, BroadSensors, CourseSettings, DatasetSettings, Materials};
+use anyhow::Context as _;
+use hardnessd_core::exit::USAGE;
+use hardnessd_simulator::{BroadSensors, CourseSettings, DatasetSettings};
+use hrn_train::data::presses::Layout;
 use hrn_train::data::simulated;
+use hrn_train::exit::coded;
 
 use super::arguments::Simulate;
-use super::failure::WrongUsage;
-use super::files::{check_new, write};
+use super::files::{check_new, read, write};
 
-/// The settings of the simulation.
-fn simulated_settings(arguments: &Simulate) -> Result<DatasetSettings, WrongUsage> {
-    let is_broad = arguments.materials == Materials::Broad;
-    if is_broad && arguments.all_test {
-        return Err(WrongUsage::OtherMaterials("--all-test", "named"));
-    }
-    if !is_broad && arguments.gaps {
-        return Err(WrongUsage::OtherMaterials("--gaps", "broad"));
-    }
-    Ok(DatasetSettings {
-        seed: arguments.seed,
-        materials: arguments.materials,
-        borders: if arguments.gaps {
-            Borders::Gaps
-        } else {
-            Borders::Touching
+/// The settings that the options name.
+fn asked(arguments: &Simulate) -> CourseSettings {
+    let (frames, usual) = (DatasetSettings::default(), CourseSettings::default());
+    CourseSettings {
+        objects: DatasetSettings {
+            seed: arguments.seed,
+            materials: arguments.materials,
+            objects: arguments.objects,
+            test_objects: arguments.test_objects,
+            presses: arguments.presses.unwrap_or(match arguments.sequences {
+                true => usual.objects.presses,
+                false => frames.presses,
+            }),
+            lowest_force_n: arguments.lowest_force,
+            shapes: arguments.shapes,
+            profile: arguments.sensor_profile,
+            ..frames
         },
-        all_test: arguments.all_test,
-        objects: arguments.objects,
-        test_objects: arguments.test_objects,
-        presses: arguments.presses.unwrap_or(if arguments.sequences {
-            CourseSettings::default().objects.presses
-        } else {
-            DatasetSettings::default().presses
+        sensors: arguments.sensors.map(|designs| BroadSensors {
+            designs,
+            ..BroadSensors::default()
         }),
-        lowest_force_n: arguments.lowest_force,
-        shapes: arguments.shapes,
-        profile: arguments.sensor_profile,
-    })
+        ..usual
+    }
 }
 
 pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
-    let settings = simulated_settings(arguments)?;
-    if settings.objects == 0 && settings.test_objects == 0 {
-        return Err(WrongUsage::NoObjects.into());
+    let mut settings = asked(arguments);
+    if let Some(path) = &arguments.config {
+        let text = String::from_utf8_lossy(&read(path)?).into_owned();
+        let configured = simulated::configured(&settings, &text);
+        settings = configured.with_context(|| path.display().to_string())?;
+        if settings.sensors.is_some() != arguments.sensors.is_some() {
+            return Err(coded(USAGE, "[sensors] of --config: give --sensors too"));
+        }
     }
-    if arguments.sequences {
-        return simulate_courses(arguments, settings);
+    if settings.objects.objects == 0 && settings.objects.test_objects == 0 {
+        let text = "--objects and --test-objects: found 0 and 0, expected one or more of either";
+        return Err(coded(USAGE, text));
     }
-    check_new(&arguments.out)?;
-    let begun = Instant::now();
-    let samples = simulated::simulate(&settings, jobs(arguments));
-    let seconds = begun.elapsed().as_secs_f64();
-
-    let count = samples.len();
-    write(&arguments.out, &simulated::to_bytes(&settings, samples)?)?;
-    Ok(format!(
-        "{}: {count} samples in {seconds:.1} s, {:.0} a second\n",
-        arguments.out.display(),
-        count as f64 / seconds
-    ))
-}
-
-fn simulate_courses(arguments: &Simulate, objects: DatasetSettings) -> anyhow::Result<String> {
-    check_new(&arguments.out)?;
-    let asked = &arguments.courses;
-    let (usual, many) = (CourseSettings::default(), BroadSensors::default());
-    let settings = CourseSettings {
-        objects,
-        frame_rate_hz: asked.fps.unwrap_or(usual.frame_rate_hz),
-        sensors: asked.sensors.map(|designs| BroadSensors {
-            designs,
-            covers: asked.covers.unwrap_or(many.covers),
-            test_covers: asked.test_covers.unwrap_or(many.test_covers),
-            electronics: asked.electronics.unwrap_or(many.electronics),
-        }),
+    let layout = match arguments.sequences {
+        true => Layout::OverTime,
+        false => Layout::Frames,
     };
+    check_new(&arguments.out)?;
     let begun = Instant::now();
-    let courses = simulated::simulate_courses(&settings, jobs(arguments));
+    let presses = simulated::simulate(&settings, layout);
     let seconds = begun.elapsed().as_secs_f64();
     write(
         &arguments.out,
-        &simulated::courses_to_bytes(&settings, &courses)?,
+        &simulated::to_bytes(&settings, layout, &presses)?,
     )?;
-    let (count, wanted) = (courses.len() as u64, settings.presses());
-    let frames: usize = courses.iter().map(|course| course.moments.len()).sum();
-    let unseen = if settings.sensors.is_some() {
-        "their sensor did not see one press, or they lasted over 30 s"
-    } else {
-        "they never began, or lasted over 30 s"
+    let count = presses.all.len() as u64;
+    let left_out = match layout {
+        Layout::Frames => String::new(),
+        Layout::OverTime => format!(
+            "; {} left out: no sensor saw them, or they lasted over 30 s",
+            settings.presses() - count
+        ),
     };
     Ok(format!(
-        "{}: {count} presses, {frames} frames in {seconds:.1} s, {:.0} presses a minute; {} left out: \
-         {unseen}\n",
+        "{}: {count} presses in {seconds:.1} s, {:.0} a second{left_out}\n",
         arguments.out.display(),
-        60.0 * count as f64 / seconds,
-        wanted - count
+        count as f64 / seconds
     ))
-}
-
-fn jobs(arguments: &Simulate) -> usize {
-    arguments.jobs.unwrap_or_else(simulated::all_cores)
 }

@@ -3,58 +3,20 @@
 use std::time::Instant;
 
 use anyhow::Context as _;
-use burn::tensor::Device;
 use hardnessd_core::wording;
 use hrn_train::data::presses::Presses;
-use hrn_train::settings::{self, Profile};
-use hrn_train::train::{self, Request};
+use hrn_train::settings::Profile;
+use hrn_train::train::{self, Train};
 
 use super::account;
-use super::arguments::{DeviceName, Train};
-use super::failure::{NoCuda, Unreadable};
-use super::files::read;
 
 pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
     if let Some(parent) = arguments.parent {
         end_with(parent)?;
     }
-    for other in &arguments.from {
-        let unreadable = |source| Unreadable {
-            path: other.clone(),
-            source,
-        };
-        std::fs::read_dir(other).map_err(unreadable)?;
-    }
-    let given = match &arguments.config {
-        Some(path) => {
-            let text = String::from_utf8_lossy(&read(path)?).into_owned();
-            settings::parse(&text).with_context(|| path.display().to_string())?
-        }
-        None => toml::Table::new(),
-    };
-    let request = Request {
-        recipe: arguments.method,
-        data: arguments.data.clone(),
-        out: arguments.out.clone(),
-        profile: arguments.profile,
-        seed: arguments.seed,
-        labels: arguments.labels,
-        given,
-        resume: arguments.resume,
-        from: arguments.from.clone(),
-        device: device(arguments.device)?,
-    };
     let begun = Instant::now();
-    let evaluation = train::train(&request, |presses| say(presses, arguments.profile));
-    let evaluation = match &arguments.config {
-        // An error of a value names its file.
-        Some(path) => evaluation.map_err(|error| match error.is::<settings::SettingsError>() {
-            true => error.context(path.display().to_string()),
-            false => error,
-        }),
-        None => evaluation,
-    };
-    let figures = evaluation?.as_ref().map(account::of_evaluated);
+    let evaluation = train::train(arguments, |presses| say(presses, arguments.profile))?;
+    let figures = evaluation.as_ref().map(account::of_evaluated);
     Ok(format!(
         "trained in {:.1} s: {}\n{}",
         begun.elapsed().as_secs_f64(),
@@ -73,19 +35,6 @@ fn say(presses: &Presses, profile: Profile) {
         hardnessd_core::stderr_line!(
             "--profile smoke: tries the commands in seconds; too short to learn anything"
         );
-    }
-}
-
-fn device(name: DeviceName) -> Result<Device, NoCuda> {
-    match name {
-        DeviceName::Cpu => Ok(Device::flex()),
-        #[cfg(feature = "cuda")]
-        DeviceName::Cuda => Device::enumerate(burn::tensor::DeviceType::Cuda)
-            .into_iter()
-            .next()
-            .ok_or(NoCuda),
-        #[cfg(not(feature = "cuda"))]
-        DeviceName::Cuda => Err(NoCuda),
     }
 }
 

@@ -10,7 +10,7 @@ use hardnessd_core::frame::{Array, Frame, Stamp};
 use hardnessd_core::judge::{approach_by_speed, approach_speed_mm_s, is_informative};
 use hardnessd_core::motion::Track;
 use hardnessd_core::press::thinned;
-use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, ModelFrame, ROWS, Resampling};
 
 use crate::data::source::{MOST_LEVELS, PITCH_MM};
@@ -20,12 +20,11 @@ use crate::data::source::{MOST_LEVELS, PITCH_MM};
 pub(super) struct Judged {
     /// The sensor's name.
     pub(super) sensor: String,
-    /// The chosen frame.
-    pub(super) frame: ModelFrame,
     /// Total force of the chosen frame.
     pub(super) force_n: f32,
-    /// The press's frames in contact, thinned. Empty if the recording does not have all of them.
-    pub(super) moments: Vec<KeptFrame>,
+    /// The press's frames in contact, thinned, each with the seconds since the press began and the approach since
+    /// then, where it is known.
+    pub(super) moments: Vec<(f32, Option<f32>, ModelFrame)>,
     /// Index of the chosen frame in `moments`.
     pub(super) best: usize,
     /// Stiffness of the arm. 0 if the stiffness or the approach is unknown.
@@ -37,28 +36,6 @@ pub(super) struct Judged {
     /// The level and the name of the object, if the context of the press says them.
     pub(super) level: Option<u8>,
     pub(super) object: Option<String>,
-}
-
-/// A frame of a press.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct KeptFrame {
-    /// Seconds since the press began.
-    pub(super) time_s: f32,
-    /// The approach since the press began, where it is known.
-    pub(super) approach_mm: Option<f32>,
-    pub(super) frame: ModelFrame,
-}
-
-impl Judged {
-    pub(super) fn is_whole(&self) -> bool {
-        !self.moments.is_empty()
-    }
-
-    fn is_known(&self) -> bool {
-        self.moments
-            .iter()
-            .any(|moment| moment.approach_mm.is_some())
-    }
 }
 
 /// The presses found so far, and what is held of each sensor to find more.
@@ -75,7 +52,7 @@ struct Held {
     frames: BTreeMap<u64, Shown>,
     is_pressed: bool,
     /// Numbers of the first and the last frame of the press.
-    began: Option<u64>,
+    began: u64,
     last: u64,
     /// The speed of the approach when the press under way began, if it is known.
     speed_mm_s: Option<f64>,
@@ -85,38 +62,32 @@ struct Held {
     sensor: Sensor,
 }
 
-impl Default for Held {
-    fn default() -> Self {
-        Self {
-            frames: BTreeMap::new(),
-            is_pressed: false,
-            began: None,
-            last: 0,
-            speed_mm_s: None,
-            untared: Vec::new(),
-            at_rest: [Vec::new(), Vec::new()],
-            sensor: Sensor::new(Description::default()).expect("the default is a sensor"),
-        }
-    }
-}
-
+/// A frame, as a model gets it.
 #[derive(Debug)]
 struct Shown {
     mono: Duration,
     area: u32,
-    /// What a model gets of the frame.
     frame: Frame,
 }
 
 impl Selection {
-    /// Takes a sensor's description.
-    pub(super) fn describe(&mut self, sensor: &str, description: &Description) {
-        let held = self.held.entry(sensor.to_owned()).or_default();
-        // A wrong description is an error of the playback.
-        if held.sensor.description() != description
-            && let Ok(sensor) = Sensor::new(description.clone())
-        {
-            held.sensor = sensor;
+    /// Takes a sensor as it is from now on.
+    pub(super) fn describe(&mut self, sensor: &Sensor) {
+        match self.held.get_mut(sensor.name()) {
+            Some(held) => held.sensor = sensor.clone(),
+            None => {
+                let held = Held {
+                    frames: BTreeMap::new(),
+                    is_pressed: false,
+                    began: 0,
+                    last: 0,
+                    speed_mm_s: None,
+                    untared: Vec::new(),
+                    at_rest: [Vec::new(), Vec::new()],
+                    sensor: sensor.clone(),
+                };
+                self.held.insert(sensor.name().to_owned(), held);
+            }
         }
     }
 
@@ -124,7 +95,9 @@ impl Selection {
     /// the pipeline of these events knows them.
     pub(super) fn take(&mut self, events: Vec<Event>, at: Stamp, track: &Track) {
         for event in events {
-            let held = self.held.entry(event.sensor().to_owned()).or_default();
+            let Some(held) = self.held.get_mut(event.sensor()) else {
+                continue;
+            };
             match event {
                 Event::Frame(frame) => {
                     if !held.is_pressed {
@@ -154,7 +127,7 @@ impl Selection {
                     held.is_pressed = press.state == PressState::Begin;
                     match press.state {
                         PressState::Begin => {
-                            held.began = Some(press.frame);
+                            held.began = press.frame;
                             let (context, arm) = (press.context.as_ref(), held.sensor.arm());
                             held.speed_mm_s = approach_speed_mm_s(context, arm);
                         }
@@ -179,80 +152,60 @@ impl Held {
         (0..touched.len()).map(whole).collect()
     }
 
-    /// The press that has just ended.
-    fn judged(&mut self, verdict: &Hardness, track: &Track) -> Option<Judged> {
-        // The chosen frame of a press that began before the recording may be missing from it.
-        let chosen = self.frames.get(&verdict.frame)?;
-        let pitch = self.sensor.calibration().pitch_mm;
-        let resampling = Resampling::new(&chosen.frame, pitch, grid_mm(&self.sensor));
-        let said = |key| {
-            verdict
-                .context
-                .as_ref()
-                .and_then(|context| context.get(key))
-        };
-        let is_level = |level: &u8| (1..=MOST_LEVELS).contains(&usize::from(*level));
-        let level = |number| u8::try_from(number).ok().filter(is_level);
-        let mut judged = Judged {
-            sensor: verdict.sensor.clone(),
-            frame: resampling.apply(&chosen.frame),
-            force_n: verdict.force_n as f32,
-            moments: Vec::new(),
-            best: 0,
-            arm_n_per_mm: 0.0,
-            press: verdict.press,
-            unloaded: self.unloaded(),
-            level: said("level").and_then(Value::as_u64).and_then(level),
-            object: said("object").and_then(Value::as_str).map(str::to_owned),
-        };
-        let Some(first) = self.began.take() else {
-            return Some(judged);
-        };
+    /// The press that has just ended. A playback begins at rest, so all its frames are there.
+    fn judged(&self, verdict: &Hardness, track: &Track) -> Option<Judged> {
         let least = self.sensor.thresholds().end_area_taxels;
-        let pressed = self.frames.range(first..=self.last.max(first));
+        let pressed = self.frames.range(self.began..=self.last.max(self.began));
         let pressed: Vec<(u64, &Shown)> = pressed
             .filter(|(_, shown)| shown.area >= least)
             .map(|(&number, shown)| (number, shown))
             .collect();
-        let Some(best) = pressed
-            .iter()
-            .position(|&(number, _)| number == verdict.frame)
-        else {
-            return Some(judged);
-        };
-        let moments: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
+        let mut numbers = pressed.iter().map(|&(number, _)| number);
+        let best = numbers.position(|number| number == verdict.frame)?;
+        let pitch = self.sensor.calibration().pitch_mm;
+        let resampling = Resampling::new(&pressed[best].1.frame, pitch, grid_mm(&self.sensor));
+        let times: Vec<Duration> = pressed.iter().map(|(_, shown)| shown.mono).collect();
         let arm = self.sensor.arm();
-        let (begin, end) = (moments[0], moments[moments.len() - 1]);
+        let (begin, end) = (times[0], times[times.len() - 1]);
         // The approach is what the daemon would give a model: from positions, or else from the speed.
         let way = if track.has_recent(end, arm.delay_ms) {
-            track.approach(begin, &moments, arm.delay_ms)
+            track.approach(begin, &times, arm.delay_ms)
         } else {
             self.speed_mm_s.map(|speed_mm_s| {
                 let shown = pressed.iter().map(|(_, shown)| shown.frame.force_n());
                 let forces_n: Vec<f64> = shown.collect();
-                approach_by_speed(speed_mm_s, &moments, &forces_n)
+                approach_by_speed(speed_mm_s, &times, &forces_n)
             })
         };
         let way = way.filter(|way| is_informative(way, best));
-        let way = way.unwrap_or_else(|| vec![None; moments.len()]);
+        let is_known = way.is_some();
+        let way = way.unwrap_or_else(|| vec![None; times.len()]);
+        let kept = thinned(pressed.len(), best, COURSE_FRAMES.1);
         let mut before_s = -1.0_f32;
-        for place in thinned(pressed.len(), best, COURSE_FRAMES.1) {
+        let moments = kept.iter().map(|&place| {
             // Two frames may have arrived at the same moment, but times in a file must ascend.
-            let time_s = moments[place].saturating_sub(begin).as_secs_f32();
+            let time_s = times[place].saturating_sub(begin).as_secs_f32();
             before_s = time_s.max(before_s.next_up());
-            if place == best {
-                judged.best = judged.moments.len();
-            }
-            judged.moments.push(KeptFrame {
-                time_s: before_s,
-                approach_mm: way[place].map(|mm| mm as f32),
-                frame: resampling.apply(&pressed[place].1.frame),
-            });
-        }
-        if judged.is_known() {
-            judged.arm_n_per_mm = arm.stiffness_n_per_mm.unwrap_or(0.0) as f32;
-        }
-        Some(judged)
+            let frame = resampling.apply(&pressed[place].1.frame);
+            (before_s, way[place].map(|mm| mm as f32), frame)
+        });
+        let said = |key| verdict.context.as_ref()?.get(key);
+        let is_level = |level: &u8| (1..=MOST_LEVELS).contains(&usize::from(*level));
+        let level = |number| u8::try_from(number).ok().filter(is_level);
+        Some(Judged {
+            sensor: verdict.sensor.clone(),
+            force_n: verdict.force_n as f32,
+            moments: moments.collect(),
+            best: kept.iter().position(|&place| place == best)?,
+            arm_n_per_mm: match is_known {
+                true => arm.stiffness_n_per_mm.unwrap_or(0.0) as f32,
+                false => 0.0,
+            },
+            press: verdict.press,
+            unloaded: self.unloaded(),
+            level: said("level").and_then(Value::as_u64).and_then(level),
+            object: said("object").and_then(Value::as_str).map(str::to_owned),
+        })
     }
 }
 
