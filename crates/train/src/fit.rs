@@ -8,7 +8,6 @@ pub mod candidate;
 pub mod comparison;
 pub mod folds;
 pub mod levels;
-pub mod report;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -19,10 +18,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
 use self::candidate::{Candidate, Entry};
-use self::comparison::{Compared, Comparison, Division, Outcome, What};
-pub use self::comparison::{Estimate, OfLevel};
+use self::comparison::{Compared, Comparison, Outcome, What};
+pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
-pub use self::report::{Report, Row, Wrong};
 use crate::data::collect::{self, Settings, Unnumbered};
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
@@ -99,11 +97,8 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
         let [new, later] = &divisions;
         let new = new.as_ref().map(outcome).transpose()?.flatten();
         let later = later.as_ref().map(outcome).transpose()?.flatten();
-        Ok(Compared {
-            name,
-            outcomes: [new, later],
-            left_out: candidate.err().cloned(),
-        })
+        let left_out = candidate.err().cloned();
+        Ok(Compared::of(name, [new, later], left_out, &presses))
     };
     let compared = candidates
         .iter()
@@ -128,7 +123,7 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
             let candidate = candidate
                 .as_ref()
                 .map_err(|left_out| anyhow!("{left_out}"))?;
-            let judged = comparison.candidates[place].outcomes[choice.division as usize].as_ref();
+            let judged = comparison.candidates[place].outcome(choice.division);
             let judged = judged.context("the best candidate was judged")?;
             let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
                 let mut stream = Stream::new(SEED, "calibration");

@@ -7,6 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::presses::{Press, Presses};
+use super::source::Object;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
@@ -32,15 +33,17 @@ impl Parts {
         let labelled = choose(presses, &all, labels, seed);
         let (train, held_out) = hold_out(presses, &labelled, share, seed);
         let labelled: BTreeSet<usize> = labelled.into_iter().collect();
-        let mut held = BTreeMap::<(u32, Option<u8>), BTreeSet<u8>>::new();
-        for object in presses.of(&held_out).filter_map(Press::pressed) {
-            let levels = held.entry((object.number, object.material)).or_default();
-            levels.insert(object.level);
-        }
+        let held: BTreeSet<Object> = presses.of(&held_out).filter_map(Press::pressed).collect();
         let is_held_out = |press: &Press| {
             press.pressed().is_some_and(|object| {
-                let levels = held.get(&(object.number, object.material));
-                levels.is_some_and(|of| object.level == 0 || of.contains(&object.level))
+                // An unlabelled press may be of an object that is known with its level.
+                let level = if object.level == 0 {
+                    u8::MAX
+                } else {
+                    object.level
+                };
+                let mut same = held.range(object..=Object { level, ..object });
+                same.next().is_some()
             })
         };
         let wanted = |&place: &usize| {
@@ -148,22 +151,17 @@ fn held_out_sensors(
     let references = presses.all.iter().filter(|press| press.reference.is_some());
     let known: BTreeSet<u32> = references.map(|press| press.sensor).collect();
     let stations = presses.stations(places);
-    let of_known = |(&place, &station): (&usize, &u32)| {
-        known
-            .contains(&presses.all[place].sensor)
-            .then_some((place, station))
-    };
-    let of_known: Vec<(usize, u32)> = places.iter().zip(&stations).filter_map(of_known).collect();
-    let all: BTreeSet<u32> = of_known.iter().map(|&(_, station)| station).collect();
+    let of_known = places.iter().zip(&stations);
+    let of_known = of_known.filter(|(place, _)| known.contains(&presses.all[**place].sensor));
+    let all: BTreeSet<u32> = of_known.clone().map(|(_, &station)| station).collect();
     let mut all: Vec<u32> = all.into_iter().collect();
     Stream::new(seed, "held-out sensors").shuffle(&mut all);
     let count = (share * all.len() as f64).round() as usize;
     if count < LEAST_SENSORS {
         return None;
     }
-    let held: BTreeSet<u32> = all[..count].iter().copied().collect();
-    let is_held = |&(place, station): &(usize, u32)| held.contains(&station).then_some(place);
-    Some(of_known.iter().filter_map(is_held).collect())
+    let held = of_known.filter(|(_, station)| all[..count].contains(station));
+    Some(held.map(|(&place, _)| place).collect())
 }
 
 #[cfg(test)]

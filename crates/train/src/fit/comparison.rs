@@ -1,9 +1,9 @@
 //! The comparison of the candidates, and the choice.
 //!
-//! In: what each candidate says of presses that it did not learn from. Out: the best one, what to write, and
-//! what the figures do not show.
+//! In: what each candidate says of presses that it did not learn from. Out: the best one, what to write, and a
+//! [`Report`] of all, with what the figures do not show.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use indicatif::ProgressBar;
 use rayon::prelude::*;
@@ -17,6 +17,55 @@ use crate::learn::Outputs;
 use crate::learn::calibration::{self, Calibration};
 use hardnessd_core::verdict::{Knowledge, Level, argmax};
 use hardnessd_simulator::random::Stream;
+
+/// What was compared, as `--json` prints it.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// The number of labelled presses.
+    pub presses: usize,
+    /// The levels, with what there is of each.
+    pub levels: Vec<OfLevel>,
+    /// The candidates.
+    pub candidates: Vec<Row>,
+    /// What needs no press: guessing, and the unloaded sensor.
+    pub controls: Vec<Row>,
+    /// The best candidate.
+    pub best: Option<String>,
+    /// What the best one was chosen by.
+    pub chosen_by: Option<Division>,
+    /// `model` or `references`; null if nothing is written.
+    pub writes: Option<&'static str>,
+    /// Counts of the best candidate; rows are the truth, columns the verdict.
+    pub confusion: Vec<Vec<u64>>,
+    /// The presses that the best candidate judged wrongly.
+    pub wrong: Vec<Wrong>,
+    /// What the figures say, a sentence each.
+    pub remarks: Vec<String>,
+}
+
+/// What a candidate or a control reaches.
+#[derive(Debug, Clone, Serialize)]
+pub struct Row {
+    /// Its name.
+    pub name: String,
+    /// On objects that it has not met.
+    pub new_objects: Option<Estimate>,
+    /// On the later presses of each object, after it learnt from the earlier ones.
+    pub later_presses: Option<Estimate>,
+    /// Why it was left out.
+    pub left_out: Option<String>,
+}
+
+/// A press that was judged wrongly.
+#[derive(Debug, Serialize)]
+pub struct Wrong {
+    /// The press: its recording and its number there, or its place in the data set.
+    pub press: String,
+    /// The labels of its level and of the verdict's.
+    pub level: String,
+    /// The label of the verdict's level.
+    pub said: String,
+}
 
 /// The presses of a level.
 #[derive(Debug, Serialize)]
@@ -47,14 +96,40 @@ impl Estimate {
     }
 }
 
-/// What a candidate or the control reached under each division.
+/// A candidate or the control, with what it said under each division.
 pub(super) struct Compared {
-    /// Its name.
-    pub(super) name: &'static str,
-    /// In the order of [`Division`].
-    pub(super) outcomes: [Option<Outcome>; 2],
-    /// Why it was left out.
-    pub(super) left_out: Option<String>,
+    pub(super) row: Row,
+    outcomes: [Option<Outcome>; 2],
+}
+
+impl Compared {
+    pub(super) fn of(
+        name: &str,
+        outcomes: [Option<Outcome>; 2],
+        left_out: Option<String>,
+        presses: &Presses,
+    ) -> Self {
+        let estimate = |of: &Option<Outcome>| Some(estimated(presses, of.as_ref()?.right(presses)));
+        let [new_objects, later_presses] = outcomes.each_ref().map(estimate);
+        let row = Row {
+            name: name.to_owned(),
+            new_objects,
+            later_presses,
+            left_out,
+        };
+        Self { row, outcomes }
+    }
+
+    pub(super) fn outcome(&self, division: Division) -> Option<&Outcome> {
+        self.outcomes[division as usize].as_ref()
+    }
+
+    fn estimate(&self, division: Division) -> Option<Estimate> {
+        match division {
+            Division::NewObjects => self.row.new_objects,
+            Division::LaterPresses => self.row.later_presses,
+        }
+    }
 }
 
 /// A candidate must be right this much more often than guessing, by the low end of its interval. Less is of
@@ -62,9 +137,12 @@ pub(super) struct Compared {
 const LEAST_GAIN: f64 = 0.1;
 
 /// The two ways to divide the presses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Division {
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Division {
+    /// Whole objects are judged by what was learnt from others.
     NewObjects,
+    /// The later presses of each object are judged by what was learnt from the earlier ones.
     LaterPresses,
 }
 
@@ -169,30 +247,28 @@ pub(super) struct Comparison<'a> {
 impl Comparison<'_> {
     /// The choice: by new objects, or where nothing there is better than guessing, by later presses.
     pub(super) fn choice(&self) -> Choice {
-        let built_in = self.candidates.iter().position(|of| of.left_out.is_none());
-        let built_in = built_in.filter(|&place| place == 0);
+        let has_built_in = self.candidates[0].row.left_out.is_none();
         let mut remarks = self.remarks_on_objects();
         for division in [Division::NewObjects, Division::LaterPresses] {
             let Some(best) = self.best(division) else {
                 continue;
             };
-            let found = self.estimate(&self.candidates[best], division);
-            let found = found.expect("the best candidate was judged");
-            if found.low() < self.guessing(division) + LEAST_GAIN {
+            let found = self.candidates[best].estimate(division);
+            let least = self.guessing(division) + LEAST_GAIN;
+            if found.is_none_or(|found| found.low() < least) {
                 continue;
             }
-            let name = self.candidates[best].name;
+            let name = &self.candidates[best].row.name;
             let lead = |other: &Compared| {
-                let outcome = |of: usize| self.candidates[of].outcomes[division as usize].as_ref();
-                let other = other.outcomes[division as usize].as_ref()?;
-                let other: BTreeMap<usize, f64> = other.right(self.presses).into_iter().collect();
-                let of_both = outcome(best)?.right(self.presses).into_iter();
-                let of_both = of_both.filter_map(|(press, right)| {
+                let other = other.outcome(division)?.right(self.presses);
+                let other: BTreeMap<usize, f64> = other.into_iter().collect();
+                let of_best = self.candidates[best].outcome(division)?.right(self.presses);
+                let of_both = of_best.into_iter().filter_map(|(press, right)| {
                     other.get(&press).map(|other| (press, right - other))
                 });
-                Some(self.estimated(of_both.collect()))
+                Some(estimated(self.presses, of_both.collect()))
             };
-            let control = self.estimate(&self.control, division);
+            let control = self.control.estimate(division);
             if let (Some(control), Some(lead)) = (control, lead(&self.control))
                 && control.low() > self.guessing(division)
                 && lead.low() <= 0.0
@@ -204,7 +280,7 @@ impl Comparison<'_> {
                 ));
             }
             if division == Division::LaterPresses {
-                let on_new = self.estimate(&self.candidates[best], Division::NewObjects);
+                let on_new = self.candidates[best].row.new_objects;
                 let on_new = on_new.map_or_else(String::new, |new| {
                     format!(
                         ", where it is right in {:.0} %",
@@ -217,23 +293,21 @@ impl Comparison<'_> {
                      several shapes"
                 ));
             }
-            let writes = match built_in {
-                Some(place) if place == best => {
-                    remarks.push(
-                        "the built-in model is the best one, so these presses become its references".to_owned(),
-                    );
-                    What::References
-                }
-                Some(place)
-                    if lead(&self.candidates[place]).is_some_and(|lead| lead.low() <= 0.0) =>
-                {
-                    remarks.push(format!(
-                        "{name} is not better than the built-in model by more than chance, so these presses become \
-                         references of the built-in model"
-                    ));
-                    What::References
-                }
-                _ => What::Model(best),
+            let is_ahead = |lead: Estimate| lead.low() > 0.0;
+            let writes = if has_built_in && best == 0 {
+                remarks.push(
+                    "the built-in model is the best one, so these presses become its references"
+                        .to_owned(),
+                );
+                What::References
+            } else if has_built_in && !lead(&self.candidates[0]).is_none_or(is_ahead) {
+                remarks.push(format!(
+                    "{name} is not better than the built-in model by more than chance, so these presses become \
+                     references of the built-in model"
+                ));
+                What::References
+            } else {
+                What::Model(best)
             };
             return Choice {
                 best: Some(best),
@@ -242,14 +316,14 @@ impl Comparison<'_> {
                 remarks,
             };
         }
-        remarks.push(match built_in {
-            Some(_) => "no candidate is shown to be of use: these presses become references of \
-                        the built-in model, and more presses may show more"
-                .to_owned(),
-            None => {
-                "no candidate is shown to be of use: press more objects of each level".to_owned()
+        let remark = match has_built_in {
+            true => {
+                "no candidate is shown to be of use: these presses become references of \
+                     the built-in model, and more presses may show more"
             }
-        });
+            false => "no candidate is shown to be of use: press more objects of each level",
+        };
+        remarks.push(remark.to_owned());
         let division = match self.best(Division::NewObjects) {
             Some(_) => Division::NewObjects,
             None => Division::LaterPresses,
@@ -257,7 +331,7 @@ impl Comparison<'_> {
         Choice {
             best: self.best(division),
             division,
-            writes: built_in.map(|_| What::References),
+            writes: has_built_in.then_some(What::References),
             remarks,
         }
     }
@@ -285,67 +359,23 @@ impl Comparison<'_> {
     }
 
     /// The place of the candidate with the greatest balanced accuracy, the first of equal ones.
-    pub(super) fn best(&self, division: Division) -> Option<usize> {
-        let found = self
-            .candidates
-            .iter()
-            .enumerate()
-            .rev()
-            .filter_map(|(place, of)| {
-                Some((place, self.estimate(of, division)?.balanced_accuracy))
-            });
-        let best = found.max_by(|one, other| one.1.total_cmp(&other.1));
+    fn best(&self, division: Division) -> Option<usize> {
+        let found = self.candidates.iter().enumerate().rev();
+        let found = found.filter_map(|(place, of)| Some((place, of.estimate(division)?)));
+        let accuracy = |(_, of): &(usize, Estimate)| of.balanced_accuracy;
+        let best = found.max_by(|one, other| accuracy(one).total_cmp(&accuracy(other)));
         best.map(|(place, _)| place)
     }
 
     /// The balanced accuracy of guessing.
-    pub(super) fn guessing(&self, division: Division) -> f64 {
-        let outcomes = self
-            .candidates
-            .iter()
-            .filter_map(|of| of.outcomes[division as usize].as_ref());
+    fn guessing(&self, division: Division) -> f64 {
+        let outcomes = self.candidates.iter().filter_map(|of| of.outcome(division));
         let judged = outcomes.flat_map(|outcome| &outcome.0);
-        let mut levels: Vec<u8> = judged
-            .map(|(press, _)| self.presses.all[*press].level)
-            .collect();
-        levels.sort_unstable();
-        levels.dedup();
-        1.0 / levels.len().max(1) as f64
+        let levels = judged.map(|(press, _)| self.presses.all[*press].level);
+        1.0 / levels.collect::<BTreeSet<u8>>().len().max(1) as f64
     }
 
-    pub(super) fn estimate(&self, of: &Compared, division: Division) -> Option<Estimate> {
-        let outcome = of.outcomes[division as usize].as_ref()?;
-        Some(self.estimated(outcome.right(self.presses)))
-    }
-
-    /// The mean over the levels of values of presses, with its interval.
-    fn estimated(&self, values: Vec<(usize, f64)>) -> Estimate {
-        let places: Vec<usize> = values.iter().map(|(press, _)| *press).collect();
-        let objects = folds::objects(self.presses, &places);
-        let of_level = |level| objects.keys().filter(|(of, ..)| *of == level).count();
-        let has_several = objects.keys().all(|(level, ..)| of_level(*level) > 1);
-        let units = objects
-            .values()
-            .enumerate()
-            .flat_map(|(unit, own)| own.iter().map(move |press| (*press, unit as u32)));
-        let mut units: Vec<(usize, u32)> = units.collect();
-        units.sort_unstable();
-        let drawn = values
-            .into_iter()
-            .zip(units)
-            .map(|((press, value), (_, unit))| Drawn {
-                stratum: self.presses.all[press].level,
-                unit: if has_several { unit } else { press as u32 },
-                value,
-            });
-        let drawn: Vec<Drawn> = drawn.collect();
-        Estimate {
-            balanced_accuracy: interval::mean(&drawn, Mean::OfStrata),
-            interval: interval::of(&drawn, Mean::OfStrata),
-        }
-    }
-
-    pub(super) fn of_levels(&self) -> Vec<OfLevel> {
+    fn of_levels(&self) -> Vec<OfLevel> {
         let objects = folds::objects(self.presses, self.places);
         let levels = self.presses.levels().into_iter().map(|level| {
             let own = || objects.iter().filter(|((of, ..), _)| *of == level.level);
@@ -356,5 +386,79 @@ impl Comparison<'_> {
             }
         });
         levels.collect()
+    }
+
+    pub(super) fn report(&self, choice: &Choice) -> Report {
+        let guess = |division| {
+            self.best(division).map(|_| Estimate {
+                balanced_accuracy: self.guessing(division),
+                interval: None,
+            })
+        };
+        let guessing = Row {
+            name: "guessing".to_owned(),
+            new_objects: guess(Division::NewObjects),
+            later_presses: guess(Division::LaterPresses),
+            left_out: None,
+        };
+        let best = choice.best.map(|best| &self.candidates[best]);
+        let levels = self.presses.levels();
+        let (mut confusion, mut wrong) = (Vec::new(), Vec::new());
+        if let Some(Outcome(judged)) = best.and_then(|best| best.outcome(choice.division)) {
+            confusion = vec![vec![0; levels.len()]; levels.len()];
+            for (place, row) in judged {
+                let press = &self.presses.all[*place];
+                let (said, level) = (argmax(row).0, usize::from(press.level) - 1);
+                confusion[level][said] += 1;
+                if said != level {
+                    let name = press.name.clone();
+                    wrong.push(Wrong {
+                        press: name.unwrap_or_else(|| format!("press {place}")),
+                        level: levels[level].label.clone(),
+                        said: levels[said].label.clone(),
+                    });
+                }
+            }
+        }
+        Report {
+            presses: self.places.len(),
+            levels: self.of_levels(),
+            candidates: self.candidates.iter().map(|of| of.row.clone()).collect(),
+            controls: vec![guessing, self.control.row.clone()],
+            best: best.map(|best| best.row.name.clone()),
+            chosen_by: best.map(|_| choice.division),
+            writes: choice.writes.map(|what| match what {
+                What::Model(_) => "model",
+                What::References => "references",
+            }),
+            confusion,
+            wrong,
+            remarks: choice.remarks.clone(),
+        }
+    }
+}
+
+/// The mean over the levels of values of presses, with its interval.
+fn estimated(presses: &Presses, values: Vec<(usize, f64)>) -> Estimate {
+    let places: Vec<usize> = values.iter().map(|(press, _)| *press).collect();
+    let objects = folds::objects(presses, &places);
+    let of_level = |level| objects.keys().filter(|(of, ..)| *of == level).count();
+    let has_several = objects.keys().all(|(level, ..)| of_level(*level) > 1);
+    let units = objects.values().zip(0_u32..);
+    let units = units.flat_map(|(own, unit)| own.iter().map(move |&press| (press, unit)));
+    let units: BTreeMap<usize, u32> = units.collect();
+    let drawn = values.into_iter().map(|(press, value)| Drawn {
+        stratum: presses.all[press].level,
+        unit: if has_several {
+            units[&press]
+        } else {
+            press as u32
+        },
+        value,
+    });
+    let drawn: Vec<Drawn> = drawn.collect();
+    Estimate {
+        balanced_accuracy: interval::mean(&drawn, Mean::OfStrata),
+        interval: interval::of(&drawn, Mean::OfStrata),
     }
 }

@@ -10,9 +10,6 @@ use super::checkpoint::Checkpoint;
 use super::disk::write_whole;
 use crate::net::network::Weights;
 
-/// The number of checkpoints kept for a stage: the newest, and one before it.
-const KEPT: usize = 2;
-
 /// The directory of a run's checkpoints.
 #[derive(Debug)]
 pub struct Checkpoints {
@@ -27,41 +24,38 @@ impl Checkpoints {
         }
     }
 
-    /// Writes a stage's checkpoint and removes all but the last two.
+    /// Writes a stage's checkpoint, and removes the earlier ones.
     ///
     /// # Errors
     ///
     /// Returns the errors of writing.
     pub fn save(&self, stage: &str, checkpoint: &Checkpoint) -> anyhow::Result<()> {
         let name = format!("{stage}-{:010}.npz", checkpoint.progress.step);
-        write_whole(&self.directory.join(name), &checkpoint.to_bytes()?)?;
-        let all = self.paths(stage)?;
-        for old in &all[..all.len().saturating_sub(KEPT)] {
+        let path = self.directory.join(name);
+        write_whole(&path, &checkpoint.to_bytes()?)?;
+        for old in self.paths(stage)?.iter().filter(|old| **old != path) {
             fs::remove_file(old).with_context(|| old.display().to_string())?;
         }
         Ok(())
     }
 
-    /// A stage's newest checkpoint that can be read. It must have the lists of `fresh`, the stage
-    /// before its first step. `None` without any checkpoint.
+    /// A stage's newest checkpoint. It must have the lists of `fresh`, the stage before its first step. `None`
+    /// without any checkpoint.
     ///
     /// # Errors
     ///
-    /// Returns an error if there are checkpoints but none can be read.
+    /// Returns an error if the checkpoint cannot be read.
     pub fn newest(
         &self,
         stage: &str,
         fresh: &[(String, Weights)],
         device: &Device,
     ) -> anyhow::Result<Option<Checkpoint>> {
-        let mut failure = None;
-        for path in self.paths(stage)?.iter().rev() {
-            match Checkpoint::read(path, fresh, device) {
-                Ok(checkpoint) => return Ok(Some(checkpoint)),
-                Err(error) => failure = Some(error.context(path.display().to_string())),
-            }
-        }
-        failure.map_or(Ok(None), Err)
+        let path = self.paths(stage)?.pop();
+        let read = path.map(|path| {
+            Checkpoint::read(&path, fresh, device).with_context(|| path.display().to_string())
+        });
+        read.transpose()
     }
 
     /// Paths of a stage's checkpoints, oldest first.

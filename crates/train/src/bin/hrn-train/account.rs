@@ -8,7 +8,6 @@ use hardnessd_core::verdict::{Hrn, Level};
 use hardnessd_simulator::Split;
 use hrn_train::compare::tables::thousands;
 use hrn_train::data::presses::{Press, Presses};
-use hrn_train::judge::metrics::Evaluation;
 use hrn_train::model::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
 
 /// The card of the model read from `path`.
@@ -59,39 +58,64 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
     text
 }
 
-/// The figures of an evaluation.
-pub(super) fn of_evaluated(evaluation: &Evaluated) -> String {
-    let percent = |share: f64| share * 100.0;
-    let mut text = of_evaluation(&evaluation.levels);
-    let _ = writeln!(
-        text,
-        "level off by more than one  {:.1} %",
-        percent(evaluation.beyond_neighbour)
-    );
-    if let Some(shore) = &evaluation.shore {
+/// The figures of an evaluation, and the confusion matrix with a row for each true level.
+pub(super) fn of_evaluated(evaluated: &Evaluated) -> String {
+    let of = &evaluated.levels;
+    let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+    let mut text = String::new();
+    let mut row = |name: &str, value: String| {
+        let _ = writeln!(text, "{name:<19}{value}");
+    };
+    let by = |unit: &str, interval: Option<[f64; 2]>| {
+        let [low, high] = interval?.map(percent);
+        Some(format!("95 % by {unit}: {low} to {high}"))
+    };
+    let interval = by("object", of.accuracy_interval_by_object)
+        .or(by("cover", of.accuracy_interval_by_cover))
+        .unwrap_or_else(|| {
+            "no interval: it needs two objects of each level, and a right and a wrong verdict"
+                .to_owned()
+        });
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    row("samples", of.n.to_string());
+    row("accuracy", format!("{} ({interval})", percent(of.accuracy)));
+    row("balanced accuracy", percent(of.balanced_accuracy));
+    row("kappa", number(of.kappa));
+    row("kappa, quadratic", number(of.kappa_quadratic));
+    row("calibration error", percent(of.ece));
+    row("mean NLL", format!("{:.4} nats", of.nll));
+    let levels = 1..=of.confusion.len();
+    let levels: String = levels.map(|level| format!("{level:>7}")).collect();
+    row("truth \\ said", levels);
+    let rows = of.confusion.iter().zip(&of.category_accuracy);
+    for ((counts, right), level) in rows.zip(1..) {
+        let counts: String = counts.iter().map(|count| format!("{count:>7}")).collect();
+        let right = right.map_or("-".to_owned(), percent);
+        row(&format!("level {level}"), format!("{counts}   {right}"));
+    }
+    row("off by two or more", percent(evaluated.beyond_neighbour));
+    if let Some(shore) = &evaluated.shore {
         let shown = |rmse: Option<f64>| rmse.map_or("-".to_owned(), |rmse| format!("{rmse:.1}"));
-        let levels = shore.rmse_by_level.iter().copied();
-        let levels: Vec<String> = levels.map(shown).collect();
-        let _ = writeln!(
-            text,
-            "Shore OO           rmse {:.2} (by level {}; within {NEAR_BORDER} of a border {}); 90 % interval holds \
-             {:.1} %, {:.1} wide",
-            shore.rmse,
-            levels.join(", "),
-            shown(shore.rmse_near_borders),
-            percent(shore.coverage),
-            shore.width
+        let levels: Vec<String> = shore.rmse_by_level.iter().copied().map(shown).collect();
+        row(
+            "Shore OO",
+            format!(
+                "rmse {:.2} (by level {}; within {NEAR_BORDER} of a border {}); 90 % interval holds {}, {:.1} wide",
+                shore.rmse,
+                levels.join(", "),
+                shown(shore.rmse_near_borders),
+                percent(shore.coverage),
+                shore.width
+            ),
         );
     }
-    if let Some(sets) = &evaluation.sets {
-        let others = sets.accuracy_of_others;
-        let others = others.map_or("-".to_owned(), |share| format!("{:.1} %", percent(share)));
-        let _ = writeln!(
-            text,
-            "sets of levels     hold {:.1} %; {:.1} % of presses ambiguous, {others} of the others right",
-            percent(sets.coverage),
-            percent(sets.ambiguous)
+    if let Some(sets) = &evaluated.sets {
+        let others = sets.accuracy_of_others.map_or("-".to_owned(), percent);
+        let (coverage, ambiguous) = (percent(sets.coverage), percent(sets.ambiguous));
+        let text = format!(
+            "hold {coverage}; {ambiguous} of presses ambiguous, {others} of the others right"
         );
+        row("sets of levels", text);
     }
     text
 }
@@ -109,56 +133,6 @@ pub(super) fn of_difference(difference: &Difference) -> String {
         "the second less the first  {} points of accuracy ({interval}); right alone: the first on {first} presses, \
          the second on {second}\n",
         points(difference.accuracy)
-    )
-}
-
-/// The figures of the levels, and the confusion matrix with a row for each true level.
-fn of_evaluation(evaluation: &Evaluation) -> String {
-    let percent = |share: f64| share * 100.0;
-    let by = |unit: &str, interval: Option<[f64; 2]>| {
-        interval.map(|[low, high]| {
-            let (low, high) = (percent(low), percent(high));
-            format!("95 % by {unit}: {low:.1} to {high:.1} %")
-        })
-    };
-    let interval = by("object", evaluation.accuracy_interval_by_object)
-        .or(by("cover", evaluation.accuracy_interval_by_cover))
-        .unwrap_or_else(|| {
-            "no interval: it needs two objects of each level, and a right and a wrong verdict"
-                .to_owned()
-        });
-    let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
-    let levels: String = (1..=evaluation.confusion.len())
-        .map(|level| format!("{level:>7}"))
-        .collect();
-    let rows: String = evaluation
-        .confusion
-        .iter()
-        .zip(&evaluation.category_accuracy)
-        .enumerate()
-        .map(|(level, (row, right))| {
-            let counts: String = row.iter().map(|count| format!("{count:>7}")).collect();
-            let right = right.map_or("-".to_owned(), |right| format!("{:.1} %", percent(right)));
-            format!("level {}       {counts}   {right}\n", level + 1)
-        })
-        .collect();
-    format!(
-        "samples            {}\n\
-         accuracy           {:.1} % ({interval})\n\
-         balanced accuracy  {:.1} %\n\
-         kappa              {}\n\
-         kappa, quadratic   {}\n\
-         calibration error  {:.1} %\n\
-         negative log-likelihood  {} nats a sample\n\
-         truth \\ said  {levels}\n\
-         {rows}",
-        evaluation.n,
-        percent(evaluation.accuracy),
-        percent(evaluation.balanced_accuracy),
-        number(evaluation.kappa),
-        number(evaluation.kappa_quadratic),
-        percent(evaluation.ece),
-        format_args!("{:.4}", evaluation.nll)
     )
 }
 
@@ -207,34 +181,31 @@ pub(super) fn of_levels(presses: &Presses) -> String {
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,
 /// probabilities, Shore OO with its interval, and the true Shore OO. Unknown values are empty.
 pub(super) fn csv(cases: &[Case]) -> String {
-    let mut text = String::new();
-    for case in cases {
-        let (verdict, level) = (&case.verdict, case.level);
-        if text.is_empty() {
-            text += "object,level,judged";
-            for level in 1..=verdict.probabilities.len() {
-                let _ = write!(text, ",probability_{level}");
-            }
-            text += ",shore,shore_low,shore_high,true_shore\n";
-        }
-        let object = case.object.map(|object| object.to_string());
-        let object = object.unwrap_or_default();
-        let _ = write!(text, "{object},{level},{}", verdict.level);
-        for probability in &verdict.probabilities {
-            let _ = write!(text, ",{probability:.6}");
-        }
-        match verdict.shore {
-            Some(shore) => {
-                let _ = write!(
-                    text,
-                    ",{:.3},{:.3},{:.3}",
-                    shore.value, shore.low, shore.high
-                );
-            }
-            None => text += ",,,",
-        }
-        let truth = case.shore.map(|shore| format!("{shore:.3}"));
-        let _ = writeln!(text, ",{}", truth.unwrap_or_default());
+    let levels = cases
+        .first()
+        .map_or(0, |case| case.verdict.probabilities.len());
+    let probabilities = (1..=levels).map(|level| format!("probability_{level},"));
+    let probabilities: String = probabilities.collect();
+    let mut text =
+        format!("object,level,judged,{probabilities}shore,shore_low,shore_high,true_shore\n");
+    for Case {
+        object,
+        level,
+        shore,
+        verdict,
+        ..
+    } in cases
+    {
+        let object = object.map_or_else(String::new, |object| object.to_string());
+        let mut cells = vec![object, level.to_string(), verdict.level.to_string()];
+        cells.extend(verdict.probabilities.iter().map(|of| format!("{of:.6}")));
+        let [value, low, high] = match verdict.shore {
+            Some(of) => [of.value, of.low, of.high].map(Some),
+            None => [None; 3],
+        };
+        let known = |shore: Option<f32>| shore.map_or_else(String::new, |of| format!("{of:.3}"));
+        cells.extend([value, low, high, *shore].map(known));
+        text += &(cells.join(",") + "\n");
     }
     text
 }

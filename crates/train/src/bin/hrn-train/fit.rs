@@ -7,7 +7,7 @@ use anyhow::{Context as _, bail};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Borders, Level};
-use hrn_train::fit::{self, Estimate, Fitted, Report, Request, Row, Written};
+use hrn_train::fit::{self, Division, Estimate, Fitted, Report, Request, Row, Written};
 
 use super::arguments::Fit;
 use super::configuration::{first_sensor, levels};
@@ -107,7 +107,7 @@ fn of_report(report: &Report) -> String {
     }
     if let Some(best) = &report.best {
         let by = match report.chosen_by {
-            Some("new_objects") => "objects that it had not met",
+            Some(Division::NewObjects) => "objects that it had not met",
             _ => "later presses",
         };
         let _ = writeln!(text, "\n{best} on {by}:\ntruth \\ said");

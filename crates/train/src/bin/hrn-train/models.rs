@@ -40,19 +40,18 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         .zip(&all)
         .map(|(hrn, cases)| Evaluated::of(cases, &hrn.card().levels))
         .collect();
-    let ([first, second], [of_first, of_second]) = (&all[..], &evaluations[..]) else {
-        let evaluation = &evaluations[0];
+    let [first, second] = &all[..] else {
         return Ok(match arguments.json {
-            true => serde_json::to_string(evaluation)? + "\n",
-            false => account::of_evaluated(evaluation),
+            true => serde_json::to_string(&evaluations[0])? + "\n",
+            false => account::of_evaluated(&evaluations[0]),
         });
     };
-    let places = |verdicts: &[(usize, Verdict)]| -> Vec<usize> {
-        verdicts.iter().map(|&(place, _)| place).collect()
-    };
+    let same_presses = judged[0]
+        .iter()
+        .map(|of| of.0)
+        .eq(judged[1].iter().map(|of| of.0));
     anyhow::ensure!(
-        places(&judged[0]) == places(&judged[1])
-            && models[0].card().levels == models[1].card().levels,
+        same_presses && models[0].card().levels == models[1].card().levels,
         "the two models have other levels, or judge other presses: they cannot be compared"
     );
     let difference = Difference::of(first, second);
@@ -60,15 +59,10 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         let both = serde_json::json!({"models": evaluations, "difference": difference});
         return Ok(both.to_string() + "\n");
     }
-    let name = |place: usize| arguments.model[place].display().to_string();
-    Ok(format!(
-        "{}\n{}\n{}\n{}\n{}",
-        name(0),
-        account::of_evaluated(of_first),
-        name(1),
-        account::of_evaluated(of_second),
-        account::of_difference(&difference)
-    ))
+    let of_models = arguments.model.iter().zip(&evaluations);
+    let of_models =
+        of_models.map(|(path, of)| format!("{}\n{}\n", path.display(), account::of_evaluated(of)));
+    Ok(of_models.collect::<String>() + &account::of_difference(&difference))
 }
 
 /// A model's verdicts on the presses that the arguments choose.
