@@ -208,7 +208,7 @@ fn read(request: &Request) -> anyhow::Result<Presses> {
         },
         skip_unusable: false,
     };
-    let mut all = collect::collect(&recordings, None, &settings)?.into_presses(levels);
+    let mut all = collect::collect(&recordings, None, &settings)?.into_presses(&levels);
     all.join(sets)?;
     Ok(all)
 }

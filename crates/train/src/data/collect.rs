@@ -393,14 +393,14 @@ impl Collection {
     }
 
     /// The presses, as those of one file with these levels.
-    pub fn into_presses(self, levels: Vec<Level>) -> Presses {
+    pub fn into_presses(self, levels: &[Level]) -> Presses {
         let hashes = self.captures.iter().filter_map(|of| of["sha256"].as_str());
         let mut presses = self.presses;
         for source in &mut presses.sources {
             source.name = format!("{} recordings", self.captures.len());
             source.sha256 = sha256_hex(hashes.clone().collect::<String>().as_bytes());
             source.generator = Some(collector());
-            source.levels = Some(levels.clone());
+            source.levels = Some(levels.to_owned());
         }
         presses
     }
