@@ -113,7 +113,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the [`ModelError`] for the first part of the file that breaks the format, or an
+    /// Returns a [`ModelError`] with all that breaks the format, or an
     /// error as [`Hrn::judge`] if a check frame cannot be judged.
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
         let hrn = Self::read(bytes)?;

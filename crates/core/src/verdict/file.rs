@@ -1,7 +1,7 @@
 //! What a model file says before its graph is built (`docs/formats.md`).
 //!
-//! In: the file as ONNX's own messages. Out: the model's description, or the first part that breaks
-//! the format. Nothing here runs the model.
+//! In: the file as ONNX's own messages. Out: the model's description, or all that breaks the format.
+//! Nothing here runs the model.
 
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -31,6 +31,20 @@ const LONGEST_METRICS_BYTES: usize = 1 << 20;
 const BINS: RangeInclusive<usize> = 10..=400;
 /// The numbers that such a model may take of a reference.
 const NUMBERS: RangeInclusive<usize> = 1..=1024;
+
+/// What breaks the format, so that all of it is said at once.
+#[derive(Default)]
+struct Problems(Vec<String>);
+
+impl Problems {
+    fn keep<T>(&mut self, read: Result<T, ModelError>) -> Option<T> {
+        read.map_err(|error| self.0.push(error.to_string())).ok()
+    }
+
+    fn error(&self) -> ModelError {
+        ModelError::new(self.0.join("; "))
+    }
+}
 
 /// What a model file says.
 #[derive(Debug, Clone)]
@@ -67,24 +81,36 @@ impl File {
     ///
     /// # Errors
     ///
-    /// Returns an error for the first part that breaks the format.
+    /// Returns an error with all that breaks the format.
     pub(super) fn read(proto: &pb::ModelProto) -> Result<Self, ModelError> {
         let graph = proto.graph.as_ref().filter(|_| proto.ir_version > 0);
         let graph = graph.ok_or_else(|| ModelError::new("not an ONNX model: no graph in it"))?;
-        check_opset(proto)?;
-        check_tensors_inside(graph)?;
+        let mut problems = Problems::default();
+        problems.keep(check_opset(proto));
+        problems.keep(check_tensors_inside(graph));
         let metadata = Metadata(&proto.metadata_props);
-        let card = card(&metadata)?;
+        let card = card(&metadata, &mut problems);
         let given = given(graph);
-        let (format, inputs, lengths) = match card.format.as_str() {
-            "1" => (
-                frame_input(&given, card.grid)?,
-                Vec::new(),
-                Lengths::default(),
-            ),
-            _ => course_inputs(&given)?,
+        let inputs = problems.keep(match metadata.find("hrn.format") {
+            Some("3") => course_inputs(&given),
+            _ => frame_input(&given, card.as_ref().and_then(|card| card.grid))
+                .map(|format| (format, Vec::new(), Lengths::default())),
+        });
+        // Which outputs a model of courses has depends on its inputs.
+        let taken = inputs
+            .as_ref()
+            .map(|(format, _, lengths)| (*format, *lengths));
+        let frame = (Format::Frame, Lengths::default());
+        let taken = taken.or((metadata.find("hrn.format") == Some("1")).then_some(frame));
+        let outputs = taken.and_then(|(format, lengths)| {
+            let outputs = outputs(graph, format, lengths);
+            problems.keep(outputs)
+        });
+        let (Some(card), Some((format, inputs, lengths)), Some(outputs), true) =
+            (card, inputs, outputs, problems.0.is_empty())
+        else {
+            return Err(problems.error());
         };
-        let outputs = outputs(graph, format, lengths)?;
         if let Outputs::Bins { .. } = outputs {
             let borders = Borders::of(&card.levels);
             borders.map_err(|error| {
@@ -401,48 +427,72 @@ pub fn check_line(key: &'static str, value: &str) -> Result<(), ModelError> {
 }
 
 /// Reads what a file says of itself.
-fn card(metadata: &Metadata<'_>) -> Result<Card, ModelError> {
-    let format = metadata.text("hrn.format")?;
-    if !["1", "3"].contains(&format) {
-        return Err(ModelError::of_key(
-            "hrn.format",
-            shown(format),
-            "\"1\" or \"3\"",
-        ));
+fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
+    let format = problems.keep(format(metadata));
+    let levels = problems.keep(levels(metadata));
+    let pitch_mm = problems.keep(pitch_mm(metadata));
+    let lines = ["hrn.method", "hrn.data", "hrn.validation"];
+    let [method, data, validation] = lines.map(|key| problems.keep(metadata.line(key)));
+    let metrics = problems.keep(metrics(metadata));
+    let range = problems.keep(range(metadata));
+    let format = format?;
+    let grid = problems.keep(grid(metadata, &format));
+    let conformal = problems.keep(match &*format {
+        "1" => Ok(None),
+        _ => conformal(metadata),
+    });
+    Some(Card {
+        format,
+        levels: levels?,
+        pitch_mm: pitch_mm?,
+        method: method?,
+        data: data?,
+        metrics: metrics?,
+        validation: validation?,
+        range: range?,
+        grid: grid?,
+        conformal: conformal?,
+    })
+}
+
+fn format(metadata: &Metadata<'_>) -> Result<String, ModelError> {
+    let key = "hrn.format";
+    let format = metadata.text(key)?;
+    match ["1", "3"].contains(&format) {
+        true => Ok(format.to_owned()),
+        false => Err(ModelError::of_key(key, shown(format), "\"1\" or \"3\"")),
     }
+}
+
+fn levels(metadata: &Metadata<'_>) -> Result<Vec<Level>, ModelError> {
     let levels: Vec<Level> = metadata.json("hrn.levels", "the levels as in hello")?;
     check_levels(&levels)?;
-    let above_0 = "millimetres above 0";
-    let pitch_mm: f32 = metadata.json("hrn.pitch_mm", above_0)?;
-    if !(pitch_mm.is_finite() && pitch_mm > 0.0) {
-        return Err(ModelError::of_key("hrn.pitch_mm", pitch_mm, above_0));
+    Ok(levels)
+}
+
+fn pitch_mm(metadata: &Metadata<'_>) -> Result<f32, ModelError> {
+    let (key, expected) = ("hrn.pitch_mm", "millimetres above 0");
+    let pitch_mm: f32 = metadata.json(key, expected)?;
+    match pitch_mm.is_finite() && pitch_mm > 0.0 {
+        true => Ok(pitch_mm),
+        false => Err(ModelError::of_key(key, pitch_mm, expected)),
     }
-    let metrics = metadata.text("hrn.metrics")?.len();
-    if metrics > LONGEST_METRICS_BYTES {
-        let (found, most) = (format!("{metrics} bytes"), LONGEST_METRICS_BYTES);
-        return Err(ModelError::of_key(
-            "hrn.metrics",
-            found,
-            format!("at most {most}"),
-        ));
+}
+
+fn metrics(metadata: &Metadata<'_>) -> Result<serde_json::Value, ModelError> {
+    let key = "hrn.metrics";
+    let bytes = metadata.text(key)?.len();
+    if bytes > LONGEST_METRICS_BYTES {
+        let expected = format!("at most {LONGEST_METRICS_BYTES}");
+        return Err(ModelError::of_key(key, format!("{bytes} bytes"), expected));
     }
-    let range: Range = metadata.json("hrn.range", "trained force and area")?;
+    metadata.json(key, "JSON")
+}
+
+fn range(metadata: &Metadata<'_>) -> Result<Range, ModelError> {
+    let range = metadata.json("hrn.range", "trained force and area")?;
     check_range(&range)?;
-    Ok(Card {
-        format: format.to_owned(),
-        levels,
-        pitch_mm,
-        method: metadata.line("hrn.method")?,
-        data: metadata.line("hrn.data")?,
-        metrics: metadata.json("hrn.metrics", "JSON")?,
-        validation: metadata.line("hrn.validation")?,
-        range,
-        grid: grid(metadata, format)?,
-        conformal: match format {
-            "1" => None,
-            _ => conformal(metadata)?,
-        },
-    })
+    Ok(range)
 }
 
 fn grid(metadata: &Metadata<'_>, format: &str) -> Result<Option<Array>, ModelError> {

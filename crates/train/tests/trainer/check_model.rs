@@ -1,4 +1,4 @@
-//! `hrn-train check-model`: what the daemon would refuse in a model file.
+//! `hrn-train check-model`: what the daemon would refuse in a model file, all at once.
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ fn the_built_in_models_pass() {
 }
 
 #[test]
-fn what_the_daemon_refuses_is_said_with_what_mends_it() {
+fn all_errors_of_a_file_are_said_at_once() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("m.onnx");
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
@@ -34,10 +34,24 @@ fn what_the_daemon_refuses_is_said_with_what_mends_it() {
     model
         .metadata_props
         .retain(|entry| entry.key != "hrn.pitch_mm");
+    for entry in &mut model.metadata_props {
+        if entry.key == "hrn.range" {
+            entry.value = "four".to_owned();
+        }
+    }
+    let graph = model.graph.as_mut().unwrap();
+    graph.input[0].name = "image".to_owned();
+    graph.output[0].name = "result".to_owned();
     std::fs::write(&path, model.encode_to_vec()).unwrap();
     let (code, lines) = check(&path);
     assert_eq!(code, Some(78), "{lines}");
-    for part in ["pitch_mm", "hardnessd.adopt"] {
+    for part in [
+        "pitch_mm",
+        "hrn.range",
+        "image",
+        "result",
+        "hardnessd.adopt",
+    ] {
         assert!(lines.contains(part), "no {part} in\n{lines}");
     }
 
