@@ -13,7 +13,6 @@ mod clients;
 pub mod config;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
-mod frame_rate;
 mod http;
 mod hub;
 pub(crate) mod lines;
@@ -45,7 +44,8 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -55,22 +55,22 @@ use tracing::{debug, info, warn};
 
 use self::baud::Load;
 use self::clients::Clients;
-use self::config::{Config, Publish, Setup};
+use self::config::{Publish, Setup};
 use self::hub::Hub;
 use self::own::Store;
 use self::publish::Publishers;
-use self::realtime::Scheduling;
 use self::record::{Progress, Recorder, Target};
 pub use self::reload::Reload;
 use self::running::Running;
-use self::sensor::{SensorCore, SensorHandle, Sensors};
+use self::sensor::{SensorCore, SensorHandle};
 use self::serial::{Source, Sources};
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
-use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO};
+use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
+use hardnessd_core::sensor::Sensor;
 
 /// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
 const QUESTIONS: usize = 16;
@@ -78,42 +78,47 @@ const QUESTIONS: usize = 16;
 /// The reason the daemon cannot start, or has stopped by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A publisher could not be opened.
-    #[error(transparent)]
-    Publish(#[from] publish::Error),
-    /// The system gives no random numbers. Without them, two runs cannot be distinguished.
-    #[error("/dev/urandom: {0}")]
-    Random(#[source] std::io::Error),
-    /// A sensor to record is missing or lost, or the recording cannot be written.
-    #[error(transparent)]
-    Record(#[from] record::Error),
-    /// The thread for the clients cannot be started.
-    #[error("cannot start a thread for the clients: {0}")]
-    Clients(#[source] std::io::Error),
-    /// The thread that writes own presses cannot be started.
-    #[error("cannot start a thread for own presses: {0}")]
-    Own(#[from] NoThread),
+    /// The configuration names what the daemon cannot use.
+    #[error("{0}")]
+    Config(String),
+    /// The system or a library refused. A later try may succeed.
+    #[error("{0}")]
+    Io(String),
+    /// A sensor to record is missing at the start.
+    #[error("sensor {sensor:?}: cannot record: {reason}")]
+    Unavailable {
+        /// The sensor's name.
+        sensor: String,
+        /// The reason its port cannot be opened.
+        reason: String,
+    },
+    /// All sensors to record are lost. What they sent is recorded.
+    #[error("sensor {sensor:?} lost: {reason}; the recording ends there")]
+    Lost {
+        /// The name of the sensor that was lost last.
+        sensor: String,
+        /// The reason its port was lost.
+        reason: String,
+    },
     /// A task ended by itself, which is a fault of this program.
     #[error("{0} stopped by itself")]
     Stopped(&'static str),
 }
 
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Publish(error) => error.exit_code(),
-            Error::Random(_) | Error::Clients(_) | Error::Own(_) => IO,
-            Error::Record(error) => error.exit_code(),
-            Error::Stopped(_) => FAILED,
-        }
+impl Error {
+    /// The error that the system has no thread for `what`.
+    fn no_thread(what: &str) -> impl FnOnce(std::io::Error) -> Self {
+        move |error| Self::Io(format!("cannot start a thread for {what}: {error}"))
     }
 }
 
-impl Coded for log::Error {
+impl Coded for Error {
     fn exit_code(&self) -> u8 {
         match self {
-            log::Error::Thread(_) => IO,
-            _ => CONFIG,
+            Error::Config(_) => CONFIG,
+            Error::Io(_) => IO,
+            Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
+            Error::Stopped(_) => FAILED,
         }
     }
 }
@@ -165,16 +170,6 @@ const READING: Duration = Duration::from_micros(100);
 /// How often the clocks are read again.
 const MOST_READINGS: usize = 3;
 
-/// Checks that a daemon can make its sockets where `config` says. The check binds nothing, so it cannot
-/// detect a path that another process uses or an address that the network refuses.
-///
-/// # Errors
-///
-/// Fails if a socket cannot be made where `config` says.
-pub fn check(config: &Config) -> Result<(), Error> {
-    Ok(publish::check(&config.publish.unix)?)
-}
-
 impl Daemon {
     /// Binds the sockets. Must be called inside a tokio runtime.
     ///
@@ -183,9 +178,10 @@ impl Daemon {
     /// Fails if the system gives no random numbers, or if a socket cannot be bound: its path or
     /// address is in use, the path holds another file, or the system refuses.
     pub fn bind(setup: Setup) -> Result<Self, Error> {
-        let hello = hello(&setup, run_token().map_err(Error::Random)?);
+        let run = run_token().map_err(|error| Error::Io(format!("/dev/urandom: {error}")))?;
+        let hello = hello(&setup, run);
         let hub = Hub::new(hello.clone());
-        let clients = Clients::start().map_err(Error::Clients)?;
+        let clients = Clients::start().map_err(Error::no_thread("the clients"))?;
         let publishers = Publishers::bind(&setup.config, &hub, &clients)?;
         Ok(Self {
             clients,
@@ -273,24 +269,29 @@ impl Daemon {
             .map(|target| Recorder::start(target, about(&setup, &hello)))
             .transpose()?;
         if let Some(recorder) = &recorder {
-            hub.record(recorder.of_hub());
+            hub.log().record(recorder.of_hub());
         }
-        let viewers = publishers.viewers.clone();
-        let store = Store::of_environment()?;
+        let store = Store::of_environment();
+        let store = store.map_err(|NoThread(error)| Error::no_thread("own presses")(error))?;
         let mut tasks = JoinSet::new();
         let mut sources = Sources::default();
-        let started = (0..setup.sensors.len()).map(|index| {
+        let started = setup.sensors.iter().enumerate().map(|(index, sensor)| {
             let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
-            let recorder = recorder.unwrap_or_default().with_viewers(viewers.clone());
+            let (commands, inbox) = mpsc::channel(QUESTIONS);
             let core = SensorCore {
-                pipeline: pipeline_of(&setup, index, None, &store),
-                recorder,
+                pipeline: pipeline_of(&setup, sensor, &store),
+                recorder: recorder.unwrap_or_default(),
                 unjudged: 0,
+                commands: inbox,
             };
             let source = sources.take(&setup.sensors, index);
-            start_sensor(&setup, index, (core, source), (&hub, &store), &mut tasks)
+            start_sensor(core, source, (&hub, &store), &mut tasks);
+            SensorHandle {
+                name: sensor.name().to_owned(),
+                commands,
+            }
         });
-        let (changed_sensors, sensors) = Sensors::new(started.collect());
+        let sensors: Arc<[SensorHandle]> = started.collect();
         let (listening, stop) = watch::channel(());
         publishers.announce();
         let publishers = publishers.serve(&sensors, &stop, &clients);
@@ -301,13 +302,11 @@ impl Daemon {
             run,
             hub,
             sensors,
-            changed_sensors,
             tasks,
             publishers,
             clients,
             store,
             recorder,
-            former: Vec::new(),
             listening,
         })
     }
@@ -328,51 +327,35 @@ fn raise_descriptors() {
     }
 }
 
-/// The pipeline of the sensor with this `index`, which goes on with the numbers of `former`.
-fn pipeline_of(setup: &Setup, index: usize, former: Option<Pipeline>, store: &Store) -> Pipeline {
-    let sensor = setup.sensors[index].clone();
+/// The pipeline of a sensor, with its own presses of earlier runs.
+fn pipeline_of(setup: &Setup, sensor: &Sensor, store: &Store) -> Pipeline {
     let hrn = setup.hrn_of(sensor.name()).clone();
-    let Some(former) = former else {
-        let mut pipeline = Pipeline::new(sensor, hrn, Clock::Arrival);
-        store.load(&mut pipeline);
-        return pipeline;
-    };
-    former.restarted(sensor, hrn)
+    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
+    store.load(&mut pipeline);
+    pipeline
 }
 
-/// Starts the task of the sensor with this `index`.
+/// Starts the task of a sensor.
 fn start_sensor(
-    setup: &Setup,
-    index: usize,
-    (core, source): (SensorCore, Source),
+    core: SensorCore,
+    source: Source,
     (hub, store): (&Hub, &Store),
     tasks: &mut JoinSet<SensorCore>,
-) -> SensorHandle {
-    let table = &setup.config.sensors[index];
-    let (commands, inbox) = mpsc::channel(QUESTIONS);
+) {
     // Whoever connects before the task runs gets a status too.
-    hub.report(sensor::state(&core.pipeline, core.unjudged));
-    tasks.spawn(sensor::serve(
-        core,
-        source,
-        (hub.clone(), store.clone()),
-        inbox,
-    ));
-    SensorHandle {
-        name: table.name.clone(),
-        commands,
-    }
+    hub.log()
+        .report(sensor::state(&core.pipeline, core.unjudged));
+    tasks.spawn(sensor::serve(core, source, hub.clone(), store.clone()));
 }
 
 fn announce(setup: &Setup, run: &str) {
-    let scheduling = Scheduling::of(Path::new("/proc/self")).map(|found| found.to_string());
     info!(
         version = env!("CARGO_PKG_VERSION"),
         robot = setup.config.robot.as_str(),
         run,
         model = short(setup),
         validation = setup.hrn.card().validation.as_str(),
-        scheduling,
+        scheduling = realtime::scheduling(),
         "started"
     );
     (0..setup.sensors.len()).for_each(|index| announce_sensor(setup, index));

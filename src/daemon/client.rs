@@ -15,9 +15,7 @@ use std::os::unix::net::UnixStream as StdStream;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{self, Poll, ready};
-use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, poll};
 use tokio::io::unix::AsyncFd;
 use tokio::io::{AsyncRead, Interest, ReadBuf};
 use tokio::net::{TcpStream, UnixStream};
@@ -39,10 +37,6 @@ const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
 /// The largest buffer that a connection keeps between two writes. A batch of the log fits.
 const KEPT_BYTES: usize = 64 * 1024;
-
-/// The first and the longest pause between checks of a connection whose other end has stopped
-/// sending.
-const HALF_CLOSED_CHECKS: (Duration, Duration) = (Duration::from_millis(1), Duration::from_secs(1));
 
 /// The requests that a connection may send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -113,8 +107,6 @@ enum End {
     Closed(#[from] Closed),
     #[error("{0}")]
     Io(#[from] io::Error),
-    #[error("hung up")]
-    HungUp,
     #[error("a line over {LONGEST_LINE_BYTES} bytes")]
     TooLong,
 }
@@ -153,7 +145,7 @@ async fn serve(stream: impl Stream, service: Service) -> Result<(), End> {
     written.and(read)
 }
 
-/// Reads requests until the writer has ended or the other end has closed.
+/// Reads requests until the writer has ended, or the other end sends no more.
 async fn read(
     mut lines: Lines<Input>,
     asked: mpsc::Sender<Asked>,
@@ -177,11 +169,8 @@ async fn read(
                 place.send(Asked::Answer(vec![requests::end(Err(message), None)]));
                 return Err(End::TooLong);
             }
-            // The other end sends no more, but it may still read.
-            LineRead::End => tokio::select! {
-                gone = lines.input().gone() => return gone,
-                () = asked.closed() => return Ok(()),
-            },
+            // The writer ends when it has sent the answers so far.
+            LineRead::End => return Ok(()),
         };
         let request::Line { id, request } = request::parse(&line);
         place.send(match request {
@@ -218,26 +207,6 @@ impl AsyncRead for Input {
             if let Ok(read) = ready.try_io(read) {
                 return Poll::Ready(read.map(|read| buffer.advance(read)));
             }
-        }
-    }
-}
-
-impl Input {
-    /// Waits until the other end, which has stopped sending, is closed.
-    async fn gone(&self) -> Result<(), End> {
-        let mut pause = HALF_CLOSED_CHECKS.0;
-        loop {
-            tokio::time::sleep(pause).await;
-            let mut socket = [PollFd::new(&self.0, PollFlags::empty())];
-            poll(&mut socket, Some(&rustix::event::Timespec::default()))
-                .map_err(io::Error::from)?;
-            if socket[0]
-                .revents()
-                .intersects(PollFlags::HUP | PollFlags::ERR)
-            {
-                return Err(End::HungUp);
-            }
-            pause = HALF_CLOSED_CHECKS.1.min(2 * pause);
         }
     }
 }
@@ -285,7 +254,6 @@ impl Writer {
             Asked::Subscribe(subscription, id) => {
                 let subscribed = self.subscriber.subscribe(&subscription);
                 let done = subscribed.map(|()| requests::Done::default());
-                let done = done.map_err(|error| error.to_string());
                 self.write(&[requests::end(done, id)]).await
             }
         }

@@ -12,7 +12,7 @@ mod check;
 mod parse;
 mod in_force;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::env;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,10 +22,7 @@ use serde_json::Value;
 
 use self::error::Problem;
 pub use self::error::{Error, Text};
-pub use self::publish::{
-    Endpoint, EndpointError, Foxglove, Http, Listen, Mode, ModeError, Publish, Ros2, Tcp, Unix,
-    Zenoh,
-};
+pub use self::publish::{Foxglove, Http, Listen, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
 use super::log;
 use hardnessd_core::exit::{Coded, USAGE};
 use hardnessd_core::range::from_to;
@@ -156,7 +153,7 @@ impl Config {
     }
 
     /// The first key that differs between `self` and `other` and that only a restart can change. This
-    /// is any key but those of the tables that are named here.
+    /// is any key but those of the tables that are named here, and the names of the sensors.
     pub fn fixed_difference(&self, other: &Self) -> Option<String> {
         let fixed = |config: &Self| Self {
             sensors: Vec::new(),
@@ -166,23 +163,12 @@ impl Config {
             log: log::Settings::default(),
             ..config.clone()
         };
-        difference(&fixed(self), &fixed(other)).or_else(|| self.fixed_names(other))
-    }
-
-    /// The key of a publisher that announces the names of the sensors once, if they differ.
-    fn fixed_names(&self, other: &Self) -> Option<String> {
-        let names = |config: &Self| -> BTreeSet<String> {
+        let names = |config: &Self| -> Vec<String> {
             let sensors = config.sensors.iter();
             sensors.map(|sensor| sensor.name.clone()).collect()
         };
-        let publish = &self.publish;
-        let announcing = [
-            ("publish.zenoh", publish.zenoh.is_some()),
-            ("publish.ros2", publish.ros2.is_some()),
-            ("publish.foxglove", publish.foxglove.is_some()),
-        ];
-        let (key, _) = announcing.into_iter().find(|(_, is_on)| *is_on)?;
-        (names(self) != names(other)).then(|| format!("sensor.name (beside {key})"))
+        let renamed = (names(self) != names(other)).then(|| "sensor.name".to_owned());
+        difference(&fixed(self), &fixed(other)).or(renamed)
     }
 }
 
@@ -370,19 +356,18 @@ impl Setup {
             .map(|(name, hrn)| (name.as_str(), hrn))
     }
 
-    /// Whether a sensor runs on with the tables of `other`: its own and `[press]` are the same.
-    pub(super) fn is_same(&self, other: &Self, sensor: &str) -> bool {
-        let table = |setup: &Self| {
-            let mut sensors = setup.config.sensors.iter();
-            let own = sensors.find(|table| table.name == sensor)?;
-            let at_its_port = setup
-                .config
-                .sensors
-                .iter()
-                .filter(|one| one.port == own.port);
-            Some((own.clone(), at_its_port.cloned().collect::<Vec<_>>()))
+    /// Whether the sensor at `index` runs on with the tables of `other`: its own, those of all sensors
+    /// at its port, and `[press]` are the same.
+    pub(super) fn is_same(&self, other: &Self, index: usize) -> bool {
+        let at_its_port = |setup: &Self| -> Vec<sensor::Settings> {
+            let sensors = &setup.config.sensors;
+            let at_it = sensors.iter().filter(|one| one.port == sensors[index].port);
+            at_it.cloned().collect()
         };
-        self.config.press == other.config.press && table(self) == table(other)
+        let is_same = self.config.sensors[index] == other.config.sensors[index];
+        is_same
+            && self.config.press == other.config.press
+            && at_its_port(self) == at_its_port(other)
     }
 
     /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.

@@ -1,10 +1,9 @@
 //! A live server for Foxglove and Lichtblick: the topics of a recording, over the websocket
 //! protocol `foxglove.sdk.v1`.
 //!
-//! In: lines of the hub, and the arm's positions as the sensors' tasks get them. Out: the messages
-//! that a recording has of these, under the same names and with the same definitions, so one layout
-//! fits both. A viewer that connects later gets
-//! the last final verdict and the last status of each sensor. The server has no capability that
+//! In: lines of the hub. Out: the messages that a recording has of these, under the same names and with
+//! the same definitions, so one layout fits both. A viewer that connects later gets the last final
+//! verdict and the last status of each sensor. The server has no capability that
 //! accepts data from a viewer, so a viewer cannot change anything. One thread does all this.
 
 use std::collections::BTreeMap;
@@ -22,11 +21,10 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
+use super::Error;
 use super::config::{self, Config};
 use super::hub::Line;
-use super::publish::Error;
 use super::relay::Worker;
-use hardnessd_core::recording::{Found, MOTION};
 use hardnessd_core::ros;
 
 /// The most messages that wait for a viewer, about 1 MB. When there are more, the oldest are
@@ -37,10 +35,6 @@ const BACKLOG: usize = 512;
 /// the next event.
 const NEWCOMERS: usize = 64;
 
-/// The most lines of positions that wait for the thread. When there are more, they are
-/// dropped.
-const ENTRIES: usize = 256;
-
 /// The time for the last messages to reach the viewers, because the library does not report when a
 /// viewer has everything.
 const LAST_MESSAGES: Duration = Duration::from_millis(50);
@@ -49,26 +43,20 @@ const LAST_MESSAGES: Duration = Duration::from_millis(50);
 /// cannot be notified, and would keep the server waiting.
 const FAREWELL: Duration = Duration::from_millis(200);
 
-/// Listens as `settings` say and announces the topics of `sensors`. Also returns the queue for the
-/// positions of the arm.
+/// Listens as `settings` say and announces the topics of the sensors.
 ///
 /// # Errors
 ///
 /// Fails if the daemon cannot listen on the address, or the library fails.
-pub(super) fn open(
-    settings: &config::Foxglove,
-    config: &Config,
-) -> Result<(Worker, mpsc::Sender<Found>), Error> {
+pub(super) fn open(settings: &config::Foxglove, config: &Config) -> Result<Worker, Error> {
     let (address, robot) = (settings.listen, config.robot.clone());
     let sensors = config.sensors.iter().map(|sensor| sensor.name.clone());
     let sensors: Vec<String> = sensors.collect();
-    let (viewers, entries) = mpsc::channel(ENTRIES);
-    let worker = Worker::start(
+    Worker::start(
         "foxglove",
         move |_| Foxglove::open(address, &robot, &sensors),
-        |foxglove: Foxglove, lines| foxglove.work(lines, entries),
-    )?;
-    Ok((worker, viewers))
+        Foxglove::work,
+    )
 }
 
 /// A message of a topic, with its time in nanoseconds since 1970.
@@ -115,7 +103,7 @@ impl Foxglove {
         let server = runtime
             .block_on(server.start())
             .map_err(|error| match error {
-                FoxgloveError::Bind(error) => Error::io(format!(
+                FoxgloveError::Bind(error) => Error::Io(format!(
                     "publish.foxglove.listen: cannot listen on {address}: {error}"
                 )),
                 other => failed(other),
@@ -131,7 +119,7 @@ impl Foxglove {
         })
     }
 
-    fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>, mut entries: mpsc::Receiver<Found>) {
+    fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>) {
         let Self {
             mut topics,
             mut newcomers,
@@ -146,13 +134,8 @@ impl Foxglove {
                         Some(lines) => lines.iter().for_each(|line| topics.publish(line)),
                         None => break,
                     },
-                    Some(found) = entries.recv() => topics.follow(&found),
                     Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
                 }
-            }
-            // What was recorded before the end is shown too.
-            while let Ok(found) = entries.try_recv() {
-                topics.follow(&found);
             }
             tokio::time::sleep(LAST_MESSAGES).await;
             // A timeout is not a failure: the runtime drops the remaining connections.
@@ -162,7 +145,7 @@ impl Foxglove {
 }
 
 fn failed(error: impl Display) -> Error {
-    Error::io(format!("publish.foxglove: {error}"))
+    Error::Io(format!("publish.foxglove: {error}"))
 }
 
 impl Topics {
@@ -175,7 +158,6 @@ impl Topics {
                 ros::HARDNESS,
                 ros::PRESS,
                 ros::STATUS,
-                MOTION,
             ] {
                 let name = topic.of(sensor);
                 let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
@@ -208,15 +190,6 @@ impl Topics {
             if event.lasts() {
                 self.last.insert(name, message);
             }
-        }
-    }
-
-    /// Sends positions of the arm.
-    fn follow(&self, found: &Found) {
-        let (topic, bytes) = found.message();
-        if let Some(channel) = self.channels.get(&topic.of(&found.sensor)) {
-            let at_ns = u64::try_from(found.at.wall.as_nanosecond()).unwrap_or(0);
-            Message { at_ns, bytes }.send(channel, None);
         }
     }
 

@@ -127,9 +127,6 @@ impl Http {
             let message = "the Host header is not an address of this machine: use localhost or \
                            the address in [http] listen";
             refusal(StatusCode::MISDIRECTED_REQUEST, message)
-        } else if head_bytes(&request) > BUFFER_BYTES {
-            let message = format!("the head is longer than {BUFFER_BYTES} bytes");
-            refusal(StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE, message)
         } else if !self.allows(&request) {
             let message = "method not allowed: this server is read-only: use GET or HEAD";
             let allow = [(header::ALLOW, "GET, HEAD")];
@@ -176,17 +173,6 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
     }
 }
 
-/// The bytes of a request's head. hyper's own bound holds for what it has not parsed yet, so a head
-/// that comes in one piece may be a little longer.
-fn head_bytes(request: &Request<Incoming>) -> usize {
-    let target = request.uri();
-    let target = target.path().len() + target.query().map_or(0, str::len);
-    let headers = request.headers().iter();
-    // `: ` and the end of the line.
-    let headers = headers.map(|(name, value)| name.as_str().len() + value.len() + 4);
-    target + headers.sum::<usize>()
-}
-
 /// An answer with an error code and one line with the reason.
 fn refusal(code: StatusCode, why: impl Display) -> Response {
     (code, format!("{why}\n")).into_response()
@@ -220,8 +206,7 @@ async fn history(
         let why = format!("sensor: found {sensor:?}, expected the name of a sensor");
         return Ok(refusal(StatusCode::NOT_FOUND, why));
     };
-    let line = history.line(&sensor).json().to_owned();
-    Ok(text("application/json", line))
+    Ok(text("application/json", history.json(&sensor).to_string()))
 }
 
 async fn metrics(State(hub): State<Hub>) -> Result<Response, Closed> {

@@ -25,13 +25,9 @@ pub(crate) use self::history::History;
 use self::log::Log;
 pub(crate) use self::log::{SensorSnapshot, Snapshot};
 pub(crate) use self::subscriber::Subscriber;
-pub(crate) use self::tally::Verdicts;
 use super::now;
-use super::record::EventRecorder;
 use super::request::Subscription;
-use super::sensor::SensorState;
 use hardnessd_core::event::{Event, Hello, Reply, Status};
-use hardnessd_core::judge::Unjudged;
 
 /// How long a thread without a runtime waits for an answer.
 #[cfg(feature = "zenoh")]
@@ -40,16 +36,18 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// A line to send.
 #[derive(Debug)]
 pub(crate) struct Line {
-    /// The number of the event, if it has one.
-    pub(crate) seq: Option<u64>,
-    /// The event that the line was made from. A reply has none, and neither has a numbered event
-    /// in a program without a library that needs it.
+    /// The event that the line was made from. A reply has none.
     pub(crate) event: Option<Box<Event>>,
     /// The JSON with its newline, once somebody needs it.
     text: OnceLock<Box<str>>,
 }
 
 impl Line {
+    /// The number of the event, if it has one.
+    pub(crate) fn seq(&self) -> Option<u64> {
+        self.event.as_ref()?.seq()
+    }
+
     /// The JSON of the line, with its newline.
     pub(crate) fn json(&self) -> &str {
         self.text.get_or_init(|| {
@@ -61,17 +59,8 @@ impl Line {
         })
     }
 
-    fn of_text(text: String) -> Arc<Self> {
-        Arc::new(Self {
-            seq: None,
-            event: None,
-            text: OnceLock::from(text.into_boxed_str()),
-        })
-    }
-
     fn of_event(event: Event) -> Arc<Self> {
         Arc::new(Self {
-            seq: event.seq(),
             event: Some(Box::new(event)),
             text: OnceLock::new(),
         })
@@ -79,7 +68,10 @@ impl Line {
 
     /// The line of a reply.
     pub(crate) fn reply(reply: &Reply) -> Arc<Self> {
-        Self::of_text(reply.to_line())
+        Arc::new(Self {
+            event: None,
+            text: OnceLock::from(reply.to_line().into_boxed_str()),
+        })
     }
 
     /// The line of a status that is not an event: it has no number.
@@ -95,14 +87,6 @@ impl Line {
 #[derive(Debug, thiserror::Error)]
 #[error("the daemon is stopping")]
 pub(crate) struct Closed;
-
-/// The error of a `since` that this run has not reached.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("since: found {found}, expected at most {latest}")]
-pub(crate) struct SinceInFuture {
-    found: u64,
-    latest: u64,
-}
 
 /// A handle to the log.
 #[derive(Debug, Clone)]
@@ -121,13 +105,13 @@ impl Hub {
         }
     }
 
-    /// The log, on the sensors' thread.
-    fn log(&self) -> MutexGuard<'_, Log> {
+    /// The log. Call this on the sensors' thread alone.
+    pub(crate) fn log(&self) -> MutexGuard<'_, Log> {
         // A panic ends the process. In a test, it ends the test.
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Publishes events of one sensor, which is now in `state`. Call it on the sensors' thread.
+    /// Publishes events of one sensor. Call this on the sensors' thread alone.
     pub(crate) fn publish(&self, events: Vec<Event>) {
         let mut log = self.log();
         for event in events {
@@ -135,44 +119,12 @@ impl Hub {
         }
     }
 
-    /// Logs that the model failed on a press. Call it on the sensors' thread.
-    pub(crate) fn unjudged(&self, failed: &Unjudged) {
-        self.log().unjudged(failed, now().mono);
-    }
-
-    /// Takes over the current state of a sensor. Call it on the sensors' thread.
-    pub(crate) fn report(&self, state: SensorState) {
-        self.log().report(state);
-    }
-
-    /// The number of sensors that are live, and of all. Call it on the sensors' thread.
-    pub(crate) fn live(&self) -> (usize, usize) {
-        self.log().live()
-    }
-
-    /// Changes the `hello` of new subscribers. The run and the numbers stay. Call it on the sensors'
-    /// thread.
-    pub(crate) fn describe(&self, hello: Hello) {
-        self.log().describe(hello);
-    }
-
-    /// Passes every event on to `recorder` from now on. Call it on the sensors' thread.
-    pub(crate) fn record(&self, recorder: EventRecorder) {
-        self.log().record(recorder);
-    }
-
-    /// Closes the log after its last event. Subscribers get the remaining lines, and then no more.
-    /// Call it on the sensors' thread.
-    pub(crate) fn close(&self) {
-        self.log().close();
-    }
-
     /// Adds a subscriber, and returns what is true where its lines begin. The inner error is for the
     /// subscriber.
     pub(crate) async fn join(
         &self,
         wanted: Subscription,
-    ) -> Result<Result<(Subscriber, Snapshot), SinceInFuture>, Closed> {
+    ) -> Result<Result<(Subscriber, Snapshot), String>, Closed> {
         let hub = self.clone();
         self.ask(move |log| {
             let now = log.snapshot();
@@ -198,7 +150,7 @@ impl Hub {
     }
 
     /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
-    /// sensor. Its line is made by the caller, because the sensors' thread has no time for it.
+    /// sensor. Its JSON is made by the caller, because the sensors' thread has no time for it.
     pub(crate) async fn history(&self, sensor: String) -> Result<Option<History>, Closed> {
         self.ask(move |log| log.history(&sensor)).await
     }

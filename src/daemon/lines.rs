@@ -38,11 +38,6 @@ impl<R: AsyncRead + Unpin> Lines<R> {
         }
     }
 
-    /// What the lines are read from.
-    pub(crate) fn input(&self) -> &R {
-        &self.input
-    }
-
     /// Waits for a whole line. Cancelling the wait loses nothing.
     pub(crate) async fn next(&mut self) -> io::Result<LineRead> {
         loop {

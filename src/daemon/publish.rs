@@ -5,10 +5,10 @@ use std::path::Path;
 
 use rustix::process::Gid;
 use tokio::runtime::Handle;
-use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::info;
 
+use super::Error;
 use super::accept::{Stop, accept};
 use super::client::{Access, Service};
 use super::clients::Clients;
@@ -25,15 +25,14 @@ use super::socket::{self, Socket};
 use super::tcp::Tcp;
 #[cfg(feature = "zenoh")]
 use super::zenoh;
-use hardnessd_core::exit::{CONFIG, Coded, IO};
-use hardnessd_core::recording::Found;
 
 /// The keys of the sockets' paths in the configuration.
 const EVENTS_KEY: &str = "publish.unix.path";
 const CONTROL_KEY: &str = "publish.unix.control_path";
 const GROUP_KEY: &str = "publish.unix.control_group";
 
-/// Checks that the sockets can be made, without making them.
+/// Checks that the sockets can be made where the configuration says. The check binds nothing, so it cannot
+/// detect a path that another process uses.
 pub(crate) fn check(unix: &Unix) -> Result<(), Error> {
     if unix.enabled {
         socket::check(EVENTS_KEY, &unix.path())?;
@@ -52,35 +51,7 @@ fn control_group(unix: &Unix) -> Result<Option<Gid>, Error> {
     let expected = "expected a group of /etc/group, such as \"hardnessd-control\" of the package";
     found
         .map(Some)
-        .ok_or_else(|| Error::config(format!("{GROUP_KEY}: found {name:?}, {expected}")))
-}
-
-/// The reason a publisher could not be opened.
-#[derive(Debug, thiserror::Error)]
-#[error("{message}")]
-pub struct Error {
-    message: String,
-    code: u8,
-}
-
-impl Error {
-    /// The configuration names what the daemon cannot use.
-    pub(super) fn config(message: String) -> Self {
-        let code = CONFIG;
-        Self { message, code }
-    }
-
-    /// The system or a library refused. A later try may succeed.
-    pub(super) fn io(message: String) -> Self {
-        let code = IO;
-        Self { message, code }
-    }
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        self.code
-    }
+        .ok_or_else(|| Error::Config(format!("{GROUP_KEY}: found {name:?}, {expected}")))
 }
 
 /// The publishers. Connections wait until [`Publishers::serve`] is called.
@@ -95,8 +66,6 @@ pub(crate) struct Publishers {
     sets_context: bool,
     /// The publishers whose library has a thread of its own.
     workers: Vec<Worker>,
-    /// The queue for the positions of the arm, if a publisher shows them.
-    pub(crate) viewers: Option<mpsc::Sender<Found>>,
 }
 
 impl Publishers {
@@ -130,13 +99,10 @@ impl Publishers {
             http: http.transpose()?,
             sets_context,
             workers: Vec::new(),
-            viewers: None,
         };
         #[cfg(feature = "foxglove")]
         if let Some(settings) = &publish.foxglove {
-            let (worker, viewers) = foxglove::open(settings, config)?;
-            opened.workers.push(worker);
-            opened.viewers = Some(viewers);
+            opened.workers.push(foxglove::open(settings, config)?);
         }
         #[cfg(feature = "ros2")]
         if let Some(settings) = &publish.ros2 {

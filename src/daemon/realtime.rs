@@ -7,14 +7,12 @@
 //! unit has removed the limit (`LimitMEMLOCK=`), or where the daemon may ignore the limit.
 
 use std::cell::Cell;
-use std::path::Path;
+use std::fs;
 use std::time::Duration;
-use std::{fmt, fs};
 
 use rustix::mm::MlockAllFlags;
 use rustix::process::{Resource, getrlimit};
 use rustix::time::{ClockId, clock_gettime};
-use serde::Serialize;
 use tracing::warn;
 
 /// Work for this long is followed by a pause. `LimitRTTIME` in the unit is 500 ms.
@@ -68,87 +66,31 @@ fn may_lock(status: &str) -> bool {
     bits.is_some_and(|bits| bits >> IPC_LOCK & 1 == 1)
 }
 
-/// The scheduling of a process, and whether its memory is locked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Scheduling {
-    /// The policy of its main thread.
-    #[serde(rename = "scheduling")]
-    pub policy: Policy,
-    /// Its real-time priority; 0 for ordinary scheduling.
-    pub priority: u32,
-    /// Whether its pages stay in memory once they are there.
-    pub memory_locked: bool,
+/// How the kernel schedules the main thread of this process, in words, and whether its memory is locked.
+/// `None` where /proc does not say it.
+pub(super) fn scheduling() -> Option<String> {
+    let stat = fs::read_to_string("/proc/self/stat").ok()?;
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    in_words(&stat, &status)
 }
 
-/// A scheduling policy of sched(7).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Policy {
-    /// Ordinary scheduling: SCHED_OTHER.
-    Other,
-    /// Real time, until the thread waits: SCHED_FIFO.
-    Fifo,
-    /// Real time, in turns with threads of the same priority: SCHED_RR.
-    Rr,
-    /// Ordinary scheduling for work that does not interact: SCHED_BATCH.
-    Batch,
-    /// Only when nothing else runs: SCHED_IDLE.
-    Idle,
-    /// Real time, by deadlines: SCHED_DEADLINE.
-    Deadline,
-}
-
-impl Scheduling {
-    /// Reads the scheduling of a process from its directory in /proc. Returns `None` if the
-    /// directory does not have it.
-    pub fn of(process: &Path) -> Option<Self> {
-        let stat = fs::read_to_string(process.join("stat")).ok()?;
-        let status = fs::read_to_string(process.join("status")).ok()?;
-        Self::read(&stat, &status)
+/// Reads proc_pid_stat(5) and proc_pid_status(5). The policies are those of sched(7).
+fn in_words(stat: &str, status: &str) -> Option<String> {
+    // The name of the process may have spaces and parentheses. Field 3 follows the last parenthesis.
+    let (_, fields) = stat.rsplit_once(") ")?;
+    let mut fields = fields.split_whitespace().skip(40 - 3);
+    let priority = fields.next()?;
+    let mut words = match fields.next()? {
+        "1" => format!("real time (fifo, priority {priority})"),
+        "2" => format!("real time (rr, priority {priority})"),
+        _ => "ordinary".to_owned(),
+    };
+    let mut lines = status.lines();
+    let locked = lines.find_map(|line| line.strip_prefix("VmLck:"))?;
+    if locked.split_whitespace().next()? != "0" {
+        words += ", memory locked";
     }
-
-    /// Reads proc_pid_stat(5) and proc_pid_status(5).
-    fn read(stat: &str, status: &str) -> Option<Self> {
-        // The name of the process may have spaces and parentheses. Field 3 follows the last
-        // parenthesis.
-        let (_, fields) = stat.rsplit_once(") ")?;
-        let mut fields = fields.split_whitespace().skip(40 - 3);
-        let priority = fields.next()?.parse().ok()?;
-        let policy = match fields.next()? {
-            "0" => Policy::Other,
-            "1" => Policy::Fifo,
-            "2" => Policy::Rr,
-            "3" => Policy::Batch,
-            "5" => Policy::Idle,
-            "6" => Policy::Deadline,
-            _ => return None,
-        };
-        let locked = status
-            .lines()
-            .find_map(|line| line.strip_prefix("VmLck:"))?;
-        Some(Self {
-            policy,
-            priority,
-            memory_locked: locked.split_whitespace().next()? != "0",
-        })
-    }
-}
-
-impl fmt::Display for Scheduling {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.policy {
-            Policy::Fifo => write!(out, "real time (fifo, priority {})", self.priority)?,
-            Policy::Rr => write!(out, "real time (rr, priority {})", self.priority)?,
-            Policy::Deadline => out.write_str("real time (deadline)")?,
-            Policy::Other => out.write_str("ordinary")?,
-            Policy::Batch => out.write_str("batch")?,
-            Policy::Idle => out.write_str("idle")?,
-        }
-        if self.memory_locked {
-            out.write_str(", memory locked")?;
-        }
-        Ok(())
-    }
+    Some(words)
 }
 
 #[cfg(test)]
@@ -176,37 +118,21 @@ mod tests {
             fields[41 - 4] = policy.to_owned();
             format!("7 (a ) S b) S {}\n", fields.join(" "))
         };
-        let status = |locked: &str| format!("VmPeak:\t 9 kB\nVmLck:\t{locked} kB\n");
-        let expected = Scheduling {
-            policy: Policy::Rr,
-            priority: 10,
-            memory_locked: true,
-        };
-        assert_eq!(
-            Scheduling::read(&stat("10", "2"), &status("  4096")),
-            Some(expected)
-        );
-        let expected = Scheduling {
-            policy: Policy::Other,
-            priority: 0,
-            memory_locked: false,
-        };
-        assert_eq!(
-            Scheduling::read(&stat("0", "0"), &status("     0")),
-            Some(expected)
-        );
-        assert_eq!(Scheduling::read("7 (cut) S 1", &status("0")), None);
+        for (priority, policy, locked, expected) in [
+            (
+                "10",
+                "2",
+                "  4096",
+                "real time (rr, priority 10), memory locked",
+            ),
+            ("0", "0", "     0", "ordinary"),
+        ] {
+            let status = format!("VmPeak:\t 9 kB\nVmLck:\t{locked} kB\n");
+            let found = in_words(&stat(priority, policy), &status);
+            assert_eq!(found.as_deref(), Some(expected));
+        }
+        assert_eq!(in_words("7 (cut) S 1", "VmLck:\t0 kB\n"), None);
         // /proc also exists where tests run.
-        assert!(Scheduling::of(Path::new("/proc/self")).is_some());
-        assert_eq!(expected.to_string(), "ordinary");
-        let locked = Scheduling {
-            policy: Policy::Rr,
-            priority: 10,
-            memory_locked: true,
-        };
-        assert_eq!(
-            locked.to_string(),
-            "real time (rr, priority 10), memory locked"
-        );
+        assert!(scheduling().is_some());
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! In: the sensors' inputs, and events, through a bounded queue. Out: files. Nothing waits for the
 //! thread. A sensor's first entry is its state at rest, from which a replay can begin. When the queue
-//! is full, entries are dropped and counted, up to the sensor's next rest. A disk that fails or is full stops the recording, not
-//! the daemon. The recording continues when there is room again.
+//! is full, entries are dropped and counted, up to the sensor's next rest. A disk that fails or is full
+//! stops the recording, not the daemon. The recording continues when there is room again.
 
 mod file;
 mod worker;
@@ -17,16 +17,15 @@ use std::time::Duration;
 
 use rustix::fs::{Access, AtFlags, CWD};
 use rustix::io::Errno;
-use tokio::sync::{mpsc, oneshot, watch};
-use tracing::{info, warn};
+use tokio::sync::{oneshot, watch};
+use tracing::info;
 
 use self::worker::Worker;
-use super::config;
+use super::{Error, config};
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::exit::{Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Input, Pipeline};
-use hardnessd_core::recording::{About, Entry, Found, Labels, State};
+use hardnessd_core::recording::{About, Entry, Labels, State};
 
 /// The most entries and events that wait: about 4 s of a sensor at 100 frames/s.
 const QUEUED: usize = 8192;
@@ -77,85 +76,14 @@ pub struct Progress {
     pub said: Option<u8>,
 }
 
-/// The reason a recording failed.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The file cannot be written.
-    #[error("{path}: {source}")]
-    Write {
-        /// The path of the recording.
-        path: PathBuf,
-        /// The error of the write.
-        source: hardnessd_core::recording::Error,
-    },
-    /// A sensor is missing at the start.
-    #[error("sensor {sensor:?}: cannot record: {reason}")]
-    Unavailable {
-        /// The sensor's name.
-        sensor: String,
-        /// The reason its port cannot be opened.
-        reason: String,
-    },
-    /// All sensors are lost. What they sent is recorded.
-    #[error("sensor {sensor:?} lost: {reason}; the recording ends there")]
-    Lost {
-        /// The name of the sensor that was lost last.
-        sensor: String,
-        /// The reason its port was lost.
-        reason: String,
-    },
-    /// The thread could not be started.
-    #[error("no thread for the recording: {0}")]
-    Thread(#[source] std::io::Error),
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
-            Error::Write { .. } | Error::Thread(_) => IO,
-        }
-    }
-}
-
 /// So many black boxes of faults are kept, with so many megabytes. A sender that comes and goes would
 /// fill the disk.
 const MOST_BLACKBOXES: usize = 200;
 const MOST_BLACKBOX_MB: u64 = 1000;
 
-/// The reason a black box was not written.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum NoBlackbox {
-    #[error("nothing is kept: the configuration has no [record]")]
-    NotKept,
-    #[error("`hardnessd record` keeps none: ask a daemon that has [record]")]
-    OneFile,
-    #[error("one was written less than a second ago: ask again in a second")]
-    TooSoon,
-    #[error("the press under way takes more memory than is kept: ask again after its release")]
-    LongPress,
-    #[error(
-        "found {count} black boxes of {mb} MB in record.dir, expected fewer than {MOST_BLACKBOXES} and \
-         {MOST_BLACKBOX_MB} MB for another one of a fault: move old ones away"
-    )]
-    Full { count: usize, mb: u64 },
-    #[error(transparent)]
-    Write(#[from] hardnessd_core::recording::Error),
-}
-
-/// The directory of the recordings cannot be written to.
-#[derive(Debug, thiserror::Error)]
-#[error("record.dir: cannot write to {path}: {source}: set a directory that can be written to")]
-pub(crate) struct NoDirectory {
-    /// The directory, or the nearest path above it that exists.
-    path: PathBuf,
-    /// The system's error.
-    source: std::io::Error,
-}
-
 /// Checks that this process may write to the directory of the recordings, or make it. A daemon runs on
 /// without it.
-pub(crate) fn check(settings: &config::Record) -> Result<(), NoDirectory> {
+pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
     let directory = settings.dir();
     // Missing directories will be made, so check the nearest path that exists.
     let there = directory.ancestors().find(|place| place.exists());
@@ -166,9 +94,11 @@ pub(crate) fn check(settings: &config::Record) -> Result<(), NoDirectory> {
     } else {
         Err(Errno::NOTDIR.into())
     };
-    found.map_err(|source| NoDirectory {
-        path: there.to_owned(),
-        source,
+    found.map_err(|error| {
+        let there = there.display();
+        Error::Io(format!(
+            "record.dir: cannot write to {there}: {error}: set a directory that can be written to"
+        ))
     })
 }
 
@@ -188,7 +118,7 @@ enum Job {
     /// A client requests the last minute of a sensor as a file.
     Blackbox {
         sensor: usize,
-        reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>,
+        reply: oneshot::Sender<Result<PathBuf, String>>,
     },
 }
 
@@ -283,7 +213,7 @@ impl Recorder {
                 // The daemon may no longer wait for the result.
                 let _ = end.send(worker.run(&inbox));
             })
-            .map_err(Error::Thread)?;
+            .map_err(Error::no_thread("the recording"))?;
         Ok(Self {
             jobs: Jobs { sender, load },
             labels,
@@ -306,10 +236,7 @@ impl Recorder {
             looked: None,
             counted: (0, 0),
         };
-        SensorRecorder {
-            active: Some(Box::new(active)),
-            viewers: None,
-        }
+        SensorRecorder(Some(Box::new(active)))
     }
 
     /// The recorder for the hub.
@@ -334,11 +261,7 @@ impl Recorder {
 
 /// Records the inputs of one sensor. Without a recorder, it records nothing.
 #[derive(Debug, Default)]
-pub(crate) struct SensorRecorder {
-    active: Option<Box<Active>>,
-    /// The viewers of the arm's positions and of new beginnings.
-    viewers: Option<mpsc::Sender<Found>>,
-}
+pub(crate) struct SensorRecorder(Option<Box<Active>>);
 
 #[derive(Debug)]
 struct Active {
@@ -361,51 +284,32 @@ struct Active {
 }
 
 impl SensorRecorder {
-    /// Also passes the positions of the arm on to `viewers`, as a recording has them.
-    pub(crate) fn with_viewers(self, viewers: Option<mpsc::Sender<Found>>) -> Self {
-        Self { viewers, ..self }
-    }
-
-    /// Records with `next` from now on. The viewers stay.
-    pub(crate) fn replace(&mut self, next: Self) {
-        self.active = next.active;
-    }
-
     /// Records `input`, which `pipeline` is about to take.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input, at: Stamp) {
-        if let Some(active) = &mut self.active {
-            active.follow(pipeline, at, Entry::Input(input.to_owned()));
-        }
-        if let (Input::Motion(_), Some(viewers)) = (input, &self.viewers) {
-            let found = Found {
-                sensor: pipeline.sensor().name().to_owned(),
-                at,
-                entry: Entry::Input(input.to_owned()),
-            };
-            if let Err(mpsc::error::TrySendError::Full(_)) = viewers.try_send(found) {
-                warn!("viewers are too slow for the positions of the arm");
-            }
+        if let Some(active) = &mut self.0 {
+            active.follow(pipeline, at, Entry::Input(input.clone()));
         }
     }
 
     /// Records that `pipeline`, which is at rest, begins anew or has another model.
     pub(crate) fn begin_anew(&mut self, pipeline: &Pipeline, at: Stamp) {
-        if let Some(active) = &mut self.active {
+        if let Some(active) = &mut self.0 {
             active.noted = None;
             active.begin(pipeline, at);
         }
     }
 
     /// Requests the last minute as a file. The answer comes when the file is written.
-    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, NoBlackbox>>) {
+    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
         // If there is no room for the job, `reply` is dropped with the job, which the caller sees.
-        match &self.active {
+        match &self.0 {
             Some(active) => {
                 let sensor = active.index;
                 active.jobs.send(Job::Blackbox { sensor, reply });
             }
             None => {
-                let _ = reply.send(Err(NoBlackbox::NotKept));
+                let none = "nothing is kept: the configuration has no [record]";
+                let _ = reply.send(Err(none.to_owned()));
             }
         }
     }

@@ -14,9 +14,9 @@ use std::thread;
 use tokio::sync::{mpsc, oneshot};
 use tracing::warn;
 
+use super::Error;
 use super::client;
 use super::hub::{Hub, Line};
-use super::publish::Error;
 use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
@@ -84,7 +84,7 @@ impl Worker {
             }
             drop(end);
         });
-        started.map_err(|error| Error::io(format!("no thread for publish.{way}: {error}")))?;
+        started.map_err(|error| Error::Io(format!("no thread for publish.{way}: {error}")))?;
         outcome
             .recv()
             .expect("a thread that panics ends the process")?;

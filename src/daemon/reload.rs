@@ -9,10 +9,9 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 
-use super::config::{self, Setup};
+use super::config::Setup;
 use super::log::Log;
-use super::record;
-use crate::thread::{NoThread, spawn_thread};
+use crate::thread::spawn_thread;
 
 /// How long reading the files of a configuration may take. The built-in model takes well under a
 /// second.
@@ -30,35 +29,22 @@ pub struct Reload {
     pub log: Log,
 }
 
-/// The reason a reload was refused.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Refusal {
-    #[error(transparent)]
-    Config(#[from] config::Error),
-    #[error("{key} has changed, which a running daemon cannot take over: restart it")]
-    Fixed { key: String },
-    #[error(transparent)]
-    Record(#[from] record::Error),
-    #[error("{path}: reading it and its files did not end within {} s", PATIENCE.as_secs())]
-    Late { path: PathBuf },
-    #[error("{path}: cannot start a thread to read it: {source}")]
-    Thread {
-        path: PathBuf,
-        source: std::io::Error,
-    },
-}
+/// The reason a reload was refused, in words: nobody tells reasons apart.
+pub(super) type Refusal = String;
 
 /// Reads the configuration at `path` and its model, or `model` in its place.
 pub(super) async fn read((path, model): (PathBuf, Option<PathBuf>)) -> Result<Setup, Refusal> {
-    let named = path.clone();
-    let reading = spawn_thread("reload", move || Setup::load(&named, model.as_deref()));
-    let reading = match reading {
-        Ok(reading) => reading,
-        Err(NoThread(source)) => return Err(Refusal::Thread { path, source }),
-    };
+    let shown = path.display().to_string();
+    let reading = spawn_thread("reload", move || Setup::load(&path, model.as_deref()));
+    let reading = reading.map_err(|error| format!("{shown}: {error}"))?;
     match tokio::time::timeout(PATIENCE, reading).await {
-        Ok(loaded) => Ok(loaded.expect("a configuration is read without a panic")?),
-        Err(_) => Err(Refusal::Late { path }),
+        Ok(loaded) => loaded
+            .expect("a configuration is read without a panic")
+            .map_err(|error| error.to_string()),
+        Err(_) => Err(format!(
+            "{shown}: reading it and its files did not end within {} s",
+            PATIENCE.as_secs()
+        )),
     }
 }
 
@@ -73,19 +59,15 @@ pub(super) async fn requested(reload: &mut Option<Reload>) -> (PathBuf, Option<P
     std::future::pending().await
 }
 
-/// Returns `changed` if all of it can change while the daemon runs.
-pub(super) fn change(setup: &Setup, changed: Setup) -> Result<Setup, Refusal> {
-    match setup.config.fixed_difference(&changed.config) {
-        Some(key) => Err(Refusal::Fixed { key }),
-        None => Ok(changed),
+/// Returns `changed` if all of it can change while the daemon runs, and writes the log as it says.
+pub(super) fn change(setup: &Setup, changed: Setup, log: Option<&Log>) -> Result<Setup, Refusal> {
+    if let Some(key) = setup.config.fixed_difference(&changed.config) {
+        return Err(format!(
+            "{key} has changed, which a running daemon cannot take over: restart it"
+        ));
     }
-}
-
-/// Changes the log if its settings differ.
-pub(super) fn change_log(setup: &Setup, changed: &Setup, log: Option<&Log>) {
-    if let Some(log) = log
-        && changed.config.log != setup.config.log
-    {
+    if let Some(log) = log {
         log.change(changed.config.log);
     }
+    Ok(changed)
 }

@@ -40,8 +40,6 @@ pub(crate) enum Query {
     Status,
     /// Every sensor's last final verdict.
     Last,
-    /// The force and contact area of this sensor in the last two minutes.
-    History(String),
 }
 
 impl Request {
@@ -211,40 +209,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_request_of_the_protocol_is_understood() {
-        let subscription = |text: &str| match parse(text.as_bytes()).request {
-            Ok(Request::Subscribe(subscription)) => subscription,
-            other => panic!("{text}: {other:?}"),
-        };
-        let all = subscription(r#"{"subscribe":["hardness","press","status","frame"]}"#);
-        assert!(all.kinds.contains(&Kind::Frame) && all.kinds.contains(&Kind::Status));
-        assert_eq!(all.policy, Policy::Queue);
-        let resumed = subscription(r#"{"subscribe":["press"],"policy":"latest","since":"ab:7"}"#);
-        assert!(!resumed.kinds.contains(&Kind::Hardness));
-        assert_eq!(resumed.policy, Policy::Latest);
-        assert_eq!(
-            resumed.since,
-            Some(Since {
-                run: "ab".to_owned(),
-                seq: 7
-            })
-        );
-        assert_eq!(
-            parse(br#"{"get":"status"}"#).request,
-            Ok(Request::Get(Query::Status))
-        );
-        assert_eq!(
-            parse(br#"{"get":"last","id":4}"#).request,
-            Ok(Request::Get(Query::Last))
-        );
-        let sensor = "forearm".to_owned();
-        assert_eq!(
-            parse(br#"{"tare":"forearm"}"#).request,
-            Ok(Request::Tare(sensor))
-        );
-    }
-
-    #[test]
     fn a_context_is_kept_as_it_came_and_neither_long_nor_deep() {
         let context = |more: &str| {
             let line = format!(r#"{{"context":{{"sensor":"forearm"{more}}}}}"#);
@@ -289,32 +253,21 @@ mod tests {
                 &br#"{"subscribe":["touch"],"id":"a"}"#[..],
                 "subscribe: unknown variant `touch`",
             ),
-            (br#"{"subscribe":"press","id":"a"}"#, "string \"press\""),
             (
                 br#"{"subscribe":[],"policy":"all","id":"a"}"#,
                 "`all`, expected `queue` or `latest`",
             ),
             (
-                br#"{"subscribe":[],"since":"7","id":"a"}"#,
-                "since: found \"7\", expected \"RUN:SEQ\"",
+                br#"{"subscribe":[],"since":"ab:-7","id":"a"}"#,
+                "since: found \"ab:-7\", expected \"RUN:SEQ\"",
             ),
-            (br#"{"subscribe":[],"since":"ab:-7","id":"a"}"#, "\"ab:-7\""),
             (
                 br#"{"subscribe":[],"sinse":"ab:7","id":"a"}"#,
                 "unknown field `sinse`",
             ),
             (
-                br#"{"get":"frames","id":"a"}"#,
-                "get: unknown variant `frames`",
-            ),
-            (br#"{"tare":7,"id":"a"}"#, "tare: invalid type: integer `7`"),
-            (
                 br#"{"tare":"a","context":{},"id":"a"}"#,
                 "expected map with a single key",
-            ),
-            (
-                br#"{"context":"pick","id":"a"}"#,
-                "context: invalid type: string \"pick\"",
             ),
             (
                 br#"{"context":{"tag":"x"},"id":"a"}"#,
@@ -326,16 +279,8 @@ mod tests {
                 "retare: unknown variant `retare`, expected one of `subscribe`",
             ),
             (
-                br#"{"motion":{"at":[]},"id":"a"}"#,
-                "motion: missing field `sensor`",
-            ),
-            (
                 br#"{"motion":{"sensor":"a"},"id":"a"}"#,
                 "motion: missing field `at`",
-            ),
-            (
-                br#"{"motion":{"sensor":"a","at":[],"mm":1},"id":"a"}"#,
-                "unknown field `mm`",
             ),
         ] {
             let read = parse(line);

@@ -2,9 +2,9 @@
 //!
 //! In: lines of the hub. Out: messages of the node `hardnessd`. ROS need not be installed. Verdicts
 //! and statuses are reliable, and a subscriber that comes later gets the last of each. Frames are
-//! best effort. Further topics are for the usual tools of ROS: pictures, arrays of taxels and
-//! diagnostics. If the configuration names topics with positions of the arm, the node subscribes to
-//! them. The node has no service and no parameter, so nothing else comes in.
+//! best effort. Further topics are for the usual tools of ROS: pictures and diagnostics. If the
+//! configuration names topics with positions of the arm, the node subscribes to them. The node has no
+//! service and no parameter, so nothing else comes in.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,9 +23,9 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 
+use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line};
-use super::publish::Error;
 use super::relay::{PositionQueue, Worker};
 use super::request::motion::{Positions, ReportedPoint};
 use hardnessd_core::event::{Event, FrameEvent, Status};
@@ -57,7 +57,8 @@ const LEAST_SCALE_N: f32 = 0.2;
 ///
 /// Fails if the domain cannot be joined, for example because no port is free.
 pub(super) fn open(settings: &config::Ros2, config: &Config, hub: &Hub) -> Result<Worker, Error> {
-    let (domain, namespace) = (settings.domain_id(), &settings.namespace);
+    let domain = settings.domain_id().map_err(Error::Config)?;
+    let namespace = &settings.namespace;
     info!(way = "ros2", domain, namespace, "publishing");
     let (settings, robot) = (settings.clone(), config.robot.clone());
     let sensors = config.sensors.iter().map(|sensor| sensor.name.clone());
@@ -66,8 +67,8 @@ pub(super) fn open(settings: &config::Ros2, config: &Config, hub: &Hub) -> Resul
     Worker::start(
         "ros2",
         move |positions| {
-            let opened = Ros2::open(&settings, robot, &sensors, &positions);
-            opened.map_err(|error| Error::io(format!("publish.ros2: {error}")))
+            let opened = Ros2::open(&settings, domain, robot, &sensors, &positions);
+            opened.map_err(|error| Error::Io(format!("publish.ros2: {error}")))
         },
         move |(runtime, mut ros2), lines| {
             runtime.block_on(ros2.work(lines, &hub));
@@ -92,11 +93,12 @@ struct Ros2 {
 impl Ros2 {
     fn open(
         settings: &config::Ros2,
+        domain: u16,
         robot: String,
         sensors: &[String],
         queue: &PositionQueue,
     ) -> Result<(Runtime, Self), Failure> {
-        let mut domain = DomainParticipantBuilder::new(settings.domain_id());
+        let mut domain = DomainParticipantBuilder::new(domain);
         if !settings.networks.is_empty() {
             domain = domain.with_only_networks(settings.networks.iter().copied());
         }

@@ -1,7 +1,7 @@
 //! One port, which is opened, read, and opened again when it is lost.
 //!
-//! In: the configured port, and what the sensor expects to be sent. Out: one [`Turn`] at a time:
-//! bytes, or what happened to the port. This module tries to open the port for as long as it runs,
+//! In: the configured port, and what the sensor expects to be sent. Out: one input of a pipeline at a
+//! time: bytes, or what happened to the port. This module tries to open the port for as long as it runs,
 //! and never interprets the bytes. A read of no bytes means that the port is lost: every read of an
 //! unplugged tty gives no bytes, and so does a read of a connection that the other end has closed.
 
@@ -11,14 +11,13 @@ pub(crate) mod tty;
 
 use std::collections::BTreeMap;
 use std::io;
-use std::net::SocketAddr;
 use std::ops::Range;
 use std::time::Duration;
 
 use rustix::io::Errno;
-use serialport::TTYPort;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
+use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
@@ -27,12 +26,14 @@ use self::network::{Datagram, Udp};
 use self::shared::Share;
 use self::tty::LineSettings;
 use super::baud::BITS_A_BYTE;
-use super::realtime;
+use super::{log, realtime};
 use crate::maybe;
 use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::allowance::Allowance;
+use hardnessd_core::pipeline::Input;
 use hardnessd_core::port::Port;
 use hardnessd_core::sensor::Sensor;
+use hardnessd_core::wire::is_telnet;
 use hardnessd_core::wording;
 
 /// The pause before the first try to reopen. It doubles with each try that fails.
@@ -61,25 +62,6 @@ const OVERFLOW_PAUSE: Duration = Duration::from_millis(1);
 
 /// How often the settings of a serial line are compared while its sensor is stale.
 const COMPARE_EVERY: Duration = Duration::from_secs(1);
-
-/// A change of the port, or bytes from it.
-#[derive(Debug)]
-pub(crate) enum Turn<'a> {
-    /// The port was opened, or another sender of datagrams has taken the place of the last one. The
-    /// next bytes do not continue the earlier ones.
-    Opened,
-    /// The port cannot be opened now, for this reason.
-    Unavailable(String),
-    /// Bytes arrived.
-    Bytes(&'a [u8]),
-    /// This many bytes arrived, which are more than the sensor's frames can have. The next bytes do not
-    /// continue the earlier ones.
-    Skipped(u64),
-    /// The port was open and is lost, for this reason.
-    Lost(String),
-    /// Datagrams of this sender are ignored, because another one sends.
-    Stranger(SocketAddr),
-}
 
 /// What a link must know of its sensor.
 #[derive(Debug, Clone)]
@@ -145,11 +127,11 @@ pub(crate) enum Source {
 }
 
 impl Source {
-    /// Waits for the next turn of the port. Cancelling the wait loses nothing.
-    pub(crate) async fn turn(&mut self) -> Turn<'_> {
+    /// Waits for the next input. Cancelling the wait loses nothing.
+    pub(crate) async fn next(&mut self) -> Input {
         match self {
-            Self::Own(link) => link.turn().await,
-            Self::Shared(share) => share.turn().await,
+            Self::Own(link) => link.next().await,
+            Self::Shared(share) => share.next().await,
         }
     }
 
@@ -232,16 +214,8 @@ enum State {
     /// The port will be opened at this time.
     Waiting(Instant),
     /// A separate thread is opening the port, because a driver or a network may be slow.
-    Opening(oneshot::Receiver<Result<Opened, String>>),
+    Opening(oneshot::Receiver<io::Result<Line>>),
     Open(Open),
-}
-
-/// A port that is open, but not known to the runtime yet.
-#[derive(Debug)]
-enum Opened {
-    Tty(TTYPort, LineSettings),
-    Tcp(std::net::TcpStream),
-    Udp(std::net::UdpSocket),
 }
 
 #[derive(Debug)]
@@ -251,8 +225,10 @@ struct Open {
     request_at: Option<Instant>,
     /// When the settings of a serial line are compared next.
     compare_at: Option<Instant>,
-    /// The bytes in the buffer that the next turns return.
+    /// The bytes in the buffer that come next.
     held: Range<usize>,
+    /// Whether a telnet server at the other end would begin with its options now.
+    is_new: bool,
     /// When the next bytes are read, if the sensor sends too many.
     read_at: Option<Instant>,
     since: Instant,
@@ -273,7 +249,7 @@ enum Happened {
 }
 
 impl Link {
-    /// A link to `port`. The first turn opens it.
+    /// A link to `port`. The first wait opens it.
     pub(crate) fn new(port: &Port, baud: u32, settings: Settings) -> Self {
         let bytes = match port {
             Port::Device(_) | Port::Tcp(_) => BUFFER_BYTES,
@@ -291,8 +267,9 @@ impl Link {
         }
     }
 
-    /// Waits for the next turn of the port. Cancelling the wait loses nothing.
-    pub(crate) async fn turn(&mut self) -> Turn<'_> {
+    /// Waits for the next input: the port was opened, could not be opened or is lost, or bytes came. Another
+    /// sender of datagrams counts as another opening. Cancelling the wait loses nothing.
+    pub(crate) async fn next(&mut self) -> Input {
         loop {
             match &mut self.state {
                 State::Waiting(until) => {
@@ -302,25 +279,24 @@ impl Link {
                         Ok(opening) => self.state = State::Opening(opening),
                         Err(NoThread(error)) => {
                             self.wait();
-                            return Turn::Unavailable(format!("no thread to open it: {error}"));
+                            let reason = format!("no thread to open it: {error}");
+                            return Input::Unavailable(reason);
                         }
                     }
                 }
                 State::Opening(opening) => {
                     let opened = match opening.await {
-                        Ok(opened) => opened.and_then(|opened| {
-                            Open::new(opened, &self.settings).map_err(|error| wording::line(&error))
-                        }),
+                        Ok(opened) => opened.map_err(|error| reason(&self.port, &error)),
                         Err(ended) => Err(ended.to_string()),
                     };
                     match opened {
-                        Ok(open) => {
-                            self.state = State::Open(open);
-                            return Turn::Opened;
+                        Ok(line) => {
+                            self.state = State::Open(Open::new(line, &self.settings));
+                            return Input::Opened;
                         }
                         Err(reason) => {
                             self.wait();
-                            return Turn::Unavailable(reason);
+                            return Input::Unavailable(reason);
                         }
                     }
                 }
@@ -330,7 +306,11 @@ impl Link {
                         let begin = open.held.start;
                         let bytes = open.held.len().min(self.settings.bytes_at_once);
                         open.held.start += bytes;
-                        return Turn::Bytes(&self.buffer[begin..][..bytes]);
+                        let bytes = &self.buffer[begin..][..bytes];
+                        if std::mem::take(&mut open.is_new) && is_telnet(bytes) {
+                            log::telnet(&self.port);
+                        }
+                        return Input::Bytes(bytes.to_vec());
                     }
                     // A sensor may send faster than the daemon reads.
                     realtime::rest();
@@ -349,21 +329,13 @@ impl Link {
                             open.held = 0..read;
                             match std::mem::take(&mut self.skipped) {
                                 0 => continue,
-                                skipped => return Turn::Skipped(skipped),
+                                skipped => return Input::Skipped(skipped),
                             }
                         }
-                        Happened::Read(Ok(Datagram::First(read))) => {
+                        Happened::Read(Ok(Datagram::OfAnother(read))) => {
                             open.line.send(&self.settings.opening());
                             open.held = 0..read;
-                            continue;
-                        }
-                        Happened::Read(Ok(Datagram::Next(read))) => {
-                            open.line.send(&self.settings.opening());
-                            open.held = 0..read;
-                            return Turn::Opened;
-                        }
-                        Happened::Read(Ok(Datagram::Stranger(address))) => {
-                            return Turn::Stranger(address);
+                            return Input::Opened;
                         }
                         Happened::Read(Ok(Datagram::Ignored)) => continue,
                         Happened::Read(Err(error)) => error.to_string(),
@@ -382,7 +354,7 @@ impl Link {
                         }
                     };
                     self.wait();
-                    return Turn::Lost(lost);
+                    return Input::Lost(lost);
                 }
             }
         }
@@ -421,22 +393,18 @@ impl Link {
 }
 
 impl Open {
-    fn new(opened: Opened, settings: &Settings) -> io::Result<Self> {
+    fn new(line: Line, settings: &Settings) -> Self {
         let now = Instant::now();
-        let line = match opened {
-            Opened::Tty(port, settings) => Line::Tty(SerialStream::try_from(port)?, settings),
-            Opened::Tcp(stream) => Line::Tcp(TcpStream::from_std(stream)?),
-            Opened::Udp(socket) => Line::Udp(Udp::new(socket)?),
-        };
         let is_tty = matches!(line, Line::Tty(..));
-        Ok(Self {
+        Self {
             line,
             request_at: settings.request.as_ref().map(|(_, every)| now + *every),
             compare_at: is_tty.then_some(now + COMPARE_EVERY),
             held: 0..0,
+            is_new: !is_tty,
             read_at: None,
             since: now,
-        })
+        }
     }
 
     async fn wait(&mut self, buffer: &mut [u8], stale_after: Duration) -> Happened {
@@ -513,43 +481,34 @@ fn start_opening(
     port: &Port,
     baud: u32,
     first: Vec<u8>,
-) -> Result<oneshot::Receiver<Result<Opened, String>>, NoThread> {
-    let port = port.clone();
+) -> Result<oneshot::Receiver<io::Result<Line>>, NoThread> {
+    let (port, runtime) = (port.clone(), Handle::current());
     spawn_thread("port", move || {
-        open(&port, baud, &first).map_err(|error| reason(&port, &error))
+        let _in_runtime = runtime.enter();
+        let line = open(&port, baud)?;
+        // The first bytes to a sender of datagrams are sent when it is known.
+        line.send(&first);
+        Ok(line)
     })
 }
 
-fn open(port: &Port, baud: u32, first: &[u8]) -> io::Result<Opened> {
-    match port {
+fn open(port: &Port, baud: u32) -> io::Result<Line> {
+    Ok(match port {
         Port::Device(path) => {
             let (port, settings) = tty::open(path, baud)?;
-            if !first.is_empty() {
-                settings.send(first)?;
-            }
-            Ok(Opened::Tty(port, settings))
+            Line::Tty(SerialStream::try_from(port)?, settings)
         }
-        Port::Tcp(address) => {
-            let stream = network::connect(address)?;
-            if !first.is_empty() {
-                rustix::io::write(&stream, first)?;
-            }
-            Ok(Opened::Tcp(stream))
-        }
-        // The first bytes go to the first sender.
-        Port::Udp(address) => {
-            let socket = std::net::UdpSocket::bind(address)?;
-            socket.set_nonblocking(true)?;
-            Ok(Opened::Udp(socket))
-        }
-    }
+        Port::Tcp(address) => Line::Tcp(TcpStream::from_std(network::connect(address)?)?),
+        Port::Udp(address) => Line::Udp(Udp::bind(address)?),
+    })
 }
 
 /// Opens a port that is no device for a moment. Returns whether a telnet server is at its other end.
 pub(crate) fn probe(port: &Port) -> io::Result<bool> {
-    match open(port, 0, &[])? {
-        Opened::Tcp(stream) => Ok(network::is_telnet(&stream)),
-        Opened::Tty(..) | Opened::Udp(_) => Ok(false),
+    match port {
+        Port::Device(_) => Ok(false),
+        Port::Tcp(address) => Ok(network::is_telnet(&network::connect(address)?)),
+        Port::Udp(address) => std::net::UdpSocket::bind(address).map(|_| false),
     }
 }
 

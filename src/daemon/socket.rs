@@ -5,7 +5,7 @@
 
 use std::fs::{self, DirBuilder, Permissions};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, FileTypeExt, PermissionsExt};
 use std::os::unix::net::UnixListener as StdListener;
 use std::path::{Path, PathBuf};
 
@@ -15,8 +15,8 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 use rustix::process::Gid;
 use tokio::net::{UnixListener, UnixStream};
 
+use super::Error;
 use super::accept::Listener;
-use super::publish::Error;
 use hardnessd_core::part::directory_of;
 
 /// The longest path of a Unix socket: `sun_path` of unix(7), without its final NUL.
@@ -30,12 +30,7 @@ const BACKLOG: i32 = 4096;
 pub(crate) struct Socket {
     listener: UnixListener,
     path: PathBuf,
-    /// A file that another process put in the place of ours is not ours to remove.
-    identity: Identity,
 }
-
-/// The device and the inode of a file.
-type Identity = (u64, u64);
 
 impl Socket {
     /// Listens at `path`. A socket at which nobody listens is replaced. The file has `mode` and `group`
@@ -62,7 +57,6 @@ impl Socket {
         Ok(Self {
             listener: listen(path, mode, group).map_err(place.failed("listen"))?,
             path: path.to_owned(),
-            identity: identity(path).map_err(place.failed("find"))?,
         })
     }
 
@@ -82,9 +76,7 @@ impl Listener for Socket {
 
 impl Drop for Socket {
     fn drop(&mut self) {
-        if identity(&self.path).ok() == Some(self.identity) {
-            let _ = fs::remove_file(&self.path);
-        }
+        let _ = fs::remove_file(&self.path);
     }
 }
 
@@ -104,7 +96,7 @@ impl Place<'_> {
         let Self { key, path } = self;
         let (bytes, shown) = (path.as_os_str().len(), path.display());
         if bytes > LONGEST_PATH_BYTES {
-            return Err(Error::config(format!(
+            return Err(Error::Config(format!(
                 "{key}: found {shown}, {bytes} bytes, expected a path of at most {LONGEST_PATH_BYTES}"
             )));
         }
@@ -116,7 +108,7 @@ impl Place<'_> {
             Ok(parent) => parent.is_dir(),
         };
         if !has_directory {
-            return Err(Error::config(format!(
+            return Err(Error::Config(format!(
                 "{key}: {shown} is in no directory: make the directory, or set another path"
             )));
         }
@@ -130,7 +122,7 @@ impl Place<'_> {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
             Err(error) => Err(self.failed("look at it")(error)),
             Ok(file) if file.file_type().is_socket() => Ok(true),
-            Ok(_) => Err(Error::config(format!(
+            Ok(_) => Err(Error::Config(format!(
                 "{key}: {} is no socket: remove it, or set another path",
                 path.display()
             ))),
@@ -146,7 +138,7 @@ impl Place<'_> {
         match probe() {
             Err(Errno::CONNREFUSED | Errno::NOENT) => Ok(()),
             Err(error @ (Errno::ACCESS | Errno::PERM)) => Err(self.failed("try it")(error.into())),
-            _ => Err(Error::io(format!(
+            _ => Err(Error::Io(format!(
                 "{}: a daemon serves {} already: stop it (the package's with `sudo systemctl stop hardnessd`), \
                  or set another path",
                 self.key,
@@ -166,7 +158,7 @@ impl Place<'_> {
             };
             let Self { key, path } = self;
             let path = path.display();
-            Error::io(format!("{key}: {path}: cannot {what}: {source}{remedy}"))
+            Error::Io(format!("{key}: {path}: cannot {what}: {source}{remedy}"))
         }
     }
 }
@@ -200,9 +192,4 @@ pub(crate) fn group(name: &str) -> Option<Gid> {
 fn socket() -> rustix::io::Result<OwnedFd> {
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
     rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)
-}
-
-fn identity(path: &Path) -> io::Result<Identity> {
-    let file = fs::symlink_metadata(path)?;
-    Ok((file.dev(), file.ino()))
 }

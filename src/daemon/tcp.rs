@@ -7,8 +7,8 @@ use std::time::Duration;
 use rustix::net::sockopt;
 use tokio::net::{TcpListener, TcpStream};
 
+use super::Error;
 use super::accept::Listener;
-use super::publish::Error;
 
 /// The bytes that the system may hold for a subscriber that does not read, as many as for a Unix
 /// socket. The system doubles the number for its own use. The system's default would grow to
@@ -47,7 +47,7 @@ impl Tcp {
             Ok(Self { listener, address })
         };
         let failed = |error| format!("{key}: cannot listen on {address}: {error}");
-        bound().map_err(|error: io::Error| Error::io(failed(error)))
+        bound().map_err(|error: io::Error| Error::Io(failed(error)))
     }
 
     /// The listener's address. If the configured port was 0, the address has the port that the

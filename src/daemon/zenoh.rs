@@ -21,9 +21,9 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
+use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
-use super::publish::Error;
 use super::relay::{PositionQueue, Worker};
 use super::request::{self, Request};
 use hardnessd_core::event::{self, Kind, Reply};
@@ -38,10 +38,12 @@ pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Resu
     // Try the addresses here first, because the library's error is a page long and names paths of
     // its sources.
     for endpoint in &settings.listen {
-        TcpListener::bind(endpoint.address()).map_err(|error| {
-            let key = "publish.zenoh.listen";
-            Error::io(format!("{key}: cannot listen on {endpoint:?}: {error}"))
-        })?;
+        TcpListener::bind(config::Zenoh::address(endpoint).unwrap_or_default()).map_err(
+            |error| {
+                let key = "publish.zenoh.listen";
+                Error::Io(format!("{key}: cannot listen on {endpoint:?}: {error}"))
+            },
+        )?;
     }
     let site = settings.site(&config.robot).to_owned();
     let (listen, connect) = (&settings.listen, &settings.connect);
@@ -53,7 +55,7 @@ pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Resu
         "zenoh",
         move |positions| {
             let opened = Zenoh::open(&settings, site, &sensors, hub, positions);
-            opened.map_err(|error| Error::io(format!("publish.zenoh: {error}")))
+            opened.map_err(|error| Error::Io(format!("publish.zenoh: {error}")))
         },
         Zenoh::work,
     )
@@ -210,9 +212,8 @@ fn text(line: &Line) -> &str {
 /// again. By default zenoh listens on every interface and looks for peers by multicast. This configuration
 /// does neither.
 fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, zenoh::Error> {
-    let json = |endpoints: &[config::Endpoint]| {
-        serde_json::to_string(endpoints).expect("a list of strings is JSON")
-    };
+    let json =
+        |endpoints: &[String]| serde_json::to_string(endpoints).expect("a list of strings is JSON");
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"peer\"".to_owned()),

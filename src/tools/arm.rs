@@ -17,9 +17,9 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
 use super::player::Played;
+use crate::daemon;
 use crate::daemon::accept::Listener;
 use crate::daemon::lines::{LineRead, Lines};
-use crate::daemon::publish;
 use crate::daemon::socket::Socket;
 use crate::thread::NoThread;
 use hardnessd_core::event::round_3;
@@ -115,7 +115,7 @@ impl Arm {
     /// # Errors
     ///
     /// Fails as [`Socket::bind`] does.
-    pub(crate) fn bind(path: &Path) -> Result<Self, publish::Error> {
+    pub(crate) fn bind(path: &Path) -> Result<Self, daemon::Error> {
         let leg = Leg {
             from_mm: 0.0,
             start: Instant::now(),

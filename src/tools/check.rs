@@ -10,8 +10,8 @@ use rustix::fs::Access;
 use super::configuration::Configuration;
 use super::exit::{Coded, Failure};
 use crate::daemon::baud::{Load, Pace};
-use crate::daemon::config::{Endpoint, Setup};
-use crate::daemon::{self, record};
+use crate::daemon::config::{Setup, Zenoh};
+use crate::daemon::{publish, record};
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::sensor::Settings;
 use hardnessd_core::tare;
@@ -44,7 +44,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let path = &args.config.path()?;
     let setup = Setup::load(path, None)?;
-    daemon::check(&setup.config)
+    publish::check(&setup.config.publish.unix)
         .map_err(|error| Failure::of(error.exit_code(), path.display(), error))?;
     let mut lines = format!("robot {}\n", setup.config.robot);
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
@@ -96,12 +96,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
     }
     if let Some(zenoh) = &setup.config.publish.zenoh {
-        let open = |endpoint: &&Endpoint| {
-            let parsed = endpoint.address().parse::<SocketAddr>();
+        let open = |address: &&str| {
+            let parsed = address.parse::<SocketAddr>();
             parsed.map_or(true, |address| !address.ip().is_loopback())
         };
-        for endpoint in zenoh.listen.iter().filter(open) {
-            warn_of_strangers("publish.zenoh.listen", &endpoint.address(), path);
+        let addresses = zenoh.listen.iter().filter_map(|one| Zenoh::address(one));
+        for address in addresses.filter(open) {
+            warn_of_strangers("publish.zenoh.listen", &address, path);
         }
     }
     lines += &format!("\n{}", setup.in_force());

@@ -25,7 +25,7 @@ use super::exit::Failure;
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::{Error as RecordError, Progress};
+use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
@@ -195,7 +195,7 @@ fn create(path: &Path) -> Result<(File, File), Failure> {
 /// What lost sensors sent is kept, because its bytes may say why it has no frame.
 fn holds_nothing(recorded: &Result<(), Error>, frames: u64) -> bool {
     match recorded {
-        Ok(()) | Err(Error::Daemon(daemon::Error::Record(RecordError::Lost { .. }))) => false,
+        Ok(()) | Err(Error::Daemon(daemon::Error::Lost { .. })) => false,
         Err(Error::Unavailable { .. }) => true,
         Err(_) => frames == 0,
     }
@@ -214,7 +214,7 @@ pub(super) async fn record(
     let ports: BTreeMap<String, Port> = setup.config.sensors.iter().map(port_of).collect();
     let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
     match daemon.run(end, None).await {
-        Err(daemon::Error::Record(RecordError::Unavailable { sensor, reason })) => {
+        Err(daemon::Error::Unavailable { sensor, reason }) => {
             let port = ports[&sensor].clone();
             Err(doctor::Unavailable::new(sensor, port, reason).into())
         }

@@ -16,7 +16,7 @@ use hardnessd_sniff::{Arrival, Capture, Found, Known, Proposal, Ranked, Scale, s
 use super::exit::{Fail, Failure};
 use super::simulate::positive;
 use super::{absolute, cannot_read, doctor};
-use crate::daemon::serial::{self, Link, Turn};
+use crate::daemon::serial::{self, Link};
 use crate::thread::spawn_thread;
 use hardnessd_core::exit::{FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::MOST_SIDE;
@@ -139,17 +139,14 @@ fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
     let Captured { bytes, arrivals } = captured;
     let found = sniff(&Capture { bytes, arrivals }, Known { rows, cols, cell });
     let found = found.of_file(path, FAILED)?;
-    let proposal = match (&found.doubt, &found.best.proposal) {
-        (None, Some(proposal)) => proposal,
-        (doubt, _) => {
-            for ranked in [&found.best].into_iter().chain(&found.next) {
-                show(ranked);
-            }
-            let doubt = doubt.as_ref().map_or(String::new(), ToString::to_string);
-            let message = format!("{}: not sure: {doubt}", path.display());
-            return Err(Failure::new(FAILED, message));
+    if let Some(doubt) = &found.doubt {
+        for ranked in [&found.best].into_iter().chain(&found.next) {
+            show(ranked);
         }
-    };
+        let message = format!("{}: not sure: {doubt}", path.display());
+        return Err(Failure::new(FAILED, message));
+    }
+    let proposal = &found.best.proposal;
     let frame = toml(path, bytes.len(), &found, proposal);
     let Some(out) = &args.out else {
         super::print(frame.as_bytes())?;
@@ -282,19 +279,19 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
     let listened = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let _ = tokio::time::timeout(listened, async {
         while captured.bytes.len() < MOST_BYTES {
-            match link.turn().await {
-                Turn::Opened => {
+            match link.next().await {
+                Input::Opened => {
                     let port = escaped(&port.to_string());
                     hardnessd_core::stderr_line!(
                         "listening at {port} for {seconds} s: press the sensor"
                     );
                 }
-                Turn::Bytes(read) => captured.take(read, begin.elapsed()),
-                Turn::Stranger(_) | Turn::Skipped(_) => {}
-                Turn::Unavailable(reason) | Turn::Lost(reason) => {
+                Input::Bytes(read) => captured.take(&read, begin.elapsed()),
+                Input::Unavailable(reason) | Input::Lost(reason) => {
                     lost = Some(reason);
                     return;
                 }
+                _ => {}
             }
         }
     })
@@ -310,11 +307,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
 
 /// Shows the strongest press as an array would have it.
 fn show(ranked: &Ranked) {
-    let title = match &ranked.proposal {
-        Some(_) => ranked.options(),
-        None => format!("{} {}", ranked.array, ranked.words),
-    };
-    hardnessd_core::stderr_line!("{title}:");
+    hardnessd_core::stderr_line!("{}:", ranked.options());
     for line in draw(&ranked.picture, ranked.array.cols) {
         hardnessd_core::stderr_line!("    |{line}|");
     }
@@ -373,7 +366,7 @@ fn toml(path: &Path, bytes: usize, found: &Found, proposal: &Proposal) -> String
 fn array_in_words(ranked: &Ranked) -> String {
     match ranked.cell {
         Some(cell) => format!("{} {}", ranked.array, hardnessd_sniff::cell_name(cell)),
-        None => format!("{} {}", ranked.array, ranked.words),
+        None => format!("{} decimals", ranked.array),
     }
 }
 

@@ -255,13 +255,8 @@ pub struct Daemon {
 impl Daemon {
     /// Starts a daemon and waits until it serves.
     pub fn start(config: &Path) -> Self {
-        Self::start_by(&mut Command::new(BINARY), config)
-    }
-
-    /// Starts a daemon by `command`, which takes the arguments of `hardnessd`.
-    pub fn start_by(command: &mut Command, config: &Path) -> Self {
         let mut process = Process(
-            command
+            Command::new(BINARY)
                 .args(["run", "--config"])
                 .arg(config)
                 .env("RUST_LOG", "info")

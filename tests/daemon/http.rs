@@ -222,7 +222,7 @@ fn only_this_machine_by_its_address_is_served_and_no_route_changes_anything() {
     assert!(!answer.head.contains("access-control-"), "{}", answer.head);
     // hyper itself refuses a target or a header that is too long.
     let target = format!("/{}", "a".repeat(66_000));
-    let header = format!("X-Long: {}", "a".repeat(66_000));
+    let header = format!("X-Long: {}", "a".repeat(150_000));
     assert_eq!(get(address, &target).code, 414);
     assert_eq!(ask(address, "GET /livez", &[&header]).code, 431);
     for path in ["/metrics", "/events"] {
@@ -335,14 +335,6 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     assert_eq!(forearm["last"]["phase"], "final");
     assert_eq!(forearm["contact_threshold_n"], 0.07);
     assert!(forearm["last_frame_age_s"].as_f64().unwrap() > 0.0);
-    // A test has no right to real time, so its daemon has the test's own scheduling.
-    let process = &status["process"];
-    assert_eq!(
-        (&process["scheduling"], &process["priority"]),
-        (&json!("other"), &json!(0))
-    );
-    assert!(process["memory_locked"].is_boolean(), "{process}");
-
     // A page that opens now has the curve of the press that is over.
     let history = get(address, "/api/history?sensor=forearm");
     let history: Value = serde_json::from_str(&history.body).unwrap();

@@ -27,7 +27,7 @@ from websockets.sync.client import connect
 
 LAYOUT = pathlib.Path(__file__).resolve().parents[2] / "clients/foxglove/hardnessd.json"
 TABLE = '[publish.foxglove]\nlisten = "127.0.0.1:0"\n'
-TOPICS = ["contact", "frame", "hardness", "motion", "press", "status"]
+TOPICS = ["contact", "frame", "hardness", "press", "status"]
 PROTOCOL = "foxglove.sdk.v1"
 
 
@@ -54,8 +54,6 @@ class Viewer:
         self.topics = {channel["topic"]: channel for channel in self.channels.values()}
         self.decoders = {number: decoder(channel) for number, channel in self.channels.items()}
         self.messages = queue.Queue()
-        # The positions of the arm as they came: the time and the bytes of each line.
-        self.motion = []
         # The number of a subscription is not that of its channel.
         wanted = [{"id": 1000 + number, "channelId": number} for number in self.channels]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
@@ -72,8 +70,6 @@ class Viewer:
             channel = self.channels[subscription - 1000]
             message = self.decoders[channel["id"]](data[13:])
             topic = channel["topic"].rsplit("/", 1)[1]
-            if topic == "motion":
-                self.motion.append((time_ns, data[13:]))
             self.messages.put((topic, time_ns, message))
 
     def until(self, there):
@@ -151,11 +147,6 @@ def compare(got, events):
             newtons = struct.unpack("<784f", bytes(message.data))
             assert (message.height, message.width, message.encoding, message.step) == (28, 28, "32FC1", 112)
             assert all(abs(a - b) <= 0.0005 + 1e-6 for a, b in zip(newtons, event["newtons"], strict=True))
-        elif topic == "motion":
-            assert message.header.frame_id == "forearm" and len(message.at_ns) == len(message.approach_mm) > 0, message
-            # The simulated robot sends its positions at once.
-            assert all(abs(message.mono_ns - at_ns) < 5_000_000_000 for at_ns in message.at_ns), message
-            assert all(-1000 < mm < 1000 for mm in message.approach_mm), message
         else:
             continue
         compared[topic] += 1
@@ -187,10 +178,6 @@ def check_recording(path, viewer, got):
             decoder(viewer.topics[channel.topic])(message.data)
             for _, channel, message in reader.iter_messages(topics=["/tactile/forearm/contact"])
         ]
-        moved = reader.iter_messages(topics=["/tactile/forearm/motion"])
-        moved = [(message.log_time, message.data) for _, _, message in moved]
-    # The recorder has no lines that the viewer has not, and the other way round.
-    assert moved == viewer.motion and len(moved) > 50, (len(moved), len(viewer.motion))
     recorded = {message.frame: message.force_n for message in contacts}
     live = {message.frame: message.force_n for topic, _, message in got if topic == "contact"}
     assert live.items() <= recorded.items() and len(live) > 50

@@ -70,7 +70,6 @@ pub struct StepBack {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AtRest {
     points: Vec<Point>,
-    uncertain_ns: Option<i64>,
 }
 
 impl AtRest {
@@ -82,10 +81,7 @@ impl AtRest {
 
 impl From<AtRest> for Track {
     fn from(state: AtRest) -> Self {
-        let mut track = Self {
-            uncertain_ns: state.uncertain_ns,
-            ..Self::default()
-        };
+        let mut track = Self::default();
         // Of points that step back, the earlier ones are forgotten.
         let _ = track.push(&state.points);
         track
@@ -121,9 +117,6 @@ impl From<AtRest> for Track {
 pub struct Track {
     /// The points, ascending in time.
     points: VecDeque<Point>,
-    /// The last moment that is uncertain, because this machine's calendar clock was set. All points are
-    /// later.
-    uncertain_ns: Option<i64>,
     /// The number of points since the start.
     received: u64,
     /// The number of points that came after the verdict that they belong to.
@@ -155,9 +148,7 @@ impl Track {
                     back_ms: (latest.saturating_sub(point.at_ns)) as f64 / 1e6,
                 });
             }
-            if self.uncertain_ns.is_none_or(|until| point.at_ns > until) {
-                self.points.push_back(point);
-            }
+            self.points.push_back(point);
             let oldest = point.at_ns.saturating_sub(HELD_NS);
             let is_old = |first: &Point| first.at_ns < oldest;
             while self.points.len() > MOST_POINTS || self.points.front().is_some_and(is_old) {
@@ -165,14 +156,6 @@ impl Track {
             }
         }
         first_back.map_or(Ok(()), Err)
-    }
-
-    /// Takes in that this machine's calendar clock was set since the latest point. Moments from
-    /// calendar times are uncertain up to `until_ns`, because nobody knows by which setting the robot or
-    /// this machine took them.
-    pub fn clock_set(&mut self, until_ns: i64) {
-        self.points.clear();
-        self.uncertain_ns = Some(until_ns);
     }
 
     /// The number of points since the start, and the number of points that came too late.
@@ -196,8 +179,8 @@ impl Track {
     /// frames, and ascend. The arm's stamps are `delay_ms` earlier. A moment after the latest
     /// position has `None`.
     ///
-    /// Returns `None` if there is a gap, a jump, a step back in time or a set clock between `begin`
-    /// and the last moment, or if the points do not cover `begin`.
+    /// Returns `None` if there is a gap, a jump or a step back in time between `begin` and the
+    /// last moment, or if the points do not cover `begin`.
     pub fn approach(
         &self,
         begin: Duration,
@@ -252,7 +235,6 @@ impl Track {
             .min(self.points.len().saturating_sub(1));
         AtRest {
             points: self.points.range(first..).copied().collect(),
-            uncertain_ns: self.uncertain_ns,
         }
     }
 }

@@ -5,10 +5,10 @@
 
 use std::ops::Range;
 
-use hardnessd_core::wire::Checksum;
+use hardnessd_core::wire::{Cell, Checksum};
 
 use crate::columns::{Kind, number};
-use crate::numbers::Type;
+use crate::numbers;
 
 /// What holds for the bytes at `at`. Places are counted from the end of the cells.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,8 +24,8 @@ pub(crate) enum What {
     From(Checksum, usize),
     /// A checksum of the cells.
     Cells(Checksum),
-    /// A plain sum of the cells, which no key describes. Its high byte may be first.
-    Sum(bool),
+    /// A plain sum of the cells, which no key describes.
+    Sum,
 }
 
 /// The checksums, the most certain first. A plain sum of two bytes or four comes before the last two,
@@ -54,8 +54,8 @@ pub(crate) fn long(spans: &[&[u8]], beside: &[Kind]) -> Option<Check> {
 }
 
 /// The sum of the cells or the checksum of one byte that holds.
-pub(crate) fn short(spans: &[&[u8]], beside: &[Kind], of: &Type) -> Option<Check> {
-    sum(spans, beside, of).or_else(|| checksum(spans, beside, &SHORT))
+pub(crate) fn short(spans: &[&[u8]], beside: &[Kind], cell: Cell) -> Option<Check> {
+    sum(spans, beside, cell).or_else(|| checksum(spans, beside, &SHORT))
 }
 
 fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<Check> {
@@ -95,7 +95,7 @@ fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<
 }
 
 /// The plain sum of the cells in four bytes or two. Four, only if more than two change.
-fn sum(spans: &[&[u8]], beside: &[Kind], of: &Type) -> Option<Check> {
+fn sum(spans: &[&[u8]], beside: &[Kind], cell: Cell) -> Option<Check> {
     let length = beside.len();
     for bytes in [4, 2] {
         for at in 0..=length.checked_sub(bytes)? {
@@ -107,9 +107,9 @@ fn sum(spans: &[&[u8]], beside: &[Kind], of: &Type) -> Option<Check> {
             for is_big_endian in [false, true] {
                 let sum = |span: &[u8]| {
                     let cells_end = span.len() - length;
-                    let cells = span[length..cells_end].chunks_exact(of.bytes);
-                    let sum =
-                        cells.fold(0, |sum: u32, cell| sum.wrapping_add((of.read)(cell) as u32));
+                    let cells = numbers::numbers(cell, &span[length..cells_end]);
+                    let add = |sum: u32, cell: f32| sum.wrapping_add(cell as u32);
+                    let sum = cells.into_iter().fold(0, add);
                     let found = number(&span[cells_end..][at.clone()], is_big_endian) as u32;
                     (
                         sum,
@@ -122,7 +122,7 @@ fn sum(spans: &[&[u8]], beside: &[Kind], of: &Type) -> Option<Check> {
                 if holds(spans, is_right) {
                     return Some(Check {
                         at,
-                        what: What::Sum(is_big_endian),
+                        what: What::Sum,
                     });
                 }
             }

@@ -19,13 +19,10 @@ struct Escaped {
 pub(crate) enum Coding {
     /// They are packed in frames that the daemon reads.
     Packed(Framing),
-    /// They are packed in another way.
+    /// They are packed in another way, or read at a wrong speed.
     Unreadable(&'static str),
     /// The same, unless frames of one length explain them: negative numbers have many bytes of FF.
     Doubled(&'static str),
-    /// They are read at a wrong speed.
-    TooFast,
-    TooSlow,
 }
 
 const ESCAPED: [Escaped; 2] = [
@@ -44,6 +41,11 @@ const ESCAPED: [Escaped; 2] = [
         ),
     },
 ];
+
+const TOO_FAST: &str =
+    "the port is read faster than the sensor sends, for its bits come in runs: try a lower --baud";
+const TOO_SLOW: &str = "the port is read slower than the sensor sends, for stop bits are among the bits: try a \
+                        higher --baud";
 
 /// The fewest frames, and escapes, that show a packing.
 const FEWEST: usize = 8;
@@ -69,9 +71,9 @@ pub(crate) fn of(bytes: &[u8]) -> Option<Coding> {
         return Some(Coding::Packed(Framing::Cobs));
     }
     if is_too_slow(bytes) {
-        return Some(Coding::TooSlow);
+        return Some(Coding::Unreadable(TOO_SLOW));
     }
-    is_too_fast(bytes).then_some(Coding::TooFast)
+    is_too_fast(bytes).then_some(Coding::Unreadable(TOO_FAST))
 }
 
 /// The share of `of` that `is` so. None of a few.

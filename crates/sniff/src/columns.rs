@@ -205,29 +205,21 @@ impl Columns {
 
     /// Whether a constant byte may be a high one of a number, which is 0 as long as the number is small.
     pub(crate) fn is_high_byte(&self, at: usize) -> bool {
-        self.numbers.iter().any(|number| {
-            !number.wraps && self.is_high_byte_of(at, number.at, number.bytes, number.is_big_endian)
-        })
-    }
-
-    /// Whether a constant byte may be a high one of the number at `number`, of which `bytes` change.
-    pub(crate) fn is_high_byte_of(
-        &self,
-        at: usize,
-        number: usize,
-        bytes: usize,
-        is_big_endian: Option<bool>,
-    ) -> bool {
         let period = self.kinds.len();
-        // How many zeros are between them, on the side of the high bytes.
-        let after = (at + 2 * period - number - bytes) % period;
-        let before = (number + 2 * period - at - 1) % period;
         let are_zeros = |zeros: usize, from: usize| {
-            bytes + zeros < 4
-                && (0..=zeros).all(|by| self.kinds[(from + by) % period] == Kind::Constant(0))
+            (0..=zeros).all(|by| self.kinds[(from + by) % period] == Kind::Constant(0))
         };
-        is_big_endian != Some(true) && are_zeros(after, number + bytes)
-            || is_big_endian != Some(false) && are_zeros(before, at)
+        let is_high_of = |number: &Number| {
+            let end = number.at + number.bytes;
+            // How many zeros are between them, on the side of the high bytes.
+            let after = (at + 2 * period - end) % period;
+            let before = (number.at + 2 * period - at - 1) % period;
+            let has_room = |zeros: usize| number.bytes + zeros < 4;
+            number.is_big_endian != Some(true) && has_room(after) && are_zeros(after, end)
+                || number.is_big_endian != Some(false) && has_room(before) && are_zeros(before, at)
+        };
+        let mut numbers = self.numbers.iter().filter(|number| !number.wraps);
+        numbers.any(is_high_of)
     }
 
     /// Whether a frame has all constant bytes, as one without damage has.

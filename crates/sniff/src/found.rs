@@ -24,8 +24,8 @@ pub struct Found {
     pub best: Ranked,
     /// The next with another array or other cells, if there is one.
     pub next: Option<Ranked>,
-    /// Why the best is not sure.
-    pub doubt: Option<Doubt>,
+    /// Why the best is not sure, in words.
+    pub doubt: Option<String>,
 }
 
 /// A layout with the picture that it makes.
@@ -33,120 +33,69 @@ pub struct Found {
 pub struct Ranked {
     /// The array.
     pub array: Array,
-    /// How a cell is written, in words.
-    pub words: String,
-    /// `None` for text, and for cells that the daemon does not read.
+    /// `None` for text.
     pub cell: Option<Cell>,
     /// The strongest press, as the array would have it.
     pub picture: Vec<f32>,
-    /// The settings, if the daemon reads such a layout.
-    pub proposal: Option<Proposal>,
+    /// The settings.
+    pub proposal: Proposal,
     pub(crate) score: Score,
     /// The bits if no cell has to do with those around it.
     pub(crate) alone: Score,
     /// The doubt about which bytes are cells.
-    pub(crate) cells: Option<Doubt>,
-}
-
-/// Why the likeliest layout is not sure.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Doubt {
-    /// The cells, or something else, are none that the daemon reads.
-    #[error("it looks like {0}, which `[sensor.frame]` cannot describe yet")]
-    Unreadable(String),
-    /// Another array is about as likely.
-    #[error(
-        "choose with `{0}` or as the pictures say, or press with one finger at several places and at the edges"
-    )]
-    Between(String),
-    /// The cells are no picture.
-    #[error(
-        "{0} cells beside each other do not act as neighbours do: press with one finger at several places, or this is no array"
-    )]
-    NoPicture(usize),
-    /// The cells may begin elsewhere, or be more or fewer.
-    #[error(
-        "which bytes are cells: {0} bytes are between the mark and them and {1} behind them, or {2} and {3}; press the \
-         first taxels and the last"
-    )]
-    Cells(usize, usize, usize, usize),
-    /// What is beside the cells looks like more of them.
-    #[error("{0} bytes beside the cells look like cells at rest: press the edges too")]
-    Resting(usize),
-    /// There are so few cells that other numbers may pass for an array.
-    #[error("{0} numbers are too few to tell an array from others: say `{1}` if it is one")]
-    Few(usize, String),
-    /// Much is not explained.
-    #[error(
-        "{frames} whole frames and {damaged} damaged ones, with {share:.0} % of the bytes: lengths vary, as with \
-         escapes or packets of several kinds, or --baud is wrong"
-    )]
-    Unexplained {
-        /// The whole frames.
-        frames: u64,
-        /// The damaged ones.
-        damaged: u64,
-        /// The share of the bytes in whole frames, in percent.
-        share: f64,
-    },
+    pub(crate) cells: Option<String>,
 }
 
 /// The reason why no layout was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Failure {
-    /// There are no bytes.
-    #[error(
-        "nothing arrives: check the wiring, or the sensor sends only on a request (`request` and `start` of [sensor.frame])"
-    )]
-    Nothing,
-    /// Lines of text, but not as many numbers on each.
-    #[error("text, but no array: {0}")]
-    Text(String),
-    /// The bytes are packed in a way that the daemon does not read.
-    #[error("{0}")]
-    Packed(&'static str),
-    /// Bits come in runs.
-    #[error(
-        "the port is read faster than the sensor sends, for its bits come in runs: try a lower --baud"
-    )]
-    TooFast,
-    /// Stop bits are among the bits of bytes.
-    #[error(
-        "the port is read slower than the sensor sends, for stop bits are among the bits: try a higher --baud"
-    )]
-    TooSlow,
-    /// Frames of one length without an array.
-    #[error(
-        "{0} bytes recur, but they hold no array with a mark: press the sensor at several places meanwhile, try another \
-         --baud, and say --rows, --cols and --cell if you know them"
-    )]
-    NoArray(usize),
-    /// Frames of one length, but nothing presses.
-    #[error(
-        "frames of {0} bytes, but nothing presses the sensor: sniff again, and press it at several places"
-    )]
-    NoPress(usize),
-    /// Each frame comes in several packets.
-    #[error(
-        "{bytes} bytes recur, with a number from {first} to {last} that begins again: a frame comes in {packets} \
-         packets, so write its [sensor.frame.packets]"
-    )]
-    Packets {
-        /// The bytes of a packet.
-        bytes: usize,
-        /// The number of the first packet.
-        first: u8,
-        /// The number of the last packet.
-        last: u8,
-        /// The packets of a frame.
-        packets: usize,
-    },
+#[error("{words}")]
+pub struct Failure {
+    words: String,
+    /// Of several failures, the one with the highest rank says most.
+    pub(crate) rank: u8,
+}
+
+impl Failure {
+    /// The rank of a failure beside which no other is looked for.
+    pub(crate) const SURE: u8 = 4;
+
+    pub(crate) fn sure(words: impl Into<String>) -> Self {
+        Self {
+            words: words.into(),
+            rank: Self::SURE,
+        }
+    }
+
     /// The array is larger than any that the daemon reads.
-    #[error("found an array of about {rows}x{cols} taxels, expected at most 64x64", rows = .0.rows, cols = .0.cols)]
-    TooLarge(Array),
+    pub(crate) fn too_large(Array { rows, cols }: Array) -> Self {
+        let words = format!("found an array of about {rows}x{cols} taxels, expected at most 64x64");
+        Self { words, rank: 3 }
+    }
+
+    /// Frames of one length, but nothing presses.
+    pub(crate) fn no_press(frame_bytes: usize) -> Self {
+        let words = format!(
+            "frames of {frame_bytes} bytes, but nothing presses the sensor: sniff again, and press it at several \
+             places"
+        );
+        Self { words, rank: 2 }
+    }
+
+    /// Frames of one length without an array.
+    pub(crate) fn no_array(frame_bytes: usize) -> Self {
+        let words = format!(
+            "{frame_bytes} bytes recur, but they hold no array with a mark: press the sensor at several places \
+             meanwhile, try another --baud, and say --rows, --cols and --cell if you know them"
+        );
+        Self { words, rank: 1 }
+    }
+
     /// Nothing recurs.
-    #[error("nothing recurs in {0} bytes: try another --baud, or listen for longer")]
-    NotPeriodic(usize),
+    pub(crate) fn not_periodic(bytes: usize) -> Self {
+        let words =
+            format!("nothing recurs in {bytes} bytes: try another --baud, or listen for longer");
+        Self { words, rank: 0 }
+    }
 }
 
 /// The fewest taxels that show an array.
@@ -198,10 +147,9 @@ impl Found {
         };
         let best = Ranked {
             array,
-            words: "decimals".to_owned(),
             cell,
             picture: Vec::new(),
-            proposal: Some(proposal),
+            proposal,
             score: none.clone(),
             alone: none,
             cells: None,
@@ -237,41 +185,44 @@ impl Ranked {
         }
     }
 
-    fn doubt(&self, next: Option<&Self>, is_given: bool) -> Option<Doubt> {
-        let Some(proposal) = &self.proposal else {
-            let Array { rows, cols } = self.array;
-            return Some(Doubt::Unreadable(format!("{rows}x{cols} {}", self.words)));
-        };
-        if !proposal.explains_nearly_all() {
-            let Proposal {
-                frames,
-                frames_damaged: damaged,
-                share,
-                ..
-            } = *proposal;
-            return Some(Doubt::Unexplained {
-                frames,
-                damaged,
-                share: 100.0 * share,
-            });
+    fn doubt(&self, next: Option<&Self>, is_given: bool) -> Option<String> {
+        let Proposal {
+            frames,
+            frames_damaged,
+            share,
+            ..
+        } = self.proposal;
+        if !self.proposal.explains_nearly_all() {
+            return Some(format!(
+                "{frames} whole frames and {frames_damaged} damaged ones, with {:.0} % of the bytes: lengths vary, \
+                 as with escapes or packets of several kinds, or --baud is wrong",
+                100.0 * share
+            ));
         }
         if is_given {
             return None;
         }
+        let (taxels, options) = (self.array.taxels(), self.options());
         // A row of an array looks like an array of one row.
         let is_strip = self.array.rows == 1;
         if is_strip || next.is_some_and(|next| !self.score.is_surely_less(&next.score)) {
-            return Some(Doubt::Between(self.options()));
+            return Some(format!(
+                "choose with `{options}` or as the pictures say, or press with one finger at several places and at \
+                 the edges"
+            ));
         }
-        let taxels = self.array.taxels();
         if taxels < FEWEST {
-            return Some(Doubt::Few(taxels, self.options()));
+            return Some(format!(
+                "{taxels} numbers are too few to tell an array from others: say `{options}` if it is one"
+            ));
         }
-        let is_picture = self.score.is_surely_less(&self.alone);
-        let no_picture = || Doubt::NoPicture(self.array.taxels());
-        (!is_picture)
-            .then(no_picture)
-            .or_else(|| self.cells.clone())
+        if !self.score.is_surely_less(&self.alone) {
+            return Some(format!(
+                "{taxels} cells beside each other do not act as neighbours do: press with one finger at several \
+                 places, or this is no array"
+            ));
+        }
+        self.cells.clone()
     }
 }
 

@@ -176,7 +176,7 @@ impl Parts<'_> {
             What::From(checksum, begin) => Some((checksum, check.at.start, Some(begin))),
             // Of several numbers a taxel, the cells that are read are not all that it covers.
             What::Cells(checksum) if self.channels == 1 => Some((checksum, check.at.start, None)),
-            What::Cells(_) | What::Sum(_) => None,
+            What::Cells(_) | What::Sum => None,
         }
     }
 
@@ -342,7 +342,7 @@ impl Parts<'_> {
             ));
         }
         if let Some(check) = &self.place.check
-            && matches!(check.what, What::Sum(_))
+            && matches!(check.what, What::Sum)
         {
             let size = bytes(check.at.len());
             remarks.push(format!(

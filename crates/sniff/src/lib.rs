@@ -25,7 +25,7 @@ mod packed;
 use hardnessd_core::wire::{Cell, Layout, Preset, Settings};
 
 use coding::Coding;
-pub use found::{Doubt, Failure, Found, Known, Ranked, cell_name};
+pub use found::{Failure, Found, Known, Ranked, cell_name};
 pub use layout::Proposal;
 pub use scale::Scale;
 
@@ -72,20 +72,21 @@ impl Capture<'_> {
 pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
     let bytes = capture.bytes;
     if bytes.is_empty() {
-        return Err(Failure::Nothing);
+        return Err(Failure::sure(
+            "nothing arrives: check the wiring, or the sensor sends only on a request (`request` and `start` of \
+             [sensor.frame])",
+        ));
     }
     match coding::of(bytes) {
         Some(Coding::Packed(framing)) => return packed::find(framing, bytes, known),
-        Some(Coding::Unreadable(words)) => return Err(Failure::Packed(words)),
+        Some(Coding::Unreadable(words)) => return Err(Failure::sure(words)),
         Some(Coding::Doubled(words)) => {
             let found = in_periods(capture, known);
             return found
                 .ok()
                 .filter(|found| found.doubt.is_none())
-                .ok_or(Failure::Packed(words));
+                .ok_or(Failure::sure(words));
         }
-        Some(Coding::TooSlow) => return Err(Failure::TooSlow),
-        Some(Coding::TooFast) => return Err(Failure::TooFast),
         None => {}
     }
     if text::is_text(bytes) {
@@ -101,14 +102,13 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
 fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
     let bytes = capture.bytes;
     let mut open = None;
-    let mut failure = Failure::NotPeriodic(bytes.len());
+    let mut failure = Failure::not_periodic(bytes.len());
     for period in period::periods(bytes) {
         match search::in_frames(&period::Frames::new(bytes, &period), capture, known) {
             Ok(found) if found.doubt.is_none() => return Ok(found),
             Ok(found) => open = open.or(Some(found)),
-            // Several packets may seem to be one frame.
-            Err(packets @ Failure::Packets { .. }) => return Err(packets),
-            Err(other) if rank(&other) > rank(&failure) => failure = other,
+            Err(sure) if sure.rank == Failure::SURE => return Err(sure),
+            Err(other) if other.rank > failure.rank => failure = other,
             Err(_) => {}
         }
     }
@@ -124,14 +124,4 @@ fn glove(bytes: &[u8]) -> Option<Found> {
     let array = Layout::new(&settings).ok()?.array();
     let proposal = Proposal::decoded(settings, true, bytes)?;
     Some(Found::stated(array, Some(Cell::U8), proposal))
-}
-
-/// Of several failures, the one with the highest rank says most.
-fn rank(failure: &Failure) -> usize {
-    match failure {
-        Failure::TooLarge(_) => 3,
-        Failure::NoPress(_) => 2,
-        Failure::NoArray(_) => 1,
-        _ => 0,
-    }
 }

@@ -1,129 +1,56 @@
 //! The ways in which a board may write its taxels.
 //!
-//! In: bytes. Out: numbers. A type of cells is one entry of [`TYPES`].
+//! In: bytes. Out: numbers.
 
 use hardnessd_core::wire::Cell;
 
-/// How a number is written.
-#[derive(Debug)]
-pub(crate) struct Type {
-    /// What it is called in a message.
-    pub(crate) words: &'static str,
-    pub(crate) bytes: usize,
-    /// The number in as many bytes. What no sensor sends is not a number.
-    pub(crate) read: fn(&[u8]) -> f32,
-    pub(crate) is_float: bool,
-    /// Whether it differs from the entry before it only for numbers below 0.
-    pub(crate) is_signed: bool,
-    /// How many bits it takes to say that a board has it: the rarer, the more.
-    pub(crate) name_bits: f64,
-    /// The daemon's name.
-    pub(crate) cell: Cell,
-}
-
-const U8: Type = Type {
-    words: "bytes",
-    bytes: 1,
-    read: |b| b[0].into(),
-    is_float: false,
-    is_signed: false,
-    name_bits: 1.0,
-    cell: Cell::U8,
-};
-
-/// All types. One that is signed follows the one that is not.
-pub(crate) const TYPES: [Type; 10] = [
-    U8,
-    Type {
-        words: "signed bytes",
-        read: |b| (b[0] as i8).into(),
-        is_signed: true,
-        name_bits: 7.0,
-        cell: Cell::I8,
-        ..U8
-    },
-    Type {
-        words: "16-bit numbers, low byte first",
-        bytes: 2,
-        read: |b| u16::from_le_bytes([b[0], b[1]]).into(),
-        cell: Cell::U16le,
-        ..U8
-    },
-    Type {
-        words: "signed 16-bit numbers, low byte first",
-        bytes: 2,
-        read: |b| i16::from_le_bytes([b[0], b[1]]).into(),
-        is_signed: true,
-        name_bits: 7.0,
-        cell: Cell::I16le,
-        ..U8
-    },
-    Type {
-        words: "16-bit numbers, high byte first",
-        bytes: 2,
-        read: |b| u16::from_be_bytes([b[0], b[1]]).into(),
-        cell: Cell::U16be,
-        ..U8
-    },
-    Type {
-        words: "signed 16-bit numbers, high byte first",
-        bytes: 2,
-        read: |b| i16::from_be_bytes([b[0], b[1]]).into(),
-        is_signed: true,
-        name_bits: 7.0,
-        cell: Cell::I16be,
-        ..U8
-    },
-    Type {
-        words: "32-bit numbers, low byte first",
-        bytes: 4,
-        read: |b| whole(i32::from_le_bytes([b[0], b[1], b[2], b[3]])),
-        name_bits: 4.0,
-        cell: Cell::I32le,
-        ..U8
-    },
-    Type {
-        words: "32-bit numbers, high byte first",
-        bytes: 4,
-        read: |b| whole(i32::from_be_bytes([b[0], b[1], b[2], b[3]])),
-        name_bits: 4.0,
-        cell: Cell::I32be,
-        ..U8
-    },
-    Type {
-        words: "32-bit floats, low byte first",
-        bytes: 4,
-        read: |b| real(f32::from_le_bytes([b[0], b[1], b[2], b[3]])),
-        is_float: true,
-        name_bits: 4.0,
-        cell: Cell::F32le,
-        ..U8
-    },
-    Type {
-        words: "32-bit floats, high byte first",
-        bytes: 4,
-        read: |b| real(f32::from_be_bytes([b[0], b[1], b[2], b[3]])),
-        is_float: true,
-        name_bits: 4.0,
-        cell: Cell::F32be,
-        ..U8
-    },
+/// All types of cells. One that is signed follows the one that is not.
+pub(crate) const CELLS: [Cell; 10] = [
+    Cell::U8,
+    Cell::I8,
+    Cell::U16le,
+    Cell::I16le,
+    Cell::U16be,
+    Cell::I16be,
+    Cell::I32le,
+    Cell::I32be,
+    Cell::F32le,
+    Cell::F32be,
 ];
 
-/// Converters of taxels have at most 24 bits, and so many an f32 holds too.
-fn whole(number: i32) -> f32 {
-    if number.unsigned_abs() < 1 << 24 {
-        number as f32
-    } else {
-        f32::NAN
-    }
+/// The numbers in some bytes. What no sensor sends is not a number.
+pub(crate) fn numbers(cell: Cell, bytes: &[u8]) -> Vec<f32> {
+    let bytes = bytes.chunks_exact(cell.bytes());
+    bytes.map(|bytes| number(cell, bytes)).collect()
 }
 
-/// Newtons, volts, counts and their like are neither much smaller nor much larger.
-fn real(number: f32) -> f32 {
-    if number == 0.0 || (1e-9..1e9).contains(&number.abs()) {
-        number
-    } else {
-        f32::NAN
+/// The number in as many bytes as a cell has.
+pub(crate) fn number(cell: Cell, bytes: &[u8]) -> f32 {
+    let number = cell.read(bytes);
+    let is_sent = match cell {
+        // Converters of taxels have at most 24 bits, and so many an f32 holds too.
+        Cell::I32le | Cell::I32be => number.abs() < (1 << 24) as f32,
+        // Newtons, volts, counts and their like are neither much smaller nor much larger.
+        Cell::F32le | Cell::F32be => number == 0.0 || (1e-9..1e9).contains(&number.abs()),
+        _ => true,
+    };
+    if is_sent { number } else { f32::NAN }
+}
+
+pub(crate) fn is_float(cell: Cell) -> bool {
+    matches!(cell, Cell::F32le | Cell::F32be)
+}
+
+/// Whether it differs from the type before it only for numbers below 0.
+pub(crate) fn is_signed(cell: Cell) -> bool {
+    matches!(cell, Cell::I8 | Cell::I16le | Cell::I16be)
+}
+
+/// How many bits it takes to say that a board has it: the rarer, the more.
+pub(crate) fn name_bits(cell: Cell) -> f64 {
+    match cell {
+        Cell::U8 | Cell::U16le | Cell::U16be => 1.0,
+        Cell::I8 | Cell::I16le | Cell::I16be => 7.0,
+        Cell::I32le | Cell::I32be | Cell::F32le | Cell::F32be => 4.0,
     }
 }

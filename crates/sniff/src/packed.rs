@@ -26,7 +26,7 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
         *lengths.entry(frame.len()).or_default() += 1;
     }
     let usual = lengths.into_iter().max_by_key(|&(_, count)| count);
-    let (usual, _) = usual.ok_or(Failure::NotPeriodic(bytes.len()))?;
+    let (usual, _) = usual.ok_or(Failure::not_periodic(bytes.len()))?;
     let mut marked = Vec::new();
     let mut arrivals = Vec::new();
     for (index, frame) in frames
@@ -46,14 +46,12 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
         arrivals: &arrivals,
     };
     let Found { best, next, .. } = in_periods(&capture, known)?;
-    let packed = |ranked: Ranked| Ranked {
-        proposal: ranked
-            .proposal
-            .and_then(|proposal| without_mark(proposal, framing, bytes)),
-        ..ranked
+    let packed = |ranked: Ranked| {
+        let proposal = without_mark(ranked.proposal, framing, bytes)?;
+        Some(Ranked { proposal, ..ranked })
     };
-    let ranked = [Some(best), next].into_iter().flatten().map(packed);
-    Found::among(ranked.collect(), known.is_complete()).ok_or(Failure::NoArray(usual))
+    let ranked = [Some(best), next].into_iter().flatten().filter_map(packed);
+    Found::among(ranked.collect(), known.is_complete()).ok_or(Failure::no_array(usual))
 }
 
 /// The proposal for the packed bytes.

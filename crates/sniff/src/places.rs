@@ -3,7 +3,7 @@
 //! In: what each byte of a frame is. Out: [`Place`]s with the bits of what is beside the cells. Cells
 //! are anywhere in the period, and beside them is a mark.
 
-use crate::checks::{Check, What};
+use crate::checks::Check;
 use crate::columns::{Columns, Kind};
 use crate::model::{
     CONSTANT_BITS, EXPECTED_BITS, RESTLESS_TAXEL_BITS, SKIPPED_BITS, UNKNOWN_BITS,
@@ -112,7 +112,7 @@ impl Place {
     pub(crate) fn bits(&self, columns: &Columns, cell_bytes: usize) -> f64 {
         let field = self.length_field();
         let of = |(index, beside): (usize, &Beside)| {
-            if columns.is_high_byte(beside.at) || self.is_high_byte_of_sum(columns, beside.at) {
+            if columns.is_high_byte(beside.at) {
                 return EXPECTED_BITS;
             }
             match field {
@@ -122,11 +122,7 @@ impl Place {
             }
         };
         let constants: f64 = self.beside.iter().enumerate().map(of).sum();
-        let is_padding = |beside: &&Beside| {
-            beside.is_resting()
-                && !columns.is_high_byte(beside.at)
-                && !self.is_high_byte_of_sum(columns, beside.at)
-        };
+        let is_padding = |beside: &&Beside| beside.is_resting() && !columns.is_high_byte(beside.at);
         let (after, before) = self.skipped();
         let mut sides = [
             self.beside[..after].iter().rfind(is_padding),
@@ -164,29 +160,12 @@ impl Place {
         constants + in_cells + skipped + self.unknown().map(of).sum::<f64>()
     }
 
-    fn is_high_byte_of_sum(&self, columns: &Columns, at: usize) -> bool {
-        self.check.as_ref().is_some_and(|check| match check.what {
-            What::Sum(is_big_endian) => {
-                // What changes of it.
-                let changing = self.beside[check.at.clone()]
-                    .iter()
-                    .filter(|beside| beside.constant().is_none());
-                let first = changing.clone().next().map_or(0, |beside| beside.at);
-                columns.is_high_byte_of(at, first, changing.count(), Some(is_big_endian))
-            }
-            _ => false,
-        })
-    }
-
     /// How many constant bytes beside the cells look like cells at rest, and are nothing else.
     pub(crate) fn resting(&self, columns: &Columns) -> usize {
         let field = self.length_field().map_or(0..0, |end| end - 2..end);
         let beside = self.beside.iter().enumerate();
         let resting = beside.filter(|(index, beside)| {
-            beside.is_resting()
-                && !field.contains(index)
-                && !columns.is_high_byte(beside.at)
-                && !self.is_high_byte_of_sum(columns, beside.at)
+            beside.is_resting() && !field.contains(index) && !columns.is_high_byte(beside.at)
         });
         resting.count()
     }

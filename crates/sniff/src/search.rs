@@ -4,16 +4,17 @@
 //! none.
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
+use hardnessd_core::wire::Cell;
 
 use crate::Capture;
 use crate::checks::{self, Check};
 use crate::columns::{Columns, Kind};
-use crate::found::{Doubt, Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
+use crate::found::{Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
 use crate::layout::{Parts, Proposal};
 use crate::model::{
     self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, Score, UNUSED_DIGIT_BITS,
 };
-use crate::numbers::{TYPES, Type};
+use crate::numbers::{self, CELLS, is_float, is_signed};
 use crate::period::Frames;
 use crate::pictures::{Pictures, Presses, middle, some};
 use crate::places::{Place, places};
@@ -31,8 +32,6 @@ const COARSE_BYTES: usize = 32_000;
 /// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
 const MANY: usize = 10;
 const LITTLE: usize = 4;
-/// The fewest bytes that show that every second one changes.
-const FEWEST_CHANGING: usize = 4;
 /// The most bytes of a mark that look like cells at rest.
 const MOST_RESTING: usize = 4;
 /// As many arrays are decoded: the mark of a known board counts only then.
@@ -55,37 +54,19 @@ const MOST_MARKS: usize = 8;
 const COUNTING_SHARE: f64 = 0.95;
 
 /// How taxels are written: numbers of one type, several for each taxel.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Format {
-    of: &'static Type,
+    cell: Cell,
     channels: usize,
 }
 
 impl Format {
     fn bytes(self) -> usize {
-        self.of.bytes * self.channels
-    }
-
-    fn numbers(self, bytes: &[u8]) -> Vec<f32> {
-        bytes
-            .chunks_exact(self.of.bytes)
-            .map(self.of.read)
-            .collect()
-    }
-
-    fn is(self, other: Self) -> bool {
-        std::ptr::eq(self.of, other.of) && self.channels == other.channels
+        self.cell.bytes() * self.channels
     }
 
     fn name_bits(self) -> f64 {
-        self.of.name_bits + CHANNEL_BITS * (self.channels - 1) as f64
-    }
-
-    fn words(self) -> String {
-        match self.channels {
-            1 => self.of.words.to_owned(),
-            channels => format!("taxels of {channels} numbers each, {}", self.of.words),
-        }
+        numbers::name_bits(self.cell) + CHANNEL_BITS * (self.channels - 1) as f64
     }
 }
 
@@ -116,7 +97,7 @@ pub(crate) fn in_frames(
     let period = frames.period();
     // At a wrong distance, hardly a frame begins where the one before it ended.
     if frames.len() < LEAST_FRAMES || 2 * frames.pairs().count() < frames.len() {
-        return Err(Failure::NotPeriodic(capture.bytes.len()));
+        return Err(Failure::not_periodic(capture.bytes.len()));
     }
     let begin = frames.beginning(&capture.pauses());
     let frames = &frames.inner();
@@ -125,7 +106,7 @@ pub(crate) fn in_frames(
     let columns = &columns;
     let frames = &frames.retained(|frame| columns.is_whole(frame));
     if !columns.kinds.contains(&Kind::Active) {
-        return Err(Failure::NoPress(period));
+        return Err(Failure::no_press(period));
     }
     if let Some(packets) = packets(frames, columns) {
         return Err(packets);
@@ -133,17 +114,13 @@ pub(crate) fn in_frames(
     let most = (PLACE_BYTES / period).clamp(FEWEST_PLACES, MOST_PLACES);
     let places = places(columns, UNCHECKED * most);
     if places.is_empty() {
-        return Err(Failure::NoArray(period));
+        return Err(Failure::no_array(period));
     }
     let presses = Presses::of(&columns.activity(frames))
         .or_else(|| numbers_that_press(frames))
-        .ok_or(Failure::NoPress(period))?;
-    let bytes = Format {
-        of: &TYPES[0],
-        channels: 1,
-    };
-    let pictures = Pictures::of(&presses, |index| bytes.numbers(frames.get(index)))
-        .expect("bytes are numbers");
+        .ok_or(Failure::no_press(period))?;
+    let pictures = |index| numbers::numbers(Cell::U8, frames.get(index));
+    let pictures = Pictures::of(&presses, pictures).expect("bytes are numbers");
     let alone = model::unknown(&pictures);
     let search = Search {
         frames,
@@ -169,11 +146,8 @@ pub(crate) fn in_frames(
 impl Search<'_> {
     fn pictures(&self, presses: &Presses, place: &Place, format: Format) -> Option<Pictures> {
         let numbers = |index: usize| {
-            format.numbers(self.frames.from(
-                index,
-                place.start,
-                place.bytes / format.bytes() * format.bytes(),
-            ))
+            let bytes = place.bytes / format.bytes() * format.bytes();
+            numbers::numbers(format.cell, self.frames.from(index, place.start, bytes))
         };
         Pictures::of(presses, numbers)
     }
@@ -189,7 +163,7 @@ impl Search<'_> {
     ) -> Score {
         let unknown: Vec<usize> = place.unknown().map(|beside| beside.at).collect();
         let beside = |alone: &Vec<f64>| unknown.iter().map(|&at| alone[at]).sum::<f64>();
-        let unused = if format.of.is_float {
+        let unused = if is_float(format.cell) {
             0
         } else {
             pictures.step_exponent
@@ -200,7 +174,7 @@ impl Search<'_> {
                 .zip(&self.alone)
                 .map(|(bits, alone)| bits + beside(alone))
                 .collect(),
-            once: place.bits(self.columns, format.of.bytes)
+            once: place.bits(self.columns, format.cell.bytes())
                 + name_bits(array)
                 + format.name_bits()
                 + UNUSED_DIGIT_BITS * f64::from(unused),
@@ -217,21 +191,19 @@ impl Search<'_> {
             ..place.clone()
         };
         let mut found = Vec::new();
-        let types = TYPES
-            .iter()
-            .filter(|of| known.cell.is_none_or(|cell| cell == of.cell));
+        let is_allowed = |cell: &Cell| known.cell.is_none_or(|known| known == *cell);
         let most = if known.cell.is_none() {
             MOST_CHANNELS
         } else {
             1
         };
-        for of in types {
-            let Some(pictures) = self.pictures(&self.coarse, place, Format { of, channels: 1 })
-            else {
+        for cell in CELLS.into_iter().filter(is_allowed) {
+            let single = Format { cell, channels: 1 };
+            let Some(pictures) = self.pictures(&self.coarse, place, single) else {
                 continue;
             };
             let later = later(&pictures).iter().sum::<f64>();
-            for format in (1..=most).map(|channels| Format { of, channels }) {
+            for format in (1..=most).map(|channels| Format { cell, channels }) {
                 let cells = place.bytes / format.bytes();
                 // Each of several numbers of a taxel makes a picture.
                 let is_picture = |pictures: Pictures| {
@@ -254,28 +226,14 @@ impl Search<'_> {
         found.into_iter().map(|(_, format)| format).collect()
     }
 
-    /// Whether hardly any second byte of the cells ever changes, as high bytes do.
-    fn is_padded(&self, place: &Place) -> bool {
-        let period = self.frames.period();
-        let changing = |from: usize| {
-            let places = (from..place.bytes)
-                .step_by(2)
-                .map(|at| (place.start + at) % period);
-            places
-                .filter(|&at| self.columns.kinds[at].constant().is_none())
-                .count()
-        };
-        let (first, second) = (changing(0), changing(1));
-        first.max(second) >= FEWEST_CHANGING && first.min(second) * 10 < first.max(second)
-    }
-
     /// Whether numbers are below 0, as those of a signed format are: many, and by little. Large numbers
     /// without a sign are few, and pass through the least ones.
     fn has_negative(&self, place: &Place, format: Format) -> bool {
-        let quarter = 2.0_f32.powi(8 * format.of.bytes as i32 - 2);
+        let quarter = 2.0_f32.powi(8 * format.cell.bytes() as i32 - 2);
         let (mut all, mut little, mut much) = (0, 0, 0);
         for index in self.presses.frames() {
-            for number in format.numbers(self.frames.from(index, place.start, place.bytes)) {
+            let bytes = self.frames.from(index, place.start, place.bytes);
+            for number in numbers::numbers(format.cell, bytes) {
                 all += usize::from(number != 0.0);
                 little += usize::from((-quarter..0.0).contains(&number));
                 much += usize::from(number < -quarter);
@@ -294,16 +252,13 @@ impl Search<'_> {
                 formats[place.start % 4].get_or_insert_with(|| self.formats(&place, known));
             for &mut format in formats {
                 if !place.bytes.is_multiple_of(format.bytes())
-                    || format.of.is_signed && !self.has_negative(&place, format)
+                    || is_signed(format.cell) && !self.has_negative(&place, format)
                 {
-                    continue;
-                }
-                if format.of.bytes == 1 && self.is_padded(&place) {
                     continue;
                 }
                 let count = place.bytes / format.bytes();
                 let place = self.checked(place.clone(), |spans, kinds| {
-                    checks::short(spans, kinds, format.of)
+                    checks::short(spans, kinds, format.cell)
                 });
                 let Some(pictures) = self.pictures(&self.coarse, &place, format) else {
                     continue;
@@ -388,7 +343,7 @@ impl Search<'_> {
             columns: self.columns,
             place,
             array,
-            cell: format.of.cell,
+            cell: format.cell,
             channels: format.channels,
             channel,
             begin,
@@ -404,16 +359,15 @@ impl Search<'_> {
         known: Known,
     ) -> Result<Found, Failure> {
         let mut ranked: Vec<Ranked> = Vec::new();
+        let mut tried: Vec<(Array, Format)> = Vec::new();
         for candidate in candidates {
             let Candidate { array, format, .. } = *candidate;
-            let is_known =
-                |ranked: &Ranked| ranked.array == array && ranked.words == format.words();
-            if ranked.len() == RANKED || ranked.iter().any(is_known) {
+            if ranked.len() == RANKED || tried.contains(&(array, format)) {
                 continue;
             }
             if is_too_large(array) {
                 if ranked.is_empty() {
-                    return Err(Failure::TooLarge(array));
+                    return Err(Failure::too_large(array));
                 }
                 continue;
             }
@@ -440,25 +394,25 @@ impl Search<'_> {
             }
             let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
             let alone = self.score(&candidate.place, format, array, &pictures, &alone);
+            tried.push((array, format));
             ranked.push(Ranked {
                 array,
-                words: format.words(),
                 cell: Some(parts.cell),
                 picture: strongest.strongest().to_vec(),
-                proposal: Some(proposal),
+                proposal,
                 score,
                 alone,
                 cells,
             });
         }
-        Found::among(ranked, known.is_complete()).ok_or(Failure::NoArray(self.frames.period()))
+        Found::among(ranked, known.is_complete()).ok_or(Failure::no_array(self.frames.period()))
     }
 
     /// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
     /// cells.
-    fn other_cells(&self, best: &Candidate, candidates: &[Candidate]) -> Option<Doubt> {
+    fn other_cells(&self, best: &Candidate, candidates: &[Candidate]) -> Option<String> {
         let is_other = |other: &&Candidate| {
-            other.format.is(best.format)
+            other.format == best.format
                 && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
                 && !best.score.is_surely_before(&other.score)
         };
@@ -467,22 +421,25 @@ impl Search<'_> {
             && let Some(((before, after), (other_before, other_after))) =
                 around(best).zip(around(other))
         {
-            return Some(Doubt::Cells(before, after, other_before, other_after));
+            return Some(format!(
+                "which bytes are cells: {before} bytes are between the mark and them and {after} behind them, or \
+                 {other_before} and {other_after}; press the first taxels and the last"
+            ));
         }
         let resting = best.place.resting(self.columns);
-        (resting > MOST_RESTING).then_some(Doubt::Resting(resting))
+        (resting > MOST_RESTING).then(|| {
+            format!("{resting} bytes beside the cells look like cells at rest: press the edges too")
+        })
     }
 }
 
 /// The presses by the numbers of frames, where bytes alone show none: the low bytes of floats and of signed
 /// numbers change as much at rest. Of all types of cells, the one that shows the presses best.
 fn numbers_that_press(frames: &Frames) -> Option<Presses> {
-    let types = TYPES.iter().filter(|of| of.bytes > 1);
-    let ways = types.flat_map(|of| (0..of.bytes).map(move |begin| (of, begin)));
-    let found = ways.filter_map(|(of, begin)| {
-        let numbers = |frame: &[u8]| -> Vec<f32> {
-            frame[begin..].chunks_exact(of.bytes).map(of.read).collect()
-        };
+    let cells = CELLS.into_iter().filter(|cell| cell.bytes() > 1);
+    let ways = cells.flat_map(|cell| (0..cell.bytes()).map(move |begin| (cell, begin)));
+    let found = ways.filter_map(|(cell, begin)| {
+        let numbers = |frame: &[u8]| numbers::numbers(cell, &frame[begin..]);
         let frames: Vec<Vec<f32>> = frames.iter().map(numbers).collect();
         let activity = activity(&frames)?;
         let presses = Presses::of(&activity)?;
@@ -607,11 +564,11 @@ fn packets(frames: &Frames, columns: &Columns) -> Option<Failure> {
         };
         // A counter may begin again too, but then the frames before and after are alike.
         (counting.count() as f64 >= COUNTING_SHARE * pairs as f64 && change(packets) < change(1))
-            .then_some(Failure::Packets {
-                bytes,
-                first,
-                last,
-                packets,
+            .then(|| {
+                Failure::sure(format!(
+                    "{bytes} bytes recur, with a number from {first} to {last} that begins again: a frame comes in \
+                     {packets} packets, so write its [sensor.frame.packets]"
+                ))
             })
     })
 }

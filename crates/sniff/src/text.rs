@@ -62,7 +62,7 @@ fn numbers_of(line: &[u8]) -> Vec<f32> {
 
 /// The array of a text.
 pub(crate) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
-    let no_array = |words: &str| Err(Failure::Text(words.to_owned()));
+    let no_array = |words: &str| Err(Failure::sure(format!("text, but no array: {words}")));
     let lines: Vec<&[u8]> = bytes.split(|&byte| byte == b'\n').collect();
     // Lines without a digit may end frames.
     let blocks = lines
@@ -88,9 +88,9 @@ pub(crate) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
         return in_rows(Array { rows, cols: count }, bytes, known);
     }
     if let Some(rows) = rows_of_a_frame(&frames) {
-        return Err(Failure::Text(format!(
+        return no_array(&format!(
             "a frame seems to be {rows} lines of {count} numbers; let the sensor print an empty line after each frame"
-        )));
+        ));
     }
     // Numbers that count are no cells.
     let leading = (0..count).take_while(|&at| is_growing(&frames, at)).count();
@@ -103,10 +103,8 @@ pub(crate) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
         .map(|frame| frame[leading..].to_vec())
         .collect();
     let mut found = in_order(&frames, cells, bytes, known)?;
-    if leading > 0
-        && let Some(proposal) = &mut found.best.proposal
-    {
-        proposal.remarks.push(format!(
+    if leading > 0 {
+        found.best.proposal.remarks.push(format!(
             "the first {leading} numbers of each line grow steadily: a counter or a clock; they are skipped"
         ));
     }
@@ -124,7 +122,7 @@ fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize
 /// The text says the array itself.
 fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
     if is_too_large(array) {
-        return Err(Failure::TooLarge(array));
+        return Err(Failure::too_large(array));
     }
     let is_allowed = known
         .arrays(array.taxels(), MOST_SIDE)
@@ -132,7 +130,8 @@ fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
     let proposal = is_allowed
         .then(|| Proposal::decoded(settings(array), true, bytes))
         .flatten();
-    let no_array = || Failure::Text("its blocks of lines are not frames of one array".to_owned());
+    let no_array =
+        || Failure::sure("text, but no array: its blocks of lines are not frames of one array");
     Ok(Found::stated(array, None, proposal.ok_or_else(no_array)?))
 }
 
@@ -195,7 +194,7 @@ fn in_order(
     let most = changes.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
     let activity = changes.iter().map(|change| (change / most * 1e6) as u32);
     let activity: Vec<u32> = activity.collect();
-    let presses = Presses::of(&activity).ok_or(Failure::NoPress(bytes.len() / frames.len()))?;
+    let presses = Presses::of(&activity).ok_or(Failure::no_press(bytes.len() / frames.len()))?;
     let pictures =
         Pictures::of(&presses, |index| frames[index].clone()).expect("words were numbers");
     let score = |array: Array, presses| Score {
@@ -211,10 +210,9 @@ fn in_order(
     let ranked = readable.filter_map(|&array| {
         Some(Ranked {
             array,
-            words: "decimals".to_owned(),
             cell: None,
             picture: pictures.strongest().to_vec(),
-            proposal: Some(Proposal::decoded(settings(array), true, bytes)?),
+            proposal: Proposal::decoded(settings(array), true, bytes)?,
             score: score(array, model::rows(&pictures, array.cols, 1)),
             alone: score(array, alone.clone()),
             cells: None,
@@ -223,8 +221,10 @@ fn in_order(
     let is_given = known.rows.is_some() && known.cols.is_some();
     Found::among(ranked.collect(), is_given).ok_or_else(|| {
         match arrays.into_iter().find(|&array| is_too_large(array)) {
-            Some(array) => Failure::TooLarge(array),
-            None => Failure::Text(format!("{cells} numbers on each line make no array")),
+            Some(array) => Failure::too_large(array),
+            None => Failure::sure(format!(
+                "text, but no array: {cells} numbers on each line make no array"
+            )),
         }
     })
 }

@@ -33,7 +33,14 @@ pub(super) async fn answer(
 ) -> Result<Vec<Arc<Line>>, Closed> {
     let mut lines = Vec::new();
     let done = match request {
-        Request::Get(query) => get(service, query, &mut lines).await?,
+        Request::Get(query) => {
+            let now = service.hub.snapshot().await?;
+            match query {
+                Query::Status => lines.extend(now.statuses()),
+                Query::Last => lines.extend(now.sensors.into_iter().filter_map(|one| one.last)),
+            }
+            Ok(Done::default())
+        }
         request => change(service, request).await,
     };
     lines.push(end(done, id));
@@ -50,25 +57,6 @@ pub(super) fn end(done: Result<Done, Refused>, id: Option<Value>) -> Arc<Line> {
         },
         Err(message) => Reply::Error { message, id },
     })
-}
-
-async fn get(
-    service: &Service,
-    query: Query,
-    lines: &mut Vec<Arc<Line>>,
-) -> Result<Result<Done, Refused>, Closed> {
-    match query {
-        Query::Status => lines.extend(service.hub.snapshot().await?.statuses()),
-        Query::Last => {
-            let sensors = service.hub.snapshot().await?.sensors;
-            lines.extend(sensors.into_iter().filter_map(|one| one.last));
-        }
-        Query::History(sensor) => match service.hub.history(sensor.clone()).await? {
-            Some(history) => lines.push(history.line(&sensor)),
-            None => return Ok(find(&service.sensors, "history", &sensor).map(|_| Done::default())),
-        },
-    }
-    Ok(Ok(Done::default()))
 }
 
 /// Carries out a request that changes something. Of all sockets, only the control socket may.
@@ -117,7 +105,7 @@ pub(in crate::daemon) async fn move_arm(
     points: &[ReportedPoint],
 ) -> Result<(), Refused> {
     // Read the clocks now, because the sensor's task may have other work to do first.
-    let placed = motion::placed(points, crate::daemon::now()).map_err(|error| error.to_string())?;
+    let placed = motion::placed(points, crate::daemon::now())?;
     let command = |reply| Command::Motion(placed, reply);
     let taken = ask(sensors, "motion.sensor", sensor, command).await?;
     taken.map_err(|error| format!("motion.at[{}]: {error}", error.index))
@@ -141,9 +129,8 @@ async fn ask<T>(
         .map_err(|_| format!("{key}: the daemon is stopping, or has no time for it"))
 }
 
-fn find(sensors: &Sensors, key: &str, name: &str) -> Result<SensorHandle, Refused> {
-    let sensors = sensors.current();
-    let found = sensors.iter().find(|sensor| sensor.name == name).cloned();
+fn find<'a>(sensors: &'a Sensors, key: &str, name: &str) -> Result<&'a SensorHandle, Refused> {
+    let found = sensors.iter().find(|sensor| sensor.name == name);
     found.ok_or_else(|| {
         let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
         let (found, names) = (request::short(name), names.join(", "));

@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::unix;
@@ -13,10 +15,10 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// A service for a live sensor called "a", and the commands to the sensor.
 fn service(access: Access) -> (Service, mpsc::Receiver<Command>) {
     let hub = Hub::new(hello());
-    hub.report(state("a"));
+    hub.log().report(state("a"));
     let (commands, inbox) = mpsc::channel(1);
     let name = "a".to_owned();
-    let (_, sensors) = Sensors::new(vec![SensorHandle { name, commands }]);
+    let sensors = [SensorHandle { name, commands }].into();
     let service = Service {
         access,
         max_clients: 1,

@@ -1,14 +1,13 @@
 //! Checks that every value can be used, and that all of them can be used together.
 
 use std::collections::{HashMap, HashSet};
-use std::fmt::Display;
 
 use super::error::Problem;
 use super::{Config, Publish, Ros2, Unix, Zenoh};
 use crate::daemon::baud::Load;
 use hardnessd_core::port::Port;
 use hardnessd_core::sensor::{self, Sensor};
-use hardnessd_core::{verdict, wording};
+use hardnessd_core::{range, verdict, wording};
 
 /// Checks a configuration whose paths are already resolved, and returns its sensors.
 pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
@@ -31,23 +30,15 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
     Ok(sensors)
 }
 
-/// The problem of a value.
-fn value(key: &str, found: impl Display, expected: &str) -> Problem {
-    Problem::found(key, found, expected)
-}
-
 /// Checks that this program was built with the features that the tables need.
 fn check_built(publish: &Publish) -> Result<(), Problem> {
-    for (feature, built, given) in [
-        (
-            "foxglove",
-            cfg!(feature = "foxglove"),
-            publish.foxglove.is_some(),
-        ),
-        ("zenoh", cfg!(feature = "zenoh"), publish.zenoh.is_some()),
-        ("ros2", cfg!(feature = "ros2"), publish.ros2.is_some()),
+    let (foxglove, zenoh, ros2) = (&publish.foxglove, &publish.zenoh, &publish.ros2);
+    for (feature, is_built, is_given) in [
+        ("foxglove", cfg!(feature = "foxglove"), foxglove.is_some()),
+        ("zenoh", cfg!(feature = "zenoh"), zenoh.is_some()),
+        ("ros2", cfg!(feature = "ros2"), ros2.is_some()),
     ] {
-        if given && !built {
+        if is_given && !is_built {
             let problem = format_args!(
                 "this hardnessd was built without {feature}: build it with --features {feature}, or \
                  remove the table"
@@ -62,13 +53,11 @@ fn check_robot(robot: &str) -> Result<(), Problem> {
     let chars = robot.chars().count();
     if chars > MOST_ROBOT_CHARS {
         let found = format!("{chars} characters");
-        return Err(value("robot", found, "a name of at most 255"));
+        return Err(Problem::found("robot", found, "a name of at most 255"));
     }
-    if robot.is_empty() || !wording::is_plain(robot) {
-        let expected = "a name without control or bidirectional characters";
-        return Err(value("robot", format!("{robot:?}"), expected));
-    }
-    Ok(())
+    let expected = "a name without control or bidirectional characters";
+    let fits = !robot.is_empty() && wording::is_plain(robot);
+    Ok(range::check("robot", robot, fits, expected)?)
 }
 
 /// Twice as many sensors as a core can read at 100 frames/s.
@@ -77,12 +66,12 @@ const MOST_SENSORS: usize = 1000;
 fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     if config.sensors.is_empty() {
         let problem = "no sensor: add a [[sensor]] with a port";
-        return Err(Problem::Syntax(problem.to_owned()));
+        return Err(Problem::of_file(problem));
     }
     let count = config.sensors.len();
     if count > MOST_SENSORS {
         let found = format!("{count} tables");
-        return Err(value("sensor", found, "at most 1000"));
+        return Err(Problem::found("sensor", found, "at most 1000"));
     }
     let mut sensors = Vec::with_capacity(count);
     let mut taken = Taken::default();
@@ -120,6 +109,14 @@ fn check_unix(unix: &Unix) -> Result<(), Problem> {
 }
 
 fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
+    for (key, endpoints) in [("listen", &zenoh.listen), ("connect", &zenoh.connect)] {
+        for endpoint in endpoints {
+            let key = format!("publish.zenoh.{key}");
+            let expected = "an endpoint such as \"tcp/127.0.0.1:7447\"";
+            let fits = Zenoh::address(endpoint).is_some();
+            range::check(&key, endpoint, fits, expected)?;
+        }
+    }
     // These characters have a meaning in zenoh's key expressions. The log shows a site.
     let is_key = |key: &str| {
         !key.split('/').any(str::is_empty)
@@ -127,62 +124,47 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
             && wording::is_plain(key)
     };
     let site = zenoh.site(robot);
-    if !is_key(site) {
-        return Err(value(
-            "publish.zenoh.site",
-            format!("{site:?} (by default the robot's name)"),
-            "parts of a key, without * $ ? #, control or bidirectional characters",
-        ));
-    }
-    if let Some(motion) = zenoh.motion.as_ref().filter(|motion| !is_key(motion)) {
-        return Err(value(
-            "publish.zenoh.motion",
-            format!("{motion:?}"),
-            "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters",
-        ));
-    }
-    Ok(())
+    let expected = "parts of a key (by default the robot's name), without * $ ? #, control or \
+                    bidirectional characters";
+    range::check("publish.zenoh.site", site, is_key(site), expected)?;
+    let motion = zenoh.motion.as_deref().unwrap_or("motion");
+    let expected =
+        "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters";
+    Ok(range::check(
+        "publish.zenoh.motion",
+        motion,
+        is_key(motion),
+        expected,
+    )?)
 }
 
 fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> {
-    let found = match ros2.chosen_domain_id() {
-        Ok(id) if id > LAST_DOMAIN_ID => Some(format!("{id} (by default $ROS_DOMAIN_ID)")),
-        Ok(_) => None,
-        Err(found) => Some(found.to_string()),
-    };
-    if let Some(found) = found {
-        return Err(value("publish.ros2.domain_id", found, "0 to 232"));
+    let key = "publish.ros2.domain_id";
+    let expected = "0 to 232 (by default $ROS_DOMAIN_ID)";
+    match ros2.domain_id() {
+        Ok(id) => range::check(key, id, id <= LAST_DOMAIN_ID, expected)?,
+        Err(found) => return Err(Problem::found(key, found, expected)),
     }
     let token = |token: &str| {
         token.starts_with(|first: char| first.is_ascii_alphabetic())
             && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
             && !token.contains("__")
     };
+    let is_topic = |name: &str| {
+        let tokens = name.strip_prefix('/');
+        tokens.is_some_and(|tokens| tokens.split('/').all(token))
+    };
     let namespace = &ros2.namespace;
-    let tokens = namespace.strip_prefix('/');
-    if !tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token)) {
-        return Err(value(
-            "publish.ros2.namespace",
-            format!("{namespace:?}"),
-            "a namespace of ROS such as \"/arm_7\"",
-        ));
-    }
+    let fits = namespace == "/" || is_topic(namespace);
+    let expected = "a namespace of ROS such as \"/arm_7\"";
+    range::check("publish.ros2.namespace", namespace, fits, expected)?;
     for (sensor, topic) in &ros2.motion {
-        if !sensors.iter().any(|known| known.name == *sensor) {
-            return Err(value(
-                "publish.ros2.motion",
-                format!("{sensor:?}"),
-                "the name of a [[sensor]] before each topic",
-            ));
-        }
-        let tokens = topic.strip_prefix('/');
-        if !tokens.is_some_and(|tokens| tokens.split('/').all(token)) {
-            return Err(value(
-                &format!("publish.ros2.motion.{sensor}"),
-                format!("{topic:?}"),
-                "a topic of ROS such as \"/arm_7/approach\"",
-            ));
-        }
+        let is_known = sensors.iter().any(|known| known.name == *sensor);
+        let expected = "the name of a [[sensor]] before each topic";
+        range::check("publish.ros2.motion", sensor, is_known, expected)?;
+        let key = format!("publish.ros2.motion.{sensor}");
+        let expected = "a topic of ROS such as \"/arm_7/approach\"";
+        range::check(&key, topic, is_topic(topic), expected)?;
     }
     for (index, sensor) in sensors.iter().enumerate() {
         if !token(&sensor.name) {
@@ -240,11 +222,9 @@ impl<'a> Taken<'a> {
 }
 
 fn check_model(model: &verdict::Settings) -> Result<(), Problem> {
-    match &model.sha256 {
-        Some(hash) if hash.len() != 64 || !hash.chars().all(|c| c.is_ascii_hexdigit()) => {
-            let found = format!("{hash:?}");
-            Err(value("model.sha256", found, "64 hex digits"))
-        }
-        _ => Ok(()),
-    }
+    let Some(hash) = &model.sha256 else {
+        return Ok(());
+    };
+    let fits = hash.len() == 64 && hash.chars().all(|c| c.is_ascii_hexdigit());
+    Ok(range::check("model.sha256", hash, fits, "64 hex digits")?)
 }

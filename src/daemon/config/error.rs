@@ -22,57 +22,65 @@ pub struct Error {
     path: PathBuf,
     /// The line of the value, if it is written.
     line: Option<usize>,
-    #[source]
-    problem: Problem,
+    problem: Box<Problem>,
 }
 
 impl Error {
     /// Makes the error of a problem in the configuration at `path`, which has this text.
     pub(super) fn at(path: &Path, text: &Text) -> impl FnOnce(Problem) -> Self {
-        move |problem| Self {
-            path: path.to_owned(),
-            line: match &problem {
-                Problem::Value { sensor, value } => {
-                    let index = sensor.as_ref().map_or(0, |sensor| sensor.index);
-                    text.line(index, &value.key)
-                }
-                _ => None,
-            },
-            problem,
+        move |problem| {
+            let index = problem.sensor.as_ref().map_or(0, |(index, _)| *index);
+            let key = problem.key.as_deref();
+            Self {
+                path: path.to_owned(),
+                line: key.and_then(|key| text.line(index, key)),
+                problem: problem.into(),
+            }
         }
     }
 }
 
 /// The problem of a configuration, which its caller names.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum Problem {
-    /// The configuration file cannot be read.
-    #[error("cannot read: {0}")]
-    Unreadable(#[source] std::io::Error),
-    /// The file is not TOML, or has an unknown key or a value of the wrong type. The text is the
-    /// place in the file, and the parser's message.
-    #[error("{0}")]
-    Syntax(String),
-    /// A value cannot be used.
-    #[error("{}{}: {}", value.key, of(sensor.as_ref()), value.problem)]
-    Value {
-        /// The sensor, if the key is one of a `[[sensor]]`.
-        sensor: Option<Named>,
-        /// The key, what was found and what was expected.
-        value: OutOfRange,
-    },
+#[error("{}{}{words}", key.as_deref().unwrap_or_default(), after_key(key.as_ref(), sensor.as_ref()))]
+pub(super) struct Problem {
+    /// The key, if it is the problem of a value.
+    key: Option<String>,
+    /// The index and the name of the sensor, if the key is one of a `[[sensor]]`.
+    sensor: Option<(usize, String)>,
+    /// What was found and what was expected, or the problem and its remedy.
+    words: String,
+    code: u8,
 }
 
 impl From<OutOfRange> for Problem {
     fn from(value: OutOfRange) -> Self {
-        Self::Value {
-            sensor: None,
-            value,
+        Self {
+            key: Some(value.key),
+            ..Self::of_file(value.problem)
         }
     }
 }
 
 impl Problem {
+    /// The file is not TOML, or has an unknown key or a value of the wrong type.
+    pub(super) fn of_file(words: impl Into<String>) -> Self {
+        Self {
+            key: None,
+            sensor: None,
+            words: words.into(),
+            code: CONFIG,
+        }
+    }
+
+    /// The configuration file cannot be read.
+    pub(super) fn unreadable(error: &std::io::Error) -> Self {
+        Self {
+            code: NO_INPUT,
+            ..Self::of_file(format!("cannot read: {error}"))
+        }
+    }
+
     /// The problem of a value. `found` is shown as it is.
     pub(super) fn found(key: &str, found: impl fmt::Display, expected: impl fmt::Display) -> Self {
         OutOfRange::new(key, format_args!("{found}"), expected).into()
@@ -84,43 +92,30 @@ impl Problem {
     }
 
     /// The same problem in the table of a sensor, if its key is there.
-    pub(super) fn of(self, (index, sensor): (usize, &sensor::Settings)) -> Self {
-        match self {
-            Self::Value { value, .. } if value.key.starts_with("sensor.") => Self::Value {
-                sensor: Some(Named {
-                    index,
-                    name: sensor.name.clone(),
-                }),
-                value,
-            },
-            other => other,
+    pub(super) fn of(mut self, (index, sensor): (usize, &sensor::Settings)) -> Self {
+        if self
+            .key
+            .as_ref()
+            .is_some_and(|key| key.starts_with("sensor."))
+        {
+            self.sensor = Some((index, sensor.name.clone()));
         }
+        self
     }
 }
 
-/// A sensor of the configuration.
-#[derive(Debug)]
-pub(super) struct Named {
-    index: usize,
-    name: String,
-}
-
 /// The name of a sensor after a key. A name that cannot be one is not repeated.
-fn of(sensor: Option<&Named>) -> String {
-    match sensor {
-        Some(Named { name, .. }) if name.len() <= sensor::MOST_NAME_CHARS => {
-            format!(" of {name:?}")
-        }
-        _ => String::new(),
+fn after_key(key: Option<&String>, sensor: Option<&(usize, String)>) -> String {
+    match (key, sensor) {
+        (None, _) => String::new(),
+        (_, Some((_, name))) if name.len() <= sensor::MOST_NAME_CHARS => format!(" of {name:?}: "),
+        _ => ": ".to_owned(),
     }
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
-        match self.problem {
-            Problem::Unreadable(_) => NO_INPUT,
-            _ => CONFIG,
-        }
+        self.problem.code
     }
 }
 

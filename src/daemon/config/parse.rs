@@ -22,16 +22,16 @@ pub(super) fn load(path: &Path) -> Result<(Config, Text), Error> {
 }
 
 fn text(path: &Path) -> Result<Text, Problem> {
-    let bytes = read(path, MAX_BYTES).map_err(Problem::Unreadable)?;
+    let bytes = read(path, MAX_BYTES).map_err(|error| Problem::unreadable(&error))?;
     if bytes.len() > MAX_BYTES {
         let problem = "no configuration is so long: name another file";
-        return Err(Problem::Syntax(format!(
+        return Err(Problem::of_file(format!(
             "more than {MAX_BYTES} bytes: {problem}"
         )));
     }
     let text = String::from_utf8(bytes);
     text.map(Text)
-        .map_err(|error| Problem::Syntax(error.utf8_error().to_string()))
+        .map_err(|error| Problem::of_file(error.utf8_error().to_string()))
 }
 
 fn config(Text(text): &Text, path: &Path) -> Result<Config, Problem> {
@@ -139,9 +139,9 @@ fn syntax(text: &str, error: &toml::de::Error) -> Problem {
     let table = text.parse::<toml::Table>().unwrap_or_default();
     if table.get("sensor").is_some_and(toml::Value::is_table) {
         let problem = "write [[sensor]], not [sensor]: there may be several";
-        return Problem::Syntax(problem.to_owned());
+        return Problem::of_file(problem);
     }
-    Problem::Syntax(wording::of_toml(text, error))
+    Problem::of_file(wording::of_toml(text, error))
 }
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time

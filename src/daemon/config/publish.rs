@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::env;
-use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
@@ -79,9 +78,9 @@ settings! {
     /// for other peers.
     pub struct Zenoh {
         /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-        pub listen: Vec<Endpoint> = vec![Endpoint("tcp/127.0.0.1:7447".to_owned())];
+        pub listen: Vec<String> = vec!["tcp/127.0.0.1:7447".to_owned()];
         /// Endpoints of routers or peers to connect to. The session retries until they answer.
-        pub connect: Vec<Endpoint> = Vec::new();
+        pub connect: Vec<String> = Vec::new();
         /// The part after `tactile/` in every key. The default is the robot's name.
         site: Option<String>;
         /// The key at which the robot reports the positions of its arms. `None`: it reports none.
@@ -94,53 +93,12 @@ impl Zenoh {
     pub fn site<'a>(&'a self, robot: &'a str) -> &'a str {
         self.site.as_deref().unwrap_or(robot)
     }
-}
 
-/// An endpoint at which a zenoh session listens or connects: `tcp/HOST:PORT`.
-#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct Endpoint(String);
-
-impl Endpoint {
-    /// The address of the endpoint: `HOST:PORT`.
-    pub fn address(&self) -> &str {
-        let address = Self::parse(&self.0);
-        address.expect("an endpoint is read from a text that is one")
-    }
-
-    fn parse(text: &str) -> Option<&str> {
-        let address = text.strip_prefix("tcp/")?;
+    /// The address of an endpoint `tcp/HOST:PORT`: `HOST:PORT`.
+    pub fn address(endpoint: &str) -> Option<&str> {
+        let address = endpoint.strip_prefix("tcp/")?;
         let (_host, port) = address.rsplit_once(':')?;
         port.parse::<u16>().ok().map(|_| address)
-    }
-}
-
-/// Formats an endpoint as it is written in the configuration.
-impl fmt::Debug for Endpoint {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(out)
-    }
-}
-
-/// The error of a text that is not an [`Endpoint`].
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("found {0:?}, expected an endpoint such as \"tcp/127.0.0.1:7447\"")]
-pub struct EndpointError(String);
-
-impl TryFrom<String> for Endpoint {
-    type Error = EndpointError;
-
-    fn try_from(text: String) -> Result<Self, EndpointError> {
-        match Self::parse(&text) {
-            Some(_) => Ok(Self(text)),
-            None => Err(EndpointError(text)),
-        }
-    }
-}
-
-impl From<Endpoint> for String {
-    fn from(endpoint: Endpoint) -> Self {
-        endpoint.0
     }
 }
 
@@ -162,28 +120,19 @@ settings! {
 impl Ros2 {
     /// The domain ID: the configured one, else that of the environment, else 0.
     ///
-    /// # Panics
+    /// # Errors
     ///
-    /// Panics if the configuration was not checked and `$ROS_DOMAIN_ID` is not a number.
-    pub fn domain_id(&self) -> u16 {
-        let chosen = self.chosen_domain_id();
-        chosen.expect("the domain was checked when the configuration was read")
-    }
-
-    /// The domain ID before it is checked.
-    pub(super) fn chosen_domain_id(&self) -> Result<u16, DomainIdError> {
+    /// Returns what `$ROS_DOMAIN_ID` is, if it is not a number.
+    pub fn domain_id(&self) -> Result<u16, String> {
         match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
             (Some(id), _) => Ok(id),
-            (None, Ok(text)) if !text.is_empty() => text.parse().map_err(|_| DomainIdError(text)),
+            (None, Ok(text)) if !text.is_empty() => {
+                text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
+            }
             (None, _) => Ok(0),
         }
     }
 }
-
-/// The error of a `$ROS_DOMAIN_ID` that is not a number.
-#[derive(Debug, thiserror::Error)]
-#[error("$ROS_DOMAIN_ID {0:?}")]
-pub(super) struct DomainIdError(String);
 
 settings! {
     /// The `[publish.unix]` table.
@@ -248,18 +197,15 @@ impl Unix {
 #[serde(try_from = "String", into = "String")]
 pub struct Mode(pub u32);
 
-/// The error of a text that is not a [`Mode`].
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("found {0:?}, expected octal permissions such as \"0660\"")]
-pub struct ModeError(String);
-
 impl TryFrom<String> for Mode {
-    type Error = ModeError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, ModeError> {
+    fn try_from(text: String) -> Result<Self, String> {
         match u32::from_str_radix(&text, 8) {
             Ok(mode) if mode <= 0o777 => Ok(Self(mode)),
-            _ => Err(ModeError(text)),
+            _ => Err(format!(
+                "found {text:?}, expected octal permissions such as \"0660\""
+            )),
         }
     }
 }

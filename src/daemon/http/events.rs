@@ -60,7 +60,7 @@ pub(super) async fn answer(State(hub): State<Hub>, request: Request) -> Result<R
         Some((stream::iter(batch), batches))
     });
     let lines = stream::iter(greeting).chain(batches.flatten());
-    let events = lines.map(move |line: Arc<Line>| event(&run, line.seq, &line));
+    let events = lines.map(move |line: Arc<Line>| event(&run, line.seq(), &line));
     let events = stream::iter([hello]).chain(events).map(Ok::<_, Infallible>);
     let beat = KeepAlive::new().interval(HEARTBEAT);
     // Without it, nginx and its like hold events back.
@@ -125,18 +125,6 @@ mod tests {
             request = request.header("Last-Event-ID", last);
         }
         wanted(&request.body(()).unwrap())
-    }
-
-    #[test]
-    fn a_query_names_types_and_a_place_and_the_header_is_newer() {
-        let plain = ask("/events", None).unwrap();
-        assert!(plain.kinds.contains(&Kind::Hardness) && !plain.kinds.contains(&Kind::Frame));
-        assert_eq!(plain.policy, Policy::LatestFrames);
-        let asked = ask("/events?types=press%2Cframe&since=ab%3A7", None).unwrap();
-        assert!(asked.kinds.contains(&Kind::Frame) && !asked.kinds.contains(&Kind::Status));
-        assert_eq!(asked.since.unwrap().seq, 7);
-        let newer = ask("/events?since=ab:7", Some(b"ab:9")).unwrap();
-        assert_eq!(newer.since.unwrap().seq, 9);
     }
 
     #[test]

@@ -63,25 +63,19 @@ mod tests {
             assert_eq!(is_ours(&request, listen, local), expected, "{host}");
         };
         for host in [
-            "localhost:8256",
             "LocalHost",
-            "127.0.0.1:8256",
             "127.0.0.1:9000",
             "[::1]:8256",
             "192.168.7.2:8256",
-            "192.168.7.2",
             "0.0.0.0:8256",
         ] {
             check(host, true);
         }
         for host in [
-            "evil.example:8256",
             "localhost.evil.example",
-            "127.0.0.1.evil.example:8256",
             "192.168.7.3:8256",
             "robot.local",
             "evil@127.0.0.1",
-            "[::1",
             "",
         ] {
             check(host, false);

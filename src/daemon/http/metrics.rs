@@ -11,17 +11,15 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::info::Info;
-use prometheus_client::registry::{Registry, Unit};
+use prometheus_client::registry::Registry;
 
-use crate::daemon::hub::{SensorSnapshot, Snapshot, Verdicts};
+use crate::daemon::hub::{SensorSnapshot, Snapshot};
 use crate::daemon::sensor::SensorState;
 use hardnessd_core::event::{self, LinkState};
 
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 type Labels = Vec<(&'static str, String)>;
-type Counters = Family<Labels, Counter>;
-type Gauges = Family<Labels, Gauge<f64, AtomicU64>>;
 
 /// The state of the hub and the sensors in the text format. Every series has the label `robot`.
 pub(super) fn encode(now: &Snapshot) -> String {
@@ -39,10 +37,13 @@ pub(super) fn encode(now: &Snapshot) -> String {
     );
     links(&mut registry, now);
     presses(&mut registry, now);
-    let subscribers: Gauge = Gauge::default();
-    subscribers.set(i64::try_from(now.subscribers).unwrap_or(i64::MAX));
     let help = "Subscribers there are, on sockets and pages";
-    registry.register("subscribers", help, subscribers);
+    gauges(
+        &mut registry,
+        "subscribers",
+        help,
+        [(Vec::new(), now.subscribers as f64)],
+    );
     for (name, help, count) in [
         ("events", "Numbered events published", hello.seq),
         ("gaps", "Gaps that subscribers were told of", now.gaps),
@@ -52,9 +53,7 @@ pub(super) fn encode(now: &Snapshot) -> String {
             now.dropped,
         ),
     ] {
-        let counter: Counter = Counter::default();
-        counter.inc_by(count);
-        registry.register(name, help, counter);
+        counters(&mut registry, name, help, [(Vec::new(), count)]);
     }
     let mut text = String::new();
     text::encode(&mut text, &registry).expect("writing to a string cannot fail");
@@ -67,114 +66,130 @@ fn escaped(value: &str) -> String {
     value.replace('\\', r"\\").replace('"', r#"\""#)
 }
 
+/// Registers counters. Those with the same labels are added.
+fn counters(
+    registry: &mut Registry,
+    name: &str,
+    help: &str,
+    series: impl IntoIterator<Item = (Labels, u64)>,
+) {
+    let family: Family<Labels, Counter> = Family::default();
+    for (labels, count) in series {
+        family.get_or_create(&labels).inc_by(count);
+    }
+    registry.register(name, help, family);
+}
+
+fn gauges(
+    registry: &mut Registry,
+    name: &str,
+    help: &str,
+    series: impl IntoIterator<Item = (Labels, f64)>,
+) {
+    let family: Family<Labels, Gauge<f64, AtomicU64>> = Family::default();
+    for (labels, value) in series {
+        family.get_or_create(&labels).set(value);
+    }
+    registry.register(name, help, family);
+}
+
+/// The labels of a series of a sensor.
+fn of(sensor: &SensorSnapshot, more: &[(&'static str, &str)]) -> Labels {
+    let mut labels = vec![("sensor", sensor.state.status.sensor.clone())];
+    labels.extend(more.iter().map(|&(key, value)| (key, value.to_owned())));
+    labels
+}
+
 /// The series of the links.
 fn links(registry: &mut Registry, now: &Snapshot) {
-    let (frames, damaged, dropped) = <(Counters, Counters, Counters)>::default();
-    let (skipped, failed) = <(Counters, Counters)>::default();
-    let (positions, late) = <(Counters, Counters)>::default();
-    let (state, rate, age) = <(Gauges, Gauges, Gauges)>::default();
-    for sensor in &now.sensors {
-        let SensorSnapshot {
-            state:
-                SensorState {
-                    status,
-                    unjudged,
-                    motion,
-                    ..
-                },
-            last_frame_age,
-            ..
-        } = sensor;
-        let labels = vec![("sensor", status.sensor.clone())];
-        frames.get_or_create(&labels).inc_by(status.frames);
-        damaged.get_or_create(&labels).inc_by(status.frames_damaged);
-        dropped.get_or_create(&labels).inc_by(status.frames_dropped);
-        skipped.get_or_create(&labels).inc_by(status.bytes_skipped);
-        failed.get_or_create(&labels).inc_by(*unjudged);
-        positions.get_or_create(&labels).inc_by(motion.0);
-        late.get_or_create(&labels).inc_by(motion.1);
-        if let Some(hz) = status.frame_rate_hz {
-            rate.get_or_create(&labels).set(hz);
-        }
-        if let Some(since) = last_frame_age {
-            age.get_or_create(&labels).set(since.as_secs_f64());
-        }
-        for known in LinkState::ALL {
-            let mut labels = labels.clone();
-            labels.push(("state", event::name(&known)));
-            let holds = f64::from(u8::from(status.state == known));
-            state.get_or_create(&labels).set(holds);
-        }
+    type Count = fn(&SensorState) -> u64;
+    let counts: [(&str, &str, Count); 7] = [
+        ("frames", "Whole frames", |of| of.status.frames),
+        ("frames_damaged", "Damaged frames", |of| {
+            of.status.frames_damaged
+        }),
+        ("frames_dropped", "Frames above twice frame_rate_hz", |of| {
+            of.status.frames_dropped
+        }),
+        (
+            "skipped_bytes",
+            "Bytes that belonged to no whole frame",
+            |of| of.status.bytes_skipped,
+        ),
+        (
+            "verdicts_failed",
+            "Verdicts that did not come: the log says how",
+            |of| of.unjudged,
+        ),
+        (
+            "motion_points",
+            "Positions of the arm that the robot told",
+            |of| of.motion.0,
+        ),
+        (
+            "motion_points_late",
+            "Positions of the arm after their verdict",
+            |of| of.motion.1,
+        ),
+    ];
+    for (name, help, count) in counts {
+        let series = now
+            .sensors
+            .iter()
+            .map(|one| (of(one, &[]), count(&one.state)));
+        counters(registry, name, help, series);
     }
-    registry.register("frames", "Whole frames", frames);
-    registry.register("frames_damaged", "Damaged frames", damaged);
-    let help = "Whole frames that were dropped: more than twice frame_rate_hz";
-    registry.register("frames_dropped", help, dropped);
-    let help = "Bytes that belonged to no whole frame";
-    registry.register_with_unit("skipped", help, Unit::Bytes, skipped);
-    let help = "Verdicts that did not come: the model failed, the log says how";
-    registry.register("verdicts_failed", help, failed);
-    let help = "Positions of the arm that the robot told";
-    registry.register("motion_points", help, positions);
-    let help = "Positions of the arm that came after the verdict that they belong to";
-    registry.register("motion_points_late", help, late);
+    let states = now.sensors.iter().flat_map(|one| {
+        LinkState::ALL.map(|known| {
+            let holds = f64::from(u8::from(one.state.status.state == known));
+            (of(one, &[("state", &event::name(&known))]), holds)
+        })
+    });
     let help = "State of the link: 1 for the one that holds";
-    registry.register("link_state", help, state);
-    let hertz = Unit::Other("hertz".to_owned());
-    registry.register_with_unit("frame_rate", "Measured frame rate", hertz, rate);
+    gauges(registry, "link_state", help, states);
+    let rates = now
+        .sensors
+        .iter()
+        .filter_map(|one| Some((of(one, &[]), one.state.status.frame_rate_hz?)));
+    gauges(registry, "frame_rate_hertz", "Measured frame rate", rates);
+    let ages = now
+        .sensors
+        .iter()
+        .filter_map(|one| Some((of(one, &[]), one.last_frame_age?.as_secs_f64())));
     let help = "Age of the last whole frame; absent before the first";
-    registry.register_with_unit("last_frame_age", help, Unit::Seconds, age);
+    gauges(registry, "last_frame_age_seconds", help, ages);
 }
 
 /// The series of presses and verdicts.
 fn presses(registry: &mut Registry, now: &Snapshot) {
-    let (presses, verdicts, rejected) = <(Counters, Counters, Counters)>::default();
-    for SensorSnapshot { state, counts, .. } in &now.sensors {
-        let with = |more: &[(&'static str, &str)]| {
-            let mut labels = vec![("sensor", state.status.sensor.clone())];
-            labels.extend(more.iter().map(|&(key, value)| (key, value.to_owned())));
-            labels
-        };
-        for (state, count) in [
-            ("begin", counts.begun),
-            ("end", counts.ended),
-            ("aborted", counts.aborted),
-        ] {
-            let counter = presses.get_or_create_owned(&with(&[("state", state)]));
-            counter.inc_by(count);
+    let (mut presses, mut verdicts, mut rejected) = (Vec::new(), Vec::new(), Vec::new());
+    for one in &now.sensors {
+        let counts = &one.counts;
+        let with_phase = |phase: &str, key, value: &str| of(one, &[("phase", phase), (key, value)]);
+        let states = ["begin", "end", "aborted"].map(|state| (of(one, &[("state", state)]), 0));
+        presses.extend(states);
+        for phase in ["early", "final"] {
+            for level in &now.hello.model.levels {
+                let level = level.level.to_string();
+                verdicts.push((with_phase(phase, "level", &level), 0));
+            }
+            let reasons = ["low_confidence", "low_force", "ambiguous"];
+            rejected.extend(reasons.map(|reason| (with_phase(phase, "reason", reason), 0)));
         }
-        for (phase, made) in [("early", &counts.early), ("final", &counts.finals)] {
-            // Keep the series for the levels of a model that a reload has replaced.
-            let known = now.hello.model.levels.iter().map(|level| level.level);
-            let mut levels: Vec<u8> = known.chain(made.levels.keys().copied()).collect();
-            levels.sort_unstable();
-            levels.dedup();
-            for level in levels {
-                let labels = with(&[("phase", phase), ("level", &level.to_string())]);
-                let count = made.levels.get(&level).copied().unwrap_or(0);
-                verdicts.get_or_create(&labels).inc_by(count);
-            }
-            let Verdicts {
-                low_confidence,
-                low_force,
-                ambiguous,
-                ..
-            } = *made;
-            for (reason, count) in [
-                ("low_confidence", low_confidence),
-                ("low_force", low_force),
-                ("ambiguous", ambiguous),
-            ] {
-                let labels = with(&[("phase", phase), ("reason", reason)]);
-                rejected.get_or_create(&labels).inc_by(count);
-            }
+        // A reload may have replaced the model of some levels.
+        for ([phase, level], &count) in &counts.verdicts {
+            verdicts.push((with_phase(phase, "level", level), count));
+        }
+        for ([phase, reason], &count) in &counts.rejected {
+            rejected.push((with_phase(phase, "reason", reason), count));
+        }
+        for (state, &count) in &counts.presses {
+            presses.push((of(one, &[("state", state)]), count));
         }
     }
-    registry.register("presses", "Presses, by what became of them", presses);
-    registry.register("verdicts", "Verdicts, by level", verdicts);
-    registry.register(
-        "verdicts_rejected",
-        "Verdicts withheld, by reason",
-        rejected,
-    );
+    let help = "Presses, by what became of them";
+    counters(registry, "presses", help, presses);
+    counters(registry, "verdicts", "Verdicts, by level", verdicts);
+    let help = "Verdicts withheld, by reason";
+    counters(registry, "verdicts_rejected", help, rejected);
 }

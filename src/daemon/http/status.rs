@@ -1,15 +1,12 @@
 //! `/api/status`: the present state as one JSON object.
 
-use std::path::Path;
-
 use serde_json::{Value, json};
 
 use crate::daemon::hub::Snapshot;
-use crate::daemon::realtime::Scheduling;
 use hardnessd_core::event::{Event, Reply};
 
-/// An object of `hello` as on a socket, `subscribers`, `process` (how the kernel runs the daemon,
-/// [`Scheduling`]), `sets_context` (whether the page may say what is being pressed), and a list of `sensors`. A sensor has its `status` and `last` (its last final
+/// An object of `hello` as on a socket, `subscribers`, `sets_context` (whether the page may say what is
+/// being pressed), and a list of `sensors`. A sensor has its `status` and `last` (its last final
 /// verdict, or null) as on a socket, `last_frame_age_s` (null before the first frame) and the
 /// current `contact_threshold_n`.
 pub(super) fn json(now: &Snapshot, sets_context: bool) -> String {
@@ -32,7 +29,6 @@ pub(super) fn json(now: &Snapshot, sets_context: bool) -> String {
         "sensors": sensors.collect::<Vec<Value>>(),
         "subscribers": now.subscribers,
         "sets_context": sets_context,
-        "process": Scheduling::of(Path::new("/proc/self")),
     })
     .to_string()
 }

@@ -41,128 +41,114 @@ impl Place {
 /// A subscriber's place, and the events that it wants.
 #[derive(Debug)]
 pub(super) struct Cursor {
-    kinds: [bool; Kind::ALL.len()],
+    wanted: [bool; Kind::ALL.len()],
     pub(super) policy: Policy,
-    pub(super) place: Place,
-    /// Of each kind, the first events that the subscriber does not get: it wanted the kind later, or
-    /// has had them.
-    from: Place,
+    /// Of each kind, the number of the first event that the subscriber has not passed.
+    next: Place,
+    /// Of each kind, the number of the first event since which it missed none.
+    begun: Place,
+    /// Of each kind, events that it had before a `since`, which does not give them again.
+    had: [Range<u64>; Kind::ALL.len()],
     /// How many events the subscriber may be behind.
     allowed: u64,
     /// The events that it has missed since its last line. `None`: an unknown number.
     lost: Option<u64>,
-    /// The numbered events that earlier subscriptions of this connection gave it. A `since` does not
-    /// give them again.
-    had: Vec<Had>,
-    /// The number of the last event before the current subscription.
-    begun: u64,
     pub(super) waker: Option<Waker>,
-}
-
-/// Events of these kinds and numbers.
-#[derive(Debug)]
-struct Had {
-    kinds: [bool; Kind::ALL.len()],
-    seqs: Range<u64>,
 }
 
 impl Cursor {
     /// A cursor at the end of the log.
     pub(super) fn new(wanted: &Subscription, end: Place) -> Self {
         Self {
-            kinds: kinds(wanted),
+            wanted: Kind::ALL.map(|kind| wanted.kinds.contains(&kind)),
             policy: wanted.policy,
-            place: end,
-            from: end,
+            next: end,
+            begun: end,
+            had: Default::default(),
             allowed: QUEUE,
             lost: Some(0),
-            had: Vec::new(),
-            begun: end.seq(),
             waker: None,
         }
     }
 
     pub(super) fn wants_kind(&self, kind: Kind) -> bool {
-        self.kinds[kind as usize]
+        self.wanted[kind as usize]
     }
 
-    /// Whether a `gap` counts the kind. With the policies for views, a newer frame replaces an older
-    /// one silently.
-    fn counts(&self, kind: Kind) -> bool {
-        self.wants_kind(kind) && (self.policy == Policy::Queue || kind != Kind::Frame)
+    /// Whether a newer event of the kind and of the same sensor replaces an older one.
+    pub(super) fn wants_newest(&self, kind: Kind) -> bool {
+        match self.policy {
+            Policy::Queue => false,
+            Policy::Latest => true,
+            Policy::LatestFrames => kind == Kind::Frame,
+        }
     }
 
+    /// The kinds that a `gap` counts. With the policies for views, frames are replaced silently.
+    fn counted(&self) -> impl Iterator<Item = Kind> + '_ {
+        let is_counted =
+            |kind: Kind| self.wants_kind(kind) && (kind != Kind::Frame || !self.wants_newest(kind));
+        Kind::ALL.into_iter().filter(move |&kind| is_counted(kind))
+    }
+
+    /// Whether the subscriber has passed `entry` and all that it wants before.
+    pub(super) fn has_passed(&self, entry: &Entry) -> bool {
+        let mut wanted = Kind::ALL.into_iter().filter(|&kind| self.wants_kind(kind));
+        wanted.all(|kind| entry.before.of(kind) < self.next.of(kind))
+    }
+
+    /// Whether the subscriber wants `entry` and has not passed it.
     pub(super) fn wants(&self, entry: &Entry) -> bool {
-        self.wants_kind(entry.kind) && entry.before.of(entry.kind) >= self.first(entry.kind)
+        self.wants_kind(entry.kind) && entry.before.of(entry.kind) >= self.next.of(entry.kind)
     }
 
-    /// The first event of a kind that the subscriber may still get.
-    fn first(&self, kind: Kind) -> u64 {
-        self.place.of(kind).max(self.from.of(kind))
+    /// The first frame that must be kept for this subscriber.
+    pub(super) fn first_frame(&self) -> Option<u64> {
+        let queues = self.wants_kind(Kind::Frame) && !self.wants_newest(Kind::Frame);
+        queues.then(|| self.next.of(Kind::Frame))
     }
 
-    /// The number of frames that nobody keeps for this subscriber.
-    pub(super) fn frames_read(&self) -> Option<u64> {
-        let queues = self.wants_kind(Kind::Frame) && self.policy == Policy::Queue;
-        queues.then(|| self.first(Kind::Frame))
-    }
-
-    /// The number of events between the subscriber's place and `entry` that it does not get.
-    fn missed(&self, entry: &Entry) -> u64 {
-        let kinds = Kind::ALL.into_iter().filter(|&kind| self.counts(kind));
-        kinds
-            .map(|kind| entry.before.of(kind).saturating_sub(self.first(kind)))
-            .sum()
-    }
-
-    /// The number of its events from `place` to `end`.
-    fn behind(&self, place: Place, end: Place) -> u64 {
-        let kinds = Kind::ALL.into_iter().filter(|&kind| self.counts(kind));
-        kinds
-            .map(|kind| end.of(kind) - place.of(kind).max(self.from.of(kind)).min(end.of(kind)))
-            .sum()
+    /// The number of its events from `place` to `end` that it has not passed.
+    fn between(&self, place: Place, end: Place) -> u64 {
+        let of = |kind| {
+            let first = place.of(kind).max(self.next.of(kind));
+            end.of(kind).saturating_sub(first)
+        };
+        self.counted().map(of).sum()
     }
 
     /// Whether the subscriber is too far behind to get `entry`.
     pub(super) fn drops(&self, entry: &Entry, end: Place) -> bool {
-        self.counts(entry.kind) && self.behind(entry.before, end) > self.allowed
+        let is_counted = self.counted().any(|kind| kind == entry.kind);
+        is_counted && self.between(entry.before, end) > self.allowed
     }
 
-    /// Whether an earlier subscription gave the subscriber this entry.
+    /// Whether the subscriber had this entry before a `since`.
     pub(super) fn has_had(&self, entry: &Entry) -> bool {
-        let seq = entry.line.seq;
-        seq.is_some_and(|seq| {
-            let mut had = self.had.iter();
-            had.any(|had| had.kinds[entry.kind as usize] && had.seqs.contains(&seq))
-        })
+        self.had[entry.kind as usize].contains(&entry.before.of(entry.kind))
     }
 
-    /// Moves to `entry`, which the subscriber gets or has had. What it has missed before is lost.
-    /// `oldest` is the first number that the log holds.
-    pub(super) fn reach(&mut self, entry: &Entry, oldest: u64) {
-        let missed = self.missed(entry);
-        if missed > 0 {
-            self.lost = self.lost.map(|lost| lost + missed);
-            self.note_had(oldest);
-            self.begun = entry.before.seq();
-        }
-        self.place = entry.before.after(entry.kind);
+    /// Passes `entry`, which the subscriber gets or has had. What it has missed before is lost.
+    pub(super) fn pass(&mut self, entry: &Entry) {
+        self.pass_to(entry.before);
+        self.next = self.next.after(entry.kind);
     }
 
-    /// Moves to `end`. What it wanted up to there is lost.
-    pub(super) fn reach_end(&mut self, end: Place, oldest: u64) {
-        let missed = self.behind(self.place, end);
+    /// Moves to `place`. What the subscriber wanted up to there is lost.
+    pub(super) fn pass_to(&mut self, place: Place) {
+        let missed = self.between(Place::default(), place);
         if missed > 0 {
             self.lost = self.lost.map(|lost| lost + missed);
-            self.note_had(oldest);
-            self.begun = end.seq();
+            self.begun = place;
         }
-        self.place = end;
+        for (next, place) in self.next.0.iter_mut().zip(place.0) {
+            *next = place.max(*next);
+        }
     }
 
     /// Whether the subscriber has everything up to `end`.
     pub(super) fn has_all(&self, end: Place) -> bool {
-        self.place == end && self.lost == Some(0)
+        self.next == end && self.lost == Some(0)
     }
 
     /// The number of lost events that a `gap` must announce now, if there are any.
@@ -173,44 +159,42 @@ impl Cursor {
 
     /// After a `since`, the subscriber may be as far behind as it asked for, until it has caught up.
     pub(super) fn tighten(&mut self, end: Place) {
-        if self.behind(self.place, end) <= QUEUE {
+        if self.between(Place::default(), end) <= QUEUE {
             self.allowed = QUEUE;
-        }
-    }
-
-    /// Notes what the subscriber had until now.
-    pub(super) fn note_had(&mut self, oldest: u64) {
-        let seqs = self.begun + 1..self.place.seq() + 1;
-        self.begun = self.place.seq();
-        self.had.retain(|had| had.seqs.end > oldest);
-        if !seqs.is_empty() {
-            let kinds = self.kinds;
-            self.had.push(Had { kinds, seqs });
         }
     }
 
     /// Changes what the subscriber gets from now on. Events that wait and are no longer wanted are
     /// left out without a `gap`.
     pub(super) fn change(&mut self, wanted: &Subscription, end: Place) {
-        let kinds = kinds(wanted);
         for kind in Kind::ALL {
-            if !self.wants_kind(kind) {
-                self.from.0[kind as usize] = end.of(kind);
+            let (index, is_wanted) = (kind as usize, wanted.kinds.contains(&kind));
+            if self.wanted[index] && !is_wanted {
+                self.note_had(kind);
+            } else if is_wanted && !self.wanted[index] {
+                (self.next.0[index], self.begun.0[index]) = (end.of(kind), end.of(kind));
             }
+            self.wanted[index] = is_wanted;
         }
-        (self.kinds, self.policy) = (kinds, wanted.policy);
+        self.policy = wanted.policy;
+    }
+
+    fn note_had(&mut self, kind: Kind) {
+        let had = self.begun.of(kind)..self.next.of(kind);
+        if !had.is_empty() {
+            self.had[kind as usize] = had;
+        }
     }
 
     /// Goes back to `place`, for numbered events. Frames go on where they are.
     pub(super) fn go_back(&mut self, place: Place, lost: Option<u64>, end: Place) {
-        let frames = self.first(Kind::Frame);
-        self.from = Place::default();
-        self.from.0[Kind::Frame as usize] = frames;
-        (self.place, self.lost, self.begun) = (place, lost, place.seq());
-        self.allowed = self.behind(place, end).max(QUEUE);
+        for kind in Kind::NUMBERED {
+            if self.wants_kind(kind) {
+                self.note_had(kind);
+            }
+            self.next.0[kind as usize] = place.of(kind);
+        }
+        (self.begun, self.lost) = (place, lost);
+        self.allowed = self.between(place, end).max(QUEUE);
     }
-}
-
-fn kinds(wanted: &Subscription) -> [bool; Kind::ALL.len()] {
-    Kind::ALL.map(|kind| wanted.kinds.contains(&kind))
 }

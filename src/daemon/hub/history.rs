@@ -1,12 +1,10 @@
 //! The force and the contact area of a sensor in the last two minutes, for views that open later.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
-use serde_json::json;
+use serde_json::{Value, json};
 
-use super::Line;
 use hardnessd_core::event::{FrameEvent, round_3};
 
 /// How far back a history goes.
@@ -59,8 +57,8 @@ impl History {
         self.0.push_back(point);
     }
 
-    /// The line of the history. A point has its age at `time` in seconds, newtons and taxels.
-    pub(crate) fn line(&self, sensor: &str) -> Arc<Line> {
+    /// The history as JSON. A point has its age at `time` in seconds, newtons and taxels.
+    pub(crate) fn json(&self, sensor: &str) -> Value {
         let newest = self.0.back().map(|point| point.at);
         let point = |point: &Point| {
             let age = newest.unwrap_or(point.at).duration_since(point.at);
@@ -70,20 +68,17 @@ impl History {
                 point.contact_area_taxels
             ])
         };
-        let line = json!({
+        json!({
             "type": "history",
             "sensor": sensor,
             "time": newest.map(|time| format!("{time:.6}")),
             "points": self.0.iter().map(point).collect::<Vec<_>>(),
-        });
-        Line::of_text(format!("{line}\n"))
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use serde_json::Value;
-
     use super::*;
 
     fn frame(ms: i64, newtons: f32) -> FrameEvent {
@@ -102,8 +97,7 @@ mod tests {
     }
 
     fn points(history: &History) -> Value {
-        let line: Value = serde_json::from_str(history.line("forearm").json()).unwrap();
-        line["points"].clone()
+        history.json("forearm")["points"].clone()
     }
 
     #[test]

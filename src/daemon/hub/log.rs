@@ -1,18 +1,18 @@
 //! The log: the last numbered events, the frames that somebody still reads, and the state of each
 //! sensor. It has no clock and no channel.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::task::Waker;
 use std::time::Duration;
 
+use super::Line;
 use super::cursor::{Cursor, Place, QUEUE};
 use super::history::History;
 use super::quota::LineQuota;
 use super::tally::Counts;
-use super::{Line, SinceInFuture};
 use crate::daemon::record::EventRecorder;
-use crate::daemon::request::{Policy, Since, Subscription};
+use crate::daemon::request::{Since, Subscription};
 use crate::daemon::sensor::SensorState;
 use crate::daemon::{log, now};
 use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply};
@@ -24,14 +24,6 @@ pub(super) const HELD: usize = 4096;
 /// A read ends with the line that reaches this many bytes. So one write carries many events, and a
 /// subscriber that has stopped reading holds little beside the log.
 const BATCH_BYTES: usize = 32 * 1024;
-
-/// Whether events are held beside their texts, for the libraries that make messages of their own of
-/// them.
-const HOLDS_EVENTS: bool = cfg!(any(
-    feature = "foxglove",
-    feature = "ros2",
-    feature = "zenoh"
-));
 
 /// An event in the log.
 #[derive(Debug, Clone)]
@@ -59,8 +51,13 @@ struct OfSensor {
 
 impl OfSensor {
     /// The number of its events so far that are counted together with those of `kind`.
-    fn entries(&mut self, kind: Kind) -> &mut u64 {
-        &mut self.entries[usize::from(kind == Kind::Frame)]
+    fn entries(&self, kind: Kind) -> u64 {
+        self.entries[usize::from(kind == Kind::Frame)]
+    }
+
+    /// How many of these there were from `entry` on.
+    fn since(&self, entry: &Entry) -> u64 {
+        self.entries(entry.kind).saturating_sub(entry.nth)
     }
 }
 
@@ -103,17 +100,16 @@ pub(crate) struct SensorSnapshot {
     pub(crate) counts: Counts,
 }
 
-/// The whole state of the hub.
+/// The whole state of the hub. It belongs to the sensors' thread.
 #[derive(Debug)]
-pub(super) struct Log {
+pub(crate) struct Log {
     hello: Hello,
     recorder: EventRecorder,
-    /// The last [`HELD`] numbered events.
+    /// The last [`HELD`] numbered events, and older ones within the share of their sensor.
     events: VecDeque<Entry>,
-    /// The frames that a subscriber with the policy `queue` has not read, at most [`QUEUE`].
+    /// The newest frame of each sensor, and those that a subscriber with a queue has not read. There are
+    /// none if nobody wants frames.
     pub(super) frames: VecDeque<Entry>,
-    /// The newest frame of each sensor, for the other policies.
-    pub(super) newest_frames: BTreeMap<Arc<str>, Entry>,
     /// The place after the newest event. Frames that nobody wanted do not count.
     end: Place,
     sensors: BTreeMap<Arc<str>, OfSensor>,
@@ -131,7 +127,6 @@ impl Log {
             recorder: EventRecorder::default(),
             events: VecDeque::new(),
             frames: VecDeque::new(),
-            newest_frames: BTreeMap::new(),
             end: Place::default(),
             sensors: BTreeMap::new(),
             subscribers: BTreeMap::new(),
@@ -144,7 +139,7 @@ impl Log {
 
     /// Numbers `event`, holds it, and wakes the subscribers that want it. `now` is a time of
     /// CLOCK_MONOTONIC.
-    pub(super) fn publish(&mut self, mut event: Event, now: Duration) {
+    pub(crate) fn publish(&mut self, mut event: Event, now: Duration) {
         let kind = event.kind();
         if let Event::Hardness(verdict) = &mut event {
             // Round to microseconds, because further digits are noise of the clock.
@@ -160,42 +155,45 @@ impl Log {
             event.number(self.hello.seq);
         }
         self.recorder.event(&event);
-        let (sensor, of_sensor) = self.of_sensor(event.sensor());
+        let sensor: Arc<str> = event.sensor().into();
+        let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
         match &event {
             Event::Frame(frame) => of_sensor.history.add(frame),
             event => {
                 of_sensor.counts.count(event);
-                of_sensor
-                    .lines
-                    .write(&sensor, now, log::is_routine(event), || log::event(event));
+                let line = || log::event(event);
+                let is_routine = log::is_routine(event);
+                of_sensor.lines.write(&sensor, now, is_routine, line);
             }
         }
-        let is_final = matches!(&event, Event::Hardness(verdict) if verdict.phase == Phase::Final);
-        if kind == Kind::Frame && !self.subscribers.values().any(|one| one.wants_kind(kind)) {
+        if kind == Kind::Frame && !self.wants_frames() {
             return;
         }
-        let mut line = Line::of_event(event);
+        let is_final = matches!(&event, Event::Hardness(verdict) if verdict.phase == Phase::Final);
+        let line = Line::of_event(event);
         if kind != Kind::Frame {
             line.json();
-            if !HOLDS_EVENTS && let Some(line) = Arc::get_mut(&mut line) {
-                line.event = None;
-            }
         }
+        let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
         if is_final {
-            self.of_sensor(&sensor).1.last = Some(Arc::clone(&line));
+            of_sensor.last = Some(Arc::clone(&line));
         }
+        let nth = of_sensor.entries(kind);
+        of_sensor.entries[usize::from(kind == Kind::Frame)] += 1;
         let before = self.end;
         self.end = before.after(kind);
-        let entries = self.of_sensor(&sensor).1.entries(kind);
-        let nth = *entries;
-        *entries += 1;
-        self.hold(Entry {
+        let held = match kind {
+            Kind::Frame => &mut self.frames,
+            _ => &mut self.events,
+        };
+        held.push_back(Entry {
             before,
             kind,
             sensor,
             nth,
             line,
         });
+        self.forget();
         for subscriber in self.subscribers.values_mut() {
             if subscriber.wants_kind(kind)
                 && let Some(waker) = subscriber.waker.take()
@@ -205,80 +203,78 @@ impl Log {
         }
     }
 
-    fn hold(&mut self, entry: Entry) {
-        if entry.kind == Kind::Frame {
-            self.newest_frames
-                .insert(Arc::clone(&entry.sensor), entry.clone());
-            self.frames.push_back(entry);
-            self.forget_frames();
-        } else {
-            self.events.push_back(entry);
-            let oldest = self.end.seq().saturating_sub(HELD as u64);
-            let sensors = &self.sensors;
-            forget(&mut self.events, HELD, |entry| {
-                entry.before.seq() >= oldest || is_in_share(sensors, entry)
-            });
-        }
+    fn wants_frames(&self) -> bool {
+        let mut subscribers = self.subscribers.values();
+        subscribers.any(|one| one.wants_kind(Kind::Frame))
     }
 
-    /// Logs that the model failed on a press.
-    pub(super) fn unjudged(&mut self, failed: &Unjudged, now: Duration) {
-        let (sensor, of_sensor) = self.of_sensor(&failed.sensor);
-        let line = || log::unjudged(failed);
-        of_sensor.lines.write(&sensor, now, false, line);
-    }
-
-    /// Forgets the frames that nobody reads any more.
-    fn forget_frames(&mut self) {
-        if !self
-            .subscribers
-            .values()
-            .any(|one| one.wants_kind(Kind::Frame))
-        {
-            self.newest_frames.clear();
+    /// Forgets the entries that are old, and the frames that nobody reads any more. Each sensor has an
+    /// equal share of a queue, and keeps it.
+    fn forget(&mut self) {
+        let (sensors, end) = (&self.sensors, self.end);
+        let is_held = |entry: &Entry| {
+            entry.before.seq() + HELD as u64 >= end.seq() || is_in_share(sensors, entry)
+        };
+        while self.events.front().is_some_and(|entry| !is_held(entry)) {
+            self.events.pop_front();
         }
-        let read = self.subscribers.values().filter_map(Cursor::frames_read);
+        // The other ones are looked through only now and then.
+        if self.events.len() > HELD + 3 * QUEUE as usize / 2 {
+            self.events.retain(is_held);
+        }
+        if !self.wants_frames() {
+            self.frames.clear();
+        }
+        let read = self.subscribers.values().filter_map(Cursor::first_frame);
         let read = read.min().unwrap_or(u64::MAX);
-        let oldest = self.end.of(Kind::Frame).saturating_sub(QUEUE);
-        let sensors = &self.sensors;
-        forget(&mut self.frames, QUEUE as usize, |entry| {
+        self.frames.retain(|entry| {
             let frame = entry.before.of(Kind::Frame);
-            frame >= read && (frame >= oldest || is_in_share(sensors, entry))
+            let is_newest = || {
+                sensors
+                    .get(&entry.sensor)
+                    .is_some_and(|of_sensor| of_sensor.since(entry) == 1)
+            };
+            let is_new = || frame + QUEUE >= end.of(Kind::Frame) || is_in_share(sensors, entry);
+            frame >= read && is_new() || is_newest()
         });
     }
 
-    fn of_sensor(&mut self, name: &str) -> (Arc<str>, &mut OfSensor) {
-        let known = self.sensors.get_key_value(name);
-        let name = known.map_or_else(|| name.into(), |(name, _)| Arc::clone(name));
-        let of_sensor = self.sensors.entry(Arc::clone(&name)).or_default();
-        (name, of_sensor)
+    /// Logs that the model failed on a press.
+    pub(crate) fn unjudged(&mut self, failed: &Unjudged, now: Duration) {
+        let sensor = failed.sensor.as_str();
+        let of_sensor = self.sensors.entry(sensor.into()).or_default();
+        let line = || log::unjudged(failed);
+        of_sensor.lines.write(sensor, now, false, line);
     }
 
     /// Takes over the current state of a sensor.
-    pub(super) fn report(&mut self, state: SensorState) {
-        let (_, of_sensor) = self.of_sensor(&state.status.sensor);
-        of_sensor.state = Some(state);
+    pub(crate) fn report(&mut self, state: SensorState) {
+        // No name is made where there is one, because this happens with each frame.
+        match self.sensors.get_mut(state.status.sensor.as_str()) {
+            Some(of_sensor) => of_sensor.state = Some(state),
+            None => {
+                let of_sensor = self.sensors.entry(state.status.sensor.as_str().into());
+                of_sensor.or_default().state = Some(state);
+            }
+        }
     }
 
-    pub(super) fn record(&mut self, recorder: EventRecorder) {
+    /// Passes every event on to `recorder` from now on.
+    pub(crate) fn record(&mut self, recorder: EventRecorder) {
         self.recorder = recorder;
     }
 
-    /// Describes the daemon with `hello` from now on. What is kept of sensors that `hello` lacks is
-    /// forgotten.
-    pub(super) fn describe(&mut self, hello: Hello) {
+    /// Changes the `hello` of new subscribers. The run and the numbers stay.
+    pub(crate) fn describe(&mut self, hello: Hello) {
         self.hello = Hello {
             seq: self.hello.seq,
             run: std::mem::take(&mut self.hello.run),
             ..hello
         };
-        let names = self.hello.sensors.iter();
-        let names: BTreeSet<&str> = names.map(|sensor| sensor.name.as_str()).collect();
-        self.sensors.retain(|name, _| names.contains(&**name));
-        self.newest_frames.retain(|name, _| names.contains(&**name));
     }
 
-    pub(super) fn close(&mut self) {
+    /// Closes the log after its last event. Subscribers get the remaining lines, and then no more.
+    pub(crate) fn close(&mut self) {
         self.is_closed = true;
         self.recorder = EventRecorder::default();
         let wakers = self.subscribers.values_mut();
@@ -292,7 +288,7 @@ impl Log {
     }
 
     /// The number of sensors that are live, and of all.
-    pub(super) fn live(&self) -> (usize, usize) {
+    pub(crate) fn live(&self) -> (usize, usize) {
         let states = self.sensors.values().filter_map(|one| one.state.as_ref());
         let live = states.filter(|one| one.status.state == LinkState::Live);
         (live.count(), self.sensors.len())
@@ -325,13 +321,11 @@ impl Log {
     /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
     /// sensor.
     pub(super) fn history(&self, sensor: &str) -> Option<History> {
-        let known = self.hello.sensors.iter().any(|one| one.name == sensor);
-        let of_sensor = self.sensors.get(sensor);
-        known.then(|| of_sensor.map_or_else(History::default, |one| one.history.clone()))
+        Some(self.sensors.get(sensor)?.history.clone())
     }
 
-    /// Adds a subscriber, and returns its number.
-    pub(super) fn join(&mut self, wanted: &Subscription) -> Result<u64, SinceInFuture> {
+    /// Adds a subscriber, and returns its number. The error is for the subscriber.
+    pub(super) fn join(&mut self, wanted: &Subscription) -> Result<u64, String> {
         let id = self.joined + 1;
         self.subscribers.insert(id, Cursor::new(wanted, self.end));
         if let Err(refused) = self.subscribe(id, wanted) {
@@ -344,7 +338,7 @@ impl Log {
 
     pub(super) fn leave(&mut self, id: u64) {
         self.subscribers.remove(&id);
-        self.forget_frames();
+        self.forget();
     }
 
     /// Wakes the subscriber when there may be lines for it.
@@ -354,96 +348,82 @@ impl Log {
         }
     }
 
-    /// The place before the oldest numbered event that is held.
-    fn oldest(&self) -> Place {
-        self.events.front().map_or(self.end, |entry| entry.before)
-    }
-
     /// Changes what a subscriber gets from now on.
-    pub(super) fn subscribe(
-        &mut self,
-        id: u64,
-        wanted: &Subscription,
-    ) -> Result<(), SinceInFuture> {
+    pub(super) fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), String> {
         let from = match &wanted.since {
             Some(since) => Some(self.place_of(since, wanted)?),
             None => None,
         };
-        let (oldest, end) = (self.oldest(), self.end);
         if let Some(cursor) = self.subscribers.get_mut(&id) {
-            cursor.note_had(oldest.seq());
-            cursor.change(wanted, end);
+            cursor.change(wanted, self.end);
             if let Some((place, lost)) = from {
-                cursor.go_back(place, lost, end);
+                cursor.go_back(place, lost, self.end);
             }
         }
-        self.forget_frames();
+        self.forget();
         Ok(())
     }
 
     /// The first place that is held after `since`, and the number of wanted events that are no longer
-    /// held before it.
+    /// held before it. `None` if that is not known.
     fn place_of(
         &self,
         since: &Since,
         wanted: &Subscription,
-    ) -> Result<(Place, Option<u64>), SinceInFuture> {
-        let (oldest, latest) = (self.oldest(), self.hello.seq);
+    ) -> Result<(Place, Option<u64>), String> {
+        let (found, latest) = (since.seq, self.hello.seq);
         if since.run != self.hello.run {
+            let oldest = self.events.front().map_or(self.end, |entry| entry.before);
             return Ok((oldest, None));
         }
-        if since.seq > latest {
-            let found = since.seq;
-            return Err(SinceInFuture { found, latest });
+        if found > latest {
+            return Err(format!("since: found {found}, expected at most {latest}"));
         }
         // The event `since` itself may be held, or the one after it.
-        let next = self
-            .events
-            .partition_point(|entry| entry.before.seq() < since.seq);
+        let is_before = |entry: &Entry| entry.before.seq() < found;
+        let next = self.events.partition_point(is_before);
         let held = self.events.get(next).map_or(self.end, |entry| entry.before);
         let last = next.checked_sub(1).map(|index| &self.events[index]);
         let after = last.map(|entry| entry.before.after(entry.kind));
-        let places = [after, Some(held)].into_iter().flatten();
-        if let Some(place) = places.into_iter().find(|place| place.seq() == since.seq) {
+        let mut places = [after, Some(held)].into_iter().flatten();
+        if let Some(place) = places.find(|place| place.seq() == found) {
             return Ok((place, Some(0)));
         }
-        let is_wanted = |kind: &Kind| wanted.kinds.contains(kind);
-        let lost = if Kind::NUMBERED.iter().all(is_wanted) {
-            Some(held.seq() - since.seq)
-        } else if since.seq == 0 {
-            let kinds = Kind::NUMBERED.into_iter().filter(is_wanted);
-            Some(kinds.map(|kind| held.of(kind)).sum())
-        } else {
-            // The kinds of these events are no longer known.
-            None
-        };
-        Ok((held, lost))
+        // The kinds of the events between are no longer known.
+        let wants_all = Kind::NUMBERED
+            .iter()
+            .all(|kind| wanted.kinds.contains(kind));
+        Ok((held, wants_all.then(|| held.seq() - found)))
     }
 
     /// The next lines of a subscriber. Empty if there are none.
     pub(super) fn read(&mut self, id: u64) -> Vec<Arc<Line>> {
-        let (oldest, end) = (self.oldest().seq(), self.end);
+        let end = self.end;
         let Some(cursor) = self.subscribers.get_mut(&id) else {
             return Vec::new();
         };
         if cursor.has_all(end) {
             return Vec::new();
         }
-        let events = from(&self.events, cursor.place);
-        let newest: BTreeMap<_, _> = match cursor.policy {
-            Policy::Latest => events
-                .clone()
-                .map(|entry| (entry.about(), entry.before))
-                .collect(),
-            Policy::Queue | Policy::LatestFrames => BTreeMap::new(),
-        };
-        let frames: Vec<&Entry> = match cursor.policy {
-            _ if !cursor.wants_kind(Kind::Frame) => Vec::new(),
-            Policy::Queue => from(&self.frames, cursor.place).collect(),
-            Policy::Latest | Policy::LatestFrames => self.newest_frames.values().collect(),
-        };
-        let mut entries: Vec<&Entry> = events.chain(frames).collect();
+        let held = [&self.events, &self.frames].into_iter();
+        let ahead = held.flat_map(|held| {
+            let first = held.partition_point(|entry| cursor.has_passed(entry));
+            held.range(first..)
+        });
+        let mut entries: Vec<&Entry> = ahead.filter(|entry| cursor.wants(entry)).collect();
         entries.sort_unstable_by_key(|entry| entry.before.total());
+        // By kind and sensor, where only the newest counts.
+        let mut newest: BTreeMap<(Kind, &str), u64> = BTreeMap::new();
+        for entry in entries
+            .iter()
+            .filter(|entry| cursor.wants_newest(entry.kind))
+        {
+            newest.insert((entry.kind, &entry.sensor), entry.before.total());
+        }
+        let is_superseded = |entry: &Entry| {
+            let newest = newest.get(&(entry.kind, &*entry.sensor));
+            newest.is_some_and(|&newest| newest > entry.before.total())
+        };
         let mut announced = |cursor: &mut Cursor| {
             let lost = cursor.take_lost()?;
             self.gaps += 1;
@@ -453,20 +433,15 @@ impl Log {
         let mut lines = Vec::new();
         let mut bytes = 0;
         for entry in entries {
-            if !cursor.wants(entry) {
-                continue;
-            }
             if cursor.has_had(entry) {
-                cursor.reach(entry, oldest);
+                cursor.pass(entry);
                 continue;
             }
-            let is_superseded = newest
-                .get(&entry.about())
-                .is_some_and(|place| place.seq() > entry.before.seq());
-            if is_superseded || (cursor.drops(entry, end) && !is_in_share(&self.sensors, entry)) {
+            let is_dropped = || cursor.drops(entry, end) && !is_in_share(&self.sensors, entry);
+            if is_superseded(entry) || is_dropped() {
                 continue;
             }
-            cursor.reach(entry, oldest);
+            cursor.pass(entry);
             lines.extend(announced(cursor));
             bytes += entry.line.json().len();
             lines.push(Arc::clone(&entry.line));
@@ -475,19 +450,11 @@ impl Log {
                 return lines;
             }
         }
-        // Events after the last one are of other kinds, the subscriber has had them, or they are no longer
-        // held.
-        cursor.reach_end(end, oldest);
+        // Events after the last one are of other kinds, or they are no longer held.
+        cursor.pass_to(end);
         lines.extend(announced(cursor));
         cursor.tighten(end);
         lines
-    }
-}
-
-impl Entry {
-    /// The kind and the sensor of the event. With the policy `latest`, the newest of each counts.
-    fn about(&self) -> (Kind, &str) {
-        (self.kind, &self.sensor)
     }
 }
 
@@ -495,27 +462,6 @@ impl Entry {
 /// queue. So events of one that sends much do not displace those of the others.
 fn is_in_share(sensors: &BTreeMap<Arc<str>, OfSensor>, entry: &Entry) -> bool {
     let share = QUEUE / (sensors.len() as u64).max(1);
-    sensors.get(&entry.sensor).is_some_and(|of_sensor| {
-        let entries = of_sensor.entries[usize::from(entry.kind == Kind::Frame)];
-        (entries.saturating_sub(share)..entries).contains(&entry.nth)
-    })
-}
-
-/// Forgets the oldest entries that are not kept. The other ones are looked through only now and then.
-/// `held` is how many of them are usually kept.
-fn forget(entries: &mut VecDeque<Entry>, held: usize, is_kept: impl Fn(&Entry) -> bool) {
-    while entries.front().is_some_and(|entry| !is_kept(entry)) {
-        entries.pop_front();
-    }
-    // At most as many as a queue holds are kept for their sensors' sake.
-    let queue = QUEUE as usize;
-    if entries.len() > held + queue + queue / 2 {
-        entries.retain(is_kept);
-    }
-}
-
-/// The entries from `place` on.
-fn from(entries: &VecDeque<Entry>, place: Place) -> impl Iterator<Item = &Entry> + Clone {
-    let first = entries.partition_point(|entry| entry.before.total() < place.total());
-    entries.range(first..)
+    let of_sensor = sensors.get(&entry.sensor);
+    of_sensor.is_some_and(|of_sensor| of_sensor.since(entry) <= share)
 }

@@ -6,7 +6,7 @@ use std::task::Poll;
 
 use tokio::sync::mpsc;
 
-use super::{Hub, Line, SinceInFuture};
+use super::{Hub, Line};
 use crate::daemon::request::Subscription;
 
 /// A subscriber. Its cursor ends when this is dropped. It belongs to the sensors' thread.
@@ -40,7 +40,7 @@ impl Subscriber {
     }
 
     /// Changes the subscription from now on.
-    pub(crate) fn subscribe(&mut self, wanted: &Subscription) -> Result<(), SinceInFuture> {
+    pub(crate) fn subscribe(&mut self, wanted: &Subscription) -> Result<(), String> {
         self.hub.log().subscribe(self.id, wanted)
     }
 

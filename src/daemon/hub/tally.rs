@@ -2,25 +2,17 @@
 
 use std::collections::BTreeMap;
 
-use hardnessd_core::event::{Event, Phase, PressState, Rejection};
+use hardnessd_core::event::{Event, name};
 
-/// Counts of one sensor.
+/// Counts of one sensor, by the labels of the metrics.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Counts {
-    pub(crate) begun: u64,
-    pub(crate) ended: u64,
-    pub(crate) aborted: u64,
-    pub(crate) early: Verdicts,
-    pub(crate) finals: Verdicts,
-}
-
-/// Verdicts of one phase.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Verdicts {
-    pub(crate) levels: BTreeMap<u8, u64>,
-    pub(crate) low_confidence: u64,
-    pub(crate) low_force: u64,
-    pub(crate) ambiguous: u64,
+    /// By state.
+    pub(crate) presses: BTreeMap<String, u64>,
+    /// By phase and level.
+    pub(crate) verdicts: BTreeMap<[String; 2], u64>,
+    /// By phase and reason.
+    pub(crate) rejected: BTreeMap<[String; 2], u64>,
 }
 
 impl Counts {
@@ -28,25 +20,14 @@ impl Counts {
     pub(super) fn count(&mut self, event: &Event) {
         match event {
             Event::Status(_) | Event::Frame(_) => {}
-            Event::Press(press) => match press.state {
-                PressState::Begin => self.begun += 1,
-                PressState::End => self.ended += 1,
-                PressState::Aborted => self.aborted += 1,
-            },
+            Event::Press(press) => *self.presses.entry(name(&press.state)).or_default() += 1,
             Event::Hardness(verdict) => {
-                let verdicts = match verdict.phase {
-                    Phase::Early => &mut self.early,
-                    Phase::Final => &mut self.finals,
-                };
-                match verdict.rejected {
-                    Some(Rejection::LowConfidence) => verdicts.low_confidence += 1,
-                    Some(Rejection::LowForce) => verdicts.low_force += 1,
-                    Some(Rejection::Ambiguous) => verdicts.ambiguous += 1,
-                    None => {
-                        if let Some(level) = verdict.level {
-                            *verdicts.levels.entry(level).or_default() += 1;
-                        }
-                    }
+                let phase = name(&verdict.phase);
+                if let Some(reason) = &verdict.rejected {
+                    *self.rejected.entry([phase, name(reason)]).or_default() += 1;
+                } else if let Some(level) = verdict.level {
+                    let labels = [phase, level.to_string()];
+                    *self.verdicts.entry(labels).or_default() += 1;
                 }
             }
         }

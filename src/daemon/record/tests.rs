@@ -1,10 +1,8 @@
 use std::sync::mpsc::Receiver;
 
 use super::*;
-use hardnessd_core::frame::Pitch;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
-use hardnessd_core::sensor::Sensor;
 use hardnessd_core::test_support;
 
 fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
@@ -23,11 +21,7 @@ fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
         looked: None,
         counted: (0, 0),
     };
-    let recorder = SensorRecorder {
-        active: Some(Box::new(active)),
-        viewers: None,
-    };
-    (recorder, pipeline)
+    (SensorRecorder(Some(Box::new(active))), pipeline)
 }
 
 fn at(ms: u64) -> Stamp {
@@ -153,51 +147,5 @@ fn a_flood_is_bounded_in_the_black_box() {
         }
         let kept: usize = ring.all().map(|(_, entry)| entry.weight()).sum();
         assert!((28 << 20..=36 << 20).contains(&kept), "{kept} bytes");
-    }
-}
-
-#[test]
-fn viewers_get_the_positions_of_the_arm_also_without_a_recording() {
-    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
-    let (viewers, mut shown) = mpsc::channel(1);
-    let mut recorder = SensorRecorder::default().with_viewers(Some(viewers));
-    let point = hardnessd_core::motion::Point {
-        at_ns: 5_000_000,
-        mm: 1.5,
-    };
-    let motion = Input::Motion(vec![point]);
-    recorder.note(&pipeline, &Input::Tick, at(6));
-    recorder.note(&pipeline, &motion, at(7));
-    // There is no room for another line, and nothing waits for it.
-    recorder.note(&pipeline, &motion, at(8));
-    let found = shown.try_recv().unwrap();
-    assert_eq!((found.sensor.as_str(), found.at), ("forearm", at(7)));
-    assert_eq!(found.entry, Entry::Input(motion.to_owned()));
-    assert!(shown.try_recv().is_err());
-}
-
-#[test]
-fn viewers_and_the_recording_get_each_new_beginning() {
-    let (sender, inbox) = sync_channel(4);
-    let (recorder, pipeline) = recorder(sender);
-    let (viewers, mut shown) = mpsc::channel(1);
-    let mut recorder = recorder.with_viewers(Some(viewers));
-    recorder.note(&pipeline, &Input::Tick, at(6));
-    let mut description = pipeline.sensor().description().clone();
-    description.sensor.calibration.pitch_mm = Pitch::square(2.0);
-    let (changed, hrn) = (Sensor::new(description).unwrap(), test_support::hrn());
-    recorder.begin_anew(&pipeline.restarted(changed, hrn), at(7));
-    drop(recorder);
-    let recorded = inbox.into_iter().filter_map(|job| match job {
-        Job::Entry { entry, .. } => Some(entry),
-        _ => None,
-    });
-    let last = recorded.last().unwrap();
-    for entry in [shown.try_recv().unwrap().entry, last] {
-        let Entry::State(state) = entry else {
-            panic!("{entry:?}");
-        };
-        let pitch_mm = state.sensor.description.sensor.calibration.pitch_mm;
-        assert_eq!(pitch_mm, Pitch::square(2.0));
     }
 }

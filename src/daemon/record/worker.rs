@@ -12,8 +12,8 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::file::{MB, Open, blackboxes, create, has_room};
-use super::{Error, Job, Load, MOST_BLACKBOX_MB, MOST_BLACKBOXES, NoBlackbox, Progress, Target};
-use crate::daemon::config;
+use super::{Job, Load, MOST_BLACKBOX_MB, MOST_BLACKBOXES, Progress, Target};
+use crate::daemon::{Error, config};
 use hardnessd_core::event::{Event, LinkState, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Input;
@@ -65,19 +65,6 @@ struct Watched {
     is_open: Option<bool>,
     last_fault: Option<Instant>,
     last_asked: Option<Instant>,
-}
-
-/// The reason a job failed.
-enum Failure {
-    Write(recording::Error),
-    /// A sensor is missing at the start, or no sensor is left.
-    Gone(Error),
-}
-
-impl From<recording::Error> for Failure {
-    fn from(error: recording::Error) -> Self {
-        Failure::Write(error)
-    }
 }
 
 impl Worker {
@@ -136,10 +123,9 @@ impl Worker {
     fn begin(&mut self) -> Result<(), Error> {
         match &self.target {
             Target::File { path, file, .. } => {
-                let opened = file.try_clone().map_err(recording::Error::from);
-                let opened = opened.and_then(|file| Open::new(path.clone(), file, &self.about));
-                let path = path.clone();
-                self.open = Some(opened.map_err(|source| Error::Write { path, source })?);
+                let file = file.try_clone().map_err(recording::Error::from);
+                let opened = file.and_then(|file| Open::new(path.clone(), file, &self.about));
+                self.open = Some(opened.map_err(|error| cannot_write(path, &error))?);
             }
             Target::Directory(settings) if settings.continuous => {
                 self.retry = Some(Instant::now());
@@ -150,28 +136,29 @@ impl Worker {
         Ok(())
     }
 
-    /// Handles a failure. A failed write ends a recording into one file. In a directory, another
-    /// file may work.
-    fn settle(&mut self, done: Result<(), Failure>) -> Result<(), Error> {
+    /// Handles a failed write. It ends a recording into one file. In a directory, another file may work.
+    fn settle(&mut self, done: Result<(), recording::Error>) -> Result<(), Error> {
         match (done, &self.target) {
-            (Ok(()), _) => {}
-            (Err(Failure::Gone(gone)), _) => {
-                self.gone = self.gone.take().or(Some(gone));
-                if let Some(stop) = self.stop.take() {
-                    // The daemon may be stopping already.
-                    let _ = stop.send(());
-                }
-            }
-            (Err(Failure::Write(source)), Target::File { path, .. }) => {
-                let path = path.clone();
-                return Err(Error::Write { path, source });
-            }
-            (Err(Failure::Write(error)), Target::Directory(_)) => {
+            (Ok(()), _) => Ok(()),
+            (Err(error), Target::File { path, .. }) => Err(cannot_write(path, &error)),
+            (Err(error), Target::Directory(_)) => {
                 self.open = None;
                 self.pause(&error);
+                Ok(())
             }
         }
-        Ok(())
+    }
+
+    /// Ends a recording into one file, because there is no sensor to record.
+    fn end_because(&mut self, gone: Error) {
+        if self.directory().is_some() {
+            return;
+        }
+        self.gone.get_or_insert(gone);
+        if let Some(stop) = self.stop.take() {
+            // The daemon may be stopping already.
+            let _ = stop.send(());
+        }
     }
 
     /// Pauses the recording, and logs the reason once.
@@ -185,12 +172,14 @@ impl Worker {
 
     fn end(mut self) -> Result<(), Error> {
         let gone = self.gone.take().map_or(Ok(()), Err);
-        let Some(open) = self.open.take() else {
+        let Some(Open {
+            path, file, writer, ..
+        }) = self.open.take()
+        else {
             return gone;
         };
-        let (path, file) = (open.path.clone(), open.file.clone());
-        let mut finished = open.finish();
-        if matches!(self.target, Target::File { .. }) {
+        let mut finished = writer.finish().map(drop);
+        if self.directory().is_none() {
             finished = finished.and_then(|()| Ok(file.sync_all()?));
             // If a sensor was missing at the start, the file is not kept, so do not report it.
             if !matches!(gone, Err(Error::Unavailable { .. })) {
@@ -202,15 +191,10 @@ impl Worker {
                 );
             }
         }
-        match (finished, &self.target) {
-            (Ok(()), _) => {}
-            (Err(source), Target::File { .. }) => return Err(Error::Write { path, source }),
-            (Err(reason), Target::Directory(_)) => self.pause(&reason),
-        }
-        gone
+        self.settle(finished).and(gone)
     }
 
-    fn take(&mut self, job: Job) -> Result<(), Failure> {
+    fn take(&mut self, job: Job) -> Result<(), recording::Error> {
         match job {
             Job::Entry { sensor, at, entry } => self.entry(sensor, at, entry),
             Job::Event(event) => self.event(&event),
@@ -226,50 +210,43 @@ impl Worker {
         }
     }
 
-    fn entry(&mut self, sensor: usize, at: Stamp, entry: Entry) -> Result<(), Failure> {
+    fn entry(&mut self, sensor: usize, at: Stamp, entry: Entry) -> Result<(), recording::Error> {
+        let watched = &mut self.sensors[sensor];
+        let name = || self.about.sensors[sensor].name().to_owned();
+        let mut gone = None;
+        match &entry {
+            Entry::State(_) => watched.is_begun = true,
+            Entry::Input(Input::Opened) => watched.is_open = Some(true),
+            Entry::Input(Input::Lost(reason)) => {
+                watched.is_open = Some(false);
+                let (sensor, reason) = (name(), reason.clone());
+                let is_gone = |one: &Watched| one.is_open == Some(false);
+                gone = (self.sensors.iter().all(is_gone)).then_some(Error::Lost { sensor, reason });
+            }
+            Entry::Input(Input::Unavailable(reason)) if watched.is_open.is_none() => {
+                let (sensor, reason) = (name(), reason.clone());
+                gone = Some(Error::Unavailable { sensor, reason });
+            }
+            Entry::Input(_) => {}
+        }
+        if let Some(gone) = gone {
+            self.end_because(gone);
+        }
         if let Entry::State(state) = &entry {
             self.about.sensors[sensor].clone_from(&state.sensor);
         }
-        let watched = &mut self.sensors[sensor];
-        watched.is_begun |= matches!(entry, Entry::State(_));
         let written = match &mut self.open {
-            Some(open) if watched.is_begun => open.writer.entry(sensor, at, &entry),
+            Some(open) if self.sensors[sensor].is_begun => open.writer.entry(sensor, at, &entry),
             _ => Ok(()),
-        };
-        let gone = match &entry {
-            Entry::Input(Input::Opened) => {
-                self.sensors[sensor].is_open = Some(true);
-                None
-            }
-            Entry::Input(Input::Lost(reason)) => {
-                self.sensors[sensor].is_open = Some(false);
-                let any = self.sensors.iter().any(|s| s.is_open != Some(false));
-                (!any).then(|| Error::Lost {
-                    sensor: self.about.sensors[sensor].name().to_owned(),
-                    reason: reason.clone(),
-                })
-            }
-            Entry::Input(Input::Unavailable(reason)) if self.sensors[sensor].is_open.is_none() => {
-                Some(Error::Unavailable {
-                    sensor: self.about.sensors[sensor].name().to_owned(),
-                    reason: reason.clone(),
-                })
-            }
-            _ => None,
         };
         if self.directory().is_some() {
+            // Also after a failed write, so that the next file can have the entry.
             self.sensors[sensor].ring.push(at, entry);
         }
-        // Return a failed write only now: the entry is in the ring, so that the next file can have
-        // it.
-        written?;
-        match gone {
-            Some(gone) if matches!(self.target, Target::File { .. }) => Err(Failure::Gone(gone)),
-            _ => Ok(()),
-        }
+        written
     }
 
-    fn event(&mut self, event: &Event) -> Result<(), Failure> {
+    fn event(&mut self, event: &Event) -> Result<(), recording::Error> {
         match event {
             Event::Frame(frame) => {
                 self.progress.frames += 1;
@@ -308,49 +285,43 @@ impl Worker {
 
     /// Writes the black box that a client requests, unless one was written less than
     /// [`ASKED_EVERY`] ago.
-    fn asked(&mut self, sensor: usize) -> Result<PathBuf, NoBlackbox> {
-        let now = Instant::now();
+    fn asked(&mut self, sensor: usize) -> Result<PathBuf, String> {
         let last = self.sensors[sensor].last_asked;
-        if last.is_some_and(|last| now.duration_since(last) < ASKED_EVERY) {
-            return Err(NoBlackbox::TooSoon);
+        if last.is_some_and(|last| last.elapsed() < ASKED_EVERY) {
+            return Err("one was written less than a second ago: ask again in a second".to_owned());
         }
-        let written = self.blackbox(sensor, "asked for");
-        match &written {
-            Ok(_) => self.sensors[sensor].last_asked = Some(now),
-            Err(reason) => self.report_no_blackbox(sensor, reason),
-        }
-        written
+        let written = self.blackbox(sensor, "asked for")?;
+        self.sensors[sensor].last_asked = Some(Instant::now());
+        Ok(written)
     }
 
     /// Writes a black box of a fault, unless the last one of this sensor was less than
     /// [`FAULT_EVERY`] ago.
     fn fault(&mut self, sensor: usize, fault: &str) {
-        let now = Instant::now();
-        let recent = |last: Instant| now.duration_since(last) < FAULT_EVERY;
-        if self.directory().is_none() || self.sensors[sensor].last_fault.is_some_and(recent) {
+        let last = self.sensors[sensor].last_fault;
+        if self.directory().is_none() || last.is_some_and(|last| last.elapsed() < FAULT_EVERY) {
             return;
         }
-        self.sensors[sensor].last_fault = Some(now);
+        self.sensors[sensor].last_fault = Some(Instant::now());
         let written = self.has_few().and_then(|()| self.blackbox(sensor, fault));
         if let Err(reason) = written {
-            self.report_no_blackbox(sensor, &reason);
+            let sensor = self.about.sensors[sensor].name();
+            warn!(sensor, reason, "no black box");
         }
     }
 
     /// Whether there are few enough black boxes for another one of a fault. Nothing is deleted.
-    fn has_few(&self) -> Result<(), NoBlackbox> {
-        let directory = self.directory().ok_or(NoBlackbox::OneFile)?.dir();
-        let (count, bytes) = blackboxes(&directory);
+    fn has_few(&self) -> Result<(), String> {
+        let directory = self.directory().map(config::Record::dir);
+        let (count, bytes) = blackboxes(&directory.unwrap_or_default());
         let mb = bytes / MB;
         match count < MOST_BLACKBOXES && mb < MOST_BLACKBOX_MB {
             true => Ok(()),
-            false => Err(NoBlackbox::Full { count, mb }),
+            false => Err(format!(
+                "found {count} black boxes of {mb} MB in record.dir, expected fewer than \
+                 {MOST_BLACKBOXES} and {MOST_BLACKBOX_MB} MB for another one of a fault: move old ones away"
+            )),
         }
-    }
-
-    fn report_no_blackbox(&self, sensor: usize, reason: &NoBlackbox) {
-        let sensor = self.about.sensors[sensor].name();
-        warn!(sensor, %reason, "no black box");
     }
 
     fn directory(&self) -> Option<&config::Record> {
@@ -361,13 +332,16 @@ impl Worker {
     }
 
     /// Writes the last minute of a sensor to a file of its own.
-    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, NoBlackbox> {
+    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, String> {
         let Some(settings) = self.directory() else {
-            return Err(NoBlackbox::OneFile);
+            let none = "`hardnessd record` keeps none: ask a daemon that has [record]";
+            return Err(none.to_owned());
         };
         let ring = &self.sensors[sensor].ring;
         if ring.is_waiting() {
-            return Err(NoBlackbox::LongPress);
+            let long =
+                "the press under way takes more memory than is kept: ask again after its release";
+            return Err(long.to_owned());
         }
         let name = self.about.sensors[sensor].name();
         let about = About {
@@ -390,13 +364,13 @@ impl Worker {
             })?;
             Ok(path)
         };
-        let path = written()?;
+        let path = written().map_err(|error| error.to_string())?;
         info!(sensor = name, reason, path = %path.display(), "black box");
         Ok(path)
     }
 
     /// Does the work that is due every [`FLUSH_EVERY`].
-    fn look_after(&mut self) -> Result<(), Failure> {
+    fn look_after(&mut self) -> Result<(), recording::Error> {
         let dropped = self.load.dropped.load(Ordering::Relaxed);
         if dropped > self.dropped_reported && Instant::now() >= self.report_at {
             self.report_at = Instant::now() + REPORT_EVERY;
@@ -485,6 +459,10 @@ impl Worker {
             Ok(open)
         })
     }
+}
+
+fn cannot_write(path: &Path, error: &recording::Error) -> Error {
+    Error::Io(format!("{}: {error}", path.display()))
 }
 
 /// Fills the new file at `path`. If this fails, removes the file, because the disk may be full.

@@ -60,50 +60,25 @@ enum ReportedTime {
     Wall(Timestamp),
 }
 
-/// The reason points cannot be used.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub(crate) enum Unusable {
-    #[error("motion.at: found {0} points, expected 1 to {MOST_POINTS}")]
-    Count(usize),
-    #[error("motion.at[{index}]: found {mm:?} mm, expected at most {FURTHEST_MM} from zero")]
-    Far { index: usize, mm: f64 },
-    #[error(
-        "motion.at[{index}]: found a moment {} s {}, expected one of the last {} s by this \
-         machine's CLOCK_MONOTONIC, or an RFC 3339 time",
-        .away_ms.unsigned_abs() as f64 / 1e3,
-        if *.away_ms > 0 { "ahead" } else { "ago" },
-        HELD.as_secs()
-    )]
-    Clock { index: usize, away_ms: i64 },
-}
-
-/// Positions on CLOCK_MONOTONIC.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Placed {
-    pub(crate) points: Vec<Point>,
-    /// The time of both clocks by which calendar times were converted. `None` if no point has a
-    /// calendar time.
-    pub(crate) converted: Option<Stamp>,
-}
-
 /// The points on CLOCK_MONOTONIC. `now` is the current time of both clocks.
 ///
 /// # Errors
 ///
 /// Fails if there are no points or more than [`MOST_POINTS`], or if a point is too far from zero,
 /// more than [`AHEAD_NS`] ahead of `now`, or older than [`HELD`].
-pub(crate) fn placed(reported: &[ReportedPoint], now: Stamp) -> Result<Placed, Unusable> {
+pub(crate) fn placed(reported: &[ReportedPoint], now: Stamp) -> Result<Vec<Point>, String> {
     if !(1..=MOST_POINTS).contains(&reported.len()) {
-        return Err(Unusable::Count(reported.len()));
+        let found = reported.len();
+        return Err(format!(
+            "motion.at: found {found} points, expected 1 to {MOST_POINTS}"
+        ));
     }
-    let is_converted = reported
-        .iter()
-        .any(|point| matches!(point.at, ReportedTime::Wall(_)));
     let mono_now = now.mono.as_nanos() as i128;
     let point = |(index, reported): (usize, &ReportedPoint)| {
         let ReportedPoint { at, mm } = *reported;
         if mm.is_nan() || mm.abs() > FURTHEST_MM {
-            return Err(Unusable::Far { index, mm });
+            let expected = format!("expected at most {FURTHEST_MM} from zero");
+            return Err(format!("motion.at[{index}]: found {mm:?} mm, {expected}"));
         }
         let away = match at {
             // The conversion ends at the bounds of `i64`, which are away from any moment.
@@ -114,62 +89,16 @@ pub(crate) fn placed(reported: &[ReportedPoint], now: Stamp) -> Result<Placed, U
         let is_near = (-(HELD.as_nanos() as i128)..=AHEAD_NS).contains(&away);
         match i64::try_from(mono_now + away) {
             Ok(at_ns) if is_near => Ok(Point { at_ns, mm }),
-            _ => Err(Unusable::Clock {
-                index,
-                away_ms: i64::try_from(away / 1_000_000).unwrap_or(i64::MAX),
-            }),
+            _ => Err(format!(
+                "motion.at[{index}]: found a moment {} s {}, expected one of the last {} s by this \
+                 machine's CLOCK_MONOTONIC, or an RFC 3339 time",
+                (away / 1_000_000).unsigned_abs() as f64 / 1e3,
+                if away > 0 { "ahead" } else { "ago" },
+                HELD.as_secs()
+            )),
         }
     };
-    Ok(Placed {
-        points: reported
-            .iter()
-            .enumerate()
-            .map(point)
-            .collect::<Result<_, _>>()?,
-        converted: is_converted.then_some(now),
-    })
-}
-
-/// If the difference of the two clocks changes by more than this, the calendar clock was set.
-/// Otherwise the difference is constant, because the kernel slews both clocks together. At 20 mm/s
-/// an arm moves by 0.04 mm in this time.
-const SET_NS: i128 = 2_000_000;
-
-/// This machine's calendar clock, as the positions of one sensor were converted by it.
-#[derive(Debug, Default)]
-pub(crate) struct Calendar {
-    /// Calendar time minus CLOCK_MONOTONIC, in nanoseconds, when the clock was last found set, or
-    /// at the first positions with calendar times.
-    offset_ns: Option<i128>,
-}
-
-/// A setting of the calendar clock.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct ClockSet {
-    /// How far the clock was set, in milliseconds. It is negative if the clock was set back.
-    pub(crate) by_ms: f64,
-    /// The moment of CLOCK_MONOTONIC, in nanoseconds, up to which converted times are uncertain.
-    pub(crate) until_ns: i64,
-}
-
-impl Calendar {
-    /// Whether the calendar clock was set between the last converted positions and those of `now`.
-    pub(crate) fn set(&mut self, now: Stamp) -> Option<ClockSet> {
-        let mono_ns = now.mono.as_nanos() as i128;
-        let offset_ns = now.wall.as_nanosecond() - mono_ns;
-        let by_ns = offset_ns - *self.offset_ns.get_or_insert(offset_ns);
-        if by_ns.abs() <= SET_NS {
-            return None;
-        }
-        self.offset_ns = Some(offset_ns);
-        // A robot on this machine may have taken times before the setting. If the clock was set
-        // back, they are ahead by as much.
-        let until_ns = mono_ns + by_ns.abs().min(AHEAD_NS);
-        Some(ClockSet {
-            by_ms: by_ns as f64 / 1e6,
-            until_ns: i64::try_from(until_ns).unwrap_or(i64::MAX),
-        })
-    }
+    reported.iter().enumerate().map(point).collect()
 }
 
 #[cfg(test)]
@@ -192,8 +121,8 @@ mod tests {
     }
 
     fn place(at: Value) -> Result<Vec<(i64, f64)>, String> {
-        let placed = placed(&points(at)?, now()).map_err(|error| error.to_string())?;
-        Ok(placed.points.into_iter().map(Into::into).collect())
+        let placed = placed(&points(at)?, now())?;
+        Ok(placed.into_iter().map(Into::into).collect())
     }
 
     #[test]
@@ -207,48 +136,6 @@ mod tests {
         let expected = [(499_999_000_000, 3.5), (500_000_000_000, -1.0)];
         assert_eq!(placed.as_ref().unwrap()[..2], expected);
         assert_eq!(placed.unwrap()[2], (500_250_000_000, 4.0));
-    }
-
-    #[test]
-    fn the_clocks_are_kept_only_of_calendar_times() {
-        let converted = |at: Value| placed(&points(at).unwrap(), now()).unwrap().converted;
-        assert_eq!(converted(json!([[5e11, 1]])), None);
-        let mixed = json!([[5e11, 1], ["2026-11-21T10:00:00.1Z", 2]]);
-        assert_eq!(converted(mixed), Some(now()));
-    }
-
-    #[test]
-    fn a_calendar_clock_that_is_set_is_noticed_once_and_a_late_reading_is_not() {
-        let mut calendar = Calendar::default();
-        // The time `ms` later, with a calendar clock that was set by `set_ms` in total.
-        let later = |ms: i64, set_ms: i64| Stamp {
-            mono: now().mono + Duration::from_millis(ms.unsigned_abs()),
-            wall: now().wall + jiff::SignedDuration::from_millis(ms + set_ms),
-        };
-        let mut set = |ms, set_ms| {
-            calendar
-                .set(later(ms, set_ms))
-                .map(|set| (set.by_ms, set.until_ns))
-        };
-        assert_eq!(set(0, 0), None);
-        assert_eq!(set(3_600_000, 2), None);
-        let second = 1_000_000_000;
-        assert_eq!(
-            set(4_000_000, -200),
-            Some((-200.0, 4_500 * second + second / 5))
-        );
-        assert_eq!(set(4_000_020, -200), None);
-        assert_eq!(
-            set(4_001_000, 3_600_000),
-            Some((3_600_200.0, 4_502 * second))
-        );
-        assert_eq!(set(4_001_020, 3_600_000), None);
-        // Small settings add up.
-        assert_eq!(set(4_001_040, 3_600_002), None);
-        assert_eq!(
-            set(4_002_000, 3_600_004),
-            Some((4.0, 4_502 * second + 4_000_000))
-        );
     }
 
     #[test]

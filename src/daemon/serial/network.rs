@@ -8,6 +8,7 @@ use rustix::io::Errno;
 use tokio::net::UdpSocket;
 use tokio::time::Instant;
 
+use crate::daemon::log;
 use hardnessd_core::wire;
 
 /// How long a connection may take.
@@ -71,18 +72,14 @@ fn probe(stream: &TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-/// A datagram, or one that is not taken.
+/// What came from a line.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Datagram {
-    /// This many bytes came from the sender.
+    /// This many bytes.
     Bytes(usize),
-    /// The first sender has sent this many bytes.
-    First(usize),
-    /// Another sender has taken the place of the last one, and has sent this many bytes.
-    Next(usize),
-    /// Another one sends, too. It is reported once.
-    Stranger(SocketAddr),
-    /// It says nothing.
+    /// This many bytes of the first sender, or of another one that has taken its place.
+    OfAnother(usize),
+    /// A datagram that is not taken.
     Ignored,
 }
 
@@ -111,7 +108,9 @@ impl Sender {
 }
 
 impl Udp {
-    pub(super) fn new(socket: std::net::UdpSocket) -> io::Result<Self> {
+    pub(super) fn bind(address: &SocketAddr) -> io::Result<Self> {
+        let socket = std::net::UdpSocket::bind(address)?;
+        socket.set_nonblocking(true)?;
         Ok(Self {
             socket: UdpSocket::from_std(socket)?,
             sender: None,
@@ -138,22 +137,19 @@ impl Udp {
                 }
             }
             Some(sender) if sender.address != address && sender.is_new(stale_after) => {
-                match std::mem::replace(&mut sender.reported, true) {
-                    true => Datagram::Ignored,
-                    false => Datagram::Stranger(address),
+                if !std::mem::replace(&mut sender.reported, true) {
+                    log::other_sender(sender.address, address);
                 }
+                Datagram::Ignored
             }
             sender => {
-                let last = sender.replace(Sender {
+                *sender = Some(Sender {
                     address,
                     last: Instant::now(),
                     sends_frames: false,
                     reported: false,
                 });
-                match last {
-                    None => Datagram::First(bytes),
-                    Some(_) => Datagram::Next(bytes),
-                }
+                Datagram::OfAnother(bytes)
             }
         })
     }

@@ -1,22 +1,21 @@
 //! One port of several sensors: it has one owner, which hands each sensor what is for it.
 //!
-//! In: a link, and what each sensor wants to be sent. Out: the turns of the link, to each sensor that they
+//! In: a link, and what each sensor wants to be sent. Out: the inputs of the link, to each sensor that they
 //! concern. The sensors that ask for their frames take turns: the owner sends a request, and its sensor
 //! says when a frame came, or the time for it runs out. Bytes after a request go to the sensor that asked,
 //! because the answers of equal modules are alike. A sensor that does not ask gets all bytes.
 
-use std::net::SocketAddr;
-use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 
-use super::{Link, Settings, Turn};
+use super::{Link, Settings};
 use crate::maybe;
+use hardnessd_core::pipeline::Input;
 
-/// The most turns that wait for a sensor. When the queue is full, the owner waits.
-const TURNS: usize = 64;
+/// The most inputs that wait for a sensor. When the queue is full, the owner waits.
+const INPUTS: usize = 64;
 
 /// How long an answer may take, beside its bytes on the line: so many times as long as the slowest of late, ...
 const TIMES_AS_SLOW: u32 = 8;
@@ -28,42 +27,22 @@ const MOST_TIMEOUT: Duration = Duration::from_millis(100);
 /// take less than half of the time of the others.
 const REST: Duration = Duration::from_millis(150);
 
-/// What a link says, for several sensors.
-#[derive(Debug, Clone)]
-enum Said {
-    Opened,
-    Unavailable(String),
-    Bytes(Arc<[u8]>),
-    Skipped(u64),
-    Lost(String),
-    Stranger(SocketAddr),
-}
-
 /// A sensor's share of a port.
 #[derive(Debug)]
 pub(crate) struct Share {
     index: usize,
-    turns: mpsc::Receiver<Said>,
+    inputs: mpsc::Receiver<Input>,
     /// Tells the owner that a frame of this sensor came.
     frames: mpsc::Sender<usize>,
     /// Changes when the owner has closed the port.
     ended: watch::Receiver<()>,
-    /// The last turn, whose bytes are borrowed.
-    said: Option<Said>,
 }
 
 impl Share {
-    /// Waits for the next turn. Cancelling the wait loses nothing.
-    pub(super) async fn turn(&mut self) -> Turn<'_> {
-        match self.turns.recv().await {
-            Some(said) => match self.said.insert(said) {
-                Said::Opened => Turn::Opened,
-                Said::Unavailable(reason) => Turn::Unavailable(std::mem::take(reason)),
-                Said::Bytes(bytes) => Turn::Bytes(bytes),
-                Said::Skipped(bytes) => Turn::Skipped(*bytes),
-                Said::Lost(reason) => Turn::Lost(std::mem::take(reason)),
-                Said::Stranger(address) => Turn::Stranger(*address),
-            },
+    /// Waits for the next input. Cancelling the wait loses nothing.
+    pub(super) async fn next(&mut self) -> Input {
+        match self.inputs.recv().await {
+            Some(input) => input,
             // The owner ends after its sensors.
             None => std::future::pending().await,
         }
@@ -78,7 +57,7 @@ impl Share {
     /// Gives the share back. The port is closed when all have done so, and then this returns.
     pub(super) async fn close(self) {
         let mut ended = self.ended;
-        drop((self.turns, self.frames));
+        drop((self.inputs, self.frames));
         let _ = ended.changed().await;
     }
 }
@@ -110,7 +89,7 @@ struct Asking {
 #[derive(Debug)]
 struct Owner {
     link: Link,
-    members: Vec<mpsc::Sender<Said>>,
+    members: Vec<mpsc::Sender<Input>>,
     asks: Vec<Ask>,
     /// The members that do not ask.
     listeners: Vec<usize>,
@@ -124,9 +103,10 @@ struct Owner {
 
 /// Shares `link` among sensors with these settings. The owner runs until all shares are given back.
 pub(super) fn share(link: Link, settings: &[Settings]) -> Vec<Share> {
-    let (frames, frames_in) = mpsc::channel(TURNS);
+    let (frames, frames_in) = mpsc::channel(INPUTS);
     let (ending, ended) = watch::channel(());
-    let (members, turns): (Vec<_>, Vec<_>) = settings.iter().map(|_| mpsc::channel(TURNS)).unzip();
+    let (members, inputs): (Vec<_>, Vec<_>) =
+        settings.iter().map(|_| mpsc::channel(INPUTS)).unzip();
     let now = Instant::now();
     let mut asks: Vec<Ask> = Vec::new();
     let mut listeners = Vec::new();
@@ -165,14 +145,13 @@ pub(super) fn share(link: Link, settings: &[Settings]) -> Vec<Share> {
         owner.serve(frames_in).await;
         drop(ending);
     });
-    let shares = turns.into_iter().enumerate();
+    let shares = inputs.into_iter().enumerate();
     shares
-        .map(|(index, turns)| Share {
+        .map(|(index, inputs)| Share {
             index,
-            turns,
+            inputs,
             frames: frames.clone(),
             ended: ended.clone(),
-            said: None,
         })
         .collect()
 }
@@ -181,15 +160,8 @@ impl Owner {
     async fn serve(mut self, mut frames: mpsc::Receiver<usize>) {
         loop {
             let due = self.due();
-            let said = tokio::select! {
-                turn = self.link.turn() => match turn {
-                    Turn::Opened => Said::Opened,
-                    Turn::Unavailable(reason) => Said::Unavailable(reason),
-                    Turn::Bytes(bytes) => Said::Bytes(bytes.into()),
-                    Turn::Skipped(bytes) => Said::Skipped(bytes),
-                    Turn::Lost(reason) => Said::Lost(reason),
-                    Turn::Stranger(address) => Said::Stranger(address),
-                },
+            let input = tokio::select! {
+                input = self.link.next() => input,
                 frame = frames.recv() => {
                     let Some(member) = frame else {
                         return;
@@ -203,16 +175,13 @@ impl Owner {
                     continue;
                 }
             };
-            match said {
-                Said::Opened | Said::Unavailable(_) | Said::Lost(_) => {
-                    self.is_open = matches!(said, Said::Opened);
-                    self.asking = None;
-                }
-                Said::Bytes(_) | Said::Skipped(_) | Said::Stranger(_) => {}
+            if !matches!(input, Input::Bytes(_) | Input::Skipped(_)) {
+                self.is_open = matches!(input, Input::Opened);
+                self.asking = None;
             }
-            for member in self.audience(&said) {
+            for member in self.audience(&input) {
                 // A sensor that has ended takes nothing.
-                let _ = self.members[member].send(said.clone()).await;
+                let _ = self.members[member].send(input.clone()).await;
             }
             // A sensor that never pauses leaves the others their turns.
             tokio::task::yield_now().await;
@@ -220,8 +189,8 @@ impl Owner {
     }
 
     /// The members that something concerns.
-    fn audience(&self, said: &Said) -> Vec<usize> {
-        let Some(asked) = self.last.filter(|_| matches!(said, Said::Bytes(_))) else {
+    fn audience(&self, input: &Input) -> Vec<usize> {
+        let Some(asked) = self.last.filter(|_| matches!(input, Input::Bytes(_))) else {
             return (0..self.members.len()).collect();
         };
         [self.asks[asked].members.as_slice(), &self.listeners].concat()

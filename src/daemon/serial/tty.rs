@@ -59,30 +59,7 @@ fn open_alone(path: &Path, baud: u32) -> io::Result<(TTYPort, LineSettings)> {
     // Bytes from before the port had its settings are of unknown age, and may be garbled.
     port.clear(ClearBuffer::Input)?;
     let settings = tcgetattr(&file)?;
-    lower_latency(path);
     Ok((port, LineSettings { file, settings }))
-}
-
-/// Asks an FTDI adapter to pass bytes on after 1 ms instead of 16. Failure is no error: most ports
-/// have no such timer, and a daemon that is not root leaves it to the udev rule.
-fn lower_latency(path: &Path) {
-    let Ok(device) = path.canonicalize() else {
-        return;
-    };
-    let Some(name) = device.file_name() else {
-        return;
-    };
-    let timer = Path::new("/sys/bus/usb-serial/devices")
-        .join(name)
-        .join("latency_timer");
-    match std::fs::read_to_string(&timer) {
-        Ok(ms) if ms.trim() != "1" => {
-            if let Err(error) = std::fs::write(&timer, "1") {
-                tracing::debug!(timer = %timer.display(), ms = ms.trim(), %error, "latency timer");
-            }
-        }
-        _ => {}
-    }
 }
 
 /// The settings of an open serial line, on a descriptor of their own: that of the port is not

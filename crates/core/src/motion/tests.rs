@@ -104,18 +104,6 @@ fn a_step_back_is_told_and_time_goes_on_from_there() {
 }
 
 #[test]
-fn where_a_clock_was_set_is_unknown_and_a_press_after_it_is_not() {
-    for before in [&steady(0, 2000, 50)[..], &[]] {
-        let mut track = track(before);
-        track.clock_set(2300 * MS);
-        // The first of these points may be of the earlier setting.
-        track.push(&steady(2200, 4000, 50)).unwrap();
-        let known = |begin| approach(&track, begin, &[begin, 3000]).is_some();
-        assert!(!known(1900) && !known(2250) && known(2350));
-    }
-}
-
-#[test]
 fn a_minute_is_held() {
     let mut track = Track::default();
     track.push(&steady(0, 61_000, 50)).unwrap();

@@ -57,9 +57,6 @@ pub enum Input {
     Context(Option<Value>),
     /// Positions of the arm from the robot.
     Motion(Vec<Point>),
-    /// This machine's calendar clock was set. Moments from calendar times are uncertain up to this
-    /// moment of CLOCK_MONOTONIC, in nanoseconds.
-    ClockSet(i64),
     /// The daemon stops.
     Shutdown,
 }
@@ -101,10 +98,6 @@ impl Pipeline {
             }
             Input::Motion(points) => {
                 self.judge.track.push(&points)?;
-                Vec::new()
-            }
-            Input::ClockSet(until_ns) => {
-                self.judge.track.clock_set(until_ns);
                 Vec::new()
             }
         })

@@ -106,7 +106,6 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
             });
         }
         Entry::State(state) => (9, json(state)),
-        Entry::Input(Input::ClockSet(until_ns)) => (10, json(until_ns)),
         Entry::Input(Input::Skipped(bytes)) => (11, json(bytes)),
     };
     ros::to_cdr(&InputMessage {
@@ -202,10 +201,6 @@ pub(super) fn decode_entry(
             let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
             check_context(state.at_rest.context())?;
             Entry::State(Box::new(state))
-        }
-        10 => {
-            let until_ns: i64 = serde_json::from_slice(&data).map_err(unreadable)?;
-            Entry::Input(Input::ClockSet(until_ns))
         }
         11 => {
             let bytes: u64 = serde_json::from_slice(&data).map_err(unreadable)?;

@@ -10,7 +10,6 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use super::message::{self, INPUT, MOTION};
 use super::{Entry, Error};
 use crate::frame::Stamp;
-use crate::ros::Topic;
 
 /// An entry of a sensor, and its moment.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,14 +20,6 @@ pub struct Found {
     pub at: Stamp,
     /// The entry.
     pub entry: Entry,
-}
-
-impl Found {
-    /// The message that a recording has of the entry, with its channel.
-    pub fn message(&self) -> (Topic, Vec<u8>) {
-        let bytes = message::encode_entry(&self.sensor, self.at, &self.entry);
-        (message::topic_of(&self.entry), bytes)
-    }
 }
 
 /// The longest chunk that is read, packed and unpacked. A chunk of ours ends with the first message

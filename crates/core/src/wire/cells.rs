@@ -40,7 +40,7 @@ impl Cell {
     }
 
     /// The number in the first bytes of `b`.
-    pub(super) fn read(self, b: &[u8]) -> f32 {
+    pub fn read(self, b: &[u8]) -> f32 {
         match self {
             Cell::I8 => f32::from(b[0].cast_signed()),
             Cell::U8 => f32::from(b[0]),

@@ -137,21 +137,11 @@ fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
         points[30].mm += 30.0;
         let _ = pipeline.judge.track.push(&points);
     };
-    // The clock was set by the distance of two points, which nothing else shows.
-    let set = |pipeline: &mut Pipeline| {
-        pipeline.judge.track.push(&positions(1000, 2500)).unwrap();
-        pipeline.judge.track.clock_set(2_550_000_000);
-        let mut shifted = positions(2550, 9000);
-        shifted
-            .iter_mut()
-            .for_each(|point| point.at_ns += 50_000_000);
-        pipeline.judge.track.push(&shifted).unwrap();
-    };
     let speed_beside_positions = |pipeline: &mut Pipeline| {
         pipeline.context = Some(json!({"speed_mm_s": 5.0}));
         let _ = pipeline.judge.track.push(&positions(1000, 1500));
     };
-    let prepare: [fn(&mut Pipeline); 5] = [|_| {}, late, jump, set, speed_beside_positions];
+    let prepare: [fn(&mut Pipeline); 4] = [|_| {}, late, jump, speed_beside_positions];
     for prepare in prepare {
         let mut pipeline = tared(&[], |_| {});
         prepare(&mut pipeline);
