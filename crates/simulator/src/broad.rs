@@ -5,9 +5,9 @@
 //! materials, except for creep: three of them have one element, and a broad material has two. Three
 //! ranges have such a number near their middle.
 
-use super::body::Body;
 use super::durometer::{self, Durometer};
 use super::level::{self, Borders, LEVELS, level_of};
+use super::material::{Body, Material};
 use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::{Stream, log_even};
 
@@ -118,7 +118,7 @@ fn stiff(borders: Borders, stream: &mut Stream) -> Body {
 
 /// Index of a law among the materials' names, after the eight named materials.
 fn material_index(law: LawName) -> u8 {
-    super::material::Material::ALL.len() as u8 + law as u8
+    Material::ALL.len() as u8 + law as u8
 }
 
 fn substance(law: LawName, shore: f64, stream: &mut Stream) -> Substance {

@@ -11,12 +11,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::{Deserialize, Serialize};
 
 pub use self::world::{BroadSensors, SensorDesigns};
-use super::body::{Body, draw_patch};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
-use super::material::Split;
+use super::material::{Body, Split};
 use super::motion::Arm;
 use super::object::{Family, POSTURES, Pose, Shapes};
-use super::press::{Bench, Specimen};
+use super::press::{Bench, Specimen, draw_patch};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
@@ -114,12 +113,6 @@ pub struct LabelledCourse {
     /// Whether the object is a soft layer on a stiff core: the durometer reads the layer, a press feels
     /// the core.
     pub layered: bool,
-    /// The object's Young's modulus, MPa.
-    pub young_mpa: f32,
-    /// Frames per second.
-    pub frame_rate_hz: f32,
-    /// The arm's true speed.
-    pub speed_mm_s: f32,
 }
 
 /// One frame of a press.
@@ -252,8 +245,8 @@ pub fn courses(
                 let mut paired = subject.draws.geometry.child(3).child(press);
                 let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
                 let read = subject.pressed(bench, &plan, press, |solved, force_n, noise| {
-                    let read = read_press(&subject.sensor, solved, plan.reading, noise)?;
-                    Some(subject.labelled(object, plan.course(plan.reading, force_n, read)))
+                    let press = plan.read(&subject.sensor, solved, force_n, plan.reading, noise)?;
+                    Some(subject.labelled(object, press))
                 });
                 made.extend(read);
                 progress(done.fetch_add(1, Ordering::Relaxed) + 1);
@@ -333,18 +326,58 @@ impl Subject {
             shore: self.body.shore as f32,
             family: self.object.family,
             layered: matches!(self.body.substance.law, Law::Layered { .. }),
-            young_mpa: self.body.young_mpa as f32,
             ..press
         }
     }
 }
 
 impl Plan {
-    /// A press of this plan on a rigid disc, without labels.
-    pub(super) fn course(&self, reading: Reading, force_n: f64, read: ReadPress) -> LabelledCourse {
-        LabelledCourse {
-            moments: read.moments,
-            best: read.best,
+    /// A press of this plan as a sensor reads it, without labels. `None` unless the daemon sees one press
+    /// in it.
+    pub(super) fn read(
+        &self,
+        sensor: &Sensor,
+        solved: &SolvedPress,
+        force_n: f64,
+        reading: Reading,
+        noise: &mut Stream,
+    ) -> Option<LabelledCourse> {
+        let Reading { period_s, phase } = reading;
+        // The frames from a few before the touch to the release, with their times after the touch.
+        let gain = sensor.press_gain(noise);
+        let felt = solved.felt(&sensor.grid);
+        let mut film = Film::new(&sensor.design);
+        let first_s = -(BEFORE as f64 + phase) * period_s;
+        let last_s = solved.duration_s() + sensor.design.settled_s();
+        let (times, frames): (Vec<f64>, Vec<Frame>) = (0_u32..)
+            .map(|number| first_s + f64::from(number) * period_s)
+            .take_while(|&time_s| time_s < last_s)
+            .map(|time_s| {
+                let forces = felt.taxels_n(time_s);
+                let film_n = film.advance(&sensor.design, &forces, period_s);
+                (time_s, sensor.felt(&sensor.read(&film_n, gain, noise)))
+            })
+            .unzip();
+        let Seen { contact, best } = one_press(&frames, &sensor.thresholds(), period_s)?;
+        let begin = contact[0];
+        let of_contact = contact.binary_search(&best);
+        let of_contact = of_contact.expect("the best frame is in contact");
+        let thin = thinned(contact.len(), of_contact, COURSE_FRAMES.1);
+        let places: Vec<usize> = (begin.saturating_sub(BEFORE)..begin)
+            .chain(thin.iter().map(|&place| contact[place]))
+            .collect();
+        let resampling = Resampling::new(&frames[best], sensor.grid.pitch, Pitch::JX255N.rows_mm);
+        let approach_mm = |place: usize| solved.motion.approach_mm(times[place]);
+        let moment = |&place: &usize| Sample {
+            millinewtons: millinewtons(&resampling.apply(&frames[place]).newtons),
+            time_s: (times[place] - times[begin]) as f32,
+            approach_mm: (approach_mm(place) - approach_mm(begin)) as f32,
+        };
+        Some(LabelledCourse {
+            moments: places.iter().map(moment).collect(),
+            best: places
+                .binary_search(&best)
+                .expect("thinning keeps the best frame"),
             arm_n_per_mm: self.arm.n_per_mm as f32,
             level: 0,
             object: 0,
@@ -356,87 +389,7 @@ impl Plan {
             reference: None,
             family: Family::Disc,
             layered: false,
-            young_mpa: f32::INFINITY,
-            frame_rate_hz: (1.0 / reading.period_s) as f32,
-            speed_mm_s: self.arm.speed_mm_s as f32,
-        }
-    }
-}
-
-/// A press as a data set holds it.
-pub(super) struct ReadPress {
-    pub(super) moments: Vec<Sample>,
-    /// Index of the best frame.
-    pub(super) best: usize,
-}
-
-/// A press as a sensor reads it. `None` unless the daemon sees one press in it.
-pub(super) fn read_press(
-    sensor: &Sensor,
-    solved: &SolvedPress,
-    reading: Reading,
-    noise: &mut Stream,
-) -> Option<ReadPress> {
-    let frames = frames(sensor, solved, reading, noise);
-    let seen = one_press(
-        frames.iter().map(|(_, frame)| frame),
-        &sensor.thresholds(),
-        reading.period_s,
-    )?;
-    Some(kept(&frames, &seen, sensor.grid.pitch, solved))
-}
-
-/// The sensor's frames from a few before the touch to the release, with their times after the
-/// touch.
-fn frames(
-    sensor: &Sensor,
-    solved: &SolvedPress,
-    reading: Reading,
-    noise: &mut Stream,
-) -> Vec<(f64, Frame)> {
-    let gain = sensor.press_gain(noise);
-    let felt = solved.felt(&sensor.grid);
-    let mut film = Film::new(&sensor.design);
-    let first_s = -(BEFORE as f64 + reading.phase) * reading.period_s;
-    let last_s = solved.duration_s() + sensor.design.settled_s();
-    (0_u32..)
-        .map(|number| first_s + f64::from(number) * reading.period_s)
-        .take_while(|&time_s| time_s < last_s)
-        .map(|time_s| {
-            let forces = felt.taxels_n(time_s);
-            let film_n = film.advance(&sensor.design, &forces, reading.period_s);
-            (time_s, sensor.felt(&sensor.read(&film_n, gain, noise)))
         })
-        .collect()
-}
-
-/// The frames to keep, on the model's grid, and the best frame among them.
-fn kept(frames: &[(f64, Frame)], seen: &Seen, pitch: Pitch, solved: &SolvedPress) -> ReadPress {
-    let begin = seen.contact[0];
-    let best = seen
-        .contact
-        .binary_search(&seen.best)
-        .expect("the best frame is in contact");
-    let thin = thinned(seen.contact.len(), best, COURSE_FRAMES.1);
-    let places: Vec<usize> = (begin.saturating_sub(BEFORE)..begin)
-        .chain(thin.iter().map(|&place| seen.contact[place]))
-        .collect();
-    let begin_s = frames[begin].0;
-    let resampling = Resampling::new(&frames[seen.best].1, pitch, Pitch::JX255N.rows_mm);
-    let moment = |&place: &usize| {
-        let (time_s, frame) = &frames[place];
-        let approach_mm = solved.motion.approach_mm(*time_s) - solved.motion.approach_mm(begin_s);
-        Sample {
-            millinewtons: millinewtons(&resampling.apply(frame).newtons),
-            time_s: (time_s - begin_s) as f32,
-            approach_mm: approach_mm as f32,
-        }
-    };
-    ReadPress {
-        moments: places.iter().map(moment).collect(),
-        best: places
-            .binary_search(&seen.best)
-            .expect("thinning keeps the best frame"),
     }
 }
 

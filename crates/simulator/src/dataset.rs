@@ -5,11 +5,10 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use super::body::draw_patch;
 use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
-use super::press::{Bench, Specimen};
+use super::press::{Bench, Specimen, draw_patch};
 use super::sensor::Film;
 use super::settings::DatasetSettings;
 use super::subject::{Subject, shared_out, units};

@@ -116,6 +116,34 @@ pub(super) struct Properties {
     pub(super) substance: Substance,
 }
 
+/// The material of one object, with its hardness and level, which are its labels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Body {
+    pub(super) substance: Substance,
+    pub(super) young_mpa: f64,
+    /// Shore OO hardness.
+    pub(super) shore: f64,
+    /// Hardness level, 1 to 4.
+    pub(super) level: u8,
+    /// Index in [`super::material_names`].
+    pub(super) material: u8,
+}
+
+impl Body {
+    /// An object of a named material, with a hardness drawn from the material's distribution.
+    pub(super) fn named(material: Material, stream: &mut Stream) -> Self {
+        let properties = material.properties();
+        let shore = properties.shore.draw(stream);
+        Self {
+            substance: properties.substance,
+            young_mpa: properties.young_mpa(shore),
+            shore,
+            level: material.level(),
+            material: material.index(),
+        }
+    }
+}
+
 /// Distribution of the Shore OO hardness over a material's objects.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shore {

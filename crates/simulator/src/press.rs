@@ -11,8 +11,9 @@ use super::contact::{self, Axes, Column, Contact, Fields, Local, Problem, Standi
 use super::fourier::Convolver;
 use super::kernel::{self, Base, Layer};
 use super::object::{Face, Pose};
-use super::substance::{Law, Substance};
+use super::substance::{Law, Substance, Texture};
 use super::texture::Patch;
+use crate::random::Stream;
 
 /// Width of a cell, mm: a quarter of a taxel of the JX255N.
 pub(super) const CELL_MM: f64 = 0.875;
@@ -85,6 +86,12 @@ struct Blocked {
     /// For Young's modulus 1 MPa.
     column: Column,
     axes: Axes,
+}
+
+/// Draws the roughness of one posture's face.
+pub(super) fn draw_patch(texture: &Texture, roughness: f64, stream: &mut Stream) -> Patch {
+    let factor = roughness * (0.35 * stream.normal()).exp();
+    Patch::new(texture, factor, CELL_MM, stream)
 }
 
 /// The part of the sensor on which a press is solved.
@@ -594,7 +601,6 @@ mod tests {
     use super::super::object::{Face, Pose};
     use super::super::sensor::Grid;
     use super::*;
-    use crate::random::Stream;
 
     /// A ball of radius 27 mm of this material, with `roughness` times its roughness.
     fn ball(material: Material, roughness: f64) -> Specimen {

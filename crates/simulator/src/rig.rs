@@ -4,8 +4,7 @@
 //! goes on from the creep and the dents that the steps before left in the object, also after the
 //! sensor has left it.
 
-use super::body::Body;
-use super::material::Material;
+use super::material::{Body, Material};
 use super::motion::Arm;
 use super::press::{Bench, Specimen};
 use super::sensor::{Film, Sensor};
@@ -136,7 +135,7 @@ impl Placed {
         let place = object.saturating_sub(1);
         let mut draws = root.child(1).child(u64::from(place));
         let material = settings.materials[place as usize % settings.materials.len()];
-        let (Body { shore, .. }, specimen) = presented(settings.shapes, Some(material), &mut draws);
+        let (Body { shore, .. }, specimen) = presented(Some(material), &mut draws);
         let window = bench.press(&specimen, FIRST_N, 1.0, 0.0).0;
         Self {
             at: State::new(&specimen, window),

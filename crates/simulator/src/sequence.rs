@@ -5,14 +5,13 @@
 
 use std::collections::VecDeque;
 
-use super::body::{Body, draw_patch};
 use super::broad::{self, LawName};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::level::Borders;
-use super::material::Material;
+use super::material::{Body, Material};
 use super::motion::{Approach, Arm, Motion};
 use super::object::{Object, POSTURES, Pose, Shapes};
-use super::press::{Bench, Specimen};
+use super::press::{Bench, Specimen, draw_patch};
 use super::rigid::{self, Reference};
 use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
 use super::solved::SolvedPress;
@@ -37,8 +36,6 @@ pub struct SequenceSettings {
     pub presses: Option<u32>,
     /// Least rest before the first press and after each, s.
     pub rest_s: f64,
-    /// Distribution of shapes.
-    pub shapes: Shapes,
     /// Spread of the sensor.
     pub profile: SensorProfile,
     /// The rigid piece to press in place of the objects.
@@ -56,7 +53,6 @@ impl Default for SequenceSettings {
             forces_n: Vec::new(),
             presses: None,
             rest_s: REST_S,
-            shapes: Shapes::Matched,
             profile: SensorProfile::Clean,
             piece: None,
         }
@@ -118,8 +114,6 @@ pub struct SequenceFrame {
     pub raw: RawFrame,
     /// Number of the press, from 1, which includes the rest after it. 0 before the first press.
     pub press: u32,
-    /// Material of the current or last press; `None` before the first press, and for a random one.
-    pub material: Option<Material>,
     /// Whether the object is being touched.
     pub loaded: bool,
     /// The arm's motion around this frame.
@@ -232,9 +226,6 @@ impl Sequence {
         SequenceFrame {
             raw: RawFrame::zero(ARRAY),
             press: self.made,
-            material: (self.made > 0)
-                .then(|| self.settings.material(self.made))
-                .flatten(),
             loaded: false,
             approach,
         }
@@ -250,7 +241,7 @@ impl Sequence {
         let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
         let specimen = match self.settings.piece {
             Some(piece) => rigid::specimen(&rigid::face(piece), &mut draws.child(2)),
-            None => presented(self.settings.shapes, material, &mut draws).1,
+            None => presented(material, &mut draws).1,
         };
         let rate = self.settings.frame_rate_hz;
         let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
@@ -276,7 +267,6 @@ impl Sequence {
                     .extend(frames.into_iter().map(|(raw, loaded)| SequenceFrame {
                         raw,
                         press: self.made,
-                        material,
                         loaded,
                         approach,
                     }));
@@ -324,13 +314,9 @@ fn body(material: Option<Material>, draws: &Stream) -> Body {
 }
 
 /// Draws an object of the material, or of a random one, and one of its faces in a pose.
-pub(super) fn presented(
-    shapes: Shapes,
-    material: Option<Material>,
-    draws: &mut Stream,
-) -> (Body, Specimen) {
+pub(super) fn presented(material: Option<Material>, draws: &mut Stream) -> (Body, Specimen) {
     let body = body(material, draws);
-    let object = Object::draw(shapes, body.level, &mut draws.child(0));
+    let object = Object::draw(Shapes::Matched, body.level, &mut draws.child(0));
     let face = object.face(draws.below(POSTURES));
     let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
     let pose = Pose::draw(&face, &mut draws.child(2));
@@ -375,8 +361,6 @@ mod tests {
             assert!((held as f64) < 15.0 * rate, "{held} frames");
             let rest = own.clone().filter(|frame| !frame.loaded).count() as f64;
             assert!(rest >= 5.0_f64.max(0.9 * rate), "{press} rests {rest}");
-            let material = settings.material(press);
-            assert!(own.clone().all(|frame| frame.material == material));
         }
         let is_free = |frame: &SequenceFrame| frame.raw == RawFrame::default();
         assert!(frames.iter().all(|frame| frame.loaded || is_free(frame)));
@@ -482,10 +466,7 @@ mod tests {
             assert!(one.name.starts_with("random-"), "{one:?}");
             assert_eq!(one.level, crate::level_of(one.shore));
         }
-        let frames = check(&settings);
-        for frame in frames.iter().filter(|frame| frame.press > 0) {
-            assert_eq!(frame.material.is_none(), frame.press > 4);
-        }
+        check(&settings);
     }
 
     #[test]

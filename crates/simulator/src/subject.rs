@@ -7,10 +7,9 @@
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use super::body::Body;
 use super::broad;
 use super::level::LEVELS;
-use super::material::{Material, Split};
+use super::material::{Body, Material, Split};
 use super::object::{Object, Shapes};
 use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};

@@ -28,17 +28,12 @@ pub(super) struct Seen {
 
 /// The press that a press tracker sees in these frames, when frames without load follow. `None`
 /// unless there is exactly one press and it ends with a release.
-pub(super) fn one_press<'a>(
-    frames: impl IntoIterator<Item = &'a Frame>,
-    settings: &Thresholds,
-    period_s: f64,
-) -> Option<Seen> {
-    let frames: Vec<&Frame> = frames.into_iter().collect();
+pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) -> Option<Seen> {
     let free = Frame::zero(frames.first()?.array);
     let rest = std::iter::repeat_n(&free, settings.end_frames as usize);
     let mut tracker = PressTracker::new(settings.clone());
     let (mut contact, mut best) = (Vec::new(), None);
-    for (number, frame) in (0_u32..).zip(frames.iter().copied().chain(rest)) {
+    for (number, frame) in (0_u32..).zip(frames.iter().chain(rest)) {
         let at = FrameAt {
             frame: number.into(),
             stamp: Stamp {

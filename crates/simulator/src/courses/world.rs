@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading, read_press};
+use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading};
 use crate::material::Split;
 use crate::object::Family;
 use crate::press::{Bench, Cover};
@@ -205,11 +205,11 @@ impl Electronics {
             period_s: self.period_s,
             phase: noise.uniform(),
         };
-        let read = read_press(&self.sensor, solved, reading, noise)?;
+        let press = plan.read(&self.sensor, solved, force_n, reading, noise)?;
         Some(LabelledCourse {
             sensor: self.number,
             arm_n_per_mm: (plan.arm.n_per_mm * self.arm_factor) as f32,
-            ..plan.course(reading, force_n, read)
+            ..press
         })
     }
 }
