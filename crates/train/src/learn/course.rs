@@ -189,45 +189,29 @@ impl<'a> Course<'a> {
     }
 
     /// The network's inputs for a question.
-    fn group(&self, question: &Question, vary: Option<&mut Stream>) -> course::Group {
-        let press = |&place: &usize| self.prepared[place].clone();
-        let presses: Vec<Press> = question.presses.iter().map(press).collect();
-        let references = question.references.iter();
-        let references: Vec<(Press, Piece)> = references
-            .map(|(place, piece)| (press(place), *piece))
-            .collect();
-        let (presses, references) = match vary {
-            Some(stream) => self.varied(&presses, &references, stream),
-            None => (presses, references),
-        };
-        let inputs = |press: &Press| press.inputs(&self.standard);
-        course::Group {
-            presses: presses.iter().map(inputs).collect(),
-            references: references
-                .iter()
-                .map(|(press, piece)| (inputs(press), *piece))
-                .collect(),
-        }
-    }
-
-    /// Presses with the robot's errors, as training presses have them. References are whole presses.
-    fn varied(
-        &self,
-        presses: &[Press],
-        references: &[(Press, Piece)],
-        stream: &mut Stream,
-    ) -> (Vec<Press>, Vec<(Press, Piece)>) {
+    fn group(&self, question: &Question, mut vary: Option<&mut Stream>) -> course::Group {
         let whole = ArmReports {
             early: 0.0,
             ..self.reports
         };
-        let presses = presses
-            .iter()
-            .map(|press| self.reports.varied(press, stream))
-            .collect();
-        let references = references.iter();
-        let references = references.map(|(press, piece)| (whole.varied(press, stream), *piece));
-        (presses, references.collect())
+        // With a stream, presses have the robot's errors, as training presses have them. References are
+        // whole presses.
+        let mut inputs = |place: usize, reports: &ArmReports| {
+            let press = &self.prepared[place];
+            let press = match vary.as_deref_mut() {
+                Some(stream) => &reports.varied(press, stream),
+                None => press,
+            };
+            press.inputs(&self.standard)
+        };
+        let presses = question.presses.iter();
+        let references = question.references.iter();
+        course::Group {
+            presses: presses.map(|&place| inputs(place, &self.reports)).collect(),
+            references: references
+                .map(|&(place, piece)| (inputs(place, &whole), piece))
+                .collect(),
+        }
     }
 }
 

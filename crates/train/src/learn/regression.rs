@@ -202,22 +202,6 @@ impl<'a> Regression<'a> {
         weights.add("levels.bias", &[self.levels], bias, self.device);
         weights
     }
-
-    fn coefficients(&self, weights: &Weights) -> Vec<f64> {
-        let (matrix, bias) = (
-            weights.numbers("levels.matrix"),
-            weights.numbers("levels.bias"),
-        );
-        let of_level = |level: usize| {
-            let varying = self.varying.iter();
-            let column = varying.map(|column| matrix[column * self.levels + level]);
-            column
-                .chain([bias[level]])
-                .map(f64::from)
-                .collect::<Vec<_>>()
-        };
-        (0..self.levels).flat_map(of_level).collect()
-    }
 }
 
 impl Learning for Regression<'_> {
@@ -279,11 +263,24 @@ impl Learning for Regression<'_> {
         questions: &[Question],
         _vary: Option<&mut Stream>,
     ) -> Vec<Vec<f32>> {
-        let coefficients = self.coefficients(&weights[0]);
+        let [matrix, bias] = ["levels.matrix", "levels.bias"].map(|name| weights[0].numbers(name));
         let presses = questions.iter().flat_map(|question| &question.presses);
-        presses
-            .map(|&press| logits(&coefficients, &self.row(press)))
-            .collect()
+        let judge = |press: &usize| {
+            let mut logits: Vec<f64> = vec![0.0; self.levels];
+            for &column in &self.varying {
+                let seen = self.table.rows[press][column];
+                let x = f64::from(self.standard.apply(column, seen));
+                let of_levels = &matrix[column * self.levels..];
+                for (logit, &coefficient) in logits.iter_mut().zip(of_levels) {
+                    *logit += f64::from(coefficient) * x;
+                }
+            }
+            let logits = logits.iter().zip(&bias);
+            logits
+                .map(|(x, &bias)| (x + f64::from(bias)) as f32)
+                .collect()
+        };
+        presses.map(judge).collect()
     }
 
     fn outputs(&self) -> Outputs {

@@ -39,21 +39,22 @@ pub fn inherited(
     seed: u64,
     device: &Device,
 ) -> Weights {
-    let mut weights = discriminator.clone();
-    weights
-        .entries
-        .retain(|weight| !weight.name.starts_with("head."));
+    let mut weights = without_head(discriminator);
     let stream = Stream::new(seed, "hrn weights");
     network::add_head(&mut weights, [features(pooling), levels], &stream, device);
     weights
 }
 
+fn without_head(discriminator: &Weights) -> Weights {
+    let mut weights = discriminator.clone();
+    let is_kept = |name: &str| !name.starts_with("head.");
+    weights.entries.retain(|weight| is_kept(&weight.name));
+    weights
+}
+
 /// HRN from a discriminator whose first `levels` logits are the levels. Further logits are cut off.
 pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Weights {
-    let mut weights = discriminator.clone();
-    weights
-        .entries
-        .retain(|weight| !weight.name.starts_with("head."));
+    let mut weights = without_head(discriminator);
     let outputs = discriminator.numbers("head.bias").len();
     for (name, dims) in [
         ("head.matrix", vec![FEATURES, levels]),
