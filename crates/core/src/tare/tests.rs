@@ -166,27 +166,24 @@ fn touch_of(tare: &Tare) -> Option<Touch> {
 
 #[test]
 fn a_moving_or_a_resting_load_is_contact() {
-    let moving = [[2, 4], [2, 4], [2, 4]];
-    let check = |touch: &dyn Fn(usize) -> Vec<(usize, u16)>, expected: Option<&str>| {
+    let moves = "3 taxels varied by 0.07 N or more, [0, 2] by 0.08 N: free the sensor; if";
+    let rests = "3 taxels read more than 0.5 N above the array's median, [0, 2] 0.52 N: free";
+    for (taxels, counts, expected) in [
+        (3, [2, 4], Some(moves)),
+        (2, [2, 4], None),
+        (3, [15, 15], Some(rests)),
+        (3, [14, 14], None),
+    ] {
         let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
-        (0..5).for_each(|frame| tare.observe(&raw(&touch(frame))));
+        for frame in 0..5 {
+            let touch: Vec<_> = (0..taxels).map(|i| (i, counts[frame % 2])).collect();
+            tare.observe(&raw(&touch));
+        }
         let found = touch_of(&tare).map(|touch| touch.to_string());
         assert_eq!(tare.aim().is_some(), expected.is_some());
         let (found, expected) = (found.unwrap_or_default(), expected.unwrap_or_default());
         assert!(found.starts_with(expected), "{found}");
-    };
-    let moves = Some("3 taxels varied by 0.07 N or more, [0, 2] by 0.08 N: free the sensor; if");
-    let rests = Some("3 taxels read more than 0.5 N above the array's median, [0, 2] 0.52 N: free");
-    check(
-        &|frame| (0..3).map(|i| (i, moving[i][frame % 2])).collect(),
-        moves,
-    );
-    check(
-        &|frame| (0..2).map(|i| (i, moving[i][frame % 2])).collect(),
-        None,
-    );
-    check(&|_| (0..3).map(|i| (i, 2 + 13)).collect(), rests);
-    check(&|_| (0..3).map(|i| (i, 2 + 12)).collect(), None);
+    }
 }
 
 /// The counts of 40 taxels in each frame of a robot that presses again and again. `unloaded` of `cycle`
@@ -231,39 +228,30 @@ fn the_first_tare_takes_the_first_quiet_frames_wherever_a_robot_begins() {
 
 #[test]
 fn what_a_tare_compares_is_the_array_and_its_live_taxels() {
-    let check = |settings: &Settings, array: Array, contact, frames: [RawFrame; 2]| {
-        let mut tare = Tare::new(settings, array, contact);
-        frames.iter().for_each(|raw| tare.observe(raw));
-        touch_of(&tare).map(|touch| touch.kind)
-    };
-    let settings = |dead: &[[usize; 2]]| Settings {
-        tare_frames: 2,
-        ..settings(dead)
-    };
-    let touched = Some(TouchKind::Varies);
-    let flicker = [[(0, 2), (1, 2), (2, 2)], [(0, 9), (1, 9), (2, 9)]].map(|c| raw(&c));
-    let row = [[0, 0], [0, 1], [0, 2]];
-    for (dead, expected) in [(&row[..], None), (&row[..2], None), (&[], touched)] {
-        let found = check(&settings(dead), Array::JX255N, CONTACT, flicker.clone());
-        assert_eq!(found, expected, "{dead:?}");
-    }
-    // Only values above the median count as high: some taxels may rest low.
-    let mut high = even(Array::JX255N, 30);
-    high.counts[..4].fill(0.0);
-    assert_eq!(
-        check(&settings(&[]), Array::JX255N, CONTACT, [high.clone(), high]),
-        None
-    );
-    // A variation equal to the threshold counts: two counts are 0.08 N.
-    let two = [[(0, 2), (1, 2), (2, 2)], [(0, 4), (1, 4), (2, 4)]].map(|c| raw(&c));
-    for (threshold_n, expected) in [(0.08, touched), (0.081, None)] {
+    let check = |dead: &[[usize; 2]], threshold_n, frames: [RawFrame; 2]| {
+        let mut settings = settings(dead);
+        settings.tare_frames = 2;
         let contact = Contact {
             threshold_n,
             ..CONTACT
         };
-        let found = check(&settings(&[]), Array::JX255N, contact, two.clone());
-        assert_eq!(found, expected, "{threshold_n} N");
+        let mut tare = Tare::new(&settings, Array::JX255N, contact);
+        frames.iter().for_each(|raw| tare.observe(raw));
+        touch_of(&tare).map(|touch| touch.kind)
+    };
+    let touched = Some(TouchKind::Varies);
+    let flicker = |count| [2, count].map(|count| raw(&[(0, count), (1, count), (2, count)]));
+    let row = [[0, 0], [0, 1], [0, 2]];
+    for (dead, expected) in [(&row[..], None), (&row[..2], None), (&[], touched)] {
+        assert_eq!(check(dead, 0.07, flicker(9)), expected, "{dead:?}");
     }
+    // Only values above the median count as high: some taxels may rest low.
+    let mut high = even(Array::JX255N, 30);
+    high.counts[..4].fill(0.0);
+    assert_eq!(check(&[], 0.07, [high.clone(), high]), None);
+    // A variation equal to the threshold counts: two counts are 0.08 N.
+    assert_eq!(check(&[], 0.08, flicker(4)), touched);
+    assert_eq!(check(&[], 0.081, flicker(4)), None);
 }
 
 #[test]

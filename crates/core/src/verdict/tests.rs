@@ -305,41 +305,28 @@ fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
     assert_eq!(verdict.levels, Some(vec![2, 3]));
 }
 
-fn with_range(bytes: &[u8], key: &str, range: &Value) -> Result<Hrn, ModelError> {
-    Hrn::load(&changed(bytes, |p| {
-        edit(p, "hrn.range", |of| of[key] = range.clone());
-    }))
-}
-
-/// The ranges of presses, each with its number for `course(4, true)`.
-const OF_PRESSES: [(&str, f32); 5] = [
-    ("duration_s", 0.6),
-    ("frame_period_s", 0.2),
-    ("speed_mm_s", 5.0),
-    ("approach_mm", 3.0),
-    ("arm_n_per_mm", 7.5),
-];
-
 #[test]
 fn a_press_is_held_by_the_range_that_it_lies_in() {
-    let model = course_model(8, &[]);
-    assert_eq!(
-        Hrn::load(&model).unwrap().card().range.of_presses(),
-        [None; 5]
-    );
     let known = course(4, true);
-    for (place, (key, number)) in OF_PRESSES.into_iter().enumerate() {
+    // Where nothing is known of the arm, its ranges exclude nothing.
+    let mut unknown = course(4, false);
+    unknown.arm_n_per_mm = 0.0;
+    let numbers = [
+        ("duration_s", 0.6),
+        ("frame_period_s", 0.2),
+        ("speed_mm_s", 5.0),
+        ("approach_mm", 3.0),
+        ("arm_n_per_mm", 7.5),
+    ];
+    for (place, (key, number)) in numbers.into_iter().enumerate() {
         let [low, high] = known.extents()[place].unwrap();
         assert!((low / number - 1.0).abs() < 1e-5 && low == high, "{key}");
         for (range, is_held) in [([0.5, 1.5], true), ([1.1, 1.5], false), ([0.5, 0.9], false)] {
-            let range = range.map(|part: f32| part * number);
-            let hrn = with_range(&model, key, &json!(range)).unwrap();
-            assert_eq!(hrn.card().range.holds(&known), is_held, "{key} {range:?}");
-            // Where nothing is known of the arm, its ranges exclude nothing.
-            let mut unknown = course(4, false);
-            unknown.arm_n_per_mm = 0.0;
-            let held = hrn.card().range.holds(&unknown);
-            assert_eq!(held, is_held || place > 1, "{key} {range:?}");
+            let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
+            of[key] = json!(range.map(|part: f32| part * number));
+            let range: Range = serde_json::from_value(of).unwrap();
+            assert_eq!(range.holds(&known), is_held, "{range:?}");
+            assert_eq!(range.holds(&unknown), is_held || place > 1, "{range:?}");
         }
     }
 }

@@ -93,18 +93,6 @@ fn a_press_is_never_followed_however_slow_or_long() {
     );
     let (_, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 1, |_| 0.0, &TOUCHED);
     assert!((most_n - 1.0).abs() < 1e-4, "{most_n}");
-
-    // The load grows by 2 N an hour on each taxel, twice the bound. After 252 s it is 0.07 N above
-    // the baseline, which has followed by 0.07 N. From then on the baseline stays.
-    let mut pipeline = following(true);
-    let slow = |second: u64| 2.0 * (second - 10) as f64 / HOUR as f64;
-    let (published, most_n) = play_at_2_hz(&mut pipeline, 10, HOUR, slow, &[]);
-    assert_eq!(published[0], "Begin 1");
-    let lost_n = 2.0 - most_n;
-    assert!(
-        (0.03..0.11).contains(&lost_n),
-        "{lost_n} N a taxel are lost"
-    );
 }
 
 #[test]
