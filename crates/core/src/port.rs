@@ -19,14 +19,6 @@ pub enum Port {
     Udp(SocketAddr),
 }
 
-/// The error of a text that names no port.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("found {found:?}, expected {expected}")]
-pub struct PortError {
-    found: String,
-    expected: &'static str,
-}
-
 impl Port {
     /// The path of the device file, if the port has one.
     pub fn device(&self) -> Option<&Path> {
@@ -51,13 +43,10 @@ impl From<PathBuf> for Port {
 }
 
 impl FromStr for Port {
-    type Err = PortError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, PortError> {
-        let error = |expected| PortError {
-            found: text.to_owned(),
-            expected,
-        };
+    fn from_str(text: &str) -> Result<Self, String> {
+        let error = |expected: &str| format!("found {text:?}, expected {expected}");
         if let Some(address) = text.strip_prefix("tcp://") {
             let is_host = |host: &str| {
                 let is_part = |c: char| c.is_ascii_graphic() && c != '/';
@@ -90,9 +79,9 @@ impl FromStr for Port {
 }
 
 impl TryFrom<String> for Port {
-    type Error = PortError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, PortError> {
+    fn try_from(text: String) -> Result<Self, String> {
         text.parse()
     }
 }
@@ -142,7 +131,7 @@ mod tests {
             ("udp://0.0.0.0:0", "expected udp://ADDRESS:PORT"),
             ("http://host:80", "expected a device file, tcp://"),
         ] {
-            let error = text.parse::<Port>().unwrap_err().to_string();
+            let error = text.parse::<Port>().unwrap_err();
             assert!(error.contains(expected), "{error}");
             assert!(error.starts_with(&format!("found {text:?}")), "{error}");
         }

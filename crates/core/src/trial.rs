@@ -16,7 +16,6 @@ use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, Signal};
 use rustix::time::ClockId;
-use serde::{Deserialize, Serialize};
 
 use crate::verdict::{self, Hrn, ModelError};
 use crate::wording;
@@ -39,16 +38,9 @@ const TIMED: Duration = Duration::from_secs(1);
 /// The program that runs as a trial. Without it, there is no trial.
 static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
-/// The answer of a trial, as a line of JSON.
-#[derive(Debug, Serialize, Deserialize)]
-enum Answer {
-    /// The file is good. The number is the median of the processor time of its verdicts.
-    Good {
-        verdict_us: f64,
-    },
-    Refused(String),
-    Panicked(String),
-}
+/// The answer of a trial, as a line of JSON: the median of the processor time of verdicts, in
+/// microseconds, or why the file is refused.
+type Answer = Result<f64, String>;
 
 /// The longest time for a verdict if the fastest sensor sends `frame_rate_hz` frames a second.
 pub fn verdict_most(frame_rate_hz: f64) -> Duration {
@@ -120,15 +112,12 @@ fn tried(command: &mut Command, bytes: &[u8]) -> Result<Duration, ModelError> {
         output.map_err(|error| refused(format!("the process that tried it is lost: {error}")))?;
     // After a panic, a second answer may follow. Only the first answer counts.
     let mut answers = serde_json::Deserializer::from_slice(&output.stdout).into_iter();
-    match answers.next().and_then(Result::ok) {
-        Some(Answer::Good { verdict_us }) => {
+    match answers.next().and_then(serde_json::Result::<Answer>::ok) {
+        Some(Ok(verdict_us)) => {
             let verdict = Duration::try_from_secs_f64(verdict_us / 1e6);
             Ok(verdict.unwrap_or(Duration::MAX))
         }
-        Some(Answer::Refused(problem)) => Err(ModelError::new(problem)),
-        Some(Answer::Panicked(problem)) => Err(refused(format!(
-            "the inference library failed on it: {problem}"
-        ))),
+        Some(Err(problem)) => Err(ModelError::new(problem)),
         None => Err(refused(why_silent(output.status))),
     }
 }
@@ -154,7 +143,10 @@ fn trial() -> ExitCode {
     panic::set_hook(Box::new(|info| {
         let text = info.payload_as_str().unwrap_or("a panic");
         let text = text.chars().take(200).collect::<String>();
-        write_answer(&Answer::Panicked(wording::escaped(&text)));
+        let text = wording::escaped(&text);
+        write_answer(&Err(format!(
+            "model: the inference library failed on it: {text}"
+        )));
     }));
     let mut bytes = Vec::new();
     let read = std::io::stdin()
@@ -166,10 +158,7 @@ fn trial() -> ExitCode {
             .and_then(|hrn| median_us(&hrn))
             .map_err(|error| error.to_string()),
     };
-    write_answer(&match judged {
-        Ok(verdict_us) => Answer::Good { verdict_us },
-        Err(problem) => Answer::Refused(problem),
-    });
+    write_answer(&judged);
     ExitCode::SUCCESS
 }
 
@@ -255,16 +244,15 @@ mod tests {
             ("kill -XCPU $$", "more than 10 s of processor time"),
             ("echo nonsense", "the inference library failed on it"),
             (
-                r#"echo '{"Panicked":"at sea"}{"Refused":"so"}'"#,
-                "failed on it: at sea",
+                r#"echo '{"Err":"model of clay"}{"Err":"so"}'"#,
+                "model of clay",
             ),
-            (r#"echo '{"Refused":"model of clay"}'"#, "model of clay"),
         ] {
             let line = tried(script).unwrap_err().to_string();
             assert!(line.contains(expected), "{script}: {line}");
             assert!(!line.contains('\n'), "{line}");
         }
-        let good = tried(r#"echo '{"Good":{"verdict_us":2000.0}}'"#);
+        let good = tried(r#"echo '{"Ok":2000.0}'"#);
         assert_eq!(good.unwrap(), Duration::from_millis(2));
         let none = super::tried(&mut Command::new("/nonexistent"), b"").unwrap_err();
         assert!(

@@ -26,6 +26,6 @@ pub use self::checksum::{Checksum, ChecksumOver};
 pub use self::decoder::{Damage, Decoded, Decoder, Place, TELNET, is_telnet};
 pub use self::layout::Layout;
 pub use self::settings::{
-    Cell, FooterBytes, Framing, HexBytes, HexError, LengthField, Order, Packets, Preset, Settings,
+    Cell, FooterBytes, Framing, HexBytes, LengthField, Order, Packets, Preset, Settings,
 };
 pub use self::text::is_separator;

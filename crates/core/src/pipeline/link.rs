@@ -138,10 +138,11 @@ impl Link {
         }
     }
 
-    /// The span of the latest frames and their number. `None` before two frames.
-    fn measured(&self) -> Option<(Duration, usize)> {
+    /// The rate of the latest frames. `None` before two frames.
+    fn measured_hz(&self) -> Option<f64> {
         let span = self.recent.back()?.checked_sub(*self.recent.front()?)?;
-        (self.recent.len() >= 2).then_some((span, self.recent.len()))
+        let periods = self.recent.len() - 1;
+        (!span.is_zero()).then(|| periods as f64 / span.as_secs_f64())
     }
 }
 
@@ -277,12 +278,11 @@ impl Pipeline {
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {
-        let (span, frames) = self.link.measured()?;
-        let span = span.as_secs_f64();
-        match self.clock {
-            Clock::FrameRate => Some(self.sensor.frame_rate_hz()),
-            Clock::Arrival => (span > 0.0).then(|| (frames - 1) as f64 / span),
-        }
+        let measured = self.link.measured_hz()?;
+        Some(match self.clock {
+            Clock::FrameRate => self.sensor.frame_rate_hz(),
+            Clock::Arrival => measured,
+        })
     }
 
     /// When a silence settles the pending bytes.

@@ -190,18 +190,13 @@ pub enum Framing {
 #[serde(try_from = "String", into = "String")]
 pub struct HexBytes(pub Vec<u8>);
 
-/// The error of a text that is not pairs of hex digits.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("found {0:?}, expected pairs of hex digits such as \"BB AA\"")]
-pub struct HexError(String);
-
 impl TryFrom<String> for HexBytes {
-    type Error = HexError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, HexError> {
+    fn try_from(text: String) -> Result<Self, String> {
         let digits: String = text.chars().filter(|c| !c.is_whitespace()).collect();
         let bytes = hex::decode(digits).map(Self);
-        bytes.map_err(|_| HexError(text))
+        bytes.map_err(|_| format!("found {text:?}, expected pairs of hex digits such as \"BB AA\""))
     }
 }
 
