@@ -268,11 +268,11 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`].
+    /// Returns the errors of [`Self::judge`], and one if there are more presses than the model takes.
     ///
     /// # Panics
     ///
-    /// Panics if a press has no frame or too many, or there are more presses than the model takes.
+    /// Panics if a press has no frame.
     pub fn references(&self, presses: &[ReferencePress]) -> Result<References, ModelError> {
         let Outputs::Bins {
             reference: Some(reference),
@@ -281,8 +281,7 @@ impl Hrn {
         else {
             return Ok(References::NONE);
         };
-        let (found, most) = (presses.len(), self.most_references());
-        assert!(found <= most, "{found} references of {most}");
+        at_most(presses.len(), self.most_references(), "references")?;
         let mut features = Vec::new();
         for press in presses {
             let outputs = self.run_course(&Query {
@@ -334,11 +333,11 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`].
+    /// Returns the errors of [`Self::judge`], and one if there are more frames than the model takes.
     ///
     /// # Panics
     ///
-    /// Panics if the course has no frame, or has more frames than a model of courses takes.
+    /// Panics if the course has no frame.
     pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
         self.judge_beside(course, &self.references)
     }
@@ -406,8 +405,11 @@ impl Hrn {
     }
 
     fn run_course(&self, query: &Query) -> Result<TVec<TValue>, ModelError> {
-        let (found, most) = (query.course.moments.len(), self.file.lengths.frames);
-        assert!(found <= most, "{found} frames of {most}");
+        at_most(
+            query.course.moments.len(),
+            self.file.lengths.frames,
+            "frames of a press",
+        )?;
         let tensor = |input: &Input| Ok(input.tensor(query, self.file.lengths)?.into());
         let inputs: TractResult<TVec<TValue>> = self.file.inputs.iter().map(tensor).collect();
         self.run(inputs.map_err(ModelError::of_judgement)?)
@@ -483,7 +485,7 @@ impl Hrn {
     /// Judges every check frame or press. The first judgement also warms up the plan.
     fn reproduce_check(&self) -> Result<(), ModelError> {
         let checks = self.checks();
-        for check in 0..checks.count() {
+        for (check, (probabilities, shore)) in checks.expected().into_iter().enumerate() {
             let verdict = self.judge_check(check)?;
             let same = |found: &[f32], expected: &[f32], most: f32, what: &str| {
                 let difference = largest_difference(found, expected);
@@ -496,16 +498,26 @@ impl Hrn {
             };
             let found = &verdict.probabilities;
             let what = "probabilities differ from the trainer's";
-            same(found, checks.probabilities(check), CHECK_TOLERANCE, what)?;
+            same(found, probabilities, CHECK_TOLERANCE, what)?;
             let what = "`probabilities` differs from softmax(`logits`)";
             same(found, &softmax(&verdict.logits), CHECK_TOLERANCE, what)?;
-            if let (Some(found), Some(expected)) = (verdict.shore, checks.shore(check)) {
+            if let (Some(found), Some(expected)) = (verdict.shore, shore) {
                 let [found, expected] = [found, expected].map(<[f32; 3]>::from);
                 let what = "`shore` differs from the trainer's";
                 same(&found, &expected, SHORE_TOLERANCE, what)?;
             }
         }
         Ok(())
+    }
+}
+
+/// Refuses more than the model takes.
+fn at_most(found: usize, most: usize, what: &str) -> Result<(), ModelError> {
+    match found <= most {
+        true => Ok(()),
+        false => Err(ModelError::new(format!(
+            "found {found} {what}, expected at most {most}"
+        ))),
     }
 }
 

@@ -223,19 +223,19 @@ impl Checks {
         }
     }
 
-    /// The probabilities that the trainer computed for check `index`.
-    pub(super) fn probabilities(&self, index: usize) -> &[f32] {
+    /// What the trainer computed for each check: the probabilities, and perhaps the Shore hardness.
+    pub(super) fn expected(&self) -> Vec<(&[f32], Option<Shore>)> {
         match self {
-            Self::Frames(check) => &check.probabilities[index],
-            Self::Courses(check) => &check.presses[index].probabilities,
-        }
-    }
-
-    /// The Shore hardness that the trainer computed for check `index`.
-    pub(super) fn shore(&self, index: usize) -> Option<Shore> {
-        match self {
-            Self::Frames(_) => None,
-            Self::Courses(check) => check.presses[index].shore,
+            Self::Frames(check) => {
+                let rows = check.probabilities.iter();
+                rows.map(|row| (&row[..], None)).collect()
+            }
+            Self::Courses(check) => {
+                let presses = check.presses.iter();
+                presses
+                    .map(|press| (&press.probabilities[..], press.shore))
+                    .collect()
+            }
         }
     }
 }

@@ -163,45 +163,18 @@ impl File {
         }
     }
 
-    /// Refuses checks that the model cannot take. There are 8, or two a level: only a model of four
-    /// levels has both.
+    /// Refuses checks of another number. There are 8, or two a level: only a model of four levels has
+    /// both.
     fn check_checks(&self) -> Result<(), ModelError> {
-        let levels = self.card.levels.len();
-        let (count, rows_fit, inputs_fit, input) = match &*self.checks {
-            Checks::Frames(check) => {
-                let newtons: usize = self.format.shape(self.card.grid).iter().product();
-                let fit = check.frames.iter().all(|frame| frame.len() == newtons)
-                    && check.frames.len() == check.probabilities.len();
-                let mut rows = check.probabilities.iter();
-                let rows_fit = rows.all(|row| row.len() == levels);
-                (
-                    check.frames.len(),
-                    rows_fit,
-                    fit,
-                    format!("{newtons} newtons"),
-                )
-            }
-            Checks::Courses(check) => {
-                let most = self.lengths.frames;
-                let presses = check.presses.iter().map(|press| &press.course);
-                let references = check.references.iter().map(|press| &press.course);
-                let mut courses = presses.chain(references);
-                let fit = courses.all(|course| course.moments.len() <= most)
-                    && check.references.len() <= self.lengths.references;
-                let mut rows = check.presses.iter();
-                let rows_fit = rows.all(|press| press.probabilities.len() == levels);
-                let input = format!(
-                    "at most {most} frames, and at most {} references",
-                    self.lengths.references
-                );
-                (check.presses.len(), rows_fit, fit, input)
-            }
-        };
-        if [8, 2 * levels].contains(&count) && rows_fit && inputs_fit {
+        let (levels, count) = (self.card.levels.len(), self.checks.count());
+        let rows = self.checks.expected();
+        let mut lengths = rows.iter().map(|(probabilities, _)| probabilities.len());
+        let fits = [8, 2 * levels].contains(&count) && rows.len() == count;
+        if fits && lengths.all(|length| length == levels) {
             return Ok(());
         }
         let found = format!("{count} of other lengths or number");
-        let expected = format!("8, or two a level, each with {levels} probabilities and {input}");
+        let expected = format!("8, or two a level, each with {levels} probabilities");
         Err(ModelError::of_key("hrn.check", found, expected))
     }
 }

@@ -36,21 +36,11 @@ pub(super) struct Fixed {
     checksum_over: ChecksumOver,
     tail: Vec<u8>,
     /// How the packets are numbered, if there are several.
-    numbering: Option<Numbering>,
+    packets: Option<Packets>,
     /// The footer bytes of each packet of a frame, in order.
     footers: Vec<usize>,
     /// Whether a frame is the answer to a request, so that nothing comes before the first one.
     is_answer: bool,
-}
-
-/// The numbers of packets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Numbering {
-    /// The place of the number in a packet.
-    at: usize,
-    number: Cell,
-    first: u16,
-    step: u16,
 }
 
 impl Fixed {
@@ -102,9 +92,9 @@ impl Fixed {
             let expected = "sync, with which each packet begins, and no framing";
             return Err(OutOfRange::new("packets", found, expected));
         }
-        let numbering = keys
-            .packets
-            .map(|packets| Numbering::new(packets, mark.len(), header_bytes));
+        if let Some(packets) = keys.packets {
+            check_numbers(packets, header_bytes)?;
+        }
         let fixed = Self {
             framing,
             sync,
@@ -116,7 +106,7 @@ impl Fixed {
             checksum: keys.checksum.unwrap_or_default(),
             checksum_over: keys.checksum_over.unwrap_or_default(),
             tail,
-            numbering: numbering.transpose()?,
+            packets: keys.packets,
             footers,
             is_answer: keys.request.is_some(),
         };
@@ -208,8 +198,12 @@ impl Fixed {
             let start = out.len();
             out.extend_from_slice(&self.mark);
             out.resize(start + self.cells_in_packet().start, 0);
-            if let Some(numbering) = self.numbering {
-                numbering.write(index, &mut out[start..]);
+            if let Some(packets) = self.packets {
+                let mut number = Vec::new();
+                let value = packets.first + packets.step * index as u16;
+                packets.number.write(value.into(), &mut number);
+                let at = start + self.mark.len() + packets.number_at;
+                out[at..][..number.len()].copy_from_slice(&number);
             }
             for (at, cell) in cells.by_ref().take(self.cells_of_a_packet()).enumerate() {
                 let place = start + self.cells_in_packet().start + at * self.stride;
@@ -286,9 +280,25 @@ impl Fixed {
     /// Whether `bytes` begin with a packet that does not begin a frame: the packets before it are
     /// missing, or the candidate that they began was damaged and has been counted.
     fn begins_later_packet(&self, bytes: &[u8]) -> bool {
-        let number = self.numbering.and_then(|numbering| numbering.index(bytes));
         bytes.starts_with(&self.mark)
-            && number.is_some_and(|index| (1..self.footers.len()).contains(&index))
+            && self
+                .index(bytes)
+                .is_some_and(|index| (1..self.footers.len()).contains(&index))
+    }
+
+    /// The place of `packet` among those of a frame by its number, if it has one.
+    fn index(&self, packet: &[u8]) -> Option<usize> {
+        let Packets {
+            number_at,
+            number,
+            first,
+            step,
+            ..
+        } = self.packets?;
+        let at = self.mark.len() + number_at;
+        let number = number.read(packet.get(at..at + number.bytes())?) as u16;
+        let by = number.checked_sub(first)?;
+        by.is_multiple_of(step).then_some(usize::from(by / step))
     }
 
     /// Whether the packets of a frame begin at `at`, each with the right mark, number, checksum and
@@ -299,11 +309,11 @@ impl Fixed {
             if !shares(rest, &self.mark) {
                 return Some(false);
             }
-            if let Some(numbering) = self.numbering
-                && numbering.has(rest)?
-                && numbering.index(rest) != Some(index)
-            {
-                return Some(false);
+            if let Some(packets) = self.packets {
+                rest.get(..self.mark.len() + packets.number_at + packets.number.bytes())?;
+                if self.index(rest) != Some(index) {
+                    return Some(false);
+                }
             }
             let packet = rest.get(..self.packet_bytes(footer))?;
             let checksum_at = packet.len() - self.tail.len() - self.checksum.bytes();
@@ -434,59 +444,30 @@ impl Framing {
 /// The longest frame: 64x64 taxels of four numbers of four bytes, and as much beside them.
 const MOST_BYTES: usize = 128 * 1024;
 
-impl Numbering {
-    fn new(packets: Packets, mark_bytes: usize, header_bytes: usize) -> Result<Self, OutOfRange> {
-        let Packets {
-            count,
-            number_at,
-            number,
-            first,
-            step,
-        } = packets;
-        range::check(
-            "packets.number_at",
-            number_at,
-            number_at + number.bytes() <= header_bytes,
-            format_args!("a place in the header (header_bytes: {header_bytes})"),
-        )?;
-        range::check("packets.step", step, step > 0, "at least 1")?;
-        let max = number.range().map_or(0, |(_, most)| most as usize);
-        let last = usize::from(first) + (count - 1) * usize::from(step);
-        range::check(
-            "packets.first",
-            format_args!("{first}, and {last} for the last packet"),
-            last <= max,
-            format_args!("at most {max} for this number"),
-        )?;
-        Ok(Self {
-            at: mark_bytes + number_at,
-            number,
-            first,
-            step,
-        })
-    }
-
-    /// Whether `packet` has its number. `None` if it is not long enough to have one.
-    fn has(self, packet: &[u8]) -> Option<bool> {
-        (packet.len() >= self.at + self.number.bytes()).then_some(true)
-    }
-
-    /// The place of `packet` among those of a frame by its number.
-    fn index(self, packet: &[u8]) -> Option<usize> {
-        let bytes = packet.get(self.at..self.at + self.number.bytes())?;
-        let number = self.number.read(bytes) as u16;
-        let by = number.checked_sub(self.first)?;
-        by.is_multiple_of(self.step)
-            .then_some(usize::from(by / self.step))
-    }
-
-    /// Writes the number of the packet at `index` into it.
-    fn write(self, index: usize, packet: &mut [u8]) {
-        let number = self.first + self.step * index as u16;
-        let mut bytes = Vec::new();
-        self.number.write(number.into(), &mut bytes);
-        packet[self.at..][..bytes.len()].copy_from_slice(&bytes);
-    }
+/// Checks that the number of each packet lies in the header, and fits.
+fn check_numbers(packets: Packets, header_bytes: usize) -> Result<(), OutOfRange> {
+    let Packets {
+        count,
+        number_at,
+        number,
+        first,
+        step,
+    } = packets;
+    range::check(
+        "packets.number_at",
+        number_at,
+        number_at + number.bytes() <= header_bytes,
+        format_args!("a place in the header (header_bytes: {header_bytes})"),
+    )?;
+    range::check("packets.step", step, step > 0, "at least 1")?;
+    let max = number.range().map_or(0, |(_, most)| most as usize);
+    let last = usize::from(first) + (count - 1) * usize::from(step);
+    range::check(
+        "packets.first",
+        format_args!("{first}, and {last} for the last packet"),
+        last <= max.min(usize::from(u16::MAX)),
+        format_args!("at most {max} for this number"),
+    )
 }
 
 /// The footer bytes of each packet.
