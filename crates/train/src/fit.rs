@@ -13,12 +13,12 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context as _, anyhow, ensure};
+use anyhow::{Context as _, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
-use self::candidate::{Candidate, Entry};
-use self::comparison::{Compared, Comparison, Outcome, What};
+use self::candidate::Candidate;
+use self::comparison::{Compared, Comparison, Outcome};
 pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
 use crate::data::collect::{self, Settings, Unnumbered};
@@ -115,14 +115,15 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
     };
     let choice = comparison.choice();
     let report = comparison.report(&choice);
-    let written = match choice.writes {
-        None => None,
-        Some(What::References) => Some(write_references(&candidates, &presses, &places)?),
-        Some(What::Model(place)) => {
-            let (name, candidate) = &candidates[place];
-            let candidate = candidate
-                .as_ref()
-                .map_err(|left_out| anyhow!("{left_out}"))?;
+    let chosen = choice.writes.map(|place| (place, &candidates[place]));
+    let written = match chosen {
+        Some((_, (_, Ok(Candidate::BuiltIn(hrn))))) => {
+            let own = candidate::references(hrn, &presses, &places)?;
+            let levels = hrn.card().levels.clone();
+            let levels = Some(levels).filter(|levels| *levels != papers_levels());
+            Some(Written::References(references::write(&own)?, levels))
+        }
+        Some((place, (name, Ok(candidate)))) => {
             let judged = comparison.candidates[place].outcome(choice.division);
             let judged = judged.context("the best candidate was judged")?;
             let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
@@ -150,30 +151,9 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
             })?;
             Some(Written::Model(bytes))
         }
+        Some((_, (_, Err(_)))) | None => None,
     };
     Ok(Fitted { report, written })
-}
-
-/// References for the built-in model.
-fn write_references(
-    candidates: &[Entry],
-    presses: &Presses,
-    places: &[usize],
-) -> anyhow::Result<Written> {
-    let built_in = candidates
-        .iter()
-        .find_map(|(_, candidate)| match candidate {
-            Ok(Candidate::BuiltIn(hrn)) => Some(hrn),
-            _ => None,
-        });
-    let hrn = built_in.context("the built-in model cannot say these levels")?;
-    let own = candidate::references(hrn, presses, places)?;
-    let levels = &hrn.card().levels;
-    let is_own = *levels != papers_levels();
-    Ok(Written::References(
-        references::write(&own)?,
-        is_own.then(|| levels.clone()),
-    ))
 }
 
 /// Reads the labelled presses.

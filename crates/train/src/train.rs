@@ -1,5 +1,6 @@
 //! One training, from data to a model file: read, split once, learn, calibrate, export.
 
+use std::fmt::Write as _;
 use std::fs;
 use std::path::PathBuf;
 
@@ -7,7 +8,7 @@ use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 
 use crate::data::findings::Findings;
-use crate::data::presses::Presses;
+use crate::data::presses::{Press, Presses};
 use crate::data::split::Parts;
 use crate::exit::{coded, unreadable};
 use crate::learn;
@@ -42,7 +43,7 @@ pub struct Train {
     seed: u64,
     /// Length of the training
     #[arg(long, default_value = "paper")]
-    pub profile: Profile,
+    profile: Profile,
     /// Settings that override the method's; config/hrn-train.toml has every key
     #[arg(long, value_name = "F.toml")]
     config: Option<PathBuf>,
@@ -90,14 +91,14 @@ impl DeviceName {
     }
 }
 
-/// Trains, and gives the evaluation on the test split, if the data has one. `say` is told what the data are
-/// before anything is learnt.
+/// Trains, and gives the evaluation on the test split, if the data has one. It says what the data are before
+/// anything is learnt.
 ///
 /// # Errors
 ///
 /// Fails if the data do not have what the method needs, the directory has another run or cannot be written,
 /// or the training diverges.
-pub fn train(asked: &Train, say: impl FnOnce(&Presses)) -> anyhow::Result<Option<Evaluated>> {
+pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let &Train {
         method: recipe,
         profile,
@@ -136,7 +137,12 @@ pub fn train(asked: &Train, say: impl FnOnce(&Presses)) -> anyhow::Result<Option
         run.write("findings.txt", findings.to_string().as_bytes())?;
     }
     presses.warn_of_other_levels();
-    say(&presses);
+    hardnessd_core::stderr_part!("{}", counts(&presses));
+    if profile == Profile::Smoke {
+        hardnessd_core::stderr_line!(
+            "--profile smoke: tries the commands in seconds; too short to learn anything"
+        );
+    }
 
     let stages = Stages {
         presses: &presses,
@@ -198,6 +204,29 @@ impl Train {
             }
         }
     }
+}
+
+/// The number of presses of each level in each split.
+fn counts(presses: &Presses) -> String {
+    let mut text = String::new();
+    for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
+        let all = presses.all.iter();
+        let own: Vec<&Press> = all.filter(|press| press.split == split).collect();
+        if own.is_empty() {
+            continue;
+        }
+        let own = own.into_iter().filter(|press| press.reference.is_none());
+        let count = |level| own.clone().filter(|press| press.level == level).count();
+        let counts = presses.levels().into_iter();
+        let counts = counts.map(|of| format!("level {} {}, ", of.level, count(of.level)));
+        let counts: String = counts.collect();
+        let _ = writeln!(
+            text,
+            "{name} presses: {counts}unlabelled (level 0) {}",
+            count(0)
+        );
+    }
+    text
 }
 
 /// Checks, before anything is written, that the data has what all stages of a method need.

@@ -233,7 +233,7 @@ fn rounded(value: f64, decimals: usize) -> String {
 }
 
 /// An integer with commas between thousands.
-pub fn thousands(value: usize) -> String {
+fn thousands(value: usize) -> String {
     match value {
         0..1000 => value.to_string(),
         _ => format!("{},{:03}", thousands(value / 1000), value % 1000),

@@ -89,13 +89,4 @@ mod tests {
         assert_eq!(moved.force_n(), 1.0);
         assert_eq!(shifted(&corner(), 0, -3).force_n(), 0.0);
     }
-
-    #[test]
-    fn without_settings_nothing_changes() {
-        let mut stream = Stream::new(1, "test");
-        assert_eq!(
-            vary(&corner(), AugmentationSettings::default(), &mut stream),
-            corner()
-        );
-    }
 }

@@ -4,11 +4,12 @@
 //! not by their numbers: a recording that was collected twice has two numbers. An error means that no figure
 //! of a model of these data would say what its reader thinks.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fmt;
 use std::hash::{DefaultHasher, Hasher as _};
 
 use anyhow::bail;
+use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 
 use super::presses::{Press, Presses};
@@ -50,6 +51,7 @@ impl Findings {
         found.files(presses);
         found.contents(presses);
         found.errors.extend(units(presses));
+        found.levels(presses);
         let labelled = presses.labelled(Split::Train).count();
         if let Some(labels) = labels.filter(|&labels| labels < labelled) {
             found.warnings.push(format!(
@@ -68,6 +70,23 @@ impl Findings {
         match self.errors.first() {
             Some(first) => bail!("the data cannot mean what their labels say: {first}"),
             None => Ok(self),
+        }
+    }
+
+    /// Levels with few labelled training presses, or none.
+    fn levels(&mut self, presses: &Presses) {
+        for Level { level, .. } in presses.levels() {
+            let places = presses.labelled(Split::Train);
+            let own = places.filter(|&place| presses.all[place].level == level);
+            let objects: BTreeSet<_> = own.map(|place| presses.all[place].object).collect();
+            let warning = match (objects.len(), objects.contains(&None)) {
+                (0, _) => "no labelled training press: the model never learns to say it",
+                (1, false) => {
+                    "all training presses are of one object: the model may learn the object and not the hardness"
+                }
+                _ => continue,
+            };
+            self.warnings.push(format!("level {level}: {warning}"));
         }
     }
 
@@ -251,7 +270,11 @@ mod tests {
     /// Asserts that the presses have this one error, or this one warning, or neither.
     #[track_caller]
     fn check(presses: &Presses, labels: Option<usize>, error: &str, warning: &str) {
-        let Findings { errors, warnings } = Findings::of(presses, labels);
+        let Findings {
+            errors,
+            mut warnings,
+        } = Findings::of(presses, labels);
+        warnings.retain(|warning| !warning.starts_with("level "));
         for (found, expected) in [(errors, error), (warnings, warning)] {
             let is_expected = |text: &String| !expected.is_empty() && text.contains(expected);
             assert!(found.iter().all(is_expected), "{found:?}");

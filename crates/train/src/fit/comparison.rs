@@ -218,21 +218,13 @@ impl Outcome {
     }
 }
 
-/// What to write.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum What {
-    /// The model of the candidate at this place.
-    Model(usize),
-    /// References for the built-in model.
-    References,
-}
-
 /// The best candidate, and what to write.
 pub(super) struct Choice {
     /// The place of the best candidate.
     pub(super) best: Option<usize>,
     pub(super) division: Division,
-    pub(super) writes: Option<What>,
+    /// The place of the candidate that is written. The built-in model, which is the first, gets references.
+    pub(super) writes: Option<usize>,
     pub(super) remarks: Vec<String>,
 }
 
@@ -299,15 +291,15 @@ impl Comparison<'_> {
                     "the built-in model is the best one, so these presses become its references"
                         .to_owned(),
                 );
-                What::References
+                0
             } else if has_built_in && !lead(&self.candidates[0]).is_none_or(is_ahead) {
                 remarks.push(format!(
                     "{name} is not better than the built-in model by more than chance, so these presses become \
                      references of the built-in model"
                 ));
-                What::References
+                0
             } else {
-                What::Model(best)
+                best
             };
             return Choice {
                 best: Some(best),
@@ -331,7 +323,7 @@ impl Comparison<'_> {
         Choice {
             best: self.best(division),
             division,
-            writes: has_built_in.then_some(What::References),
+            writes: has_built_in.then_some(0),
             remarks,
         }
     }
@@ -427,9 +419,9 @@ impl Comparison<'_> {
             controls: vec![guessing, self.control.row.clone()],
             best: best.map(|best| best.row.name.clone()),
             chosen_by: best.map(|_| choice.division),
-            writes: choice.writes.map(|what| match what {
-                What::Model(_) => "model",
-                What::References => "references",
+            writes: choice.writes.map(|place| match place {
+                0 => "references",
+                _ => "model",
             }),
             confusion,
             wrong,

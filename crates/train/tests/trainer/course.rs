@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use hardnessd_core::verdict::{Checks, Course, Format, Hrn, ReferenceKinds, References};
+use hardnessd_core::verdict::{Checks, Format, Hrn, ReferenceKinds, References};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Presses, read_one};
 use prost::Message as _;
@@ -61,21 +61,8 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     assert!(range.of_presses().iter().all(Option::is_some), "{range:?}");
     assert!(range.speed_mm_s.unwrap()[1] < 25.0 && range.arm_n_per_mm.unwrap()[1] < 45.0);
     let all = (0..presses.all.len()).map(|press| presses.course(press));
-    let held: Vec<_> = all.filter(|course| range.holds(course)).collect();
-    assert!(4 * held.len() > 3 * presses.all.len(), "{range:?}");
-    let went = |course: &&Course| course.extents()[3].is_some_and(|[mm, _]| mm > 0.5);
-    let seen = held.iter().find(went).unwrap();
-    let mut long = seen.clone();
-    long.moments.last_mut().unwrap().time_s = 60.0;
-    let mut fast = seen.clone();
-    for moment in &mut fast.moments {
-        moment.approach_mm = moment.approach_mm.map(|mm| 100.0 * mm);
-    }
-    let mut soft = seen.clone();
-    soft.arm_n_per_mm = 0.5;
-    for other in [long, fast, soft] {
-        assert!(!range.holds(&other), "{other:?}");
-    }
+    let held = all.filter(|course| range.holds(course)).count();
+    assert!(4 * held > 3 * presses.all.len(), "{range:?}");
     let inspected = succeed_in(at, "inspect whole/hrn.onnx");
     assert!(inspected.contains(" mm/s in training\n"), "{inspected}");
     let known = hrn.judge_course(&course).unwrap();
@@ -131,16 +118,6 @@ fn a_model_that_never_knew_the_arm_states_no_range_of_it() {
     let range = hrn.card().range;
     assert!(range.duration_s.is_some() && range.frame_period_s.is_some());
     assert_eq!((range.speed_mm_s, range.arm_n_per_mm), (None, None));
-}
-
-#[test]
-fn a_method_of_single_frames_learns_from_the_best_frame_of_each_press() {
-    let directory = tempfile::tempdir().unwrap();
-    let at = directory.path();
-    let simulate = "simulate --sequences --materials broad --objects 4 --test-objects 2 --presses 3 --out d.npz";
-    succeed_in(at, simulate);
-    succeed_in(at, "train --method features --data d.npz --out one");
-    succeed_in(at, "evaluate --model one/hrn.onnx --data d.npz");
 }
 
 #[test]

@@ -1,13 +1,9 @@
-//! Text about a model, about an evaluation and about a data set.
+//! Text about a model and about an evaluation.
 
-use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use hardnessd_core::verdict::{Hrn, Level};
-use hardnessd_simulator::Split;
-use hrn_train::compare::tables::thousands;
-use hrn_train::data::presses::{Press, Presses};
+use hardnessd_core::verdict::Hrn;
 use hrn_train::model::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
 
 /// The card of the model read from `path`.
@@ -134,48 +130,6 @@ pub(super) fn of_difference(difference: &Difference) -> String {
          the second on {second}\n",
         points(difference.accuracy)
     )
-}
-
-/// The number of presses of each level in each split.
-pub(super) fn of_data(presses: &Presses) -> String {
-    let mut text = String::new();
-    for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
-        let all = presses.all.iter();
-        let own: Vec<&Press> = all.filter(|press| press.split == split).collect();
-        if own.is_empty() {
-            continue;
-        }
-        let own = own.into_iter().filter(|press| press.reference.is_none());
-        let count = |level| thousands(own.clone().filter(|press| press.level == level).count());
-        let counts = presses.levels().into_iter();
-        let counts = counts.map(|of| format!("level {} {}, ", of.level, count(of.level)));
-        let counts: String = counts.collect();
-        let _ = writeln!(
-            text,
-            "{name} presses: {counts}unlabelled (level 0) {}",
-            count(0)
-        );
-    }
-    text
-}
-
-/// Warnings about levels with few labelled training presses, or none.
-pub(super) fn of_levels(presses: &Presses) -> String {
-    let mut text = String::new();
-    for Level { level, .. } in presses.levels() {
-        let places = presses.labelled(Split::Train);
-        let own = places.filter(|&place| presses.all[place].level == level);
-        let objects: BTreeSet<Option<u32>> = own.map(|place| presses.all[place].object).collect();
-        let warning = match (objects.len(), objects.contains(&None)) {
-            (0, _) => "no labelled training press: the model never learns to say it",
-            (1, false) => {
-                "all training presses are of one object: the model may learn the object and not the hardness"
-            }
-            _ => continue,
-        };
-        let _ = writeln!(text, "warning: level {level}: {warning}");
-    }
-    text
 }
 
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,

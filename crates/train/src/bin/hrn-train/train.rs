@@ -3,9 +3,6 @@
 use std::time::Instant;
 
 use anyhow::Context as _;
-use hardnessd_core::wording;
-use hrn_train::data::presses::Presses;
-use hrn_train::settings::Profile;
 use hrn_train::train::{self, Train};
 
 use super::account;
@@ -15,7 +12,7 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
         end_with(parent)?;
     }
     let begun = Instant::now();
-    let evaluation = train::train(arguments, |presses| say(presses, arguments.profile))?;
+    let evaluation = train::train(arguments)?;
     let figures = evaluation.as_ref().map(account::of_evaluated);
     Ok(format!(
         "trained in {:.1} s: {}\n{}",
@@ -25,17 +22,6 @@ pub(super) fn train(arguments: &Train) -> anyhow::Result<String> {
             "not evaluated: the data has no labelled test presses\n".to_owned()
         })
     ))
-}
-
-/// Says what the data are.
-fn say(presses: &Presses, profile: Profile) {
-    hardnessd_core::stderr_part!("{}", wording::lines(&account::of_data(presses)));
-    hardnessd_core::stderr_part!("{}", account::of_levels(presses));
-    if profile == Profile::Smoke {
-        hardnessd_core::stderr_line!(
-            "--profile smoke: tries the commands in seconds; too short to learn anything"
-        );
-    }
 }
 
 /// Asks the system to end this process when its parent ends, for whatever reason.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::io::{self, Cursor, Seek, Write};
-use std::ops::{Range, RangeInclusive};
+use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
@@ -88,10 +88,24 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
         return Err(file.error("level", "no press", "at least one"));
     }
     file.within("level", &level, &(0..=presses.levels().len() as u8))?;
-    let moments = match file.layout() {
-        Layout::Frames => Moments::single(&mut file, count)?,
-        Layout::OverTime => Moments::over_time(&mut file, count)?,
+    let (array, newtons_each) = match file.layout() {
+        Layout::Frames => ("frames", 1.0),
+        Layout::OverTime => ("frames_mn", MILLINEWTON),
     };
+    let of_each = Some(count).filter(|_| file.layout() == Layout::Frames);
+    let frames: Vec<f32> = file.required(array, &[ROWS, COLS], of_each)?;
+    file.within(array, &frames, &FORCES)?;
+    let moments = frames.len() / TAXELS;
+    // A single frame is a press of one moment.
+    let each: Vec<u32> = (0..moments as u32).collect();
+    let press = file.read("press", &[], Some(moments))?;
+    let press = press.unwrap_or_else(|| each.clone());
+    let best = file.read("best", &[], Some(count))?.unwrap_or(each);
+    let time_s: Option<Vec<f32>> = file.read("time_s", &[], Some(moments))?;
+    let time_s = time_s.unwrap_or_else(|| vec![0.0; moments]);
+    file.within("time_s", &time_s, &(-1e5..=1e5))?;
+    let approach_mm = file.column("approach_mm", moments, &FORCES)?;
+    let known = file.column("known", moments, &(0..=1_u8))?;
     let object = file.column("object", count, &(0..=u32::MAX))?;
     let material = file.column("material", count, &(0..=u8::MAX))?;
     let sensor = file.column("sensor", count, &(0..=u32::MAX))?;
@@ -111,7 +125,26 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
         .map(|all| all.chunks_exact(all.len() / count));
     let mut unloaded = unloaded.into_iter().flatten();
     let (kind, recorded) = (presses.sources[0].kind(), recorded(&meta["captures"]));
-    for (number, rows) in moments.rows.iter().enumerate() {
+    let mut first = 0;
+    for (number, of_press) in press.chunk_by(|a, b| a == b).enumerate() {
+        let rows = first..first + of_press.len();
+        first = rows.end;
+        if of_press[0] as usize != number || number >= count {
+            let expected = format!("0 to {}, one after the other", count - 1);
+            return Err(file.error("press", of_press[0], expected));
+        }
+        let best = best[number] as usize;
+        if !rows.contains(&best) {
+            let found = format!("{best} of press {number}");
+            return Err(file.error("best", found, format!("one of its frames, {rows:?}")));
+        }
+        let times = &time_s[rows.clone()];
+        let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
+        if !(1..=COURSE_FRAMES.1).contains(&used) || !times.is_sorted_by(|a, b| a < b) {
+            let found = format!("{used} of 0 s or later in press {number}");
+            let expected = format!("1 to {} of these, and all ascending", COURSE_FRAMES.1);
+            return Err(file.error("time_s", found, expected));
+        }
         let mut press = Press {
             level: level[number],
             object: object[number],
@@ -128,99 +161,25 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
             shape: shape[number],
             layered: layered[number].map(|layered| layered == 1),
             unloaded: unloaded.next().map(<[f32]>::to_vec),
-            best: moments.best[number],
+            best: best - rows.start,
             ..Press::default()
         };
         let of_object = press
             .object
             .and_then(|object| recorded.get(&(object, press.level)));
         press.kind = of_object.copied().unwrap_or(kind);
-        let of_press = rows.clone().map(|row| {
-            let newtons = moments.frames[row * TAXELS..][..TAXELS].iter();
-            let newtons = newtons.map(|&value| value * moments.newtons);
-            (moments.time_s[row], moments.approach_mm[row], newtons)
+        let of_press = rows.map(|row| {
+            let newtons = frames[row * TAXELS..][..TAXELS].iter();
+            let newtons = newtons.map(|&value| value * newtons_each);
+            let approach_mm = approach_mm[row].filter(|_| known[row] == Some(1));
+            (time_s[row], approach_mm, newtons)
         });
         presses.add(press, of_press);
     }
+    if presses.all.len() < count {
+        return Err(file.error("press", format!("{} presses", presses.all.len()), count));
+    }
     Ok(presses)
-}
-
-/// The frames of all presses, and when they were.
-struct Moments {
-    /// Taxels of all frames, each worth so many newtons.
-    frames: Vec<f32>,
-    newtons: f32,
-    time_s: Vec<f32>,
-    approach_mm: Vec<Option<f32>>,
-    /// The frames of each press, and which of them is the best.
-    rows: Vec<Range<usize>>,
-    best: Vec<usize>,
-}
-
-impl Moments {
-    fn single(file: &mut File, count: usize) -> anyhow::Result<Self> {
-        let frames: Vec<f32> = file.required("frames", &[ROWS, COLS], Some(count))?;
-        file.within("frames", &frames, &FORCES)?;
-        Ok(Self {
-            frames,
-            newtons: 1.0,
-            time_s: vec![0.0; count],
-            approach_mm: vec![None; count],
-            rows: (0..count).map(|row| row..row + 1).collect(),
-            best: vec![0; count],
-        })
-    }
-
-    fn over_time(file: &mut File, count: usize) -> anyhow::Result<Self> {
-        let frames: Vec<f32> = file.required("frames_mn", &[ROWS, COLS], None)?;
-        file.within("frames_mn", &frames, &FORCES)?;
-        let moments = frames.len() / TAXELS;
-        let press: Vec<u32> = file.required("press", &[], Some(moments))?;
-        let time_s: Vec<f32> = file.required("time_s", &[], Some(moments))?;
-        let approach_mm: Vec<f32> = file.required("approach_mm", &[], Some(moments))?;
-        let known: Vec<u8> = file.required("known", &[], Some(moments))?;
-        let best_row: Vec<u32> = file.required("best", &[], Some(count))?;
-        file.within("time_s", &time_s, &(-1e5..=1e5))?;
-        file.within("approach_mm", &approach_mm, &FORCES)?;
-        let (mut rows, mut best) = (Vec::new(), Vec::new());
-        for of_press in press.chunk_by(|a, b| a == b) {
-            let first = rows.last().map_or(0, |before: &Range<usize>| before.end);
-            let (number, own) = (rows.len(), first..first + of_press.len());
-            if of_press[0] as usize != number || number >= count {
-                let expected = format!("0 to {}, one after the other", count - 1);
-                return Err(file.error("press", of_press[0], expected));
-            }
-            let row = best_row[number] as usize;
-            if !own.contains(&row) {
-                let found = format!("{row} of press {number}");
-                return Err(file.error("best", found, format!("one of its frames, {own:?}")));
-            }
-            let times = &time_s[own.clone()];
-            let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
-            if !(1..=COURSE_FRAMES.1).contains(&used) || !times.is_sorted_by(|a, b| a < b) {
-                let found = format!("{used} of 0 s or later in press {number}");
-                let expected = format!("1 to {} of these, and all ascending", COURSE_FRAMES.1);
-                return Err(file.error("time_s", found, expected));
-            }
-            best.push(row - first);
-            rows.push(own);
-        }
-        if rows.len() < count {
-            let found = format!("{} presses", rows.len());
-            return Err(file.error("press", found, count));
-        }
-        let approach_mm = approach_mm.into_iter().zip(known);
-        Ok(Self {
-            frames,
-            newtons: MILLINEWTON,
-            time_s,
-            approach_mm: approach_mm
-                .map(|(mm, known)| (known == 1).then_some(mm))
-                .collect(),
-            rows,
-            best,
-        })
-    }
 }
 
 /// The rigid piece of each press: flat or a ball. Such a press has no level.

@@ -121,22 +121,6 @@ fn the_array_and_what_it_reads_unloaded_come_back() {
 }
 
 #[test]
-fn the_best_frame_has_the_largest_contact_area() {
-    let presses = courses();
-    assert!(presses.all.len() >= 6 && presses.are_over_time() && !frames().are_over_time());
-    for place in 0..presses.all.len() {
-        let area = |frame: &ModelFrame| frame.contact_area_taxels(0.07);
-        let course = presses.course(place);
-        let areas = course.moments.iter().map(|moment| area(&moment.frame));
-        assert_eq!(
-            areas.max(),
-            Some(area(&presses.frame(place))),
-            "press {place}"
-        );
-    }
-}
-
-#[test]
 fn presses_over_time_that_contradict_themselves_are_refused() {
     let check = |change: &dyn Fn(&mut Presses), part: &str| {
         let mut bad = courses();
