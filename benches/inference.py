@@ -50,7 +50,7 @@ def compare(binary, path, rounds, peak):
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    # The daemon computes the features of a press for a model with bins; tests/peers/course.py compares those.
+    # The daemon computes the features of a press for a model with bins.
     apart = "not compared"
     if any(output.name == "probabilities" for output in session.get_outputs()):
         apart = max(

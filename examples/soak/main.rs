@@ -1,11 +1,10 @@
 //! Plays sensors with faults to a daemon for a long time, and accounts for every press.
 //!
-//!     cargo run --release --example soak -- --minutes 120
+//!     cargo build --release && cargo run --release --example soak -- --minutes 120
 //!
-//! The daemon is a child process with the code of `hardnessd run`. Each sensor sends simulated
-//! presses over a pty, with a fault in every second press. Arrays are 28x28 to
-//! 64x64. There are subscribers of all kinds, recordings, and a reload every ten seconds. At the end,
-//! every press must have its verdict, or must be lost with the link, by its number. Memory,
+//! Each sensor sends simulated presses over a pty, with a fault in every second press. Arrays are 28x28
+//! to 64x64. There are subscribers of all kinds, recordings, and a reload every ten seconds. At the
+//! end, every press must have its verdict, or must be lost with the link, by its number. Memory,
 //! descriptors and threads must not have grown. Otherwise the exit code is 1.
 
 mod account;
@@ -28,17 +27,12 @@ use std::time::{Duration, Instant};
 
 use account::{account, growth, usage};
 use clap::Parser;
-use hardnessd::daemon::config::Setup;
-use hardnessd::daemon::log::Log;
-use hardnessd::daemon::{Daemon, Reload};
 use hardnessd_core::recording::Reader;
-use hardnessd_core::trial;
 use hardnessd_simulator::random::Stream;
 use line::Line;
 use listener::{Link, Received, come_and_go, receive};
 use player::{FAULTS, Player, library};
 use rustix::process::{Pid, Signal, kill_process};
-use tokio::signal::unix::{SignalKind, signal};
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -60,56 +54,15 @@ struct Args {
     /// Seed of the faults
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Run as the daemon with this configuration; soak starts itself again with it
-    #[arg(long, hide = true)]
-    daemon: Option<PathBuf>,
 }
 
 fn main() -> ExitCode {
-    if let Some(code) = trial::entry() {
-        return code;
-    }
-    let args = Args::parse();
-    let done = match &args.daemon {
-        Some(config) => serve(config).map(|()| Vec::new()),
-        None => soak(&args),
-    };
+    let done = soak(&Args::parse());
     let problems = done.unwrap_or_else(|error| vec![error.to_string()]);
     for problem in &problems {
         eprintln!("soak: {problem}");
     }
     ExitCode::from(u8::from(!problems.is_empty()))
-}
-
-/// Runs the daemon as `hardnessd run` does.
-fn serve(config: &Path) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
-    runtime.block_on(async {
-        let mut hangup = signal(SignalKind::hangup())?;
-        let mut terminate = signal(SignalKind::terminate())?;
-        let setup = Setup::load(config, None)?;
-        let log = Log::start(setup.config.log, "warn")?;
-        let daemon = Daemon::bind(setup)?;
-        let (request, requests) = tokio::sync::mpsc::channel(1);
-        tokio::spawn(async move {
-            while hangup.recv().await.is_some() {
-                let _ = request.try_send(());
-            }
-        });
-        let path = config.to_owned();
-        let reload = Reload {
-            requests,
-            path,
-            model: None,
-            log,
-        };
-        let shutdown = async move {
-            terminate.recv().await;
-        };
-        Ok(daemon.run(shutdown, Some(reload)).await?)
-    })
 }
 
 /// The sides of the arrays, in taxels, which the sensors have in turn.
@@ -188,9 +141,11 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
     let tables = tables(&players);
     let (config, socket) = (at("soak.toml"), at("events.sock"));
     configure(&config, &tables, 0.0)?;
-    let mut daemon = Command::new(std::env::current_exe()?)
-        .arg("--daemon")
+    // Examples are built into a folder beside the program.
+    let mut daemon = Command::new(std::env::current_exe()?.with_file_name("../hardnessd"))
+        .args(["run", "--config"])
         .arg(&config)
+        .env("RUST_LOG", "warn")
         .stderr(File::create(at("log"))?)
         .stdin(Stdio::null())
         .spawn()?;

@@ -23,6 +23,8 @@ use crate::daemon::lines::{LineRead, Lines};
 use crate::daemon::socket::Socket;
 use crate::thread::NoThread;
 use hardnessd_core::event::round_3;
+use hardnessd_core::range::{self, OutOfRange};
+use hardnessd_core::stderr_line;
 use hardnessd_simulator::{Rig, SequenceSettings, Touched};
 
 /// The time between the moment that a frame shows and its first byte: a sensor needs some to scan its
@@ -94,18 +96,15 @@ struct Order {
 impl Order {
     fn read(line: &[u8]) -> Result<Self, String> {
         let order: Self = serde_json::from_slice(line).map_err(|error| error.to_string())?;
-        let check = |key, value: Option<f64>, least, most| match value {
-            Some(found) if !(least..=most).contains(&found) => {
-                Err(format!("{key}: found {found}, expected {least} to {most}"))
-            }
-            _ => Ok(()),
-        };
-        check("to_mm", order.to_mm, 0.0, REACH_MM)?;
-        check("speed_mm_s", order.speed_mm_s, 0.1, FASTEST_MM_S)?;
-        match order.object {
-            Some(0) => Err("object: found 0, expected a number from 1".to_owned()),
-            _ => Ok(order),
-        }
+        order.check().map_err(|error| error.to_string())?;
+        Ok(order)
+    }
+
+    fn check(&self) -> Result<(), OutOfRange> {
+        range::within("to_mm", self.to_mm.unwrap_or(0.0), (0.0, REACH_MM), "")?;
+        let speed_mm_s = self.speed_mm_s.unwrap_or(SPEED_MM_S);
+        range::within("speed_mm_s", speed_mm_s, (0.1, FASTEST_MM_S), "")?;
+        range::check("object", 0, self.object != Some(0), "a number from 1")
     }
 }
 
@@ -116,14 +115,13 @@ impl Arm {
     ///
     /// Fails as [`Socket::bind`] does.
     pub(crate) fn bind(path: &Path) -> Result<Self, daemon::Error> {
-        let leg = Leg {
-            from_mm: 0.0,
-            start: Instant::now(),
-            to_mm: 0.0,
-            speed_mm_s: SPEED_MM_S,
-        };
         let state = State {
-            leg,
+            leg: Leg {
+                from_mm: 0.0,
+                start: Instant::now(),
+                to_mm: 0.0,
+                speed_mm_s: SPEED_MM_S,
+            },
             object: 1,
             placements: 0,
             touched: None,
@@ -167,7 +165,7 @@ impl Arm {
             let now = Instant::now();
             self.state.send_modify(|state| state.leg.stop(now));
             if let Err(error) = served {
-                hardnessd_core::stderr_line!("warning: --arm: {error}");
+                stderr_line!("warning: --arm: {error}");
                 tokio::time::sleep(SCAN).await;
             }
         }
@@ -181,12 +179,9 @@ impl Arm {
                 Ok(order) => self.take(order).await,
                 Err(error) => json!({"error": error}),
             };
+            let answer = format!("{answer}\n");
             // A controller need not wait for an answer, and may have gone.
-            if output
-                .write_all(format!("{answer}\n").as_bytes())
-                .await
-                .is_err()
-            {
+            if output.write_all(answer.as_bytes()).await.is_err() {
                 break;
             }
         }
@@ -198,8 +193,8 @@ impl Arm {
         let now = Instant::now();
         let at_mm = self.state.borrow().leg.mm(now);
         if order.object.is_some() && at_mm > 0.0 {
-            let found = round_3(at_mm);
-            return json!({"error": format!("object: found the arm at {found} mm, expected 0: withdraw it first")});
+            let found = format!("object: found the arm at {} mm", round_3(at_mm));
+            return json!({"error": format!("{found}, expected 0: withdraw it first")});
         }
         self.state.send_modify(|state| {
             let leg = &mut state.leg;

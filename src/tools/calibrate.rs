@@ -12,7 +12,6 @@ mod taxels;
 
 use std::future::Future;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use clap::{Args as ClapArgs, ValueEnum};
 
@@ -22,14 +21,13 @@ use super::exit::{Fail, Failure};
 use super::live;
 use super::simulate::within;
 use crate::daemon::config::Setup;
-use crate::thread::spawn_thread;
 use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::Sensor;
+use hardnessd_core::stderr_line;
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::Hrn;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
@@ -122,115 +120,48 @@ pub async fn run(
     }
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // Test the output file now, before anybody presses two hundred times.
+    let path = args.out.clone();
+    let path = path.unwrap_or_else(|| config.with_file_name(GAINS));
     let out = match args.what {
-        What::Taxels => {
-            let named = args.out.clone();
-            let path = named.unwrap_or_else(|| config.with_file_name(GAINS));
-            let part = Part::new(&path).of_file(&path, IO)?;
-            Some((path, part))
-        }
+        What::Taxels => Some(Part::new(&path).of_file(&path, IO)?),
         What::Arm | What::Force => None,
     };
-    let presses = if args.from.is_empty() {
-        match live(&args, setup, &sensor, shutdown).await? {
+    let read = {
+        let (sensor, hrn) = (sensor.clone(), setup.hrn.clone());
+        let with_track = matches!(args.what, What::Arm);
+        move |file, path: &Path| gather::presses(file, path, &sensor, hrn.clone(), with_track)
+    };
+    let presses: Vec<Press> = if args.from.is_empty() {
+        let print_next = |seen| print_next(&args, seen);
+        let wanted = args.wanted();
+        let made = live::record(setup, sensor.name(), wanted, print_next, shutdown).await?;
+        let Some(file) = made else {
+            return Ok(());
+        };
+        // Something else may have been pressed before the recording ended.
+        let presses = read(file, Path::new(live::RECORDED))?.into_iter();
+        presses.take(wanted as usize).collect()
+    } else {
+        let files = args.from.clone();
+        let work = move || {
+            let mut all = Vec::new();
+            for path in &files {
+                all.extend(read(super::open(path)?, path)?);
+            }
+            Ok(all)
+        };
+        match live::unless(shutdown, "calibrate", work).await? {
             Some(presses) => presses,
             None => return Ok(()),
         }
-    } else {
-        let with_track = matches!(args.what, What::Arm);
-        let (files, sensor, hrn) = (args.from.clone(), sensor.clone(), setup.hrn.clone());
-        let work = move || recorded(&files, &sensor, &hrn, with_track);
-        let read = spawn_thread("calibrate", work)?;
-        tokio::select! {
-            read = read => read.expect("recordings are read without a panic")?,
-            () = shutdown => return Ok(()),
-        }
     };
-    let text = match args.what {
-        What::Arm => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
-        What::Force => {
-            let (found, expected) = (presses.len(), args.newtons.len());
-            if found != expected {
-                let count =
-                    format!("found {found} presses, expected {expected}: put each weight on once");
-                return Err(Failure::new(FAILED, count));
-            }
-            let weights = args.newtons.iter().copied().zip(&presses);
-            let fit = force::Fit::of(&weights.collect::<Vec<_>>(), &sensor);
-            let fit = fit.exit(FAILED)?;
-            let error = fit.error();
-            if error > DOUBTFUL_ERROR {
-                hardnessd_core::stderr_line!(
-                    "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
-                     the zero was taken? If so, leave out the weight with the greatest error",
-                    100.0 * error
-                );
-            }
-            of_force(&fit)
-        }
-        What::Taxels => {
-            let (full, presses): (Vec<Press>, _) =
-                presses.into_iter().partition(|press| press.saturated);
-            if !full.is_empty() {
-                hardnessd_core::stderr_line!(
-                    "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
-                    full.len()
-                );
-            }
-            let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
-            let dead = &dead_taxels(&sensor, &presses);
-            let array = sensor.layout().array();
-            let fit = taxels::Fit::of(&plain, array, dead).exit(FAILED)?;
-            let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
-            let (path, part) = out.expect("the gains have a file");
-            part.write(&bytes).of_file(&path, IO)?;
-            of_taxels(&fit, array, dead, &super::as_in(config, &path))
-        }
+    let text = match out {
+        None if matches!(args.what, What::Arm) => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
+        None => of_force(&args.newtons, &presses, &sensor)?,
+        Some(part) => of_taxels(presses, &sensor, part, &path, config)?,
     };
     super::print_apart(text.into_bytes()).await?;
     Ok(())
-}
-
-/// The presses that the sensor sends from now on; `None` if `shutdown` comes first.
-async fn live(
-    args: &Args,
-    setup: Setup,
-    sensor: &Sensor,
-    shutdown: impl Future<Output = ()>,
-) -> Result<Option<Vec<Press>>, Failure> {
-    let hrn = setup.hrn.clone();
-    let print_next = |seen| print_next(args, seen);
-    let recorded = live::record(setup, sensor.name(), args.wanted(), print_next, shutdown);
-    let Some(recorded) = recorded.await? else {
-        return Ok(None);
-    };
-    let with_track = matches!(args.what, What::Arm);
-    let path = Path::new(live::RECORDED);
-    let mut presses = gather::presses(recorded, path, sensor, hrn, with_track)?;
-    // Something else may have been pressed before the recording ended.
-    presses.truncate(args.wanted() as usize);
-    Ok(Some(presses))
-}
-
-/// The presses that recordings hold.
-fn recorded(
-    files: &[PathBuf],
-    sensor: &Sensor,
-    hrn: &Arc<Hrn>,
-    with_track: bool,
-) -> Result<Vec<Press>, Failure> {
-    let mut presses = Vec::new();
-    for path in files {
-        let file = super::open(path)?;
-        presses.extend(gather::presses(
-            file,
-            path,
-            sensor,
-            hrn.clone(),
-            with_track,
-        )?);
-    }
-    Ok(presses)
 }
 
 /// The dead taxels of the sensor, and those that were dead in a recording: what these show is no
@@ -267,27 +198,22 @@ fn plain(press: &Press) -> taxels::Plain {
 
 /// Says on stderr what to do next, after `seen` presses.
 fn print_next(args: &Args, seen: u64) {
-    match args.what {
-        What::Arm if seen == 0 => hardnessd_core::stderr_line!(
-            "press something rigid {} times, while the robot tells where its arm is",
-            args.wanted()
-        ),
-        What::Taxels if seen == 0 => hardnessd_core::stderr_line!(
-            "press something wide and soft {} times, each time at another place, up to the edges; or press \
-             the whole array evenly",
-            args.wanted()
-        ),
-        What::Arm | What::Taxels => {
-            hardnessd_core::stderr_line!("press {seen} of {}", args.wanted());
-        }
-        What::Force => match args.newtons.get(seen as usize) {
+    let wanted = args.wanted();
+    match (args.what, seen) {
+        (What::Force, _) => match args.newtons.get(seen as usize) {
             Some(newtons) => {
-                hardnessd_core::stderr_line!(
-                    "put {newtons} N on the sensor, wait until it rests, and take it off"
-                );
+                stderr_line!("put {newtons} N on the sensor, wait until it rests, and take it off");
             }
-            None => hardnessd_core::stderr_line!("done"),
+            None => stderr_line!("done"),
         },
+        (What::Arm, 0) => stderr_line!(
+            "press something rigid {wanted} times, while the robot tells where its arm is"
+        ),
+        (What::Taxels, 0) => stderr_line!(
+            "press something wide and soft {wanted} times, each time at another place, up to the edges; or press \
+             the whole array evenly"
+        ),
+        _ => stderr_line!("press {seen} of {wanted}"),
     }
 }
 
@@ -296,8 +222,23 @@ fn newtons(text: &str) -> Result<f64, String> {
     within(text, 0.001, 1e6)
 }
 
-/// The values, their spread and the lines for the configuration.
-fn of_force(fit: &force::Fit) -> String {
+/// The values of known weights, their spread and the lines for the configuration.
+fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<String, Failure> {
+    let (found, expected) = (presses.len(), newtons.len());
+    if found != expected {
+        let count = format!("found {found} presses, expected {expected}: put each weight on once");
+        return Err(Failure::new(FAILED, count));
+    }
+    let weights: Vec<(f64, &Press)> = newtons.iter().copied().zip(presses).collect();
+    let fit = force::Fit::of(&weights, sensor).exit(FAILED)?;
+    let error = fit.error();
+    if error > DOUBTFUL_ERROR {
+        stderr_line!(
+            "warning: the weights disagree by {:.0} %: was each put on alone, in this order, after \
+             the zero was taken? If so, leave out the weight with the greatest error",
+            100.0 * error
+        );
+    }
     let mut text = String::from("weight        read          error\n");
     for (newtons, read) in &fit.weights {
         let error = 100.0 * (read / newtons - 1.0);
@@ -312,107 +253,104 @@ fn of_force(fit: &force::Fit) -> String {
         power,
         ..
     } = fit;
-    text += &format!(
-        "\nnewtons_per_count  {newtons_per_count:.5} (weight by weight {least:.5} to {most:.5})\n\
-         line               error {:.1} %\n",
-        100.0 * line_error
-    );
-    text += &match power {
+    let power = match power {
         Some((exponent, error)) => {
-            format!(
-                "power law          exponent {exponent:.2}, error {:.1} %\n",
-                100.0 * error
-            )
+            format!("exponent {exponent:.2}, error {:.1} %", 100.0 * error)
         }
-        None => "power law          needs four different weights, one twice another\n".to_owned(),
+        None => "needs four different weights, one twice another".to_owned(),
     };
-    text += &format!(
-        "\n[sensor.calibration]\nnewtons_per_count = {newtons_per_count:.5}\nexponent = {exponent:.2}\n"
-    );
-    text
+    Ok(text
+        + &format!(
+            "\nnewtons_per_count  {newtons_per_count:.5} (weight by weight {least:.5} to {most:.5})\n\
+             line               error {:.1} %\n\
+             power law          {power}\n\
+             \n\
+             [sensor.calibration]\n\
+             newtons_per_count = {newtons_per_count:.5}\n\
+             exponent = {exponent:.2}\n",
+            100.0 * line_error
+        ))
 }
 
 /// The values, their spread and the lines for the configuration.
 fn of_arm(fit: &arm::Fit) -> String {
     let arm::Fit {
         presses,
-        force_n,
+        force_n: [least_n, most_n],
         n_per_mm,
         delay_ms,
         residual_mm,
     } = fit;
+    let (arm, delay) = (n_per_mm.value, delay_ms.value);
     format!(
-        "presses    {presses}, up to {:.1} to {:.1} N\n\
-         stiffness  {:.2} N/mm (press by press {:.2} to {:.2})\n\
-         delay      {:.1} ms (press by press {:.1} to {:.1})\n\
+        "presses    {presses}, up to {least_n:.1} to {most_n:.1} N\n\
+         stiffness  {arm:.2} N/mm (press by press {:.2} to {:.2})\n\
+         delay      {delay:.1} ms (press by press {:.1} to {:.1})\n\
          residual   {residual_mm:.3} mm\n\
          \n\
          [sensor.arm]\n\
-         stiffness_n_per_mm = {:.2}\n\
-         delay_ms = {:.1}\n",
-        force_n[0],
-        force_n[1],
-        n_per_mm.value,
-        n_per_mm.least,
-        n_per_mm.most,
-        delay_ms.value,
-        delay_ms.least,
-        delay_ms.most,
-        n_per_mm.value,
-        delay_ms.value,
+         stiffness_n_per_mm = {arm:.2}\n\
+         delay_ms = {delay:.1}\n",
+        n_per_mm.least, n_per_mm.most, delay_ms.least, delay_ms.most,
     )
 }
 
-/// The values, their spread and the lines for the configuration.
-fn of_taxels(fit: &taxels::Fit, array: Array, known_dead: &[[usize; 2]], path: &str) -> String {
-    let measured: Vec<usize> = (0..fit.gains.len())
-        .filter(|&k| fit.presses[k] > 1)
-        .collect();
-    let gains = measured.iter().map(|&k| fit.gains[k]);
-    let least = gains.clone().fold(f32::INFINITY, f32::min);
-    let most = gains.fold(0.0, f32::max);
-    let mut counts: Vec<usize> = measured.iter().map(|&k| fit.presses[k]).collect();
+/// Writes the gains to `part`, which becomes the file at `path`. Returns them with their spread and the
+/// lines for the configuration.
+fn of_taxels(
+    mut presses: Vec<Press>,
+    sensor: &Sensor,
+    part: Part,
+    path: &Path,
+    config: &Path,
+) -> Result<String, Failure> {
+    let found = presses.len();
+    presses.retain(|press| !press.saturated);
+    if presses.len() < found {
+        stderr_line!(
+            "warning: {} of the presses reached full scale on a taxel and are left out: press more softly",
+            found - presses.len()
+        );
+    }
+    let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
+    let dead = dead_taxels(sensor, &presses);
+    let array = sensor.layout().array();
+    let fit = taxels::Fit::of(&plain, array, &dead).exit(FAILED)?;
+    let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
+    part.write(&bytes).of_file(path, IO)?;
+
+    let mut text = String::from("gains, in percent; . where fewer than two presses tell of it:\n");
+    let (mut least, mut most, mut counts) = (f32::INFINITY, 0.0_f32, Vec::new());
+    for (place, (&gain, &presses)) in fit.gains.iter().zip(&fit.presses).enumerate() {
+        if presses > 1 {
+            text += &format!(" {:3.0}", 100.0 * gain);
+            (least, most) = (gain.min(least), gain.max(most));
+            counts.push(presses);
+        } else {
+            text += "   .";
+        }
+        if (place + 1).is_multiple_of(array.cols) {
+            text.push('\n');
+        }
+    }
     counts.sort_unstable();
     let median = counts.get(counts.len() / 2).copied().unwrap_or(0);
-    let list = |taxels: &[[usize; 2]]| {
-        let taxels: Vec<String> = taxels
-            .iter()
-            .map(|[row, col]| format!("[{row}, {col}]"))
-            .collect();
-        taxels.join(", ")
-    };
-    let mut text = String::from("gains, in percent; . where fewer than two presses tell of it:\n");
-    for row in 0..array.rows {
-        for col in 0..array.cols {
-            let k = row * array.cols + col;
-            text += &match fit.presses[k] {
-                0 | 1 => "   .".to_owned(),
-                _ => format!(" {:3.0}", 100.0 * fit.gains[k]),
-            };
-        }
-        text.push('\n');
-    }
     text += &format!(
         "\ntaxels  {} of {} measured, each in {median} presses (median); {} presses loaded the whole array\n\
          gains   {least:.2} to {most:.2}, spread {:.1} %\n\
          error   {:.1} % of a gain\n\
-         dead    {}\n",
-        measured.len(),
+         \n\
+         [sensor.calibration]\n\
+         gains = {}\n",
+        counts.len(),
         fit.gains.len(),
         fit.even,
         100.0 * fit.spread,
         100.0 * fit.error,
-        if fit.dead.is_empty() {
-            "none looks dead".to_owned()
-        } else {
-            list(&fit.dead)
-        }
+        toml::Value::from(super::as_in(config, path))
     );
-    text += "\n[sensor.calibration]\n";
-    text += &format!("gains = {}\n", toml::Value::from(path));
-    let all: Vec<[usize; 2]> = known_dead.iter().chain(&fit.dead).copied().collect();
-    if !all.is_empty() {
-        text += &format!("dead_taxels = [{}]\n", list(&all));
+    if !dead.is_empty() {
+        text += &format!("dead_taxels = {dead:?}\n");
     }
-    text
+    Ok(text)
 }

@@ -6,6 +6,7 @@ use clap::Args as ClapArgs;
 
 use super::exit::{Fail, Failure};
 use hardnessd_core::exit::NO_INPUT;
+use hardnessd_core::stderr_line;
 
 /// The argument `--config`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -64,7 +65,7 @@ impl Configuration {
                 ),
             ));
         };
-        hardnessd_core::stderr_line!("hardnessd: configuration {found}");
+        stderr_line!("hardnessd: configuration {found}");
         Ok(PathBuf::from(found))
     }
 }

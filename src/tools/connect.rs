@@ -42,12 +42,10 @@ pub struct Source {
 }
 
 fn host_port(text: &str) -> Result<String, &'static str> {
-    let port = text
-        .rsplit_once(':')
-        .map(|(host, port)| (host, port.parse::<u16>()));
-    match port {
-        Some((host, Ok(_))) if !host.is_empty() => Ok(text.to_owned()),
-        _ => Err("expected HOST:PORT, such as 192.168.7.2:8255"),
+    let is_one = |(host, port): (&str, &str)| !host.is_empty() && port.parse::<u16>().is_ok();
+    match text.rsplit_once(':').is_some_and(is_one) {
+        true => Ok(text.to_owned()),
+        false => Err("expected HOST:PORT, such as 192.168.7.2:8255"),
     }
 }
 
@@ -130,21 +128,16 @@ async fn find(name: &str) -> Result<Connection, Failure> {
             Err(_) => {}
         }
     }
-    let nowhere = || {
-        let places: Vec<String> = places
-            .iter()
-            .map(|path| path.display().to_string())
-            .collect();
-        let places = places.join(" or ");
-        Failure::new(
-            UNAVAILABLE,
-            format!(
-                "no daemon answers at {places}, and no demo runs: start one with `hardnessd run` or \
-                 `hardnessd demo`, or name its socket with --socket"
-            ),
-        )
-    };
-    Err(denied.unwrap_or_else(nowhere))
+    if let Some(denied) = denied {
+        return Err(denied);
+    }
+    let places = places.iter().map(|path| path.display().to_string());
+    let problem = format!(
+        "no daemon answers at {}, and no demo runs: start one with `hardnessd run` or `hardnessd demo`, or name its \
+         socket with --socket",
+        places.collect::<Vec<_>>().join(" or ")
+    );
+    Err(Failure::new(UNAVAILABLE, problem))
 }
 
 /// Connects to one of the addresses of a name. A lookup may take long.
@@ -210,11 +203,8 @@ impl Connection {
     }
 
     fn broke(&self, error: io::Error) -> Failure {
-        Failure::of(
-            UNAVAILABLE,
-            format!("{}: the connection broke", self.address),
-            error,
-        )
+        let what = format!("{}: the connection broke", self.address);
+        Failure::of(UNAVAILABLE, what, error)
     }
 
     /// Sends a request.
@@ -241,11 +231,8 @@ impl Connection {
 fn refusal(address: &Address, error: io::Error) -> Failure {
     match address {
         Address::Unix(path) if error.kind() == ErrorKind::PermissionDenied => {
-            let remedy = remedy(path);
-            Failure::new(
-                UNAVAILABLE,
-                format!("{address}: permission denied: {remedy}"),
-            )
+            let problem = format!("{address}: permission denied: {}", remedy(path));
+            Failure::new(UNAVAILABLE, problem)
         }
         _ => Failure::of(UNAVAILABLE, format!("{address}: no daemon answers"), error),
     }

@@ -9,7 +9,6 @@
 mod account;
 mod place;
 
-use std::cell::Cell;
 use std::future::Future;
 use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
@@ -17,6 +16,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
+use futures_util::FutureExt as _;
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::net::UnixStream;
@@ -39,6 +39,7 @@ use crate::daemon::config::{Config, Http, Setup};
 use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::motion;
 use hardnessd_core::sensor;
+use hardnessd_core::stderr_line;
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
@@ -74,9 +75,6 @@ pub struct Args {
 
 /// The first four presses of this seed show each kind of answer, and none is near another.
 const SEED: u64 = 2;
-
-/// The longest time from the last byte to the last verdict.
-const PATIENCE: Duration = Duration::from_secs(3);
 
 /// Runs until the presses have their verdicts, `shutdown` comes or nobody reads stdout.
 ///
@@ -123,7 +121,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     });
     let robot = Robot {
         socket: config.publish.unix.control_path(),
-        sensor: None,
         position: Box::new(player.position()),
     };
     let (config, path) = (
@@ -132,29 +129,20 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     );
     let daemon = Daemon::bind(Setup::of(config, path)?.checked(path)?)?;
     if let Some(address) = daemon.http_address() {
-        hardnessd_core::stderr_line!(
-            "live page: http://{address}/ (Ctrl-C ends the demonstration)"
-        );
+        stderr_line!("live page: http://{address}/ (Ctrl-C ends the demonstration)");
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
-    hardnessd_core::stderr_line!("socket: {} ({listen})", socket.display());
+    stderr_line!("socket: {} ({listen})", socket.display());
     let subscriber = UnixStream::connect(&socket).await.of("socket", IO)?;
     let (stop, stopped) = oneshot::channel::<()>();
-    let daemon = daemon.run(
-        async {
-            // Dropping the sender has the same effect as sending.
-            let _ = stopped.await;
-        },
-        None,
-    );
+    let daemon = daemon.run(stopped.map(drop), None);
     let printing = async {
-        let printed = print(subscriber, args.presses, player, sequence, shown, shutdown);
-        let printed = tokio::select! {
-            printed = printed => printed,
+        // When it is dropped, the daemon stops.
+        let _stop = stop;
+        tokio::select! {
+            printed = print(subscriber, args.presses, player, sequence, shown, shutdown) => printed,
             () = robot.run() => Ok(()),
-        };
-        let _ = stop.send(());
-        printed
+        }
     };
     let (served, printed) = tokio::join!(daemon, printing);
     printed?;
@@ -213,25 +201,16 @@ async fn print(
     mut shown: Shown,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let (frames, progress) = (player::sequence(sequence)?, Progress::default());
+    let frames = player::sequence(sequence)?;
     let play = async {
-        let played = player.play(frames, Instant::now()).await;
-        played.of("pty", IO)?;
-        tokio::time::sleep(PATIENCE).await;
-        while progress.is_printing.get() {
-            tokio::time::sleep(PATIENCE).await;
-        }
-        if progress.missed.get() {
-            return Ok(());
-        }
-        let (finals, presses) = (progress.finals.get(), presses.unwrap_or(0));
-        let missed = format!("only {finals} of {presses} presses got a verdict");
-        Err(Failure::new(FAILED, missed))
+        player.play(frames, Instant::now()).await.of("pty", IO)?;
+        // The loss of the port ends what is printed.
+        std::future::pending().await
     };
     let printed = tokio::select! {
         () = shutdown => Ok(()),
-        printed = print_events(subscriber, presses, &mut shown, &progress) => printed,
-        played = play => played,
+        printed = print_events(subscriber, presses, &mut shown) => printed,
+        failed = play => failed,
     };
     if let Shown::Lines(account) = &shown {
         let last = super::print_apart((account.close() + "\n").into_bytes());
@@ -241,50 +220,37 @@ async fn print(
     printed
 }
 
-/// What was printed so far.
-#[derive(Default)]
-struct Progress {
-    /// The final verdicts.
-    finals: Cell<u32>,
-    /// Whether a slow reader missed events. Verdicts may be among them.
-    missed: Cell<bool>,
-    /// Whether the reader of stdout lets it wait.
-    is_printing: Cell<bool>,
-}
-
+/// Prints events until all presses have their final verdicts.
 async fn print_events(
     subscriber: UnixStream,
     presses: Option<u32>,
     shown: &mut Shown,
-    progress: &Progress,
 ) -> Result<(), Failure> {
     let (mut lines, mut stdout) = (BufReader::new(subscriber), Stdout::open()?);
+    let (mut finals, mut is_complete) = (0, true);
     loop {
         let mut line = Vec::new();
         let read = lines.read_until(b'\n', &mut line).await;
         if read.of("socket", IO)? == 0 {
             return Err(Failure::new(FAILED, "the daemon closed the connection"));
         }
-        let event = serde_json::from_slice(&line).unwrap_or_default();
-        let finals = progress.finals.get() + u32::from(is_final(&event));
-        progress.finals.set(finals);
-        progress
-            .missed
-            .set(progress.missed.get() || event["type"] == "gap");
+        let event: Value = serde_json::from_slice(&line).unwrap_or_default();
+        finals += u32::from(event["phase"] == "final");
+        // Verdicts may be among the events that a slow reader misses.
+        is_complete &= event["type"] != "gap";
         let text = shown.of(line, &event);
-        if !text.is_empty() {
-            progress.is_printing.set(true);
-            if !stdout.print(text).await? {
-                return Ok(());
-            }
-            progress.is_printing.set(false);
+        if !text.is_empty() && !stdout.print(text).await? {
+            return Ok(());
         }
-        if Some(finals) == presses {
-            return stdout.finish().await.map(drop);
+        // The port goes after the last press.
+        let is_over = event["state"] == "lost" && event["type"] == "status";
+        if Some(finals) == presses || is_over {
+            stdout.finish().await?;
+            let missed = presses.filter(|&presses| is_complete && finals < presses);
+            return missed.map_or(Ok(()), |presses| {
+                let missed = format!("only {finals} of {presses} presses got a verdict");
+                Err(Failure::new(FAILED, missed))
+            });
         }
     }
-}
-
-fn is_final(event: &Value) -> bool {
-    event["type"] == "hardness" && event["phase"] == "final"
 }

@@ -14,7 +14,7 @@ use clap::Args as ClapArgs;
 use self::checks::{User, entry, examine, field, in_the_way, ports, refused, unreachable};
 use super::absolute;
 use super::exit::Failure;
-use hardnessd_core::exit::{Coded, FAILED, UNAVAILABLE};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::port::Port;
 use hardnessd_core::wording::escaped;
 
@@ -49,36 +49,6 @@ pub(super) fn group(gid: u32) -> Option<String> {
     Some(field(&line, 0))
 }
 
-/// A sensor whose port does not open.
-#[derive(Debug, thiserror::Error)]
-#[error("sensor {sensor:?}: {port}: {obstacle}")]
-pub struct Unavailable {
-    /// The sensor's name.
-    sensor: String,
-    /// The sensor's port, as the configuration gives it.
-    port: Port,
-    /// The fault, and the remedy.
-    obstacle: String,
-}
-
-impl Coded for Unavailable {
-    fn exit_code(&self) -> u8 {
-        UNAVAILABLE
-    }
-}
-
-impl Unavailable {
-    /// `reason` is the system's. It counts where no fault is visible.
-    pub(super) fn new(sensor: String, port: Port, reason: String) -> Self {
-        let obstacle = obstacle(&port).unwrap_or(reason);
-        Self {
-            sensor,
-            port,
-            obstacle,
-        }
-    }
-}
-
 /// Prints the faults, each with its remedy.
 ///
 /// # Errors
@@ -101,10 +71,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for port in ports {
         let (port, faults) = match port.device().map(absolute) {
             Some(path) => {
-                let faults = match refused(root, &path) {
-                    Some(fault) => vec![fault],
-                    None => examine(root, &path, &user),
-                };
+                let refused = refused(root, &path).map(|fault| vec![fault]);
+                let faults = refused.unwrap_or_else(|| examine(root, &path, &user));
                 (Port::Device(path), faults)
             }
             None => {
@@ -116,9 +84,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         if faults.is_empty() {
             lines.push(format!("{port}: no fault found"));
         }
-        for fault in faults {
-            lines.push(format!("{port}: {fault}"));
-        }
+        lines.extend(faults.iter().map(|fault| format!("{port}: {fault}")));
     }
     let printed: String = lines.iter().map(|line| escaped(line) + "\n").collect();
     super::print(printed.as_bytes())?;

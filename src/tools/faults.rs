@@ -20,10 +20,8 @@ use hardnessd_simulator::{FULL_SCALE_COUNTS, NEWTONS_PER_COUNT};
 /// The state of the line at a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Line {
-    /// Send the bytes, at the speed of the line.
+    /// Send the bytes.
     Up,
-    /// Send the bytes all at once.
-    AtOnce,
     /// Send nothing.
     Silent,
     /// Send nothing, and remove the port.
@@ -34,8 +32,6 @@ pub(crate) enum Line {
 #[derive(Debug)]
 pub(crate) struct Faults {
     faults: Vec<Fault>,
-    /// The bytes that a stall holds back.
-    held: Vec<u8>,
     stream: Stream,
 }
 
@@ -57,7 +53,6 @@ impl Faults {
     fn of(faults: Vec<Fault>, seed: u64) -> Self {
         Self {
             faults,
-            held: Vec::new(),
             stream: Stream::new(seed, "faults"),
         }
     }
@@ -65,8 +60,7 @@ impl Faults {
     /// Replaces `bytes` by those of the frame due at `time_s`, damaged as the script says, and
     /// returns how to send them. Call it for the frames in order.
     ///
-    /// The taxels are struck first, then the bytes, then the cable; among these, faults strike in
-    /// the order of the script.
+    /// The taxels are struck first, then the bytes and the cable, each in the order of the script.
     pub(crate) fn encode(
         &mut self,
         time_s: f64,
@@ -79,37 +73,17 @@ impl Faults {
         }
         bytes.clear();
         layout.encode(&middle(&raw, layout.array()), bytes);
-        for fault in &mut self.faults {
-            strike_bytes(fault, time_s, &mut self.stream, bytes);
-        }
-        self.strike_cable(time_s, bytes)
-    }
-
-    /// Makes of the frame that is due at `time_s` the bytes to send now, and returns how to send
-    /// them.
-    fn strike_cable(&mut self, time_s: f64, bytes: &mut Vec<u8>) -> Line {
         let mut line = Line::Up;
         for fault in &mut self.faults {
+            strike_bytes(fault, time_s, &mut self.stream, bytes);
             let kind = fault.kind;
             match kind {
                 Kind::Unplug {} if fault.strikes(time_s) => line = Line::Unplugged,
-                Kind::Stall {} if line == Line::Up && fault.strikes(time_s) => {
-                    self.held.append(bytes);
-                    line = Line::Silent;
-                }
                 Kind::Silence {} if line == Line::Up && fault.strikes(time_s) => {
                     line = Line::Silent;
                 }
                 _ => {}
             }
-        }
-        // A cable that is pulled loses what it holds.
-        if line == Line::Unplugged {
-            self.held.clear();
-        }
-        if line == Line::Up && !self.held.is_empty() {
-            bytes.splice(0..0, self.held.drain(..));
-            return Line::AtOnce;
         }
         line
     }
@@ -119,7 +93,6 @@ impl Faults {
 fn strike_taxels(fault: &mut Fault, time_s: f64, raw: &mut RawFrame) {
     let (stuck, newtons) = match fault.kind {
         Kind::Stuck { counts } => (Some(counts), 0.0),
-        Kind::Contact { newtons } => (None, newtons),
         Kind::Drift { newtons_per_hour } => {
             let hours = (time_s - fault.at_s).min(fault.for_s) / 3600.0;
             (None, newtons_per_hour * hours)
@@ -282,34 +255,6 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_loses_nothing_but_with_the_cable() {
-        let script = r#"
-            [[fault]]
-            at_s = 3.0
-            kind = "stall"
-            for_s = 0.5
-            [[fault]]
-            at_s = 4.0
-            kind = "stall"
-            for_s = 0.5
-            [[fault]]
-            at_s = 4.2
-            kind = "unplug"
-            for_s = 0.1
-        "#;
-        let mut played = Played::new(script, 9.0);
-        let whole = played.whole();
-        assert_eq!(played.at(3.0).0, Line::Silent);
-        assert_eq!(played.at(3.4).0, Line::Silent);
-        assert_eq!(played.at(3.5), (Line::AtOnce, whole.repeat(3)));
-        assert_eq!(played.at(3.6), (Line::Up, whole.clone()));
-        assert_eq!(played.at(4.0).0, Line::Silent);
-        assert_eq!(played.at(4.2).0, Line::Unplugged);
-        assert_eq!(played.at(4.4).0, Line::Silent);
-        assert_eq!(played.at(4.5), (Line::AtOnce, whole.repeat(2)));
-    }
-
-    #[test]
     fn each_kind_does_to_its_taxels_what_it_says() {
         let script = r#"
             [[fault]]
@@ -323,12 +268,6 @@ mod tests {
             kind = "stuck"
             counts = 0
             rows = [27, 27]
-            for_s = 0.5
-            [[fault]]
-            at_s = 3.0
-            kind = "contact"
-            cols = [5, 6]
-            newtons = 0.4
             for_s = 0.5
             [[fault]]
             at_s = 10.0
@@ -357,8 +296,6 @@ mod tests {
         assert_eq!(other(1.5), (0, None));
         assert_eq!(other(2.0), (28, Some((27 * 28, 0.0))));
         assert_eq!(other(2.5), (0, None));
-        assert_eq!(other(3.4), (56, Some((5, 17.0))));
-        assert_eq!(other(4.0), (0, None));
         // A count is 0.04 N, which 0.5 N an hour reach in 288 s.
         assert_eq!(other(10.0 + 140.0), (0, None));
         assert_eq!(other(10.0 + 150.0), (784, Some((0, 8.0))));

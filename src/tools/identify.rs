@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, BufReader, Read};
+use std::io::{BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -15,17 +15,16 @@ use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
 use super::exit::{Fail, Failure};
-use super::replay::{self, feed, no_frame};
+use super::replay::{self, feed, motion, no_frame};
 use super::{cannot_read, live, open, print_apart, unplayable};
 use crate::daemon::config::{self, Config, Setup};
-use crate::thread::spawn_thread;
 use hardnessd_core::exit::{FAILED, IO, USAGE};
-use hardnessd_core::motion::Point;
 use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{FileKind, Labels, Playback, Reader};
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
+use hardnessd_core::stderr_line;
 use hardnessd_core::verdict::{
     Borders, Course, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress, Tried,
 };
@@ -73,35 +72,24 @@ impl FromStr for What {
     type Err = &'static str;
 
     fn from_str(text: &str) -> Result<Self, &'static str> {
-        What::named(text).ok_or(
-            "expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, level:N, or unknown",
-        )
-    }
-}
-
-impl What {
-    fn named(text: &str) -> Option<Self> {
-        if text.trim() == "unknown" {
-            return Some(Self::Piece(Piece::UNKNOWN));
-        }
-        let (kind, value) = text.split_once(':')?;
+        let (kind, value) = text.split_once(':').unwrap_or((text, ""));
+        let value = value.trim();
         let within = |least: f32, most: f32| {
-            let number = value.trim().parse().ok();
+            let number = value.parse().ok();
             number.filter(|number| (least..=most).contains(number))
         };
-        Some(match kind.trim() {
-            "flat" => Self::Piece(Piece::Flat {
-                width_mm: within(0.1, 1000.0)?,
-            }),
-            "ball" => Self::Piece(Piece::Ball {
-                radius_mm: within(0.1, 1000.0)?,
-            }),
-            "shore" => Self::Piece(Piece::Shore {
-                range: [within(0.0, 100.0)?; 2],
-            }),
-            "level" => Self::Level(value.trim().parse().ok()?),
-            _ => return None,
-        })
+        let mm = within(0.1, 1000.0);
+        let what = match kind.trim() {
+            "unknown" if value.is_empty() => Some(Self::Piece(Piece::UNKNOWN)),
+            "flat" => mm.map(|width_mm| Self::Piece(Piece::Flat { width_mm })),
+            "ball" => mm.map(|radius_mm| Self::Piece(Piece::Ball { radius_mm })),
+            "shore" => within(0.0, 100.0).map(|oo| Self::Piece(Piece::Shore { range: [oo; 2] })),
+            "level" => value.parse().ok().map(Self::Level),
+            _ => None,
+        };
+        what.ok_or(
+            "expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, level:N, or unknown",
+        )
     }
 }
 
@@ -136,7 +124,7 @@ pub async fn run(
     begin(&args)?;
     let levels = setup.hrn.card().levels.clone();
     let hrn = setup.hrn.clone();
-    let file = if args.files.is_empty() {
+    let made = if args.files.is_empty() {
         let Some(what) = args.what else {
             return Err(Failure::new(
                 USAGE,
@@ -145,36 +133,32 @@ pub async fn run(
         };
         let wanted = args.presses;
         let print_next = |seen: u64| match seen {
-            0 => hardnessd_core::stderr_line!("press it {wanted} times, harder each time"),
-            _ => hardnessd_core::stderr_line!("press {seen} of {wanted}"),
+            0 => stderr_line!("press it {wanted} times, harder each time"),
+            _ => stderr_line!("press {seen} of {wanted}"),
         };
-        let hrn = setup.hrn.clone();
         let made = live::record(setup, sensor.name(), wanted, print_next, shutdown).await?;
         let Some(file) = made else {
             return Ok(());
         };
         let path = Path::new(live::RECORDED);
-        let (mut courses, _) = of_recording(file, path, sensor.name(), hrn)?;
+        let (mut courses, _) = of_recording(file, path, sensor.name(), hrn.clone())?;
         // Something else may have been pressed before the recording ended.
         courses.truncate(wanted as usize);
         made_of(courses, piece(what, &levels)?, path, &sensor)?
     } else {
-        let (args, hrn, sensor) = (args.clone(), setup.hrn.clone(), sensor.clone());
+        let (args, hrn) = (args.clone(), hrn.clone());
         let work = move || of_files(&args, &sensor, &hrn, &levels);
-        let read = spawn_thread("identify", work)?;
-        tokio::select! {
-            read = read => read.expect("recordings are read without a panic")?,
-            () = shutdown => return Ok(()),
+        match live::unless(shutdown, "identify", work).await? {
+            Some(made) => made,
+            None => return Ok(()),
         }
     };
-    let all = write(&args, file)?;
-    let tried = match all.len() <= hrn.most_references() {
-        true => {
-            hrn.identified_by(&all)
-                .of(args.out.display().to_string(), FAILED)?
-                .1
-        }
-        false => Tried::default(),
+    let all = write(&args, made)?;
+    let tried = if all.len() <= hrn.most_references() {
+        let identified = hrn.identified_by(&all);
+        identified.of_file(&args.out, FAILED)?.1
+    } else {
+        Tried::default()
     };
     let text = account(&super::as_in(config, &args.out), &all, tried);
     print_apart(text.into_bytes()).await?;
@@ -186,30 +170,26 @@ pub async fn run(
 fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
     let out = &args.out;
     if !args.append {
-        return match Part::new(out) {
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Err(Failure::new(
-                IO,
-                format!(
-                    "{} exists already: add to it with --append, or name another file",
-                    out.display()
-                ),
-            )),
-            part => Ok((Vec::new(), part.of_file(out, IO)?)),
-        };
+        let part = Part::new(out);
+        if part
+            .as_ref()
+            .is_err_and(|error| error.kind() == ErrorKind::AlreadyExists)
+        {
+            let exists = "exists already: add to it with --append, or name another file";
+            return Err(Failure::new(IO, format!("{} {exists}", out.display())));
+        }
+        return Ok((Vec::new(), part.of_file(out, IO)?));
     }
     // It refuses a pipe, whose reading might never end.
     let part = Part::over(out).of_file(out, IO)?;
     let mut bytes = Vec::new();
-    let read = File::open(out).and_then(|file| {
-        file.take(references::MAX_FILE_BYTES as u64 + 1)
-            .read_to_end(&mut bytes)
-    });
+    let most = references::MAX_FILE_BYTES as u64 + 1;
+    let read = File::open(out).and_then(|file| file.take(most).read_to_end(&mut bytes));
     match read {
-        Ok(_) => {}
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Vec::new(), part)),
-        Err(error) => return Err(cannot_read(out)(error)),
+        Ok(_) => Ok((references::read(&bytes).of_file(out, FAILED)?, part)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok((Vec::new(), part)),
+        Err(error) => Err(cannot_read(out)(error)),
     }
-    Ok((references::read(&bytes).of_file(out, FAILED)?, part))
 }
 
 /// What is known of a piece, with the model's levels.
@@ -235,10 +215,7 @@ fn of_files(
     hrn: &Arc<Hrn>,
     levels: &[Level],
 ) -> Result<Vec<ReferencePress>, Failure> {
-    let motion = match &args.motion {
-        None => None,
-        Some(path) => Some(replay::positions(path)?),
-    };
+    let motion = args.motion.as_deref().map(motion::load).transpose()?;
     let mut all = Vec::new();
     for path in &args.files {
         let (kind, file) = FileKind::read(open(path)?).map_err(cannot_read(path))?;
@@ -250,8 +227,14 @@ fn of_files(
                 of_recording(BufReader::new(file), path, sensor.name(), hrn.clone())?
             }
             FileKind::Raw => {
-                let courses = of_bytes(file, path, sensor, hrn.clone(), motion.clone())?;
-                (courses, Labels::new())
+                let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
+                pipeline.keep_courses();
+                let motion = motion.clone();
+                let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
+                if let Some(error) = end.and_then(|end| no_frame(path, &end)) {
+                    return Err(error);
+                }
+                (pipeline.courses(), Labels::new())
             }
         };
         let what = match args.what {
@@ -280,26 +263,18 @@ fn spread(mut courses: Vec<Course>, most: usize) -> Vec<Course> {
 
 /// What the labels of a recording say was pressed.
 fn labelled(labels: &Labels, path: &Path) -> Result<What, Failure> {
+    let failed = |problem: String| Failure::new(FAILED, format!("{}: {problem}", path.display()));
     let kinds = [("reference", ""), ("shore", "shore:"), ("level", "level:")];
-    let known = kinds
-        .into_iter()
-        .find_map(|(key, kind)| Some((key, kind, labels.get(key)?)));
-    let Some((key, kind, found)) = known else {
-        let unlabelled =
-            "found no label `reference`, `shore` or `level`: say what was pressed with --as";
-        return Err(Failure::new(
-            FAILED,
-            format!("{}: {unlabelled}", path.display()),
-        ));
-    };
-    let what = format!("{kind}{found}").parse();
-    what.map_err(|expected| {
-        let path = path.display();
-        Failure::new(
-            FAILED,
-            format!("{path}: label {key}: found {found:?}, {expected}"),
-        )
-    })
+    for (key, kind) in kinds {
+        if let Some(found) = labels.get(key) {
+            let what = format!("{kind}{found}").parse();
+            return what
+                .map_err(|expected| failed(format!("label {key}: found {found:?}, {expected}")));
+        }
+    }
+    let unlabelled =
+        "found no label `reference`, `shore` or `level`: say what was pressed with --as";
+    Err(failed(unlabelled.to_owned()))
 }
 
 fn made_of(
@@ -334,28 +309,11 @@ fn of_recording(
         playback.end();
         courses.extend(playback.courses(sensor));
         for note in playback.left_out() {
-            hardnessd_core::stderr_line!("warning: {}: {note}", path.display());
+            stderr_line!("warning: {}: {note}", path.display());
         }
         Ok((courses, playback.labels()))
     };
     read().map_err(unplayable(path))
-}
-
-/// The courses of the presses in raw bytes.
-fn of_bytes(
-    file: impl Read,
-    path: &Path,
-    sensor: &Sensor,
-    hrn: Arc<Hrn>,
-    motion: Option<Vec<Point>>,
-) -> Result<Vec<Course>, Failure> {
-    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
-    pipeline.keep_courses();
-    let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
-    match end.as_deref().and_then(|end| no_frame(path, end)) {
-        Some(error) => Err(error),
-        None => Ok(pipeline.courses()),
-    }
 }
 
 /// Writes the file, and returns all its presses.
@@ -392,24 +350,18 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
         (force_n.min(least), force_n.max(most))
     });
     text += &format!("greatest force of a press  {least:.1} to {most:.1} N\n");
-    let without = references.iter().filter(|press| {
+    let is_without = |press: &&ReferencePress| {
         let mut moments = press.course.moments.iter();
         moments.all(|moment| moment.approach_mm.is_none())
-    });
-    match without.count() {
-        0 => {}
-        without => {
-            text += &format!(
-                "without the arm's approach {without}: such a press does not show how deep the sensor gives way\n"
-            );
-        }
+    };
+    let without = references.iter().filter(is_without).count();
+    if without > 0 {
+        text += &format!(
+            "without the arm's approach {without}: such a press does not show how deep the sensor gives way\n"
+        );
     }
-    let Tried {
-        presses,
-        right: [with, without],
-        ..
-    } = tried;
-    if presses > 0 {
+    if tried.presses > 0 {
+        let (presses, [with, without]) = (tried.presses, tried.right);
         text +=
             &format!("judged rightly  {with} of {presses} with the others, {without} with none\n");
     }

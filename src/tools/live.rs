@@ -16,8 +16,10 @@ use super::record;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
+use crate::thread::spawn_thread;
 use hardnessd_core::exit::IO;
 use hardnessd_core::recording::Labels;
+use hardnessd_core::stderr_line;
 
 /// What an error calls the recording in place of its path.
 pub(super) const RECORDED: &str = "what was recorded";
@@ -45,7 +47,7 @@ pub(super) async fn record(
 
     let (progress, mut counted) = watch::channel(Progress::default());
     let enough = async {
-        hardnessd_core::stderr_line!("leave the sensor free until its zero is taken");
+        stderr_line!("leave the sensor free until its zero is taken");
         // The presses at the last prompt.
         let mut shown = None;
         while shown < Some(wanted) && counted.changed().await.is_ok() {
@@ -72,4 +74,17 @@ pub(super) async fn record(
     }
     recorded.seek(SeekFrom::Start(0)).of_file(&path, IO)?;
     Ok(Some(recorded))
+}
+
+/// Does what may take long on another thread; `None` if `shutdown` comes first.
+pub(super) async fn unless<T: Send + 'static>(
+    shutdown: impl Future<Output = ()>,
+    name: &str,
+    work: impl FnOnce() -> Result<T, Failure> + Send + 'static,
+) -> Result<Option<T>, Failure> {
+    let done = spawn_thread(name, work)?;
+    tokio::select! {
+        done = done => Ok(Some(done.expect("a command works without a panic")?)),
+        () = shutdown => Ok(None),
+    }
 }

@@ -125,12 +125,13 @@ impl Player {
             let time_s = since.as_secs_f64() * self.pace.speed;
             let layout = &self.layout;
             let line = self.faults.encode(time_s, frame.raw, layout, &mut bytes);
-            if matches!(line, Line::Up | Line::AtOnce) && self.pty.is_none() {
-                self.pty = Some(Pty::open(self.link.as_deref())?);
-            }
             match line {
-                Line::Up => free = self.send(&bytes, due.max(free)).await?,
-                Line::AtOnce => self.send_at_once(&bytes).await?,
+                Line::Up => {
+                    if self.pty.is_none() {
+                        self.pty = Some(Pty::open(self.link.as_deref())?);
+                    }
+                    free = self.send(&bytes, due.max(free)).await?;
+                }
                 Line::Silent => {}
                 Line::Unplugged => self.pty = None,
             }
@@ -159,21 +160,6 @@ impl Player {
             pty.write(slice)?;
         }
         Ok(at)
-    }
-
-    /// Sends `bytes` without the pace of the line, as fast as the reader takes them.
-    async fn send_at_once(&mut self, mut bytes: &[u8]) -> io::Result<()> {
-        let Some(pty) = &mut self.pty else {
-            return Ok(());
-        };
-        // Without a reader the pty drops what it holds after a while, so that this ends.
-        loop {
-            bytes = &bytes[pty.write(bytes)?..];
-            if bytes.is_empty() {
-                return Ok(());
-            }
-            tokio::time::sleep(SLICE).await;
-        }
     }
 }
 

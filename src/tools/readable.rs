@@ -1,14 +1,13 @@
 //! An event as a line: JSON, or aligned text for people. The line holds nothing that is not in the
 //! event.
 
-use std::fmt::Write;
 use std::io::{self, IsTerminal};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::answer::{Answer, with_shore};
+use super::answer::{Answer, items, with_shore};
 use hardnessd_core::wording;
 
 /// How events are printed on stdout.
@@ -72,14 +71,14 @@ fn line(event: &Value, labels: &[String]) -> String {
         return format!("-- gap: {lost} events lost --");
     }
     let time = clock(&published(event).unwrap_or_else(|| text("time").to_owned()));
-    let mut line = format!("{time}  {:<12}  {kind:<8}  ", text("sensor"));
-    match kind {
-        "status" => status(&mut line, event),
-        "press" => press(&mut line, event),
-        "hardness" => hardness(&mut line, event, labels),
-        "frame" => frame(&mut line, event),
-        _ => line += &event.to_string(),
-    }
+    let said = match kind {
+        "status" => status(event),
+        "press" => press(event),
+        "hardness" => hardness(event, labels),
+        "frame" => frame(event),
+        _ => event.to_string(),
+    };
+    let mut line = format!("{time}  {:<12}  {kind:<8}  {said}", text("sensor"));
     // A reason comes from the system and a label from a model file. Neither may move the cursor.
     line.retain(|c| !wording::is_hidden(c));
     line.truncate(line.trim_end().len());
@@ -107,121 +106,87 @@ pub(super) fn number(event: &Value, key: &str) -> u64 {
     event[key].as_u64().unwrap_or_default()
 }
 
-fn write(line: &mut String, arguments: std::fmt::Arguments) {
-    line.write_fmt(arguments)
-        .expect("writing to a string cannot fail");
-}
-
-fn status(line: &mut String, event: &Value) {
+fn status(event: &Value) -> String {
     let state = event["state"].as_str().unwrap_or_default();
     let (frames, damaged) = (number(event, "frames"), number(event, "frames_damaged"));
-    write(
-        line,
-        format_args!("{state:<10}  {frames} frames, {damaged} damaged"),
-    );
-    match number(event, "frames_dropped") {
-        0 => {}
-        dropped => write(line, format_args!(", {dropped} dropped")),
+    let mut line = format!("{state:<10}  {frames} frames, {damaged} damaged");
+    let dropped = number(event, "frames_dropped");
+    if dropped > 0 {
+        line += &format!(", {dropped} dropped");
     }
     if let Some(hz) = event["frame_rate_hz"].as_f64() {
-        write(line, format_args!(", {hz:.1} frames/s"));
+        line += &format!(", {hz:.1} frames/s");
     }
     if let Some(reason) = event["reason"].as_str() {
         let detail = event["detail"].as_str().map(|detail| format!(": {detail}"));
-        write(
-            line,
-            format_args!("  ({reason}{})", detail.unwrap_or_default()),
-        );
+        line += &format!("  ({reason}{})", detail.unwrap_or_default());
     }
+    line
 }
 
-fn press(line: &mut String, event: &Value) {
+fn press(event: &Value) -> String {
     let state = event["state"].as_str().unwrap_or_default();
     let (press, frame) = (number(event, "press"), number(event, "frame"));
-    write(line, format_args!("#{press:<4} {state:<8}  frame {frame}"));
+    let mut line = format!("#{press:<4} {state:<8}  frame {frame}");
     if state != "begin" {
-        write(
-            line,
-            format_args!(", {} in contact", number(event, "frames")),
-        );
+        line += &format!(", {} in contact", number(event, "frames"));
     }
     if let Some(reason) = event["reason"].as_str() {
-        write(line, format_args!("  ({reason})"));
+        line += &format!("  ({reason})");
     }
-    context(line, event);
+    line + &context(event)
 }
 
-fn hardness(line: &mut String, event: &Value, labels: &[String]) {
+fn hardness(event: &Value, labels: &[String]) -> String {
     let (press, phase) = (number(event, "press"), event["phase"].as_str());
     let answer = with_shore(&Answer::of(event, labels).text, event);
     let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
-    let probabilities: Vec<String> = event["probabilities"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .map(percent)
-        .collect();
-    write(
-        line,
-        format_args!(
-            "#{press:<4} {:<8}  {answer:<32} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
-            phase.unwrap_or_default(),
-            percent(&event["confidence"]),
-            probabilities.join(" "),
-            number(event, "contact_area_taxels"),
-            event["force_n"].as_f64().unwrap_or_default(),
-        ),
+    let probabilities: Vec<String> = items(event, "probabilities").map(percent).collect();
+    let mut line = format!(
+        "#{press:<4} {:<8}  {answer:<32} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
+        phase.unwrap_or_default(),
+        percent(&event["confidence"]),
+        probabilities.join(" "),
+        number(event, "contact_area_taxels"),
+        event["force_n"].as_f64().unwrap_or_default(),
     );
     if let Some(advice) = event["advice"].as_str() {
-        write(line, format_args!("  {}", advice.replace('_', " ")));
+        line += &format!("  {}", advice.replace('_', " "));
     }
     let object = &event["object"];
-    if let (Some(name), Some(presses @ 2..)) = (object["name"].as_str(), object["presses"].as_u64())
-    {
+    if let (Some(name), presses @ 2..) = (object["name"].as_str(), number(object, "presses")) {
         let level = number(object, "level");
-        let probabilities = object["probabilities"].as_array().into_iter().flatten();
-        let probabilities: Vec<f64> = probabilities.filter_map(Value::as_f64).collect();
-        let most = probabilities.iter().copied().fold(0.0, f64::max);
-        write(
-            line,
-            format_args!(
-                "  {name}: {level} by {presses} presses, {:.0} %",
-                100.0 * most
-            ),
-        );
+        let probabilities = items(object, "probabilities").filter_map(Value::as_f64);
+        let most = 100.0 * probabilities.fold(0.0, f64::max);
+        line += &format!("  {name}: {level} by {presses} presses, {most:.0} %");
     }
     if let (Some(_), Some(time)) = (published(event), event["time"].as_str()) {
         let frame = number(event, "frame");
-        write(line, format_args!("  frame {frame} at {}", clock(time)));
+        line += &format!("  frame {frame} at {}", clock(time));
     }
-    let notes: Vec<&str> = event["notes"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .filter_map(Value::as_str)
-        .collect();
+    let notes: Vec<&str> = items(event, "notes").filter_map(Value::as_str).collect();
     if !notes.is_empty() {
-        write(line, format_args!("  ({})", notes.join(", ")));
+        line += &format!("  ({})", notes.join(", "));
     }
-    context(line, event);
+    line + &context(event)
 }
 
-fn frame(line: &mut String, event: &Value) {
-    let newtons = event["newtons"].as_array().into_iter().flatten();
-    let highest_n = newtons.filter_map(Value::as_f64).fold(0.0, f64::max);
+fn frame(event: &Value) -> String {
+    let newtons = items(event, "newtons").filter_map(Value::as_f64);
+    let highest_n = newtons.fold(0.0, f64::max);
     let number = number(event, "frame");
     match event["force_n"].as_f64() {
-        Some(force_n) => write(
-            line,
-            format_args!("#{number:<13}  {force_n:>6.2} N, highest taxel {highest_n:.2} N"),
-        ),
-        None => write(line, format_args!("#{number:<13}  no zero yet")),
+        Some(force_n) => {
+            format!("#{number:<13}  {force_n:>6.2} N, highest taxel {highest_n:.2} N")
+        }
+        None => format!("#{number:<13}  no zero yet"),
     }
 }
 
-fn context(line: &mut String, event: &Value) {
-    if !event["context"].is_null() {
-        write(line, format_args!("  {}", event["context"]));
+fn context(event: &Value) -> String {
+    match &event["context"] {
+        Value::Null => String::new(),
+        context => format!("  {context}"),
     }
 }
 

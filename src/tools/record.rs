@@ -7,7 +7,6 @@
 mod session;
 
 use std::cell::Cell;
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::future::Future;
 use std::io::{self, IsTerminal, Write};
@@ -28,11 +27,10 @@ use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
-use hardnessd_core::exit::{Coded, IO, UNAVAILABLE, USAGE};
+use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
-use hardnessd_core::port::Port;
 use hardnessd_core::recording::{LabelError, Labels, check_label};
-use hardnessd_core::sensor;
+use hardnessd_core::stderr_line;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
 
@@ -68,23 +66,16 @@ pub struct Args {
     seconds: Option<f64>,
 }
 
-/// The reason why there is no recording, or why it ended early.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Error {
-    /// A sensor is missing at the start.
-    #[error(transparent)]
-    Unavailable(#[from] doctor::Unavailable),
-    /// Recording failed, or all sensors were lost.
-    #[error(transparent)]
-    Daemon(#[from] daemon::Error),
+/// A recording that could not begin, or ended by an error.
+pub(super) struct Failed {
+    failure: Failure,
+    /// Whether a sensor was missing at the start, so that there is nothing worth keeping.
+    is_unavailable: bool,
 }
 
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        match self {
-            Error::Unavailable(_) => UNAVAILABLE,
-            Error::Daemon(error) => error.exit_code(),
-        }
+impl From<Failed> for Failure {
+    fn from(failed: Failed) -> Self {
+        failed.failure
     }
 }
 
@@ -100,14 +91,14 @@ pub async fn run(
     log: &Log,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    check_level(&args.labels, &setup.hrn.card().levels)?;
-    let mut labels = BTreeMap::new();
+    let mut labels = Labels::new();
     for (key, value) in args.labels {
         if labels.insert(key.clone(), value).is_some() {
             let twice = format!("--label {key}: given twice: give it once");
             return Err(Failure::new(USAGE, twice));
         }
     }
+    check_level(&labels, &setup.hrn.card().levels)?;
     let sockets = if args.sockets {
         Sockets::Configured
     } else {
@@ -151,32 +142,25 @@ pub async fn run(
         presses,
         ..
     } = *counted.borrow();
-    if holds_nothing(&recorded, frames) {
+    if let Err(failed) = &recorded
+        && (failed.is_unavailable || frames == 0)
+    {
         // The path must be free for the next try.
         part::remove(&path, &own);
         return Ok(recorded?);
     }
-    let seen = frames_in_words(frames);
+    let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
     if io::stderr().is_terminal() {
-        hardnessd_core::stderr_line!(
-            "recorded {seen}, {}: {}",
-            presses_in_words(presses),
-            shown(&path)
-        );
+        let pressed = counted_in_words(presses, "press", "es");
+        stderr_line!("recorded {seen}, {pressed}: {shown}");
     }
     if recorded.is_ok() && presses == 0 {
-        let path = shown(&path);
-        if frames > 0 && tared == 0 {
-            hardnessd_core::stderr_line!(
-                "warning: {path}: no press in {seen}, because the zero was not taken: leave the sensor free at \
-                 the start, and record longer"
-            );
+        let why = if frames > 0 && tared == 0 {
+            ", because the zero was not taken: leave the sensor free at the start, and record longer"
         } else {
-            hardnessd_core::stderr_line!(
-                "warning: {path}: no press in {seen}: was the sensor pressed, is it live, and \
-                 is press.contact_threshold_n low enough?"
-            );
-        }
+            ": was the sensor pressed, is it live, and is press.contact_threshold_n low enough?"
+        };
+        stderr_line!("warning: {shown}: no press in {seen}{why}");
     }
     Ok(recorded?)
 }
@@ -191,16 +175,6 @@ fn create(path: &Path) -> Result<(File, File), Failure> {
     })
 }
 
-/// Whether nothing of a recording that failed is worth keeping: it could not begin, or it has no frame.
-/// What lost sensors sent is kept, because its bytes may say why it has no frame.
-fn holds_nothing(recorded: &Result<(), Error>, frames: u64) -> bool {
-    match recorded {
-        Ok(()) | Err(Error::Daemon(daemon::Error::Lost { .. })) => false,
-        Err(Error::Unavailable { .. }) => true,
-        Err(_) => frames == 0,
-    }
-}
-
 /// Records into `file`, which is at `path`, until `end` comes or no sensor is left.
 pub(super) async fn record(
     setup: Setup,
@@ -210,32 +184,40 @@ pub(super) async fn record(
     labels: Labels,
     progress: watch::Sender<Progress>,
     end: impl Future<Output = ()>,
-) -> Result<(), Error> {
-    let ports: BTreeMap<String, Port> = setup.config.sensors.iter().map(port_of).collect();
-    let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
-    match daemon.run(end, None).await {
-        Err(daemon::Error::Unavailable { sensor, reason }) => {
-            let port = ports[&sensor].clone();
-            Err(doctor::Unavailable::new(sensor, port, reason).into())
+) -> Result<(), Failed> {
+    let sensors = setup.config.sensors.clone();
+    let recorded = async {
+        let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
+        daemon.run(end, None).await
+    };
+    recorded.await.map_err(|error| match error {
+        daemon::Error::Unavailable { sensor, reason } => {
+            let mut known = sensors.iter();
+            let port = known
+                .find(|known| known.name == sensor)
+                .map(|known| &known.port);
+            let port = port.expect("a missing sensor is one of the configuration");
+            let obstacle = doctor::obstacle(port).unwrap_or(reason);
+            let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
+            Failed {
+                failure: Failure::new(UNAVAILABLE, problem),
+                is_unavailable: true,
+            }
         }
-        recorded => Ok(recorded?),
-    }
-}
-
-fn port_of(sensor: &sensor::Settings) -> (String, Port) {
-    (sensor.name.clone(), sensor.port.clone())
+        error => Failed {
+            failure: error.into(),
+            is_unavailable: false,
+        },
+    })
 }
 
 fn shown(path: &Path) -> String {
     escaped(&path.display().to_string())
 }
 
-fn frames_in_words(frames: u64) -> String {
-    format!("{frames} frame{}", if frames == 1 { "" } else { "s" })
-}
-
-fn presses_in_words(presses: u64) -> String {
-    format!("{presses} press{}", if presses == 1 { "" } else { "es" })
+fn counted_in_words(count: u64, what: &str, plural: &str) -> String {
+    let plural = if count == 1 { "" } else { plural };
+    format!("{count} {what}{plural}")
 }
 
 /// Clears the line of progress. On a terminal only, because only a terminal has one.
@@ -260,9 +242,9 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
         let Progress {
             frames, presses, ..
         } = *counted.borrow();
-        let (frames, presses) = (frames_in_words(frames), presses_in_words(presses));
-        let seconds = start.elapsed().as_secs();
-        let path = shown(path);
+        let frames = counted_in_words(frames, "frame", "s");
+        let presses = counted_in_words(presses, "press", "es");
+        let (seconds, path) = (start.elapsed().as_secs(), shown(path));
         // If the terminal has gone, its signal ends the recording.
         let _ = write!(
             stderr,
@@ -279,30 +261,25 @@ const MOST_LEVELS: u64 = 16;
 
 /// Checks the label `level`, which a data set is made from. A wrong level must be found before
 /// anything is pressed.
-fn check_level(labels: &[(String, String)], levels: &[Level]) -> Result<(), Failure> {
+fn check_level(labels: &Labels, levels: &[Level]) -> Result<(), Failure> {
     // Levels of the user's own have names, or numbers up to 16. `hrn-train fit` takes both.
     let is_level = |found: &str| match found.parse::<u64>() {
         Ok(number) => number <= MOST_LEVELS,
         Err(_) => found.starts_with(char::is_alphabetic),
     };
-    let mut labelled = labels.iter().filter(|(key, _)| key == "level");
-    match labelled.find(|(_, found)| !is_level(found)) {
-        None => Ok(()),
-        Some((_, found)) => {
-            let levels = self::levels(levels);
-            let problem = format!(
-                "--label level: found {found:?}, expected a name, or a number from 0 (unlabelled) to {MOST_LEVELS}; \
-                 the model's are {levels}"
-            );
-            Err(Failure::new(USAGE, problem))
-        }
-    }
-}
-
-/// The levels as text, such as `1 (hard), 2 (firm)`.
-fn levels(levels: &[Level]) -> String {
-    let one = |level: &Level| format!("{} ({})", level.level, level.label);
-    levels.iter().map(one).collect::<Vec<_>>().join(", ")
+    let Some(found) = labels.get("level").filter(|found| !is_level(found)) else {
+        return Ok(());
+    };
+    let levels = levels.iter();
+    let levels: Vec<String> = levels
+        .map(|level| format!("{} ({})", level.level, level.label))
+        .collect();
+    let problem = format!(
+        "--label level: found {found:?}, expected a name, or a number from 0 (unlabelled) to {MOST_LEVELS}; \
+         the model's are {}",
+        levels.join(", ")
+    );
+    Err(Failure::new(USAGE, problem))
 }
 
 /// Parses a label, `KEY=VALUE`.

@@ -12,6 +12,7 @@ use super::{cannot_read, unplayable};
 use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::part::Part;
 use hardnessd_core::recording::{self, RecoverError, Recovered};
+use hardnessd_core::stderr_line;
 
 /// Arguments of `recover`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -42,23 +43,21 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         RecoverError::Write(error) => unwritten(error),
     })?;
     let path = args.broken.display();
-    match (recovered.messages, recovered.messages_foreign) {
-        (0, _) => Err(Failure::new(
-            FAILED,
-            format!(
-                "{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read); \
-                 `mcap recover` rewrites chunks of over 64 MiB"
-            ),
+    let problem = match (recovered.messages, recovered.messages_foreign) {
+        (0, _) => Some(format!(
+            "{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read); \
+             `mcap recover` rewrites chunks of over 64 MiB"
         )),
-        (messages, foreign) if messages == foreign => {
-            let problem =
-                format!("{path}: nothing to save: all {messages} messages are of other programs");
-            Err(Failure::new(FAILED, problem))
-        }
-        _ => Ok(()),
-    }?;
+        (messages, foreign) if messages == foreign => Some(format!(
+            "{path}: nothing to save: all {messages} messages are of other programs"
+        )),
+        _ => None,
+    };
+    if let Some(problem) = problem {
+        return Err(Failure::new(FAILED, problem));
+    }
     part.finish().map_err(|error| unwritten(error.into()))?;
-    hardnessd_core::stderr_line!("{}", account(&recovered));
+    stderr_line!("{}", account(&recovered));
     Ok(())
 }
 

@@ -23,12 +23,13 @@ use crate::daemon::config::{Config, Setup};
 use crate::daemon::now;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::exit::{FAILED, NO_INPUT, USAGE};
+use hardnessd_core::exit::{FAILED, USAGE};
 use hardnessd_core::judge::Unjudged;
 use hardnessd_core::motion::Point;
 use hardnessd_core::pipeline::{Clock, Input, Pipeline};
-use hardnessd_core::recording::{self, FileKind, Playback, Reader};
+use hardnessd_core::recording::{FileKind, Playback, Reader};
 use hardnessd_core::sensor;
+use hardnessd_core::stderr_line;
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -92,29 +93,14 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
         printer: &printer,
     };
     let (kind, recording) = FileKind::read(recording).map_err(unplayable(path))?;
-    let motion = match &args.motion {
-        Some(_) if kind == FileKind::Recording => {
-            return Err(own_motion(path));
-        }
-        Some(path) => Some(positions(path)?),
-        None => None,
-    };
     match kind {
+        FileKind::Recording if args.motion.is_some() => Err(own_motion(path)),
         FileKind::Recording => play_recording(path, BufReader::new(recording), &setup, pace),
-        FileKind::Raw => play_bytes(path, recording, motion, &setup.checked(path)?, pace),
+        FileKind::Raw => {
+            let motion = args.motion.as_deref().map(motion::load).transpose()?;
+            play_bytes(path, recording, motion, &setup.checked(path)?, pace)
+        }
     }
-}
-
-/// The arm's positions in a CSV file.
-pub(super) fn positions(path: &Path) -> Result<Vec<Point>, Failure> {
-    motion::load(path).map_err(|error| {
-        let code = if error.is_unreadable() {
-            NO_INPUT
-        } else {
-            FAILED
-        };
-        Failure::new(code, format!("--motion {}:{error}", path.display()))
-    })
 }
 
 /// The timing of a replay.
@@ -148,17 +134,16 @@ fn play_recording(path: &Path, file: impl Read, setup: &Setup, pace: Pace) -> Re
     for (sensor, hrn) in setup.identified() {
         playback.identify(sensor, hrn.clone());
     }
-    let mut seq = 0;
-    let printer = pace.printer;
+    let (mut seq, printer) = (0, pace.printer);
     let played = play_entries(path, file, pace, &mut playback, &mut seq);
     if let Ok(false) = played {
         return Ok(());
     }
     for note in playback.left_out() {
-        hardnessd_core::stderr_line!("warning: {}: {note}", path.display());
+        stderr_line!("warning: {}: {note}", path.display());
     }
     if let Some(model) = playback.other_model() {
-        hardnessd_core::stderr_line!(
+        stderr_line!(
             "warning: {}: recorded with model {}, played with another",
             path.display(),
             model.get(..12).unwrap_or(model)
@@ -199,9 +184,7 @@ fn play_entries(
             true => "found no state of a sensor, expected a recording of hardnessd",
             false => "found no sensor at rest, expected a recording with a moment between presses",
         };
-        return Err(unplayable(path)(recording::Error::Content(
-            problem.to_owned(),
-        )));
+        return Err(unplayable(path)(anyhow::Error::msg(problem)));
     }
     Ok(true)
 }
@@ -223,15 +206,8 @@ fn play_bytes(
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
     let (mut seq, printer) = (0, pace.printer);
     let is_paced = pace.speed.is_some();
-    let played = feed(
-        path,
-        file,
-        motion,
-        is_paced,
-        &mut pipeline,
-        |events, since| Ok(pace.wait(since) && print(events, &mut seq, printer)?),
-    );
-    let Some(end) = played? else {
+    let each = |events, since| Ok(pace.wait(since) && print(events, &mut seq, printer)?);
+    let Some(end) = feed(path, file, motion, is_paced, &mut pipeline, each)? else {
         return Ok(());
     };
     let none = no_frame(path, &end);
@@ -332,9 +308,7 @@ fn warn(unjudged: Vec<Unjudged>) {
     } in unjudged
     {
         let phase = hardnessd_core::event::name(&phase);
-        hardnessd_core::stderr_line!(
-            "warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}"
-        );
+        stderr_line!("warning: sensor {sensor:?}: no {phase} verdict on press {press}: {error}");
     }
 }
 

@@ -18,7 +18,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 use super::connect::LONGEST_LINE_BYTES;
 use crate::daemon::lines::{LineRead, Lines};
 use crate::daemon::now;
-use hardnessd_core::wording;
+use hardnessd_core::{stderr_line, wording};
 
 /// The time between two positions.
 const STEP: Duration = Duration::from_millis(10);
@@ -31,8 +31,6 @@ const RETRY: Duration = Duration::from_millis(200);
 pub(crate) struct Robot {
     /// The daemon's control socket.
     pub(crate) socket: PathBuf,
-    /// The sensor on the arm. `None` means the daemon's first sensor.
-    pub(crate) sensor: Option<String>,
     /// Where the arm is at a moment, in mm. `None` while it does not move yet.
     pub(crate) position: Box<dyn Fn(Instant) -> Option<f64>>,
 }
@@ -45,7 +43,7 @@ impl Robot {
         loop {
             let Err(complaint) = self.send().await;
             if let Some(complaint) = complaint.filter(|_| !complained) {
-                hardnessd_core::stderr_line!("warning: {}: {complaint}", self.socket.display());
+                stderr_line!("warning: {}: {complaint}", self.socket.display());
                 complained = true;
             }
             tokio::time::sleep(RETRY).await;
@@ -67,8 +65,8 @@ impl Robot {
             let foreign = "what answers there is no hardnessd: name the control socket of a daemon";
             return Err(Some(foreign.to_owned()));
         }
-        let first = hello["sensors"][0]["name"].as_str().map(str::to_owned);
-        let sensor = self.sensor.clone().or(first).ok_or(None)?;
+        // The arm has the daemon's first sensor.
+        let sensor = &hello["sensors"][0]["name"];
         // The robot needs no events.
         let sent = output.write_all(b"{\"subscribe\":[]}\n").await;
         sent.map_err(gone)?;
@@ -79,10 +77,8 @@ impl Robot {
             tokio::select! {
                 line = next(&mut lines) => {
                     let answer = line?;
-                    if let ("error", Some(message)) =
-                        (answer["type"].as_str().unwrap_or_default(), answer["message"].as_str())
-                    {
-                        return Err(Some(message.to_owned()));
+                    if answer["type"] == "error" {
+                        return Err(answer["message"].as_str().map(str::to_owned));
                     }
                 }
                 _ = tick.tick() => {

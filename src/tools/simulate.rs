@@ -14,6 +14,7 @@ use tokio::time::Instant;
 use super::arm::{self, Arm};
 use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
+use super::live;
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
 use crate::daemon::baud::BITS_A_BYTE;
@@ -72,12 +73,10 @@ pub struct Args {
     /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// Control socket of a daemon, to which a simulated robot sends the positions of its arm, 100 a second
+    /// Control socket of a daemon, to which a simulated robot sends the positions of its arm, 100 a second. Its
+    /// first sensor is the one on the arm
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<PathBuf>,
-    /// The daemon's sensor on the arm [default: its first]
-    #[arg(long, hide_short_help = true, value_name = "NAME", requires = "motion")]
-    motion_sensor: Option<String>,
     /// Play no presses: move the arm as a controller says on this new Unix socket
     #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]
     arm: Option<PathBuf>,
@@ -102,10 +101,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         Some(path) => {
             // The script may be a pipe without a writer.
             let seed = args.seed;
-            let loaded = spawn_thread("faults", move || Faults::load(&path, seed))?;
-            tokio::select! {
-                loaded = loaded => loaded.expect("a script is read without a panic")?,
-                () = &mut shutdown => return Ok(()),
+            let load = move || Faults::load(&path, seed);
+            match live::unless(&mut shutdown, "faults", load).await? {
+                Some(faults) => faults,
+                None => return Ok(()),
             }
         }
         None => Faults::none(),
@@ -129,42 +128,33 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         return written.unwrap_or(Ok(())).of_file(&path, IO);
     }
     let baud = baud(&args, &layout)?;
-    let what = args
-        .link
-        .as_ref()
-        .map_or("pty".to_owned(), |link| link.display().to_string());
+    let link = args.link.as_ref();
+    let what = link.map_or("pty".to_owned(), |link| link.display().to_string());
     let pace = Pace::new(args.fps, baud, args.speed);
     let player = Player::new(args.link.as_deref(), layout, pace, faults).of(&what, IO)?;
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
-    let arm = args.arm.as_deref().map(Arm::bind).transpose();
-    let arm = arm.exit(IO)?;
+    let arm = args.arm.as_deref().map(Arm::bind).transpose().exit(IO)?;
     let position: Box<dyn Fn(Instant) -> Option<f64>> = match &arm {
         Some(arm) => Box::new(arm.position()),
         None => Box::new(player.position()),
     };
-    let robot = args.motion.map(|socket| Robot {
-        socket,
-        sensor: args.motion_sensor,
-        position,
-    });
-    let robot = maybe::wait(robot.map(Robot::run));
+    let robot = args.motion.map(|socket| Robot { socket, position });
     let start = Instant::now();
     let (frames, start) = match &arm {
         Some(arm) => (arm.frames(settings, start)?, start + arm::SCAN),
         None => (player::sequence(settings)?, start),
     };
-    let serving = maybe::wait(arm.map(Arm::serve));
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let printed = super::print_apart(line.into_bytes());
         let played = async { player.play(frames, start).await.of(&what, IO) };
-        tokio::try_join!(printed, played).map(|_| ())
+        tokio::try_join!(printed, played).map(drop)
     };
     tokio::select! {
         played = play => played,
-        () = robot => Ok(()),
-        () = serving => Ok(()),
+        () = maybe::wait(robot.map(Robot::run)) => Ok(()),
+        () = maybe::wait(arm.map(Arm::serve)) => Ok(()),
         () = shutdown => Ok(()),
     }
 }
@@ -239,7 +229,7 @@ fn write(
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
         let time_s = f64::from(index) / frame_rate_hz;
         match faults.encode(time_s, frame.raw, layout, &mut bytes) {
-            Line::Up | Line::AtOnce => file.write_all(&bytes)?,
+            Line::Up => file.write_all(&bytes)?,
             Line::Silent | Line::Unplugged => {}
         }
         // A process that ends during a write may leave a part of a frame.
@@ -256,22 +246,18 @@ fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
     const USUAL: [u32; 7] = [
         115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
     ];
-    let needed = |bytes: usize| (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
-    let (shortest, most) = (layout.min_frame_bytes(), needed(layout.max_frame_bytes()));
+    let fps = args.fps;
+    let needed = |bytes: usize| (fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
+    let shortest = layout.min_frame_bytes();
+    let (needed, most) = (needed(shortest), needed(layout.max_frame_bytes()));
     let usual = USUAL.into_iter().find(|&usual| usual >= most);
-    let (baud, needed, fps) = (
-        args.baud.or(usual).unwrap_or(most),
-        needed(shortest),
-        args.fps,
-    );
+    let baud = args.baud.or(usual).unwrap_or(most);
     if baud >= needed {
         return Ok(baud);
     }
     let carries = format!("expected at least {needed} to carry {fps} frames/s of {shortest} bytes");
-    Err(Failure::new(
-        USAGE,
-        format!("--baud: found {baud}, {carries}"),
-    ))
+    let problem = format!("--baud: found {baud}, {carries}");
+    Err(Failure::new(USAGE, problem))
 }
 
 /// Parses `--fps`. A press is computed as a whole, with as many frames as it takes to reach its

@@ -25,6 +25,7 @@ use hardnessd_core::pipeline::Input;
 use hardnessd_core::port::Port;
 use hardnessd_core::recording::{Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
+use hardnessd_core::stderr_line;
 use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::escaped;
 
@@ -163,7 +164,7 @@ fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
     } else {
         "set its port and frame_rate_hz, which a file does not say".to_owned()
     };
-    hardnessd_core::stderr_line!("wrote {out}: {next}");
+    stderr_line!("wrote {out}: {next}");
     Ok(())
 }
 
@@ -282,9 +283,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
             match link.next().await {
                 Input::Opened => {
                     let port = escaped(&port.to_string());
-                    hardnessd_core::stderr_line!(
-                        "listening at {port} for {seconds} s: press the sensor"
-                    );
+                    stderr_line!("listening at {port} for {seconds} s: press the sensor");
                 }
                 Input::Bytes(read) => captured.take(&read, begin.elapsed()),
                 Input::Unavailable(reason) | Input::Lost(reason) => {
@@ -307,9 +306,9 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
 
 /// Shows the strongest press as an array would have it.
 fn show(ranked: &Ranked) {
-    hardnessd_core::stderr_line!("{}:", ranked.options());
+    stderr_line!("{}:", ranked.options());
     for line in draw(&ranked.picture, ranked.array.cols) {
-        hardnessd_core::stderr_line!("    |{line}|");
+        stderr_line!("    |{line}|");
     }
 }
 

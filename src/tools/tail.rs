@@ -18,6 +18,7 @@ use super::{Stdout, answer};
 use crate::maybe;
 use hardnessd_core::event::{Kind, PROTOCOL};
 use hardnessd_core::exit::FAILED;
+use hardnessd_core::stderr_line;
 use hardnessd_core::wording;
 
 /// What `--help` says below the options.
@@ -106,7 +107,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
-        hardnessd_core::stderr_line!(
+        stderr_line!(
             "hardnessd: events of {}",
             wording::escaped(&daemon.address().to_string())
         );

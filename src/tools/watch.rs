@@ -13,6 +13,7 @@ mod view;
 
 use std::future::Future;
 use std::io::{self, IsTerminal};
+use std::pin::Pin;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
@@ -24,11 +25,13 @@ use self::draw::draw;
 use self::look::Look;
 use self::screen::{Screen, keys};
 use self::view::{Clock, Loss, Order, QUESTION, View};
-use super::connect::{Address, Source};
+use super::connect::{Address, Connection, Source};
 use super::control;
 use super::exit::{Fail, Failure};
 use crate::daemon::now;
 use hardnessd_core::exit::{IO, USAGE};
+use hardnessd_core::stderr_line;
+use hardnessd_core::wording::escaped;
 
 /// Arguments of `watch`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -67,10 +70,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         && let Ok(connection) = args.source.connect().await
     {
         let address = connection.address().to_string();
-        hardnessd_core::stderr_line!(
-            "hardnessd: watching {}",
-            hardnessd_core::wording::escaped(&address)
-        );
+        stderr_line!("hardnessd: watching {}", escaped(&address));
     }
     let mut screen = Screen::open().of("terminal", IO)?;
     let mut keys = keys().of("terminal", IO)?;
@@ -150,69 +150,50 @@ enum FromDaemon {
 
 /// The connection to the daemon. When it breaks, it is made again.
 struct Daemon {
-    received: mpsc::Receiver<Result<FromDaemon, Loss>>,
-    requests: mpsc::Sender<String>,
+    source: Source,
+    connection: Option<Connection>,
+    /// The next try to connect.
+    connecting: Pin<Box<dyn Future<Output = Result<Connection, Failure>>>>,
 }
 
 impl Daemon {
     fn new(source: Source) -> Self {
-        let (sender, received) = mpsc::channel(64);
-        let (requests, asked) = mpsc::channel(16);
-        tokio::spawn(follow(source, sender, asked));
-        Self { received, requests }
+        Self {
+            connecting: Box::pin(connect(source.clone(), Duration::ZERO)),
+            connection: None,
+            source,
+        }
     }
 
     /// The next connection or line, or the reason why there is no daemon. Cancelling the call loses
     /// nothing.
     async fn next(&mut self) -> Result<FromDaemon, Loss> {
-        let next = self.received.recv().await;
-        next.expect("the task goes on as long as there is a receiver")
+        if let Some(connection) = &mut self.connection {
+            let line = connection.next().await;
+            return line.map(FromDaemon::Line).map_err(|error| {
+                self.connection = None;
+                Loss::Broken(error.line())
+            });
+        }
+        let made = self.connecting.as_mut().await;
+        self.connecting = Box::pin(connect(self.source.clone(), PAUSE));
+        let connection = made.map_err(|error| Loss::Unreachable(error.line()))?;
+        let address = connection.address().clone();
+        self.connection = Some(connection);
+        Ok(FromDaemon::Connection(address))
     }
 
     /// Sends a request, if there is a daemon.
-    fn send(&self, request: &str) {
-        // If the daemon does not receive the request, its missing answer shows that later.
-        let _ = self.requests.try_send(request.to_owned());
+    fn send(&mut self, request: &str) {
+        if let Some(connection) = &mut self.connection {
+            connection.try_send(request);
+        }
     }
 }
 
-/// Connects again and again, until nobody receives any more.
-async fn follow(
-    source: Source,
-    sender: mpsc::Sender<Result<FromDaemon, Loss>>,
-    mut requests: mpsc::Receiver<String>,
-) {
-    while !sender.is_closed() {
-        let loss = match source.connect().await {
-            Ok(mut connection) => {
-                while requests.try_recv().is_ok() {}
-                let address = connection.address().clone();
-                if sender
-                    .send(Ok(FromDaemon::Connection(address)))
-                    .await
-                    .is_err()
-                {
-                    return;
-                }
-                loop {
-                    tokio::select! {
-                        line = connection.next() => match line {
-                            Ok(line) => {
-                                if sender.send(Ok(FromDaemon::Line(line))).await.is_err() {
-                                    return;
-                                }
-                            }
-                            Err(error) => break Loss::Broken(error.line()),
-                        },
-                        Some(request) = requests.recv() => connection.try_send(&request),
-                    }
-                }
-            }
-            Err(error) => Loss::Unreachable(error.line()),
-        };
-        let _ = sender.send(Err(loss)).await;
-        tokio::time::sleep(PAUSE).await;
-    }
+async fn connect(source: Source, pause: Duration) -> Result<Connection, Failure> {
+    tokio::time::sleep(pause).await;
+    source.connect().await
 }
 
 impl Clock {

@@ -139,7 +139,7 @@ fn presses_of_a_recording_say_the_gains() {
     fs::write(&calibrated, format!("{table}[sensor.calibration]\n{lines}")).unwrap();
     let (code, printed, message) = run(&["check", "--config", &calibrated]);
     assert!(
-        code == 0 && printed.contains("gains 0."),
+        code == 0 && printed.contains("gains = \"0."),
         "{printed}{message}"
     );
     fs::remove_file(&out).unwrap();

@@ -12,7 +12,6 @@ use crate::bench::{Bench, Daemon, Subscriber, get, wait_for};
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::{Layout, Settings};
 use rustix::fs::{FlockOperation, flock};
-use rustix::process::Signal;
 use serde_json::{Value, json};
 
 /// The time between two frames.
@@ -168,12 +167,6 @@ impl Rig {
         released(&mut self.subscriber, press)
     }
 
-    fn reload(&mut self, tables: &str) {
-        configure(&self.bench, tables);
-        self.daemon.process.signal(Signal::HUP);
-        self.daemon.logged("reloaded");
-    }
-
     /// Makes a press, and checks that it is number `press`.
     fn press(&mut self, press: u64) -> Value {
         self.cable.play(&pressed(), 10);
@@ -327,58 +320,6 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
         before = after;
     }
     assert_eq!(rig.release(1)["frames"], 7);
-}
-
-#[test]
-fn a_burst_after_a_stall_loses_no_frame_and_no_press() {
-    let mut rig = Rig::start("");
-    let before = rig.at_rest();
-    rig.cable.play(&pressed(), 5);
-    rig.sees(&json!({"type": "press", "state": "begin"}));
-    rig.at_rest();
-    rig.cable.write(&rig.cable.bytes(&pressed()).repeat(40));
-    rig.sees(&json!({"type": "status", "state": "live"}));
-    assert_eq!(rig.release(1)["frames"], 45);
-    let after = rig.at_rest();
-    let more = |key| growth(&before, &after, key);
-    assert_eq!(more("frames"), 45 + 4);
-    assert_eq!((more("bytes_skipped"), more("frames_damaged")), (0, 0));
-}
-
-#[test]
-fn a_taxel_that_sticks_begins_no_press_but_holds_one_until_it_is_named() {
-    let press = "[press]\nmax_seconds = 0.5\n";
-    let mut rig = Rig::start(press);
-    let stuck = |mut raw: RawFrame| {
-        raw.counts[0] = 255.0;
-        raw
-    };
-    rig.cable.play(&stuck(rest()), 20);
-    rig.cable.play(&stuck(pressed()), 10);
-    let begin = rig.sees(&json!({"type": "press"}));
-    assert_eq!(
-        (&begin["press"], &begin["state"]),
-        (&json!(1), &json!("begin"))
-    );
-    rig.cable.play(&stuck(rest()), 60);
-    let end = rig.sees(&json!({"type": "press", "state": "end"}));
-    assert_eq!(end["reason"], "timeout");
-    let verdict = rig.sees(&json!({"phase": "final"}));
-    assert!(
-        verdict["notes"]
-            .as_array()
-            .unwrap()
-            .contains(&json!("saturated"))
-    );
-    // The press began with the touch, and not with the taxel before it.
-    assert_eq!(verdict["contact_area_taxels"], 37);
-    rig.reload(&format!(
-        "[sensor.calibration]\ndead_taxels = [[0, 0]]\n{press}"
-    ));
-    rig.cable.play(&stuck(rest()), 10);
-    rig.cable.play(&stuck(pressed()), 10);
-    rig.cable.play(&stuck(rest()), 4);
-    assert_eq!(released(&mut rig.subscriber, 2)["frames"], 10);
 }
 
 #[test]

@@ -177,54 +177,27 @@ fn events_broken_off_and_resumed_come_once_each() {
         assert_eq!(events.next_seq(), next);
         next += 1;
     }
-
-    // With a place in another run, all held events come, and a gap says that some are missing.
-    let mut other = Events::open(address, "/events?types=press", Some("0ther:7"));
-    assert_eq!(other.next()["type"], "hello");
-    assert_eq!(other.last_id, format!("{run}:0"));
-    assert_eq!(other.next()["seq"], Value::Null, "the status as it is");
-    assert_eq!(other.next(), json!({"type": "gap", "lost": null}));
-    assert_eq!(other.next()["type"], "press");
 }
 
 #[test]
 fn only_this_machine_by_its_address_is_served_and_no_route_changes_anything() {
     let bench = Bench::new();
     let (_daemon, address) = serving(&bench);
-    let paths = [
-        "/",
-        "/events",
-        "/api/status",
-        "/api/history",
-        "/metrics",
-        "/livez",
-        "/readyz",
-        "/api/tare",
-    ];
-    for path in paths {
-        for host in ["evil.example", "localhost.evil.example", "192.0.2.7"] {
-            let host = format!("Host: {host}:{}", address.port());
-            let answer = ask(address, &format!("GET {path}"), &[&host]);
-            assert_eq!(answer.code, 421, "{path} {host}");
-        }
-        for method in ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"] {
+    for path in ["/", "/events", "/api/status", "/metrics", "/livez"] {
+        let host = format!("Host: evil.example:{}", address.port());
+        let answer = ask(address, &format!("GET {path}"), &[&host]);
+        assert_eq!(answer.code, 421, "{path} {host}");
+        for method in ["POST", "DELETE", "OPTIONS"] {
             let request = format!("{method} {path}");
             let answer = ask(address, &request, &["Content-Length: 0"]);
             assert_eq!(answer.code, 405, "{request}");
             assert!(answer.head.contains("allow: get, head"), "{}", answer.head);
         }
     }
-    for path in ["/tare", "/api", "//", "/..%2fetc/passwd", "/events/"] {
-        assert_eq!(get(address, path).code, 404, "{path}");
-    }
+    assert_eq!(get(address, "/..%2fetc/passwd").code, 404);
     // A page from another origin may not read an answer: no CORS header allows it.
     let answer = ask(address, "GET /api/status", &["Origin: null"]);
     assert!(!answer.head.contains("access-control-"), "{}", answer.head);
-    // hyper itself refuses a target or a header that is too long.
-    let target = format!("/{}", "a".repeat(66_000));
-    let header = format!("X-Long: {}", "a".repeat(150_000));
-    assert_eq!(get(address, &target).code, 414);
-    assert_eq!(ask(address, "GET /livez", &[&header]).code, 431);
     for path in ["/metrics", "/events"] {
         let head = ask(address, &format!("HEAD {path}"), &[]);
         assert_eq!((head.code, head.body.as_str()), (200, ""), "{path}");
@@ -252,39 +225,10 @@ fn the_page_is_one_file_that_may_load_nothing() {
     assert!(!page.head.contains("unsafe"), "{}", page.head);
 }
 
-/// The series of a scrape: name with labels, and value. Every line must be a series or a comment.
-fn series(text: &str) -> Vec<(String, f64)> {
-    assert_eq!(text.lines().last(), Some("# EOF"));
-    text.lines()
-        .filter(|line| !line.starts_with("# "))
-        .map(|line| {
-            let (name, value) = line.rsplit_once(' ').unwrap();
-            (name.to_owned(), value.parse().unwrap())
-        })
-        .collect()
-}
-
 #[test]
 fn metrics_say_what_was_published() {
     let bench = Bench::new();
     let (_daemon, address) = serving(&bench);
-    let value = |name: &str| {
-        let answer = get(address, "/metrics");
-        assert!(answer.head.contains("application/openmetrics-text"));
-        let all = series(&answer.body);
-        let found = all.iter().find(|(series, _)| series == name);
-        found.map(|(_, value)| *value)
-    };
-    let of = |name: &str, more: &str| {
-        value(&format!(
-            "hardnessd_{name}{{robot=\"arm-7\",sensor=\"forearm\"{more}}}"
-        ))
-    };
-    assert_eq!(of("frames_total", ""), Some(0.0));
-    assert_eq!(of("presses_total", ",state=\"begin\""), Some(0.0));
-    assert_eq!(of("link_state", ",state=\"connecting\""), Some(1.0));
-    assert_eq!(of("last_frame_age_seconds", ""), None);
-
     let mut subscriber = bench.subscriber();
     let mut sensor = bench.sensor(&["--presses", "2"]);
     let mut last = Value::Null;
@@ -293,25 +237,28 @@ fn metrics_say_what_was_published() {
     }
     bench.unplug(&mut sensor);
     let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
-    assert_eq!(of("frames_total", ""), lost["frames"].as_f64());
-    assert_eq!(of("frames_damaged_total", ""), Some(0.0));
-    assert_eq!(of("presses_total", ",state=\"begin\""), Some(2.0));
-    assert_eq!(of("presses_total", ",state=\"end\""), Some(2.0));
+    let answer = get(address, "/metrics");
+    assert!(answer.head.contains("application/openmetrics-text"));
+    assert!(answer.body.ends_with("# EOF\n"), "{}", answer.body);
+    let value = |name: &str, more: &str| -> f64 {
+        let labels = format!("robot=\"arm-7\",sensor=\"forearm\"{more}");
+        let series = format!("hardnessd_{name}{{{labels}}} ");
+        let mut lines = answer.body.lines();
+        let value = lines.find_map(|line| line.strip_prefix(&series));
+        value.expect(&series).parse().unwrap()
+    };
+    assert_eq!(Some(value("frames_total", "")), lost["frames"].as_f64());
+    assert_eq!(value("presses_total", ",state=\"end\""), 2.0);
     let levels = (1..=4).map(|level| {
         let labels = format!(",phase=\"final\",level=\"{level}\"");
-        of("verdicts_total", &labels).unwrap()
+        value("verdicts_total", &labels)
     });
     assert_eq!(levels.sum::<f64>(), 2.0);
-    assert_eq!(of("link_state", ",state=\"lost\""), Some(1.0));
-    assert_eq!(of("link_state", ",state=\"live\""), Some(0.0));
-    let age = of("last_frame_age_seconds", "").unwrap();
-    assert!((0.0..60.0).contains(&age));
-    let events = value("hardnessd_events_total{robot=\"arm-7\"}");
-    assert!(events >= lost["seq"].as_f64());
-    assert_eq!(value("hardnessd_subscribers{robot=\"arm-7\"}"), Some(1.0));
-    let build = get(address, "/metrics").body;
-    let model = last["model"].as_str().unwrap();
-    assert!(build.contains(&format!("model=\"{model}")), "{build}");
+    assert_eq!(value("link_state", ",state=\"lost\""), 1.0);
+    assert_eq!(value("link_state", ",state=\"live\""), 0.0);
+    assert!((0.0..60.0).contains(&value("last_frame_age_seconds", "")));
+    let model = format!("model=\"{}", last["model"].as_str().unwrap());
+    assert!(answer.body.contains(&model), "{}", answer.body);
 }
 
 #[test]

@@ -117,40 +117,6 @@ fn a_press_over_tcp_is_judged_silence_is_stale_and_the_end_of_the_peer_is_loss()
     assert_eq!(doctor.status.code(), Some(1));
 }
 
-/// In real-time scheduling, the system kills a process whose thread does not sleep for half a second.
-#[test]
-fn a_sensor_that_sends_without_end_costs_little() {
-    let bench = Bench::new();
-    let still = frames(&bench)[0].repeat(2000);
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = format!("tcp://{}", listener.local_addr().unwrap());
-    let mut daemon = Daemon::start(&configure(&bench, &port, ""));
-    let mut peer = accept(&listener);
-    // Until the daemon has ended.
-    let flood = std::thread::spawn(move || while peer.write_all(&still).is_ok() {});
-    bench
-        .subscriber()
-        .until(&json!({"type": "status", "state": "live"}));
-    // The first thread is that of the sensors.
-    let task = format!("/proc/{0}/task/{0}", daemon.process.0.id());
-    let worked_ticks = || -> u64 {
-        let stat = fs::read_to_string(format!("{task}/stat")).unwrap();
-        // After the name, which may have spaces, come 11 fields before the times of user and system.
-        let (_, fields) = stat.rsplit_once(") ").unwrap();
-        let times = fields.split(' ').skip(11).take(2);
-        times.map(|ticks| ticks.parse::<u64>().unwrap()).sum()
-    };
-    // What may come at once is taken in the first moment.
-    std::thread::sleep(Duration::from_secs(1));
-    let begun = worked_ticks();
-    std::thread::sleep(Duration::from_secs(2));
-    let worked = worked_ticks() - begun;
-    // A tick is 10 ms.
-    assert!(worked < 100, "{worked} ticks in 2 s");
-    daemon.end();
-    flood.join().unwrap();
-}
-
 #[test]
 fn datagrams_are_taken_from_one_sender_until_it_is_silent() {
     let bench = Bench::new();

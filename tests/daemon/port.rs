@@ -1,7 +1,6 @@
 //! `sniff` and `doctor` in use: the real binary, with recordings and ptys of the simulator.
 
 use std::fs;
-use std::path::Path;
 use std::process::Command;
 
 use crate::bench::{BINARY, Bench, run};
@@ -216,21 +215,4 @@ fn the_user_chooses_between_two_pictures() {
     let (code, _, stderr) = run(&["sniff", &path, "--rows", "65"]);
     assert_eq!(code, 2, "{stderr}");
     assert!(stderr.contains("expected 1 to 64"), "{stderr}");
-}
-
-/// Sniffing takes half a second. The test fails after ten, which are enough for a busy machine.
-#[test]
-fn ten_megabytes_are_sniffed_in_time() {
-    let bench = Bench::new();
-    let path = bench.path("long.bin").to_str().unwrap().to_owned();
-    let (code, _, stderr) = run(&["simulate", "--to", &path, "--fps", "100", "--presses", "40"]);
-    assert_eq!(code, 0, "{stderr}");
-    let bytes = fs::read(&path).unwrap();
-    fs::write(Path::new(&path), &bytes[..10_000_000]).unwrap();
-    let start = std::time::Instant::now();
-    let (code, toml, stderr) = run(&["sniff", &path]);
-    let elapsed = start.elapsed();
-    assert_eq!(code, 0, "{stderr}");
-    assert!(toml.contains("preset = \"jx255n\""), "{toml}");
-    assert!(elapsed.as_secs() < 10, "{elapsed:?}");
 }

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::{BufRead, Read, Write};
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -30,15 +30,9 @@ fn tcp_speaks_the_same_protocol_and_changes_nothing() {
     for subscriber in [&mut over_tcp, &mut over_unix] {
         let answer = subscriber.ask(r#"{"subscribe":["press","hardness"],"id":1}"#);
         assert_eq!(answer, json!({"type": "ok", "id": 1}));
-        for command in [
-            r#"{"tare":"forearm"}"#,
-            r#"{"context":{"sensor":"forearm"}}"#,
-            r#"{"blackbox":"forearm"}"#,
-        ] {
-            let answer = subscriber.ask(command);
-            let message = answer["message"].as_str().unwrap();
-            assert!(message.contains("control socket"), "{message}");
-        }
+        let answer = subscriber.ask(r#"{"tare":"forearm"}"#);
+        let message = answer["message"].as_str().unwrap();
+        assert!(message.contains("control socket"), "{message}");
     }
     let _sensor = bench.sensor(&["--presses", "1"]);
     for _ in ["begin", "end", "final"] {
@@ -47,7 +41,7 @@ fn tcp_speaks_the_same_protocol_and_changes_nothing() {
 }
 
 #[test]
-fn the_control_socket_has_the_mode_and_the_group_of_the_configuration() {
+fn the_control_socket_has_its_mode_and_group_tares_and_gives_presses_their_context() {
     let bench = Bench::new();
     // A user may give files to groups of their own; root to any.
     let group = match rustix::process::getgid().as_raw() {
@@ -55,20 +49,10 @@ fn the_control_socket_has_the_mode_and_the_group_of_the_configuration() {
         own => own,
     };
     let keys = format!("control_mode = \"0660\"\ncontrol_group = \"{group}\"\n");
-    let _daemon = bench.daemon_with(&keys);
-    let made = fs::metadata(bench.path("control.sock")).unwrap();
-    assert_eq!((made.mode() & 0o777, made.gid()), (0o660, group));
-}
-
-#[test]
-fn the_control_socket_tares_and_gives_presses_their_context() {
-    let bench = Bench::new();
-    let mut daemon = bench.daemon();
+    let mut daemon = bench.daemon_with(&keys);
     let path = bench.path("control.sock");
-    assert_eq!(
-        fs::metadata(&path).unwrap().permissions().mode() & 0o777,
-        0o600
-    );
+    let made = fs::metadata(&path).unwrap();
+    assert_eq!((made.mode() & 0o777, made.gid()), (0o660, group));
     let mut control = Subscriber::connect(&path);
     let refused = |answer: &Value, part: &str| {
         let message = answer["message"].as_str().unwrap();
@@ -76,8 +60,6 @@ fn the_control_socket_tares_and_gives_presses_their_context() {
     };
     assert_eq!(control.next().unwrap()["type"], "hello");
     refused(&control.ask(r#"{"tare":"forearm"}"#), "not live");
-    refused(&control.ask(r#"{"tare":"wrist"}"#), "forearm");
-    refused(&control.ask(r#"{"blackbox":"forearm"}"#), "[record]");
 
     let context = json!({"sensor": "forearm", "tag": "pick-17", "speed_mm_s": 5.0});
     let command = json!({"context": context, "id": "c"}).to_string();
@@ -278,43 +260,26 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
             "unix" => bench.subscriber(),
             _ => Subscriber::over_tcp(address),
         };
-        let mut binary = connect();
-        let noise: Vec<u8> = (0..4096_u32).map(|i| (i * 167 % 251) as u8).collect();
-        binary.lines.get_mut().write_all(&noise).unwrap();
-        binary.send_line("");
-        binary.until(&json!({"type": "error"}));
-        assert_eq!(
-            binary.ask(r#"{"get":"last","id":"still"}"#)["type"],
-            "error"
-        );
-        binary.until(&json!({"type": "ok", "id": "still"}));
-
         let mut long = connect();
         // The daemon closes the connection before everything is written.
         let _ = long.lines.get_mut().write_all(&[b'x'; 1 << 20]);
         let mut line = String::new();
-        let ended = loop {
+        while long
+            .lines
+            .read_line(&mut line)
+            .is_ok_and(|length| length > 0)
+        {
+            assert!(!line.contains("\"error\"") || line.contains("65536"));
             line.clear();
-            match long.lines.read_line(&mut line) {
-                Ok(0) | Err(_) => break true,
-                Ok(_) if line.contains("\"error\"") => assert!(line.contains("65536")),
-                Ok(_) => {}
-            }
-        };
-        assert!(ended);
-
-        // This subscriber sends half a line, then nothing.
-        let mut half = connect();
-        half.lines
-            .get_mut()
-            .write_all(br#"{"subscribe":["#)
-            .unwrap();
-        // This subscriber asks many questions and never reads an answer.
+        }
+        // This subscriber asks many questions and never reads an answer, then sends half a line.
         let mut deaf = connect();
         for _ in 0..200 {
             deaf.send_line(r#"{"get":"status"}"#);
         }
-        kept.extend([half, deaf]);
+        let half = br#"{"subscribe":["#;
+        deaf.lines.get_mut().write_all(half).unwrap();
+        kept.push(deaf);
     }
 
     // A thousand connect at once. Each is served or refused, and its first line says which.
@@ -340,8 +305,8 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
             refused += 1;
         }
     }
-    // Places are taken by the witness and by the two kept connections of each way. Closed
-    // connections free theirs during the loop.
+    // Places are taken by the witness and by the kept connections. Closed connections free theirs
+    // during the loop.
     assert!((240..=255).contains(&served), "{served} served");
     assert_eq!(served + refused, 1000);
     drop(crowd);

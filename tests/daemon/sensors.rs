@@ -165,20 +165,8 @@ fn seventeen_areas_of_a_hand_share_a_port_and_a_silent_one_makes_no_other_stale(
             &[1, 3, bytes as u8],
         ]
         .concat();
-        let request = [
-            high,
-            low,
-            0,
-            0,
-            0,
-            6,
-            1,
-            3,
-            high,
-            low,
-            0,
-            (rows * cols) as u8,
-        ];
+        let cells = (rows * cols) as u8;
+        let request = [&[high, low, 0, 0, 0, 6, 1, 3][..], &[high, low, 0, cells]].concat();
         text += &format!(
             "[[sensor]]\nname = \"a{first}\"\nport = \"tcp://127.0.0.1:{port}\"\nframe_rate_hz = 50.0\n\
              stale_after_ms = 1000\n[sensor.frame]\nsync = \"{}\"\ncell = \"u16be\"\nrows = {rows}\n\

@@ -184,14 +184,9 @@ fn a_terminal_that_goes_away_ends_it() {
     resize(&master, (80, 24));
     let end = || Stdio::from(device.try_clone().unwrap());
     let mut command = Command::new("setsid");
-    command
-        .args([BINARY, "watch", "--socket"])
-        .arg(bench.path("events.sock"));
-    command
-        .env("TERM", "xterm")
-        .stdin(end())
-        .stdout(end())
-        .stderr(Stdio::null());
+    command.args([BINARY, "watch", "--socket"]);
+    command.arg(bench.path("events.sock")).env("TERM", "xterm");
+    command.stdin(end()).stdout(end()).stderr(Stdio::null());
     let mut watch = Process(command.spawn().unwrap());
     drop((command, device));
     let mut shown = [0; 4096];
@@ -199,27 +194,6 @@ fn a_terminal_that_goes_away_ends_it() {
     // The other end of the terminal is closed. No signal tells `watch`, because this is not its
     // controlling terminal.
     assert_eq!(watch.exit_code(), Some(0));
-}
-
-#[test]
-fn presses_from_before_are_known() {
-    let bench = Bench::new();
-    let _daemon = bench.daemon();
-    let _sensor = bench.sensor(&["--speed", "4", "--presses", "2"]);
-    let mut subscriber = bench.subscriber();
-    for press in [1, 2] {
-        let last = serde_json::json!({"type": "hardness", "phase": "final", "press": press});
-        subscriber.until(&last);
-    }
-    let mut terminal = Terminal::new(&bench.path("events.sock"));
-    let both = |text: &str| {
-        let shows = |press| text.lines().any(|line| is_final(line, press));
-        text.contains("press 2 ") && shows(2) && shows(1)
-    };
-    terminal.until("both presses", both);
-    terminal.shows("LOST  unplugged");
-    terminal.press(b"q");
-    terminal.ends();
 }
 
 #[test]

@@ -33,18 +33,6 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def an_address_in_use(binary, key, listen):
-    """A daemon whose address another program has ends in one line and 74. `listen` is the value of the key `listen`
-    of the table `key`, with `{port}`."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        table = f"[{key}]\nlisten = {listen.format(port=taken.getsockname()[1])}\n"
-        with Bench(binary, more=table) as bench:
-            command = [binary, "run", "--config", bench.path("hardnessd.toml")]
-            run = subprocess.run(command, capture_output=True, text=True, timeout=30)
-    assert run.returncode == 74 and key in run.stderr and len(run.stderr.splitlines()) == 1, run
-    return run.stderr.strip()
-
-
 # What stands in a ROS message where an event has null, if it is not NaN.
 NULL = {
     "level": 0,

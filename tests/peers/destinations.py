@@ -5,7 +5,7 @@
     venv/bin/python tests/peers/destinations.py target/debug/hardnessd
 
 Claims: each row of the page's table has a command that does what the row says, and each `sh` and `sql` block of the page
-runs. Rows that need a feature are checked where the program has it. For them, install websockets too.
+runs. The rows that need a feature are left to foxglove_peer.py and zenoh_peer.py.
 """
 
 import json
@@ -18,7 +18,7 @@ import time
 
 import duckdb
 import pyarrow.parquet as pq
-from bench import Bench, free_port
+from bench import Bench
 from rerun.chunk import RrdReader
 from rosbags.rosbag2 import Reader
 
@@ -91,46 +91,6 @@ def live(bench, commands, http):
     assert "hardness" in line and "forearm" in line, line
 
 
-def with_features(binary, commands):
-    """The rows that need a build with features. Returns the tools that this program lacks."""
-    lacking = []
-    tables = {"Foxglove": '[publish.foxglove]\nlisten = "127.0.0.1:{port}"\n'}
-    tables["zenoh"] = '[publish.zenoh]\nlisten = ["tcp/127.0.0.1:{port}"]\n'
-    for tool, table in tables.items():
-        port = str(free_port())
-        with Bench(binary, more=table.format(port=port)) as bench:
-            checked = subprocess.run([binary, "check", "--config", bench.path("hardnessd.toml")], capture_output=True, text=True)
-            if checked.returncode == 78 and "feature" in checked.stderr:
-                lacking.append(tool)
-                continue
-            bench.sensor("forearm", "--force", "15")
-            if tool == "zenoh":
-                bench.daemon()
-                shown = shell(bench, commands[tool], **{"7447": port})
-                assert "forearm" in shown and "live" in shown, shown
-            else:
-                foxglove(bench, commands[tool], port)
-    return lacking
-
-
-def foxglove(bench, command, port):
-    from websockets.sync.client import connect
-
-    os.rename(bench.path("hardnessd.toml"), bench.path("foxglove.toml"))
-    program, *arguments = command.split()
-    assert program == "hardnessd", command
-    daemon = subprocess.Popen([bench.binary, *arguments], cwd=bench.directory.name, stderr=subprocess.DEVNULL)
-    bench.processes.append(daemon)
-    for _ in range(300):
-        try:
-            with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]) as viewer:
-                assert json.loads(viewer.recv(timeout=10))["op"] == "serverInfo"
-                return
-        except OSError:
-            time.sleep(0.1)
-    raise AssertionError("Foxglove's websocket does not come")
-
-
 def main(binary):
     commands = rows()
     more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n[http]\nlisten = "127.0.0.1:0"\n'
@@ -150,10 +110,7 @@ def main(binary):
         os.link(first, place / "takes/take.mcap")
         recorded(bench, commands)
         print("blocks:", blocks(bench))
-    lacking = with_features(binary, commands)
-    print("commands:", ", ".join(tool for tool in commands if tool not in lacking))
-    for tool in lacking:
-        print(f"skipped: {tool} of docs/where-your-data-goes.md: a build without the feature; .ci/publishers runs it")
+    print("commands:", ", ".join(tool for tool in commands if tool not in ("Foxglove", "zenoh")))
 
 
 if __name__ == "__main__":

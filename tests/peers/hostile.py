@@ -138,14 +138,11 @@ def main():
     hello = line(HELLO)
     endless = b"x" * (1 << 16)
     check(b"", "a line is longer than 1048576 bytes: this is not hardnessd", endless=endless)
-    check(hello, "a line is longer than 1048576 bytes", endless=endless)
     check(hello + line(STATUS), "a line is longer than 1048576 bytes", before=1, endless=endless)
     check(hello, "a line is not JSON: HTTP/1.1 400 Bad Request\\r", endless=b"HTTP/1.1 400 Bad Request\r\n")
     check(b"\xff\xfe\x00\n", "a line is not JSON: \\xff\\xfe\\x00")
-    check(hello + b"\n", "a line is not JSON: ")
     check(hello + b"[" * 500_000 + b"\n", "a line is not JSON: [[[")
     check(hello + b'{"type":"status","x":NaN}\n', "a line is not JSON")
-    check(hello + b'{"type":"status","x":' + b"9" * 500_000 + b"}\n", "a line is not JSON")
     check(hello + b"5\n", "a line is not an object with a type: 5")
     check(hello + b'{"type":["status"]}\n', "a line is not an object with a type")
     check(hello + b'{"type":"press","seq":"8"}\n', "seq is not a whole number")
@@ -160,9 +157,7 @@ def main():
     check(line(STATUS), "the first line is 'status', expected 'hello'")
     check(line({**HELLO, "protocol": 2}), "protocol 2, expected 1")
     check(line({"type": "hello", "protocol": 1}), "hello has no run or no seq")
-    check(line({**HELLO, "run": 5}), "hello has no run or no seq")
     check(line({"type": "error", "message": "full"}), "full")
-    check(line({"type": "error", "message": [1]}), "[1]")
     check(hello[:-5], "the daemon closed the connection")
     check(hello + line({"type": "hail"}) + line(STATUS)[:-1], "the daemon closed the connection")
     # Events without end in place of an answer to the subscription.
@@ -176,12 +171,10 @@ def main():
     check(hello[:-5], "no ", stays=True)
     # A byte, or a line of no use, comes before each wait is over.
     check(b"", "no ", endless=b"x", slowly=0.05)
-    check(hello, "no ", endless=b"x", slowly=0.05)
     check(hello, "no ", endless=line({"type": "hail"}), slowly=0.005)
 
     by_control(b"", hardnessd.LineTooLong, "longer than", endless=endless)
     by_control(hello, TimeoutError, "in time", endless=b"x", slowly=0.05)
-    by_control(hello, TimeoutError, "in time", endless=line({"type": "hail"}), slowly=0.005)
     by_control(hello, hardnessd.ProtocolError, "too many lines", endless=line({"type": "hail"}))
     # Fewer lines than the daemon may send, but more bytes.
     long = line({"type": "hail", "of": "z" * 1_000_000})

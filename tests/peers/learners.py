@@ -6,12 +6,11 @@
 It needs the client with its extra `adopt`, numpy, onnxruntime, scikit-learn and skl2onnx, and skips all without the last
 two. Claims: `python3 -m hardnessd.adopt` takes each file as skl2onnx writes it by default, and `hrn-train check-model`
 takes the result; its probabilities differ from onnxruntime's by less than 1e-5 on 288 frames; the same holds with classes
-that are texts, for two levels, and for graphs as PyTorch and Keras write them with any batch. What cannot be adopted is
+that are texts, and for graphs as PyTorch and Keras write them with any batch. What cannot be adopted is
 refused in one line that says what to change.
 """
 
 import csv
-import json
 import os
 import subprocess
 import sys
@@ -166,20 +165,6 @@ def classifiers(data):
     assert done.returncode == 78 and "integers that depend on an input" in done.stdout, done
 
 
-def two_levels(data):
-    """The same data with two levels, and the classifiers whose files differ then."""
-    arrays = dict(np.load(data))
-    arrays["level"] = (arrays["level"] + 1) // 2
-    meta = json.loads(arrays["meta"].tobytes())
-    meta["levels"] = [{"level": 1, "label": "hard", "shore": ">60"}, {"level": 2, "label": "soft", "shore": "<=60"}]
-    arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-    np.savez("two.npz", **arrays)
-    train = arrays["split"] == 0
-    inputs, level = arrays["frames"].reshape(-1, 784)[train], arrays["level"][train].astype(np.int64)
-    for name in ("logistic regression", "forest"):
-        compare(f"two levels, {name}", export(kinds()[name], inputs, level), "two.npz")
-
-
 def networks(data):
     """Graphs as exporters write them: PyTorch's for a batch that may change, and Keras's through tf2onnx."""
     random = np.random.default_rng(1)
@@ -246,7 +231,6 @@ def main(binaries):
         few = "--objects 4 --test-objects 2 --presses 12".split()
         assert hrn_train("simulate", "--out", "data.npz", *few).returncode == 0
         classifiers("data.npz")
-        two_levels("data.npz")
         networks("data.npz")
         os.chdir("/")
 

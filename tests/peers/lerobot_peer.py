@@ -5,7 +5,7 @@
     venv/bin/pip install './clients/python[export]' ./clients/lerobot 'lerobot[core-scripts]'    # 5 GB
     venv/bin/python tests/peers/lerobot_peer.py target/debug/hardnessd --pictures pictures
 
-Claims: LeRobotDataset reads an export, with the very statistics that LeRobot computes of the same frames; LeRobot finds
+Claims: LeRobotDataset reads an export; LeRobot finds
 the camera by the name of its package, and `lerobot-record` records an episode of a simulated robot with it; what
 LeRobotDataset then reads is what the socket said; and a sensor that is stale or lost, or a daemon that is gone, gives
 no frame.
@@ -44,7 +44,6 @@ from lerobot_camera_hardnessd import HardnessdCamera, HardnessdCameraConfig
 from PIL import Image
 
 FPS = 20
-OWN = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 ARRAY, STATE = "observation.tactile.forearm.newtons", "observation.tactile.forearm.state"
 
 
@@ -130,7 +129,7 @@ class SimulatedHand(Teleoperator):
 
 
 def an_export(path, directory, episodes):
-    """LeRobotDataset reads it, and writes the same again."""
+    """LeRobotDataset reads it, with windows in time."""
     out = directory / episodes
     command = [sys.executable, "-m", "hardnessd.export", path, "--to", "lerobot", "--episodes", episodes, "--out", out]
     subprocess.run(command, check=True, capture_output=True)
@@ -138,26 +137,6 @@ def an_export(path, directory, episodes):
     assert (data.num_episodes, data.num_frames) == (data.meta.total_episodes, len(data)) and len(data) > 90
     window = LeRobotDataset("hardnessd/export", root=out, delta_timestamps={ARRAY: [-1 / FPS, 0]}, episodes=[0])
     assert window[5][ARRAY].shape == (2, 28, 28) and np.array_equal(window[5][ARRAY][0], data[4][ARRAY])
-    features = {key: value for key, value in data.features.items() if key not in OWN}
-    again = LeRobotDataset.create(
-        "hardnessd/again", fps=data.meta.fps, features=features, root=directory / f"again-{episodes}", use_videos=False
-    )
-    for episode in data.meta.episodes:
-        for index in range(episode["dataset_from_index"], episode["dataset_to_index"]):
-            item = data[index]
-            again.add_frame({**{key: np.atleast_1d(item[key].numpy()) for key in features}, "task": item["task"]})
-        again.save_episode()
-    again.finalize()
-    again = LeRobotDataset("hardnessd/again", root=directory / f"again-{episodes}")
-    assert len(again) == len(data) and list(again.features) == list(data.features)
-    for ours, theirs in zip(data, again, strict=True):
-        assert all(np.array_equal(ours[key], theirs[key]) for key in data.features), (ours, theirs)
-    assert set(again.meta.stats) == set(data.meta.stats)
-    for key, stats in again.meta.stats.items():
-        for name, value in stats.items():
-            # LeRobot computes quantiles too. Its script augment_dataset_quantile_stats adds them.
-            if not name.startswith("q"):
-                assert np.allclose(data.meta.stats[key][name], value, rtol=1e-3, atol=1e-4), (key, name)
     return data.num_episodes, data.num_frames
 
 

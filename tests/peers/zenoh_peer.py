@@ -8,7 +8,7 @@ Claims: positions of an arm that a peer puts at the configured key reach the pre
 under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
 asks for the last verdict and status, beside 100 frames/s too; the liveliness token goes when the daemon is killed; a router
 that comes later is found; a frozen peer costs no other subscriber an event, nor the stop its second;
-nothing listens that was not named; and an address in use is one line and 74.
+and nothing listens that was not named.
 """
 
 import json
@@ -19,7 +19,7 @@ import sys
 import time
 
 import zenoh
-from bench import Arm, Bench, an_address_in_use, arm_reached_the_press, free_port, wait_for
+from bench import Arm, Bench, arm_reached_the_press, free_port, wait_for
 from mcap_ros2.reader import read_ros2_messages
 
 
@@ -199,4 +199,3 @@ if __name__ == "__main__":
     a_router_that_comes_later(binary)
     print("a router that comes later is found")
     print("a frozen peer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_peer(binary))
-    print("an address in use:", an_address_in_use(binary, "publish.zenoh", '["tcp/127.0.0.1:{port}"]'))

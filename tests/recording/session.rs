@@ -9,7 +9,7 @@ use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{BINARY, Bench, PATIENCE, Process, hardnessd, start_on};
+use crate::bench::{BINARY, Bench, PATIENCE, Process, fails, start_on};
 
 /// A recording, and the terminal that it runs on.
 struct Session {
@@ -114,22 +114,9 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.ends(&format!("hrn-train fit {} --out own.onnx", own.display()));
 
     let list = fs::read_to_string(own.join("session.csv")).unwrap();
-    let lines: Vec<&str> = list.lines().collect();
-    let [heading, first, second] = lines[..] else {
-        panic!("{list}");
-    };
-    assert_eq!(heading, "object,name,shore,level,presses,file");
-    assert!(first.starts_with("1,\"Yoga mat\",,4,"), "{first}");
-    assert!(second.starts_with("2,\"a \"\"b\"\", c\",,0,"), "{second}");
-    let mut files: Vec<_> = fs::read_dir(&own)
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    files.sort();
-    assert_eq!(
-        files,
-        ["001-yoga-mat.mcap", "002-a--b---c.mcap", "session.csv"]
-    );
+    assert!(list.contains("\n1,\"Yoga mat\",,4,"), "{list}");
+    assert!(list.contains("\n2,\"a \"\"b\"\", c\",,0,"), "{list}");
+    assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
     assert_collects(&bench, &own);
 
     // The next session continues, and a session without a press leaves no file.
@@ -138,19 +125,6 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.answer("q");
     session.ends("recorded 0 objects");
     assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
-
-    // Numbers go on past files that the list lacks, as after a kill.
-    fs::write(own.join("007-sponge.mcap"), "theirs").unwrap();
-    fs::remove_file(own.join("session.csv")).unwrap();
-    let mut session = Session::start(&config, &own);
-    session.talk(&[
-        ("object 8: its name: ", "foam"),
-        ("its level", "firm"),
-        ("presses: 0", "q"),
-    ]);
-    session.ends("recorded 0 objects");
-    assert!(!own.join("008-foam.mcap").exists());
-    assert_eq!(fs::read(own.join("007-sponge.mcap")).unwrap(), b"theirs");
 }
 
 #[test]
@@ -203,20 +177,9 @@ fn a_session_needs_a_terminal_and_asks_for_its_labels_itself() {
     let config = bench.configure("hardnessd.toml", "events.sock", "");
     let own = bench.path("own");
     let check = |more: &[&str], part: &str| {
-        let arguments = [
-            "record",
-            "--config",
-            config.to_str().unwrap(),
-            "--session",
-            own.to_str().unwrap(),
-        ];
-        let output = hardnessd(&[&arguments[..], more].concat());
-        let message = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(2), "{message}");
-        assert!(
-            message.contains(part) && message.lines().count() == 1,
-            "{message}"
-        );
+        let [config, own] = [&config, &own].map(|path| path.to_str().unwrap());
+        let arguments = ["record", "--config", config, "--session", own];
+        fails(&[&arguments[..], more].concat(), 2, &[part]);
     };
     check(&[], "needs a terminal");
     check(&["--label", "level=2"], "--session asks for it");

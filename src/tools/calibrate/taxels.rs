@@ -16,13 +16,28 @@ pub(super) struct Plain {
     pub(super) frames: Vec<Vec<f32>>,
 }
 
-/// The two sides of a comparison.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Compared {
-    /// A taxel and its two neighbours on opposite sides, as places in the frame.
-    Trio(usize, [usize; 2]),
-    /// A taxel and the array's median.
-    Array(usize),
+/// A comparison of a taxel with its two neighbours on opposite sides, or with the array's median.
+struct Compared {
+    /// The place of the taxel in the frame.
+    place: usize,
+    /// The places of the neighbours. None for the array's median.
+    sides: Vec<usize>,
+}
+
+impl Compared {
+    /// The taxel's logarithm, less the mean of its neighbours'.
+    fn across(&self, logs: &[f64]) -> f64 {
+        let sides: f64 = self.sides.iter().map(|&side| logs[side]).sum();
+        logs[self.place] - sides / self.sides.len().max(1) as f64
+    }
+
+    /// Adds what [`Self::across`] times `value` has of each taxel.
+    fn back(&self, into: &mut [f64], value: f64) {
+        into[self.place] += value;
+        for &side in &self.sides {
+            into[side] -= value / self.sides.len() as f64;
+        }
+    }
 }
 
 /// One comparison, over all presses.
@@ -47,18 +62,12 @@ pub(super) struct Fit {
     /// The relative error of such a gain: half of the standard deviation of the difference between
     /// two halves of the presses.
     pub(super) error: f64,
-    /// Taxels that read nothing while all their neighbours did, `[row, col]`.
-    pub(super) dead: Vec<[usize; 2]>,
 }
 
 /// A taxel is loaded well from this force on: five counts of 0.04 N.
 const LEAST_N: f32 = 0.2;
 /// The pressure on an array is even if this share of its taxels is loaded well.
 const EVEN_SHARE: f64 = 0.9;
-/// A taxel is dead if it reads nothing in this share of the presses around it.
-const DEAD_SHARE: f64 = 0.5;
-/// The least number of presses around a taxel that can show that it is dead.
-const DEAD_PRESSES: usize = 3;
 /// The expected spread of gains (standard deviation of the logarithm). On a public film array it
 /// was 0.16 between taxels, 0.03 between rows and 0.055 between columns.
 const EXPECTED_SPREAD: f64 = 0.18;
@@ -102,10 +111,6 @@ impl Fit {
         });
         let apart = measured.iter().map(|&p| halves[0][p] - halves[1][p]);
         let own = measured.iter().map(|&p| logs[p]);
-        let dead = places
-            .iter()
-            .filter(|&&p| !is_dead[p] && looks_dead(presses, array, &is_dead, p));
-        let position = |&place: &usize| <[usize; 2]>::from(array.position(place));
         Ok(Self {
             gains: places.iter().map(|&p| (-logs[p]).exp() as f32).collect(),
             presses: places.iter().map(|&p| reached[p]).collect(),
@@ -115,7 +120,6 @@ impl Fit {
                 .count(),
             spread: deviation(own),
             error: 0.5 * deviation(apart),
-            dead: dead.map(position).collect(),
         })
     }
 }
@@ -126,44 +130,30 @@ fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<u
     let (rows, noise) = compare(presses, array, is_dead);
     let mut reached = vec![0; array.taxels()];
     for row in &rows {
-        let (Compared::Trio(place, _) | Compared::Array(place)) = row.compared;
-        reached[place] = reached[place].max(row.presses);
+        let reached = &mut reached[row.compared.place];
+        *reached = row.presses.max(*reached);
     }
     // With D the comparisons, W their weights, y their values and s the expected spread:
     // (D' W D + 1/s^2) logs = D' W y.
     let weight = |row: &Row| {
-        let always = match row.compared {
-            Compared::Trio(..) => UNEVEN,
-            Compared::Array(_) => EVEN,
+        let always = match row.compared.sides.is_empty() {
+            true => EVEN,
+            false => UNEVEN,
         };
         1.0 / (noise * noise / row.presses as f64 + always * always)
-    };
-    let across = |logs: &[f64], compared: Compared| match compared {
-        Compared::Trio(place, [one, other]) => logs[place] - 0.5 * (logs[one] + logs[other]),
-        Compared::Array(place) => logs[place],
-    };
-    let back = |into: &mut [f64], compared: Compared, value: f64| match compared {
-        Compared::Trio(place, sides) => {
-            into[place] += value;
-            sides.iter().for_each(|&side| into[side] -= 0.5 * value);
-        }
-        Compared::Array(place) => into[place] += value,
     };
     let prior = 1.0 / (EXPECTED_SPREAD * EXPECTED_SPREAD);
     let apply = |logs: &[f64]| {
         let mut applied: Vec<f64> = logs.iter().map(|log| prior * log).collect();
         for row in &rows {
-            back(
-                &mut applied,
-                row.compared,
-                weight(row) * across(logs, row.compared),
-            );
+            let value = weight(row) * row.compared.across(logs);
+            row.compared.back(&mut applied, value);
         }
         applied
     };
     let mut wanted = vec![0.0; array.taxels()];
     for row in &rows {
-        back(&mut wanted, row.compared, weight(row) * row.value);
+        row.compared.back(&mut wanted, weight(row) * row.value);
     }
     let mut logs = conjugate_gradients(apply, &wanted);
     // The common scale of all taxels belongs to `newtons_per_count`, so remove the mean.
@@ -177,77 +167,54 @@ fn solve(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<f64>, Vec<u
 
 /// All comparisons, and the noise of one press in one of them.
 fn compare(presses: &[&Plain], array: Array, is_dead: &[bool]) -> (Vec<Row>, f64) {
-    let trios = trios(array, is_dead);
-    let mut values: Vec<Vec<f64>> = vec![Vec::new(); trios.len()];
-    let mut evens: Vec<Vec<f64>> = vec![Vec::new(); array.taxels()];
+    let all = comparisons(array, is_dead);
+    let mut values: Vec<Vec<f64>> = vec![Vec::new(); all.len()];
     for press in presses {
-        let even = is_even(press, array, is_dead);
-        let frames = press.frames.iter();
-        let loaded: Vec<Vec<f64>> = frames.map(|frame| logs(frame)).collect();
-        let mut own = Vec::new();
-        for (&(place, sides), values) in trios.iter().zip(&mut values) {
-            own.clear();
-            own.extend(loaded.iter().filter_map(|logs| {
-                let value = logs[place] - 0.5 * (logs[sides[0]] + logs[sides[1]]);
-                value.is_finite().then_some(value)
-            }));
-            values.extend(median(&mut own));
-        }
-        if !even {
-            continue;
-        }
-        let middles: Vec<f64> = loaded
-            .iter()
-            .map(|logs| {
-                let mut well: Vec<f64> = (0..array.taxels()).map(|p| logs[p]).collect();
-                well.retain(|log| log.is_finite());
-                median(&mut well).unwrap_or(f64::NAN)
-            })
-            .collect();
-        for place in (0..array.taxels()).filter(|&place| !is_dead[place]) {
-            let values = loaded
-                .iter()
-                .zip(&middles)
-                .map(|(logs, middle)| logs[place] - middle);
-            let mut values: Vec<f64> = values.filter(|value| value.is_finite()).collect();
-            evens[place].extend(median(&mut values));
+        let is_even = is_even(press, array, is_dead);
+        let loaded: Vec<Vec<f64>> = press.frames.iter().map(|frame| logs(frame)).collect();
+        let middle = |logs: &Vec<f64>| median(logs.clone()).unwrap_or(f64::NAN);
+        let middles: Vec<f64> = match is_even {
+            true => loaded.iter().map(middle).collect(),
+            false => vec![f64::NAN; loaded.len()],
+        };
+        for (compared, values) in all.iter().zip(&mut values) {
+            let value = |(logs, middle): (&Vec<f64>, &f64)| {
+                let taken = if compared.sides.is_empty() {
+                    *middle
+                } else {
+                    0.0
+                };
+                compared.across(logs) - taken
+            };
+            values.extend(median(loaded.iter().zip(&middles).map(value).collect()));
         }
     }
     let mut rows = Vec::new();
     let mut rests = Vec::new();
-    let mut add = |compared, mut values: Vec<f64>| {
+    for (compared, values) in all.into_iter().zip(values) {
         let presses = values.len();
-        if let Some(value) = median(&mut values) {
-            if presses > 2 {
-                rests.extend(values.iter().map(|one| (one - value).abs()));
-            }
-            rows.push(Row {
-                compared,
-                value,
-                presses,
-            });
+        let Some(value) = median(values.clone()) else {
+            continue;
+        };
+        if presses > 2 {
+            rests.extend(values.iter().map(|one| (one - value).abs()));
         }
-    };
-    for (&(place, sides), values) in trios.iter().zip(values) {
-        add(Compared::Trio(place, sides), values);
-    }
-    for (place, values) in evens.into_iter().enumerate() {
-        add(Compared::Array(place), values);
+        rows.push(Row {
+            compared,
+            value,
+            presses,
+        });
     }
     // A dome is higher in its middle than around it, wherever it is. So remove the median over all
-    // trios.
-    let is_trio = |row: &&mut Row| matches!(row.compared, Compared::Trio(..));
-    let mut curved: Vec<f64> = rows
-        .iter()
-        .filter(|r| matches!(r.compared, Compared::Trio(..)))
-        .map(|r| r.value)
-        .collect();
-    let curved = median(&mut curved).unwrap_or(0.0);
-    rows.iter_mut()
-        .filter(is_trio)
-        .for_each(|row| row.value -= curved);
+    // comparisons with neighbours.
+    let has_sides = |row: &&mut Row| !row.compared.sides.is_empty();
+    let curved = rows.iter_mut().filter(has_sides).map(|row| row.value);
+    let curved = median(curved.collect()).unwrap_or(0.0);
+    for row in rows.iter_mut().filter(has_sides) {
+        row.value -= curved;
+    }
     // In a normal distribution, the median distance from the median is 0.6745 standard deviations.
-    let noise = median(&mut rests).map_or(LEAST_NOISE, |rest| (rest / 0.6745).max(LEAST_NOISE));
+    let noise = median(rests).map_or(LEAST_NOISE, |rest| (rest / 0.6745).max(LEAST_NOISE));
     (rows, noise)
 }
 
@@ -260,23 +227,22 @@ fn logs(frame: &[f32]) -> Vec<f64> {
     frame.iter().map(log).collect()
 }
 
-/// Every live taxel between two live ones, along rows and columns.
-fn trios(array: Array, is_dead: &[bool]) -> Vec<(usize, [usize; 2])> {
-    let mut trios = Vec::new();
-    for row in 0..array.rows {
-        for col in 0..array.cols {
-            if row > 0 && row + 1 < array.rows {
-                let sides = [array.place(row - 1, col), array.place(row + 1, col)];
-                trios.push((array.place(row, col), sides));
-            }
-            if col > 0 && col + 1 < array.cols {
-                let sides = [array.place(row, col - 1), array.place(row, col + 1)];
-                trios.push((array.place(row, col), sides));
-            }
+/// Every live taxel between two live ones, along rows and columns, and every one beside the array.
+fn comparisons(array: Array, is_dead: &[bool]) -> Vec<Compared> {
+    let mut all = Vec::new();
+    for place in 0..array.taxels() {
+        let (row, col) = array.position(place);
+        let mut sides = vec![Vec::new()];
+        if row > 0 && row + 1 < array.rows {
+            sides.push(vec![array.place(row - 1, col), array.place(row + 1, col)]);
         }
+        if col > 0 && col + 1 < array.cols {
+            sides.push(vec![array.place(row, col - 1), array.place(row, col + 1)]);
+        }
+        all.extend(sides.into_iter().map(|sides| Compared { place, sides }));
     }
-    trios.retain(|&(place, [one, other])| !is_dead[place] && !is_dead[one] && !is_dead[other]);
-    trios
+    all.retain(|one| !is_dead[one.place] && !one.sides.iter().any(|&side| is_dead[side]));
+    all
 }
 
 /// Whether a press loads the whole array.
@@ -286,35 +252,6 @@ fn is_even(press: &Plain, array: Array, is_dead: &[bool]) -> bool {
         let well = live().filter(|&place| frame[place] >= LEAST_N).count();
         well as f64 >= EVEN_SHARE * live().count() as f64
     })
-}
-
-/// Whether a taxel reads nothing while all its live neighbours along its row and column are loaded
-/// well.
-fn looks_dead(presses: &[Plain], array: Array, is_dead: &[bool], place: usize) -> bool {
-    let (row, col) = array.position(place);
-    let beside = [
-        (row.wrapping_sub(1), col),
-        (row + 1, col),
-        (row, col.wrapping_sub(1)),
-        (row, col + 1),
-    ];
-    let beside = beside
-        .into_iter()
-        .filter(|&(r, c)| r < array.rows && c < array.cols);
-    let beside: Vec<usize> = beside
-        .map(|(r, c)| array.place(r, c))
-        .filter(|&p| !is_dead[p])
-        .collect();
-    let (mut around, mut silent) = (0, 0);
-    for press in presses {
-        let is_around = |frame: &&Vec<f32>| beside.iter().all(|&p| frame[p] >= LEAST_N);
-        let mut frames = press.frames.iter().filter(is_around).peekable();
-        if frames.peek().is_some() {
-            around += 1;
-            silent += usize::from(frames.all(|frame| frame[place] <= 0.0));
-        }
-    }
-    around >= DEAD_PRESSES && silent as f64 >= DEAD_SHARE * around as f64
 }
 
 /// Solves `apply(x) = wanted` for a symmetric positive `apply`.
@@ -346,7 +283,9 @@ fn conjugate_gradients(apply: impl Fn(&[f64]) -> Vec<f64>, wanted: &[f64]) -> Ve
     found
 }
 
-fn median(values: &mut [f64]) -> Option<f64> {
+/// The median of the numbers that are finite.
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_finite());
     values.sort_by(f64::total_cmp);
     let middle = values.len() / 2;
     match values.len() {

@@ -51,46 +51,39 @@ fn access(path: &Path) -> io::Result<()> {
 
 /// Every USB serial port, by its persistent name if it has one.
 pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
-    let lasting = names(root, "dev/serial/by-id");
-    let mut ports: Vec<PathBuf> = if lasting.is_empty() {
-        let of_usb = |name: &String| name.starts_with("ttyUSB") || name.starts_with("ttyACM");
-        let names = names(root, "dev").into_iter().filter(of_usb);
-        names.map(|name| Path::new("/dev").join(name)).collect()
-    } else {
-        let names = lasting.into_iter();
-        names
-            .map(|name| Path::new("/dev/serial/by-id").join(name))
-            .collect()
+    let of = |folder: &str, is_meant: fn(&Path) -> bool| {
+        let names = names(root, folder).into_iter();
+        let paths = names.map(|name| Path::new("/").join(folder).join(name));
+        let mut paths: Vec<PathBuf> = paths.filter(|path| is_meant(path)).collect();
+        paths.sort();
+        paths
     };
-    ports.sort();
-    ports
+    let lasting = of("dev/serial/by-id", |_| true);
+    match lasting.is_empty() {
+        true => of("dev", is_usb),
+        false => lasting,
+    }
 }
 
 /// The fault if `port` exists but cannot be a serial port. Then no other check makes sense.
 pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
     let file = fs::metadata(port).ok()?;
-    let found = match file.file_type() {
-        kind if kind.is_char_device() => device_of_another_kind(root, file.rdev())?,
-        kind if kind.is_dir() => "a directory".to_owned(),
-        kind if kind.is_file() => "a regular file".to_owned(),
-        kind if kind.is_block_device() => "a disk".to_owned(),
-        kind if kind.is_fifo() => "a pipe".to_owned(),
-        _ => "a socket".to_owned(),
+    let is_other = match file.file_type().is_char_device() {
+        true => is_no_tty(root, file.rdev()),
+        false => true,
     };
-    Some(Fault {
-        what: format!("this is {found}, not a serial port"),
+    is_other.then(|| Fault {
+        what: "this is not a serial port".to_owned(),
         cure: others(&ports(root)),
     })
 }
 
-/// The kernel's name for the kind of the character device `number`, if it is no tty. `None` for a
-/// pty, because it has no entry in sysfs, and on a system without sysfs.
-fn device_of_another_kind(root: &Path, number: u64) -> Option<String> {
+/// Whether the kernel says that the character device `number` is no tty. It does not say it of a pty,
+/// because that has no entry in sysfs.
+fn is_no_tty(root: &Path, number: u64) -> bool {
     let (major, minor) = (rustix::fs::major(number), rustix::fs::minor(number));
     let entry = format!("sys/dev/char/{major}:{minor}/subsystem");
-    let subsystem = fs::read_link(root.join(entry)).ok()?;
-    let name = subsystem.file_name()?.to_string_lossy();
-    (name != "tty").then(|| format!("a device of the kind {name}"))
+    fs::read_link(root.join(entry)).is_ok_and(|kind| !kind.ends_with("tty"))
 }
 
 /// All faults of `port`, an absolute path under `root`.
@@ -135,9 +128,11 @@ pub(super) fn unreachable(port: &Port) -> Option<Fault> {
 /// The faults that keep `user` from opening `port`.
 pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
     let Some(device) = device(root, port) else {
-        let mut faults = vec![missing(&ports(root))];
-        faults.extend(braille(root));
-        return faults;
+        let missing = Fault {
+            what: "no such device".to_owned(),
+            cure: others(&ports(root)),
+        };
+        return [missing].into_iter().chain(braille(root)).collect();
     };
     let denied = denied(root, &device, user).into_iter();
     denied
@@ -150,13 +145,6 @@ fn device(root: &Path, port: &Path) -> Option<PathBuf> {
     let device = under(root, port).canonicalize().ok()?;
     let device = device.strip_prefix(root.canonicalize().ok()?).ok()?;
     Some(Path::new("/").join(device))
-}
-
-fn missing(ports: &[PathBuf]) -> Fault {
-    Fault {
-        what: "no such device".to_owned(),
-        cure: others(ports),
-    }
 }
 
 /// brltty takes adapters with the chips CH340 and CP210x for braille displays. Their port goes away at
@@ -223,27 +211,21 @@ fn allows(mode: u32, shift: u32) -> bool {
 /// A fault for each process other than `own` that has the device open. Only root can see this of
 /// other users' processes.
 fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
-    let mut faults = Vec::new();
-    for pid in holders(root, device).filter(|&pid| pid != own) {
-        let tool = subcommand(root, pid);
-        // A simulator made the port and does not keep others from opening it.
-        if matches!(tool.as_deref(), Some(b"simulate" | b"demo")) {
-            continue;
-        }
-        let fault = if tool.as_deref() == Some(b"run") {
-            Fault {
-                what: format!("held by process {pid}, the daemon (hardnessd run)"),
-                cure: format!("sudo systemctl stop hardnessd; where it is no service, kill {pid}"),
-            }
-        } else {
-            Fault {
-                what: format!("held by process {pid} ({})", command(root, pid)),
-                cure: format!("kill {pid}"),
-            }
+    let others = holders(root, device).filter(|&pid| pid != own);
+    let fault = |pid| {
+        let (what, cure) = match subcommand(root, pid).as_deref() {
+            // A simulator made the port and does not keep others from opening it.
+            Some(b"simulate" | b"demo") => return None,
+            Some(b"run") => (
+                ", the daemon (hardnessd run)".to_owned(),
+                format!("sudo systemctl stop hardnessd; where it is no service, kill {pid}"),
+            ),
+            _ => (format!(" ({})", command(root, pid)), format!("kill {pid}")),
         };
-        faults.push(fault);
-    }
-    faults
+        let what = format!("held by process {pid}{what}");
+        Some(Fault { what, cure })
+    };
+    others.filter_map(fault).collect()
 }
 
 /// The subcommand of `hardnessd` that a process runs.

@@ -7,8 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
-use super::checks::{User, examine, ports, refused};
-use crate::tools::pty::Pty;
+use super::checks::{User, examine, ports};
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
 
@@ -146,23 +145,4 @@ fn who_holds_the_port_is_named_and_the_daemon_is_stopped_as_a_service() {
     // A simulator made the port and does not keep others from opening it.
     machine.put("proc/88/cmdline", "hardnessd\0simulate\0--link\0port\0");
     assert_eq!(machine.faults(PORT), Vec::<String>::new());
-}
-
-#[test]
-fn what_is_no_serial_port_is_said_to_be_none() {
-    let machine = Machine::new();
-    let root = Path::new("/");
-    let refusal = |port: &Path| refused(root, port).map(|fault| fault.to_string());
-    for (port, found) in [
-        (Path::new("/dev/null"), "this is a device of the kind mem"),
-        (machine.0.path(), "this is a directory"),
-        (&machine.path("etc/group"), "this is a regular file"),
-    ] {
-        let message = refusal(port).unwrap();
-        assert!(message.starts_with(found), "{message}");
-        assert!(message.contains("not a serial port"), "{message}");
-    }
-    let pty = Pty::open(None).unwrap();
-    assert_eq!(refusal(pty.path()), None);
-    assert_eq!(refusal(Path::new("/dev/no-such")), None);
 }

@@ -24,7 +24,6 @@ pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; tim
 
 The cable:
   kind = "silence"       # frames stay unsent; the port stays open
-  kind = "stall"         # frames are held back, at most 60 s, then come all at once
 
 Bytes, of the first frame unless `frames` says of how many:
   kind = "noise"         # `bytes` random bytes before each
@@ -33,7 +32,6 @@ Bytes, of the first frame unless `frames` says of how many:
 
 Taxels, those in `rows = [first, last]` and `cols = [first, last]`, counted from 0:
   kind = "stuck"         # they read `counts`
-  kind = "contact"       # each reads `newtons` more
   kind = "drift"         # each reads `newtons_per_hour` more every hour. After `for_s` it stays so
 
 `bytes` and `bits` are 1 unless given, and at most 1000000. `counts` is 255 unless given. Without
@@ -43,10 +41,7 @@ Taxels, those in `rows = [first, last]` and `cols = [first, last]`, counted from
 /// line at 115,200 baud needs a minute and a half for this many bytes.
 const MOST_STRUCK: usize = 1_000_000;
 
-/// The longest stall, in seconds. It bounds the memory for the frames that are held back.
-const LONGEST_STALL_S: f64 = 60.0;
-
-/// The most newtons, and newtons an hour, that a taxel can read more: far more than its full scale.
+/// The most newtons an hour that a taxel can read more: far more than its full scale.
 const MOST_NEWTONS: f64 = 1e6;
 
 #[derive(Debug, Deserialize)]
@@ -85,7 +80,6 @@ pub(super) struct Fault {
 pub(super) enum Kind {
     Unplug {},
     Silence {},
-    Stall {},
     Noise {
         #[serde(default = "one")]
         bytes: usize,
@@ -101,9 +95,6 @@ pub(super) enum Kind {
     Stuck {
         #[serde(default = "full_scale")]
         counts: u16,
-    },
-    Contact {
-        newtons: f64,
     },
     Drift {
         newtons_per_hour: f64,
@@ -159,10 +150,8 @@ impl Fault {
         let newtons = (-MOST_NEWTONS, MOST_NEWTONS);
         match self.kind {
             Kind::Unplug {} | Kind::Silence {} | Kind::Stuck { .. } => Ok(()),
-            Kind::Stall {} => range::positive("for_s", for_s, LONGEST_STALL_S),
             Kind::Noise { bytes } | Kind::DropBytes { bytes } => struck("bytes", bytes),
             Kind::Flip { bits } => struck("bits", bits),
-            Kind::Contact { newtons } => range::positive("newtons", newtons, MOST_NEWTONS),
             Kind::Drift { newtons_per_hour } => {
                 range::within("newtons_per_hour", newtons_per_hour, newtons, "")
             }
@@ -230,20 +219,12 @@ mod tests {
                 "bits: found 1000001, expected 0 to 1000000",
             ),
             (
-                "at_s = 1.0\nkind = \"stall\"",
-                "for_s: found inf, expected a number above 0 and at most 60",
-            ),
-            (
                 "at_s = 1.0\nkind = \"stuck\"\nrows = [13, 28]",
                 "rows: found [13, 28], expected [first, last] of 0 to 27",
             ),
             (
                 "at_s = 1.0\nkind = \"stuck\"\ncols = [14, 13]",
                 "cols: found [14, 13]",
-            ),
-            (
-                "at_s = 1.0\nkind = \"contact\"\nnewtons = 0.0",
-                "newtons: found 0.0, expected a number above 0",
             ),
             (
                 "at_s = 1.0\nkind = \"drift\"\nnewtons_per_hour = nan",

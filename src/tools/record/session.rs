@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{clear, record, shown};
+use super::{clear, counted_in_words, record, shown};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
@@ -21,7 +21,7 @@ use crate::daemon::record::Progress;
 use crate::thread::NoThread;
 use crate::tools::exit::{Failure, IO, USAGE};
 use hardnessd_core::part;
-use hardnessd_core::recording::{LabelError, Labels, check_label};
+use hardnessd_core::recording::{Labels, check_label};
 use hardnessd_core::verdict::{Borders, Level};
 
 /// The list of what was recorded, in the directory of a session.
@@ -78,7 +78,7 @@ impl User<'_> {
     async fn ask<T>(
         &mut self,
         question: &str,
-        usable: impl Fn(&str) -> Result<T, Unusable>,
+        usable: impl Fn(&str) -> Result<T, String>,
     ) -> Option<T> {
         loop {
             print(&format!("{question}: "));
@@ -92,17 +92,6 @@ impl User<'_> {
             }
         }
     }
-}
-
-/// The reason why an answer cannot be used.
-#[derive(Debug, thiserror::Error)]
-enum Unusable {
-    #[error("the name is empty: write what you will press")]
-    NoName,
-    #[error(transparent)]
-    Name(#[from] LabelError),
-    #[error("found {0:?}, expected a Shore OO reading from 0 to 100, or the name of a level")]
-    Hardness(String),
 }
 
 /// An object to press.
@@ -163,34 +152,30 @@ pub(super) async fn run(
         }
     }
     let count = list.next - first;
-    let next = match count {
-        0 => String::new(),
-        _ => format!(
-            "to make a model of them: hrn-train fit {} --out own.onnx\n",
-            shown(directory)
-        ),
-    };
-    let plural = if count == 1 { "" } else { "s" };
-    let score = match score.verdicts {
-        0 => String::new(),
-        verdicts => format!("{} of {verdicts} right\n", score.right),
-    };
-    print(&format!(
-        "\nrecorded {count} object{plural} in this session\n{score}{next}"
-    ));
+    let recorded = counted_in_words(count.into(), "object", "s");
+    print(&format!("\nrecorded {recorded} in this session\n"));
+    if score.verdicts > 0 {
+        print(&format!("{} of {} right\n", score.right, score.verdicts));
+    }
+    if count > 0 {
+        let directory = shown(directory);
+        print(&format!(
+            "to make a model of them: hrn-train fit {directory} --out own.onnx\n"
+        ));
+    }
     Ok(())
 }
 
 async fn ask_for_object(user: &mut User<'_>, number: u32, levels: &[Level]) -> Option<Object> {
-    let name = user
-        .ask(&format!("\nobject {number}: its name"), |name| {
-            if name.is_empty() {
-                return Err(Unusable::NoName);
-            }
-            check_label("name", name)?;
-            Ok(name.to_owned())
-        })
-        .await?;
+    let named = |name: &str| {
+        if name.is_empty() {
+            return Err("the name is empty: write what you will press".to_owned());
+        }
+        let checked = check_label("name", name).map_err(|error| error.to_string());
+        checked.map(|()| name.to_owned())
+    };
+    let question = format!("\nobject {number}: its name");
+    let name = user.ask(&question, named).await?;
     let labels: Vec<&str> = levels.iter().map(|level| level.label.as_str()).collect();
     let labels = labels.join(", ");
     let question = format!("its Shore OO reading, or its level ({labels}), or Enter if unknown");
@@ -210,7 +195,7 @@ async fn ask_for_object(user: &mut User<'_>, number: u32, levels: &[Level]) -> O
 fn hardness<'a>(
     answer: &str,
     levels: &'a [Level],
-) -> Result<(Option<String>, Option<&'a Level>), Unusable> {
+) -> Result<(Option<String>, Option<&'a Level>), String> {
     if answer.is_empty() {
         return Ok((None, None));
     }
@@ -218,12 +203,18 @@ fn hardness<'a>(
     if let Some(level) = named.find(|level| level.label.eq_ignore_ascii_case(answer)) {
         return Ok((None, Some(level)));
     }
-    let unusable = || Unusable::Hardness(answer.to_owned());
-    check_label("shore", answer).map_err(|_| unusable())?;
-    let reading = answer.parse().map_err(|_| unusable())?;
-    let borders = Borders::of(levels).map_err(|_| unusable())?;
-    let level = &levels[borders.place_of(reading)];
-    Ok((Some(answer.to_owned()), Some(level)))
+    let reading = check_label("shore", answer)
+        .ok()
+        .and_then(|()| answer.parse().ok());
+    match (reading, Borders::of(levels)) {
+        (Some(reading), Ok(borders)) => {
+            let level = &levels[borders.place_of(reading)];
+            Ok((Some(answer.to_owned()), Some(level)))
+        }
+        _ => Err(format!(
+            "found {answer:?}, expected a Shore OO reading from 0 to 100, or the name of a level"
+        )),
+    }
 }
 
 /// Records presses of one object, and again if the user asks for it. Returns `false` if the user
@@ -351,14 +342,12 @@ fn print(text: &str) {
 
 /// A name as a part of a file's name.
 fn slug(name: &str) -> String {
-    let plain = |c: char| {
-        if c.is_ascii_alphanumeric() {
-            c.to_ascii_lowercase()
-        } else {
-            '-'
-        }
-    };
-    let slug: String = name.chars().take(40).map(plain).collect();
+    let letters = name
+        .chars()
+        .take(40)
+        .collect::<String>()
+        .to_ascii_lowercase();
+    let slug = letters.replace(|c: char| !c.is_ascii_alphanumeric(), "-");
     slug.trim_matches('-').to_owned()
 }
 

@@ -1,8 +1,11 @@
 //! The arm's positions beside raw bytes: a CSV file with the columns `time_s` and `approach_mm`.
 
-use std::io::{self, Read};
+use std::io::Read;
 use std::path::Path;
 
+use crate::tools::exit::Failure;
+use crate::tools::{cannot_read, open};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::motion::{FURTHEST_MM, Point};
 
 /// The most bytes of a file: more than a day of positions, 100 a second.
@@ -10,64 +13,36 @@ const MOST_BYTES: u64 = 256 << 20;
 /// The greatest time in a file: 30 years, longer than any recording.
 const LONGEST_S: f64 = 1e9;
 
-/// The reason why positions cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The file cannot be read.
-    #[error(" cannot read: {0}")]
-    Unreadable(#[source] io::Error),
-    /// The first line does not name the columns.
-    #[error("1: found {0:?}, expected the names of the columns, time_s and approach_mm among them")]
-    Columns(String),
-    /// A line lacks one of the two numbers.
-    #[error("{line}: {key}: found {found:?}, expected {expected}")]
-    Value {
-        /// The number of the line, from 1.
-        line: usize,
-        /// The name of the column.
-        key: &'static str,
-        /// The text in the column.
-        found: String,
-        /// The expected unit.
-        expected: &'static str,
-    },
-    /// The file is too large to be one of positions.
-    #[error(" found more than {} MB, expected fewer", MOST_BYTES >> 20)]
-    TooLong,
-}
-
-impl Error {
-    /// Whether the file could not be read.
-    pub fn is_unreadable(&self) -> bool {
-        matches!(self, Self::Unreadable(_))
-    }
-}
-
-/// Reads all positions of a file, in its order.
-pub(super) fn load(path: &Path) -> Result<Vec<Point>, Error> {
-    let file = crate::tools::open_file(path).map_err(Error::Unreadable)?;
+/// Reads all positions of a file of the command line, in its order.
+pub(in crate::tools) fn load(path: &Path) -> Result<Vec<Point>, Failure> {
     let mut text = String::new();
-    let read = file.take(MOST_BYTES + 1).read_to_string(&mut text);
-    read.map_err(Error::Unreadable)?;
-    if text.len() as u64 > MOST_BYTES {
-        return Err(Error::TooLong);
-    }
-    parse(&text)
+    let read = open(path)?.take(MOST_BYTES + 1).read_to_string(&mut text);
+    read.map_err(cannot_read(path))?;
+    let points = match text.len() as u64 > MOST_BYTES {
+        true => Err(format!(" found more than {} MB", MOST_BYTES >> 20)),
+        false => parse(&text),
+    };
+    points.map_err(|why| Failure::new(FAILED, format!("--motion {}:{why}", path.display())))
 }
 
 /// Reads positions from the text of a file.
 ///
 /// # Errors
 ///
-/// Fails if the first line does not name the columns, or another line has no number in one of them.
-pub fn parse(text: &str) -> Result<Vec<Point>, Error> {
+/// Fails if the first line does not name the columns, or another line has no number in one of them. The
+/// error begins with the number of the line.
+pub fn parse(text: &str) -> Result<Vec<Point>, String> {
+    let shown = |text: &str| text.chars().take(60).collect::<String>();
     let mut lines = (1..).zip(text.lines());
     let (_, names) = lines.next().unwrap_or((1, ""));
     // A spreadsheet may have written a byte order mark.
     let names = names.trim_start_matches('\u{feff}');
     let place = |name: &str| names.split(',').position(|found| found.trim() == name);
     let (Some(time), Some(approach)) = (place("time_s"), place("approach_mm")) else {
-        return Err(Error::Columns(names.chars().take(60).collect()));
+        return Err(format!(
+            "1: found {:?}, expected the names of the columns, time_s and approach_mm among them",
+            shown(names)
+        ));
     };
     let mut points = Vec::new();
     for (line, text) in lines.filter(|(_, text)| !text.trim().is_empty()) {
@@ -75,12 +50,8 @@ pub fn parse(text: &str) -> Result<Vec<Point>, Error> {
         let number = |key, column: usize, most: f64, expected| {
             let found = cells.get(column).copied().unwrap_or_default();
             let number = found.parse().ok().filter(|n: &f64| n.abs() <= most);
-            number.ok_or_else(|| Error::Value {
-                line,
-                key,
-                found: found.chars().take(60).collect(),
-                expected,
-            })
+            let found = shown(found);
+            number.ok_or_else(|| format!("{line}: {key}: found {found:?}, expected {expected}"))
         };
         let time_s = number("time_s", time, LONGEST_S, "seconds")?;
         let mm = number("approach_mm", approach, FURTHEST_MM, "millimetres")?;
@@ -105,7 +76,7 @@ mod tests {
     #[test]
     fn what_is_no_position_is_named_with_its_line() {
         let check = |text: &str, expected: &str| {
-            let error = parse(text).unwrap_err().to_string();
+            let error = parse(text).unwrap_err();
             assert!(error.starts_with(expected), "{error}");
         };
         check("", "1: found \"\", expected the names of the columns");

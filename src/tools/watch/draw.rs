@@ -13,10 +13,14 @@ use ratatui_core::buffer::Buffer;
 use ratatui_core::layout::Rect;
 use ratatui_core::style::{Color, Modifier, Style};
 use ratatui_core::terminal::Frame;
+use serde_json::Value;
 
 use self::map::MapSize;
 use super::look::Look;
-use super::view::{Link, Sensor, Verdict, View, age};
+use super::view::{Link, Sensor, View, age};
+use crate::tools::answer::{Answer, items, with_shore};
+use crate::tools::readable::number;
+use hardnessd_core::wording;
 
 /// Pictures up to this width have no map.
 const NARROW: u16 = 64;
@@ -37,11 +41,10 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     if let Some(row) = rows.take(1) {
         page.title(row, view);
     }
-    if let Some(hello) = &view.hello
-        && !hello.without_effect.is_empty()
-    {
-        let keys = hello.without_effect.join(", ");
-        let line = format!("{keys}: changes no verdict of this model");
+    let keys = items(&view.hello["model"], "without_effect").filter_map(Value::as_str);
+    let keys: Vec<&str> = keys.collect();
+    if !keys.is_empty() {
+        let line = format!("{}: changes no verdict of this model", keys.join(", "));
         page.wrapped(&mut rows, &line, look.aside());
     }
     let Some(sensor) = view.sensor() else {
@@ -108,9 +111,12 @@ impl Rows {
 }
 
 impl Page<'_> {
+    /// Writes a text without hidden characters: a reason comes from the system and a label from a model
+    /// file, and neither may move the cursor. Returns the rest of the row.
     fn text(&mut self, area: Rect, text: &str, style: Style) -> Rect {
+        let plain: String = text.chars().filter(|&c| !wording::is_hidden(c)).collect();
         let width = usize::from(area.width);
-        let (end, _) = self.buffer.set_stringn(area.x, area.y, text, width, style);
+        let (end, _) = self.buffer.set_stringn(area.x, area.y, plain, width, style);
         Rect {
             x: end,
             width: area.right() - end,
@@ -129,11 +135,13 @@ impl Page<'_> {
     }
 
     fn title(&mut self, row: Rect, view: &View) {
-        let Some(hello) = &view.hello else {
+        let (hello, model) = (&view.hello, &view.hello["model"]);
+        if hello.is_null() {
             self.text(row, "hardnessd", self.look.strong());
             return;
-        };
-        let rest = self.text(row, &hello.robot, self.look.strong());
+        }
+        let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
+        let rest = self.text(row, &text(hello, "robot"), self.look.strong());
         // Several sensors have tabs.
         let sensor = match &view.sensors[..] {
             [only] => format!(" · {}", only.name),
@@ -141,7 +149,10 @@ impl Page<'_> {
         };
         let line = format!(
             "{sensor} · hardnessd {} · model {} ({}): {}",
-            hello.version, hello.model, hello.validation, hello.needs
+            text(hello, "version"),
+            text(model, "name"),
+            text(model, "validation"),
+            text(model, "needs")
         );
         self.text(rest, &line, self.look.aside());
     }
@@ -187,7 +198,7 @@ impl Page<'_> {
         if link == Link::Lost && reason.is_some_and(is_unplugged) {
             line.insert_str("LOST ".len(), &format!(" {UNPLUGGED_WORDS};"));
         }
-        let rate_hz = sensor.status.as_ref().and_then(|one| one.frame_rate_hz);
+        let rate_hz = sensor.status["frame_rate_hz"].as_f64();
         if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
             line += &format!(" · {rate_hz:.1} frames/s");
         }
@@ -204,13 +215,16 @@ impl Page<'_> {
         {
             self.map(area, map, sensor, link);
         }
-        let Some(status) = &sensor.status else { return };
-        for (name, count) in [
-            ("frames", status.frames),
-            ("damaged", status.frames_damaged),
-            ("dropped", status.frames_dropped),
-            ("bytes skipped", status.bytes_skipped),
+        if sensor.status.is_null() {
+            return;
+        }
+        for (name, key) in [
+            ("frames", "frames"),
+            ("damaged", "frames_damaged"),
+            ("dropped", "frames_dropped"),
+            ("bytes skipped", "bytes_skipped"),
         ] {
+            let count = number(&sensor.status, key);
             // A count of damage stands out if it is not 0.
             let style = if name == "frames" || count == 0 {
                 self.look.aside()
@@ -229,8 +243,7 @@ impl Page<'_> {
         if let Some(row) = rows.take(1) {
             self.press(row, sensor, link);
         }
-        let labels = view.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
-        if let Some(line) = sensor.score.line(labels) {
+        if let Some(line) = sensor.score.line(&view.labels) {
             self.wrapped(&mut rows, &format!("pressing {line}"), Style::new());
         }
         // Verdicts get the rest, but at least 6 rows.
@@ -246,23 +259,27 @@ impl Page<'_> {
 
     fn press(&mut self, row: Rect, sensor: &Sensor, link: Link) {
         let rest = self.text(row, "press ", self.look.heading());
-        let Some(press) = &sensor.press else {
+        let Some((at, press)) = &sensor.press else {
             self.text(rest, "none yet", self.look.aside());
             return;
         };
-        let old = age(self.now.saturating_sub(press.at));
-        let mut line = match (press.state.as_str(), link) {
-            ("begin", Link::Live) => format!("{} in contact for {old}", press.number),
-            ("begin", _) => format!("{} began {old} ago, its end is not known", press.number),
-            (state, _) => format!("{} {state} {old} ago", press.number),
+        let (old, number) = (age(self.now.saturating_sub(*at)), number(press, "press"));
+        let (mut line, style) = match (press["state"].as_str(), link) {
+            (Some("begin"), Link::Live) => {
+                (format!("{number} in contact for {old}"), self.look.strong())
+            }
+            (Some("begin"), _) => {
+                let unknown = format!("{number} began {old} ago, its end is not known");
+                (unknown, Style::new())
+            }
+            (state, _) => {
+                let state = state.unwrap_or_default();
+                (format!("{number} {state} {old} ago"), Style::new())
+            }
         };
-        if let Some(reason) = &press.reason {
+        if let Some(reason) = press["reason"].as_str() {
             line += &format!(" ({reason})");
         }
-        let style = match (press.state.as_str(), link) {
-            ("begin", Link::Live) => self.look.strong(),
-            _ => Style::new(),
-        };
         self.text(rest, &line, style);
     }
 
@@ -270,25 +287,25 @@ impl Page<'_> {
         let mut rows = Rows(area);
         let Some(row) = rows.take(1) else { return };
         let rest = self.text(row, "verdicts ", self.look.heading());
-        let labels = view.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
-        let of = format!("Shore OO, level, age; % of {}", labels.join(", "));
+        let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
         self.text(rest, &of, self.look.aside());
         if sensor.verdicts.is_empty()
             && let Some(row) = rows.take(1)
         {
             self.text(row, "none yet", self.look.aside());
         }
-        for (index, verdict) in sensor.verdicts.iter().enumerate() {
+        for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
             let Some(row) = rows.take(1) else { return };
-            let style = if verdict.is_weak {
+            let answer = Answer::of(verdict, &view.labels);
+            let style = if answer.is_weak {
                 self.look.aside()
             } else if index == 0 && link == Link::Live {
                 self.look.strong()
             } else {
                 Style::new()
             };
-            let old = age(self.now.saturating_sub(verdict.at));
-            let line = verdict_line(verdict, &old, usize::from(row.width));
+            let old = age(self.now.saturating_sub(*at));
+            let line = verdict_line(verdict, &answer.text, &old, usize::from(row.width));
             self.text(row, &line, style);
         }
     }
@@ -353,16 +370,20 @@ fn is_unplugged(reason: &str) -> bool {
 }
 
 /// Press, answer with its Shore hardness, and age. What else is known follows as far as there is room.
-fn verdict_line(verdict: &Verdict, old: &str, width: usize) -> String {
-    let shares = verdict
-        .probabilities
-        .iter()
-        .map(|share| format!(" {:>3.0}", 100.0 * share));
-    let mut line = format!("{:>3} {:<27} {old:>6}", verdict.press, verdict.answer);
-    let early = verdict.is_early.then(|| "  early".to_owned());
-    let force = format!("  {:>5.1} N", verdict.force_n);
-    let notes = verdict.notes.iter().map(|note| format!("  {note}"));
+fn verdict_line(verdict: &Value, answer: &str, old: &str, width: usize) -> String {
+    let (press, answer) = (number(verdict, "press"), with_shore(answer, verdict));
+    let mut line = format!("{press:>3} {answer:<27} {old:>6}");
+    let early = (verdict["phase"] == "early").then(|| "  early".to_owned());
+    let force_n = verdict["force_n"].as_f64().unwrap_or_default();
+    let shares = items(verdict, "probabilities").filter_map(Value::as_f64);
+    let shares = shares.map(|share| format!(" {:>3.0}", 100.0 * share));
     let shares = format!(" {}", shares.collect::<String>());
+    let notes = [&verdict["advice"]]
+        .into_iter()
+        .chain(items(verdict, "notes"));
+    let notes = notes.filter_map(Value::as_str);
+    let notes = notes.map(|note| format!("  {}", note.replace('_', " ")));
+    let force = format!("  {force_n:>5.1} N");
     for more in early.into_iter().chain([force, shares]).chain(notes) {
         if line.chars().count() + more.len() > width {
             break;

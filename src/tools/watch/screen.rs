@@ -167,7 +167,7 @@ pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
 }
 
 /// The key of an event, if `watch` knows it.
-pub(super) fn key(event: &Event) -> Option<Key> {
+fn key(event: &Event) -> Option<Key> {
     let &Event::Key(KeyEvent {
         code, modifiers, ..
     }) = event

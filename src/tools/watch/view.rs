@@ -10,13 +10,12 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use serde_json::{Value, json};
 
-pub(super) use self::sensor::{Frame, Load, Sensor, Verdict, WINDOW};
-use crate::tools::answer::items;
+pub(super) use self::sensor::{Frame, Load, Sensor, WINDOW};
+use crate::tools::answer::{items, labels};
 use crate::tools::connect::WEB_SERVER;
 use crate::tools::score::Truth;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::frame::Stamp;
-use hardnessd_core::wording;
 
 /// The time between two requests for the totals. Without a request, the daemon sends them only when
 /// the state changes.
@@ -28,8 +27,10 @@ const SILENCE: Duration = Duration::from_secs(3);
 /// Everything that `watch` shows.
 #[derive(Debug)]
 pub(super) struct View {
-    /// The daemon of the last connection.
-    pub(super) hello: Option<Hello>,
+    /// The `hello` of the last connection. Null before the first one.
+    pub(super) hello: Value,
+    /// The labels of the model's levels, in order.
+    pub(super) labels: Vec<String>,
     pub(super) sensors: Vec<Sensor>,
     /// Index of the sensor that is shown.
     pub(super) chosen: usize,
@@ -66,22 +67,6 @@ enum Daemon {
     /// why there was no daemon before.
     Unknown(String),
     Met,
-}
-
-/// The daemon, as its `hello` describes it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Hello {
-    pub(super) robot: String,
-    pub(super) version: String,
-    /// The file of the model, or `built in`.
-    pub(super) model: String,
-    pub(super) validation: String,
-    /// What the model judges, and what it needs beside the sensor.
-    pub(super) needs: String,
-    /// The keys of the configuration that change no verdict of the model.
-    pub(super) without_effect: Vec<String>,
-    /// The labels of the levels, in order.
-    pub(super) labels: Vec<String>,
 }
 
 /// The state of a link. The values of a sensor are current only if it is `Live`.
@@ -151,7 +136,8 @@ impl View {
     /// A view that knows nothing yet.
     pub(super) fn new() -> Self {
         Self {
-            hello: None,
+            hello: Value::Null,
+            labels: Vec::new(),
             sensors: Vec::new(),
             chosen: 0,
             address: String::new(),
@@ -173,18 +159,19 @@ impl View {
         }
         let event = serde_json::from_str::<Value>(line).ok()?;
         self.last_line = now.mono;
-        match text(&event, "type").as_str() {
-            "hello" => return self.meet(&event),
+        let kind = event["type"].as_str().unwrap_or_default();
+        match kind {
+            "hello" => return self.meet(event),
             // Before a `hello`, an error means that the daemon has no room.
             "error" if self.daemon != Daemon::Met => {
-                self.daemon = Daemon::Absent(text(&event, "message"));
+                let reason = event["message"].as_str().unwrap_or_default();
+                self.daemon = Daemon::Absent(reason.to_owned());
             }
-            kind => {
-                let name = text(&event, "sensor");
+            _ => {
                 let at = self.moment(&event, kind, now);
-                let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
-                if let Some(sensor) = self.sensors.iter_mut().find(|one| one.name == name) {
-                    sensor.take_event(kind, &event, at, labels);
+                let mut sensors = self.sensors.iter_mut();
+                if let Some(sensor) = sensors.find(|one| event["sensor"] == *one.name) {
+                    sensor.take_event(event, at);
                 }
             }
         }
@@ -194,8 +181,8 @@ impl View {
     /// The moment of an event. A daemon on another machine has another clock. The frame with the
     /// shortest delay shows how far that clock is behind.
     fn moment(&mut self, event: &Value, kind: &str, now: Stamp) -> Duration {
-        let time = text(event, "time").parse::<jiff::Timestamp>();
-        let Ok(past) = time.map(|time| now.wall.duration_since(time)) else {
+        let time = event["time"].as_str().and_then(|time| time.parse().ok());
+        let Some(past) = time.map(|time: jiff::Timestamp| now.wall.duration_since(time)) else {
             return now.mono;
         };
         if self.clock == Clock::Theirs && kind == "frame" {
@@ -217,21 +204,22 @@ impl View {
 
     /// Takes in a `hello`, and begins anew. Returns the request for all events of this run that the
     /// daemon still holds, and those that come.
-    fn meet(&mut self, event: &Value) -> Option<String> {
-        let protocol = &event["protocol"];
+    fn meet(&mut self, hello: Value) -> Option<String> {
+        let protocol = &hello["protocol"];
         if *protocol != PROTOCOL {
             let reason = format!("found protocol {protocol}, expected {PROTOCOL}");
             self.daemon = Daemon::Absent(reason);
             return None;
         }
         let chosen = self.sensor().map(|one| one.name.clone());
-        self.sensors = items(event, "sensors").map(Sensor::new).collect();
+        self.sensors = items(&hello, "sensors").map(Sensor::new).collect();
         let is_chosen = |one: &Sensor| Some(&one.name) == chosen.as_ref();
         self.chosen = self.sensors.iter().position(is_chosen).unwrap_or(0);
-        self.hello = Some(hello(event));
+        self.labels = labels(&hello);
         self.daemon = Daemon::Met;
         let types = ["hardness", "press", "status", "frame"];
-        let since = format!("{}:0", text(event, "run"));
+        let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
+        self.hello = hello;
         Some(json!({"subscribe": types, "since": since}).to_string())
     }
 
@@ -278,8 +266,7 @@ impl View {
 
     /// Takes in what is being pressed, as a person typed it. Returns the order to tell the daemon.
     fn pressing(&mut self, text: &str) -> Option<Order> {
-        let labels = self.hello.as_ref().map_or(&[][..], |hello| &hello.labels);
-        let truth = Truth::read(text, labels);
+        let truth = Truth::read(text, &self.labels);
         let sensor = self.sensors.get_mut(self.chosen)?;
         sensor.score.begin(truth.clone());
         let context = truth.within(&sensor.context, &sensor.name);
@@ -297,22 +284,20 @@ impl View {
         if let Some((link, reason)) = self.trouble(now) {
             return (link, Some(reason));
         }
-        let Some(status) = &sensor.status else {
-            return (Link::Connecting, None);
-        };
         let has_zero = |frame: &Frame| frame.force_n.is_some();
-        let link = match status.state.as_str() {
+        let text = |key: &str| sensor.status[key].as_str();
+        let link = match text("state").unwrap_or_default() {
             "live" if !sensor.frame.as_ref().is_none_or(has_zero) => Link::NoZero,
             "live" => Link::Live,
             "stale" => Link::Stale,
             "lost" => Link::Lost,
             _ => Link::Connecting,
         };
-        let reason = status.reason.clone();
-        let detail = status.detail.iter().map(|detail| format!(": {detail}"));
+        let detail = text("detail").map(|detail| format!(": {detail}"));
+        let detail = detail.unwrap_or_default();
         (
             link,
-            reason.map(|reason| reason + &detail.collect::<String>()),
+            text("reason").map(|reason| reason.to_owned() + &detail),
         )
     }
 
@@ -338,22 +323,6 @@ impl View {
     }
 }
 
-fn hello(event: &Value) -> Hello {
-    let model = &event["model"];
-    let keys = items(model, "without_effect").filter_map(Value::as_str);
-    Hello {
-        robot: text(event, "robot"),
-        version: text(event, "version"),
-        model: text(model, "name"),
-        validation: text(model, "validation"),
-        needs: text(model, "needs"),
-        without_effect: keys.map(plain).collect(),
-        labels: items(model, "levels")
-            .map(|level| text(level, "label"))
-            .collect(),
-    }
-}
-
 /// A time span as a short text.
 pub(super) fn age(age: Duration) -> String {
     let seconds = age.as_secs_f64();
@@ -363,14 +332,4 @@ pub(super) fn age(age: Duration) -> String {
         ..7200.0 => format!("{:.0} min", seconds / 60.0),
         _ => format!("{:.0} h", seconds / 3600.0),
     }
-}
-
-fn text(event: &Value, key: &str) -> String {
-    event[key].as_str().map(plain).unwrap_or_default()
-}
-
-/// Text without hidden characters. A reason comes from the system and a label from a model file:
-/// neither may move the cursor.
-fn plain(text: &str) -> String {
-    text.chars().filter(|&c| !wording::is_hidden(c)).collect()
 }

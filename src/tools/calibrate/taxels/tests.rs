@@ -39,7 +39,7 @@ fn uneven(row: usize, col: usize) -> f32 {
 fn gains_are_found_from_presses_at_many_places() {
     let array = Array { rows: 12, cols: 10 };
     let fit = Fit::of(&domes(array, uneven), array, &[]).unwrap();
-    assert_eq!((fit.even, fit.dead.len()), (0, 0));
+    assert_eq!(fit.even, 0);
     let left: Vec<f64> = (0..120)
         .filter(|&k| fit.presses[k] > 1)
         .map(|k| f64::from(fit.gains[k] * uneven(k / 10, k % 10)).ln())
@@ -56,7 +56,7 @@ fn gains_are_found_from_presses_at_many_places() {
 }
 
 #[test]
-fn an_even_pressure_says_all_gains_and_the_dead_taxels() {
+fn an_even_pressure_says_all_gains_but_those_of_dead_taxels() {
     let array = Array { rows: 12, cols: 10 };
     let dead = [[3, 4], [7, 7]];
     let frame = |level: f32| {
@@ -77,7 +77,7 @@ fn an_even_pressure_says_all_gains_and_the_dead_taxels() {
     let presses: Vec<Plain> = (0..6).map(|_| press()).collect();
     let known = [dead[1]];
     let fit = Fit::of(&presses, array, &known).unwrap();
-    assert_eq!((fit.even, fit.dead.as_slice()), (6, &dead[..1]));
+    assert_eq!(fit.even, 6);
     let live = (0..120).filter(|k| !dead.contains(&[k / 10, k % 10]));
     let left = live.map(|k| f64::from(fit.gains[k] * uneven(k / 10, k % 10)).ln());
     let left = deviation(left.collect::<Vec<_>>().into_iter());
@@ -142,9 +142,4 @@ fn gains_of_a_raw_simulated_sensor_are_found_from_its_presses() {
     let fit = Fit::of(&plain, Array::JX255N, &[]).unwrap();
     let correlation = correlation(&fit, &gains);
     assert!(correlation > 0.7, "{correlation}");
-    let are_dead = fit
-        .dead
-        .iter()
-        .all(|[row, col]| gains[28 * row + col] < 0.3);
-    assert!(are_dead, "{:?}", fit.dead);
 }

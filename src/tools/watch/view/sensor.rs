@@ -5,8 +5,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::{plain, text};
-use crate::tools::answer::{Answer, items, with_shore};
+use crate::tools::answer::items;
 use crate::tools::readable::number;
 use crate::tools::score::Score;
 use hardnessd_core::frame::{Array, MOST_SIDE};
@@ -24,30 +23,19 @@ pub(in crate::tools::watch) struct Sensor {
     pub(in crate::tools::watch) name: String,
     pub(in crate::tools::watch) rows: usize,
     pub(in crate::tools::watch) cols: usize,
-    pub(in crate::tools::watch) status: Option<Status>,
+    /// The last status. Null before the first one.
+    pub(in crate::tools::watch) status: Value,
     /// The sensor's last frame.
     pub(in crate::tools::watch) frame: Option<Frame>,
     trace: VecDeque<Load>,
-    pub(in crate::tools::watch) press: Option<Press>,
-    /// The verdicts, the newest press first.
-    pub(in crate::tools::watch) verdicts: VecDeque<Verdict>,
+    /// The last event of a press, and its moment.
+    pub(in crate::tools::watch) press: Option<(Duration, Value)>,
+    /// The verdicts and their moments, the newest first.
+    pub(in crate::tools::watch) verdicts: VecDeque<(Duration, Value)>,
     /// What is being pressed, and how many verdicts are right.
     pub(in crate::tools::watch) score: Score,
     /// The context of the last press.
     pub(super) context: Value,
-}
-
-/// The state of a link, as the daemon reports it.
-#[derive(Debug, Clone, PartialEq)]
-pub(in crate::tools::watch) struct Status {
-    pub(super) state: String,
-    pub(super) reason: Option<String>,
-    pub(super) detail: Option<String>,
-    pub(in crate::tools::watch) frames: u64,
-    pub(in crate::tools::watch) frames_damaged: u64,
-    pub(in crate::tools::watch) frames_dropped: u64,
-    pub(in crate::tools::watch) bytes_skipped: u64,
-    pub(in crate::tools::watch) frame_rate_hz: Option<f64>,
 }
 
 /// The last frame.
@@ -69,110 +57,36 @@ pub(in crate::tools::watch) struct Load {
     pub(in crate::tools::watch) contact_area_taxels: u32,
 }
 
-/// The last press.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(in crate::tools::watch) struct Press {
-    pub(in crate::tools::watch) at: Duration,
-    pub(in crate::tools::watch) number: u64,
-    pub(in crate::tools::watch) state: String,
-    pub(in crate::tools::watch) reason: Option<String>,
-}
-
-/// A verdict.
-#[derive(Debug, Clone, PartialEq)]
-pub(in crate::tools::watch) struct Verdict {
-    pub(in crate::tools::watch) at: Duration,
-    pub(in crate::tools::watch) press: u64,
-    pub(in crate::tools::watch) is_early: bool,
-    /// Such as `63 +- 6 OO, firm`.
-    pub(in crate::tools::watch) answer: String,
-    /// Whether the answer must not look like a sure level.
-    pub(in crate::tools::watch) is_weak: bool,
-    pub(in crate::tools::watch) probabilities: Vec<f64>,
-    pub(in crate::tools::watch) force_n: f64,
-    /// The advice, and the notes.
-    pub(in crate::tools::watch) notes: Vec<String>,
-}
-
 impl Sensor {
     pub(super) fn new(card: &Value) -> Self {
         let size = |key| {
-            let size = card[key]
-                .as_u64()
-                .and_then(|size| usize::try_from(size).ok());
-            size.unwrap_or(1).clamp(1, MOST_SIDE)
+            let size = card[key].as_u64().map_or(1, |size| size as usize);
+            size.clamp(1, MOST_SIDE)
         };
         Self {
-            name: text(card, "name"),
+            name: card["name"].as_str().unwrap_or_default().to_owned(),
             rows: size("rows"),
             cols: size("cols"),
             ..Self::default()
         }
     }
 
-    /// Takes in an event. `labels` are those of the model's levels.
-    pub(super) fn take_event(
-        &mut self,
-        kind: &str,
-        event: &Value,
-        at: Duration,
-        labels: &[String],
-    ) {
-        match kind {
-            "status" => {
-                self.status = Some(Status {
-                    state: text(event, "state"),
-                    reason: event["reason"].as_str().map(plain),
-                    detail: event["detail"].as_str().map(plain),
-                    frames: number(event, "frames"),
-                    frames_damaged: number(event, "frames_damaged"),
-                    frames_dropped: number(event, "frames_dropped"),
-                    bytes_skipped: number(event, "bytes_skipped"),
-                    frame_rate_hz: event["frame_rate_hz"].as_f64(),
-                });
-            }
-            "press" => {
-                let press = Press {
-                    at,
-                    number: number(event, "press"),
-                    state: text(event, "state"),
-                    reason: event["reason"].as_str().map(plain),
-                };
-                self.press = Some(press);
+    /// Takes in an event.
+    pub(super) fn take_event(&mut self, event: Value, at: Duration) {
+        match event["type"].as_str() {
+            Some("status") => self.status = event,
+            Some("press") => {
                 self.context = event["context"].clone();
+                self.press = Some((at, event));
             }
-            "hardness" => self.judge(event, at, labels),
-            "frame" => self.show(event, at),
+            Some("hardness") => {
+                self.score.take(&event);
+                self.verdicts.push_front((at, event));
+                self.verdicts.truncate(VERDICTS);
+            }
+            Some("frame") => self.show(&event, at),
             _ => {}
         }
-    }
-
-    fn judge(&mut self, event: &Value, at: Duration, labels: &[String]) {
-        let Answer {
-            text: answer,
-            is_weak,
-        } = Answer::of(event, labels);
-        let advice = event["advice"].as_str();
-        let notes = items(event, "notes").filter_map(Value::as_str);
-        let verdict = Verdict {
-            at,
-            press: number(event, "press"),
-            is_early: event["phase"] == "early",
-            answer: plain(&with_shore(&answer, event)),
-            is_weak,
-            probabilities: items(event, "probabilities")
-                .filter_map(Value::as_f64)
-                .collect(),
-            force_n: event["force_n"].as_f64().unwrap_or_default(),
-            notes: advice
-                .into_iter()
-                .chain(notes)
-                .map(|note| plain(note).replace('_', " "))
-                .collect(),
-        };
-        self.score.take(event);
-        self.verdicts.push_front(verdict);
-        self.verdicts.truncate(VERDICTS);
     }
 
     fn show(&mut self, event: &Value, at: Duration) {
@@ -198,13 +112,7 @@ impl Sensor {
             force_n,
             contact_area_taxels,
         };
-        while self
-            .trace
-            .front()
-            .is_some_and(|first| first.at + WINDOW < at)
-        {
-            self.trace.pop_front();
-        }
+        self.trace.retain(|one| one.at + WINDOW >= at);
         self.trace.push_back(load);
     }
 
@@ -225,7 +133,7 @@ impl Sensor {
     ) -> Vec<Option<f32>> {
         let span = WINDOW.as_secs_f64() / spans.max(1) as f64;
         let begin = now.as_secs_f64() - WINDOW.as_secs_f64();
-        let rate_hz = self.status.as_ref().and_then(|status| status.frame_rate_hz);
+        let rate_hz = self.status["frame_rate_hz"].as_f64();
         let mut curve = vec![None; spans];
         let mut held: Vec<Option<f32>> = vec![None; spans];
         for load in &self.trace {
