@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::thread::{self, JoinHandle, sleep};
+use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use account::{account, growth, usage};
@@ -30,7 +30,7 @@ use clap::Parser;
 use hardnessd_core::recording::Reader;
 use hardnessd_simulator::random::Stream;
 use line::Line;
-use listener::{Link, Received, come_and_go, receive};
+use listener::{Link, come_and_go, receive};
 use player::{FAULTS, Player, library};
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -139,7 +139,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
         });
     }
     let tables = tables(&players);
-    let (config, socket) = (at("soak.toml"), at("events.sock"));
+    let config = at("soak.toml");
     configure(&config, &tables, 0.0)?;
     // Examples are built into a folder beside the program.
     let mut daemon = Command::new(std::env::current_exe()?.with_file_name("../hardnessd"))
@@ -149,14 +149,7 @@ fn soak(args: &Args) -> Result<Vec<String>, Failure> {
         .stderr(File::create(at("log"))?)
         .stdin(Stdio::null())
         .spawn()?;
-    let played = attend(
-        args,
-        &mut daemon,
-        players,
-        &links,
-        &socket,
-        (&config, &tables),
-    );
+    let played = attend(args, &mut daemon, players, &links, (&config, &tables));
     // The daemon has already ended, unless something failed.
     let _ = daemon.kill();
     let _ = daemon.wait();
@@ -184,168 +177,100 @@ fn attend(
     daemon: &mut Child,
     players: Vec<Player>,
     links: &[Arc<Link>],
-    socket: &Path,
-    config: (&Path, &str),
+    (config, tables): (&Path, &str),
 ) -> Result<Vec<String>, Failure> {
     let pid = Pid::from_raw(i32::try_from(daemon.id())?).ok_or("no process")?;
-    await_start(daemon, socket)?;
-    let mut audience = Audience::gather(links, socket)?;
-    let played = Played::of(args, daemon, pid, players, config)?;
-    audience.send_guests_away()?;
-    // Let the subscribers read the events so far.
-    sleep(Duration::from_secs(1));
-    kill_process(pid, Signal::TERM)?;
-    let ended = daemon.wait()?;
-    let mut problems = Vec::new();
-    if !ended.success() {
-        problems.push(format!("the daemon ended with {ended}"));
-    }
-    for (number, listener) in audience.listening.into_iter().enumerate() {
-        let received = listener.join().map_err(|_| "a subscriber panicked")??;
-        if number == 0 {
-            println!(
-                "{} sensors for {:.1} minutes, {} events",
-                args.sensors, args.minutes, received.events
-            );
-        }
-        judge(number, &received, &played.sent, &mut problems);
-    }
-    played.print();
-    problems.extend(growth(&played.usages));
-    Ok(problems)
-}
-
-/// Waits until the daemon listens.
-fn await_start(daemon: &mut Child, socket: &Path) -> Result<(), Failure> {
+    let socket = config.with_file_name("events.sock");
     let start = Instant::now();
-    while UnixStream::connect(socket).is_err() {
+    while UnixStream::connect(&socket).is_err() {
         if start.elapsed() > PATIENCE || daemon.try_wait()?.is_some() {
             return Err("the daemon does not start".into());
         }
         sleep(PERIOD);
     }
-    Ok(())
-}
 
-/// The subscribers of the daemon.
-struct Audience {
-    /// Subscribers that read everything until the daemon ends.
-    listening: Vec<JoinHandle<Result<Received, Failure>>>,
-    /// Subscribers that come and go.
-    guests: Vec<JoinHandle<Result<(), Failure>>>,
-    /// Tells the guests to come no more.
-    over: Arc<AtomicBool>,
-    /// A subscriber that never reads.
-    _deaf: UnixStream,
-}
-
-impl Audience {
-    fn gather(links: &[Arc<Link>], socket: &Path) -> Result<Self, Failure> {
-        let mut listening = Vec::new();
-        for number in 0..17 {
-            // The first subscriber's links tell the players about their sensors.
-            let links: Vec<_> = links
-                .iter()
-                .map(|link| {
-                    if number == 0 {
-                        Arc::clone(link)
-                    } else {
-                        Arc::default()
-                    }
-                })
-                .collect();
-            let connection = UnixStream::connect(socket)?;
-            listening.push(thread::spawn(move || receive(connection, &links)));
-        }
-        let over = Arc::new(AtomicBool::new(false));
-        let mut guests = Vec::new();
-        for seed in 0..2 {
-            let (socket, over) = (socket.to_owned(), Arc::clone(&over));
-            guests.push(thread::spawn(move || come_and_go(&socket, seed, &over)));
-        }
-        let mut deaf = UnixStream::connect(socket)?;
-        deaf.write_all(b"{\"subscribe\":[\"frame\",\"press\",\"hardness\",\"status\"]}\n")?;
-        Ok(Self {
-            listening,
-            guests,
-            over,
-            _deaf: deaf,
-        })
+    // Subscribers that read everything until the daemon ends. The first one's links tell the players
+    // about their sensors.
+    let mut listening = Vec::new();
+    for number in 0..17 {
+        let links: Vec<Arc<Link>> = match number {
+            0 => links.to_vec(),
+            _ => links.iter().map(|_| Arc::default()).collect(),
+        };
+        let connection = UnixStream::connect(&socket)?;
+        listening.push(thread::spawn(move || receive(connection, &links)));
     }
+    // Subscribers that come and go, and one that never reads.
+    let over = Arc::new(AtomicBool::new(false));
+    let guests = [0, 1].map(|seed| {
+        let (socket, over) = (socket.clone(), Arc::clone(&over));
+        thread::spawn(move || come_and_go(&socket, seed, &over))
+    });
+    let mut deaf = UnixStream::connect(&socket)?;
+    deaf.write_all(b"{\"subscribe\":[\"frame\",\"press\",\"hardness\",\"status\"]}\n")?;
 
-    fn send_guests_away(&mut self) -> Result<(), Failure> {
-        self.over.store(true, Relaxed);
-        for guest in self.guests.drain(..) {
-            guest.join().map_err(|_| "a guest panicked")??;
+    // Meanwhile the daemon is reloaded, old recordings are removed, and its usage is looked at.
+    let start = Instant::now();
+    let length = Duration::from_secs_f64(60.0 * args.minutes);
+    let playing: Vec<_> = players
+        .into_iter()
+        .map(|player| thread::spawn(move || player.play(start + length)))
+        .collect();
+    let (mut usages, mut reloads, mut removed) = (Vec::new(), 0, 0);
+    while playing.iter().any(|player| !player.is_finished()) {
+        if daemon.try_wait()?.is_some() {
+            return Err("the daemon has ended".into());
         }
-        Ok(())
+        if start.elapsed().as_secs() / 10 > reloads {
+            reloads += 1;
+            configure(config, tables, 0.001 * (reloads % 2) as f64)?;
+            kill_process(pid, Signal::HUP)?;
+            removed += remove_old(&config.with_file_name("rec"))?;
+        }
+        usages.push((start.elapsed(), usage(daemon)?));
+        sleep(Duration::from_secs(1));
     }
-}
+    let mut sent = Vec::new();
+    for player in playing {
+        sent.push(player.join().map_err(|_| "a player panicked")??);
+    }
+    over.store(true, Relaxed);
+    for guest in guests {
+        guest.join().map_err(|_| "a guest panicked")??;
+    }
+    // Let the subscribers read the events so far.
+    sleep(Duration::from_secs(1));
+    kill_process(pid, Signal::TERM)?;
+    let ended = daemon.wait()?;
 
-/// What was played, and what the daemon needed meanwhile.
-struct Played {
-    sent: Vec<Player>,
-    /// Moments, and the daemon's usage then.
-    usages: Vec<(Duration, [u64; 3])>,
-    reloads: u64,
-    /// The number of recordings that were removed.
-    removed: u64,
-}
-
-impl Played {
-    /// Plays until the time is over. Meanwhile it reloads the daemon, removes old recordings and
-    /// looks at the daemon's usage.
-    fn of(
-        args: &Args,
-        daemon: &mut Child,
-        pid: Pid,
-        players: Vec<Player>,
-        (config, tables): (&Path, &str),
-    ) -> Result<Self, Failure> {
-        let start = Instant::now();
-        let length = Duration::from_secs_f64(60.0 * args.minutes);
-        let playing: Vec<_> = players
-            .into_iter()
-            .map(|player| thread::spawn(move || player.play(start + length)))
-            .collect();
-        let (mut usages, mut reloads, mut removed) = (Vec::new(), 0, 0);
-        while playing.iter().any(|player| !player.is_finished()) {
-            if daemon.try_wait()?.is_some() {
-                return Err("the daemon has ended".into());
+    let mut problems = Vec::new();
+    if !ended.success() {
+        problems.push(format!("the daemon ended with {ended}"));
+    }
+    let (sensors, minutes) = (args.sensors, args.minutes);
+    for (number, listener) in listening.into_iter().enumerate() {
+        let received = listener.join().map_err(|_| "a subscriber panicked")??;
+        if number == 0 {
+            let events = received.events;
+            println!("{sensors} sensors for {minutes:.1} minutes, {events} events");
+        }
+        let own = received.problems.iter();
+        problems.extend(own.map(|problem| format!("subscriber {number}: {problem}")));
+        for problem in account(&sent, &received.ends, number == 0) {
+            // All subscribers report the same problem, so keep it once.
+            if !problems.contains(&problem) {
+                problems.push(problem);
             }
-            let second = start.elapsed().as_secs();
-            if second / 10 > reloads {
-                reloads += 1;
-                configure(config, tables, 0.001 * (reloads % 2) as f64)?;
-                kill_process(pid, Signal::HUP)?;
-                removed += remove_old(&config.with_file_name("rec"))?;
-            }
-            usages.push((start.elapsed(), usage(daemon)?));
-            sleep(Duration::from_secs(1));
         }
-        let mut sent = Vec::new();
-        for player in playing {
-            sent.push(player.join().map_err(|_| "a player panicked")??);
-        }
-        Ok(Self {
-            sent,
-            usages,
-            reloads,
-            removed,
-        })
     }
-
-    fn print(&self) {
-        let faults = FAULTS.iter().enumerate().map(|(kind, name)| {
-            let count: u64 = self.sent.iter().map(|player| player.faults[kind]).sum();
-            format!("{count} {name}")
-        });
-        println!("faults: {}", faults.collect::<Vec<_>>().join(", "));
-        println!(
-            "reloads: {}; recordings removed meanwhile: {}",
-            self.reloads, self.removed
-        );
-    }
+    let faults = FAULTS.iter().enumerate().map(|(kind, name)| {
+        let count: u64 = sent.iter().map(|player| player.faults[kind]).sum();
+        format!("{count} {name}")
+    });
+    println!("faults: {}", faults.collect::<Vec<_>>().join(", "));
+    println!("reloads: {reloads}; recordings removed meanwhile: {removed}");
+    problems.extend(growth(&usages));
+    Ok(problems)
 }
 
 /// Removes all recordings but the last [`KEPT`], and returns their number.
@@ -356,20 +281,4 @@ fn remove_old(directory: &Path) -> io::Result<u64> {
         removed += 1;
     }
     Ok(removed)
-}
-
-/// Adds the problems of one subscriber to `problems`.
-fn judge(number: usize, received: &Received, sent: &[Player], problems: &mut Vec<String>) {
-    problems.extend(
-        received
-            .problems
-            .iter()
-            .map(|problem| format!("subscriber {number}: {problem}")),
-    );
-    for problem in account(sent, &received.ends, number == 0) {
-        // All subscribers report the same problem, so keep it once.
-        if !problems.contains(&problem) {
-            problems.push(problem);
-        }
-    }
 }

@@ -38,8 +38,8 @@ use hardnessd_core::wording::escaped;
 const MORE: &str = "\
     --session asks for the name of each object, and for the reading of a durometer or its level, \
     then counts its presses. Meanwhile Enter starts the next object, r and Enter records this one \
-    again, q and Enter or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap and a line of session.csv. A \
-    second session in the same directory continues the numbers.";
+    again, q and Enter or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap. A second session in the \
+    same directory continues the numbers.";
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]

@@ -73,8 +73,8 @@ pub struct Args {
     /// Bits per second on the line [default: 115200, or the first usual rate that carries the frames]
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
-    /// Control socket of a daemon, to which a simulated robot sends the positions of its arm, 100 a second. Its
-    /// first sensor is the one on the arm
+    /// Control socket of a daemon, to which a simulated robot sends the positions of its first sensor's arm, 100 a
+    /// second
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<PathBuf>,
     /// Play no presses: move the arm as a controller says on this new Unix socket

@@ -115,7 +115,6 @@ fn known_weights_say_the_newtons_of_a_count() {
     let path = bench.path("hardnessd.toml");
     let of_arm = ["calibrate", "arm", "--newtons", "5", "--config"];
     assert_eq!(run(&[&of_arm[..], &[path.to_str().unwrap()]].concat()).0, 2);
-    assert_eq!(run(&["calibrate", "force"]).0, 2);
 }
 
 #[test]

@@ -282,6 +282,7 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     assert_eq!(forearm["last"]["phase"], "final");
     assert_eq!(forearm["contact_threshold_n"], 0.07);
     assert!(forearm["last_frame_age_s"].as_f64().unwrap() > 0.0);
+
     // A page that opens now has the curve of the press that is over.
     let history = get(address, "/api/history?sensor=forearm");
     let history: Value = serde_json::from_str(&history.body).unwrap();

@@ -18,19 +18,9 @@ const PERIOD: Duration = Duration::from_millis(20);
 /// The frames of a simulated press.
 fn frames(bench: &Bench) -> Vec<Vec<u8>> {
     let path = bench.path("press.bin");
-    let played = hardnessd(&[
-        "simulate",
-        "--presses",
-        "1",
-        "--fps",
-        "20",
-        "--force",
-        "15",
-        "--material",
-        "hard-plastic",
-        "--to",
-        path.to_str().unwrap(),
-    ]);
+    let options = "simulate --presses 1 --fps 20 --force 15 --material hard-plastic --to";
+    let options: Vec<&str> = options.split(' ').collect();
+    let played = hardnessd(&[&options[..], &[path.to_str().unwrap()]].concat());
     assert!(played.status.success(), "{played:?}");
     let bytes = fs::read(path).unwrap();
     bytes.chunks_exact(FRAME).map(<[u8]>::to_vec).collect()

@@ -50,15 +50,7 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     // The chosen frame is older than the release that ended the press.
     assert!(verdict["age_at_publish_ms"].as_f64().unwrap() > 50.0);
     let line = daemon.logged("phase=\"final\"");
-    for field in [
-        "sensor=",
-        "press=1",
-        "level=",
-        "label=",
-        "confidence=",
-        "force_n=",
-        "model=",
-    ] {
+    for field in ["sensor=", "press=1", "level=", "confidence=", "model="] {
         assert!(line.contains(field), "{field} not in {line}");
     }
     subscriber.send_line(r#"{"get":"last","id":1}"#);
@@ -280,7 +272,6 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
             78,
             &["line 5: sensor.frame_rate_hz of", "14.58"][..],
         ),
-        (&["run", "--config", &config], 78, &["14.58"]),
         (
             &["run", "--config", "/no/such.toml"],
             66,
@@ -291,30 +282,14 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
             66,
             &["cannot read: Is a directory"],
         ),
-        (&["replay", directory], 66, &["cannot read: Is a directory"]),
-        (&["sniff", "/"], 66, &["/: cannot read", "directory"]),
-        (
-            &["recover", "/", "--out", "x.mcap"],
-            66,
-            &["/: cannot read", "directory"],
-        ),
         (&["replay", "/no/such.bin"], 66, &["/no/such.bin"]),
-        (&["replay"], 2, &["not provided", "<FILE>"]),
-        (
-            &["simulate", "--material", "steel"],
-            2,
-            &["steel", "--material", "wood"],
-        ),
         (
             &["simulate", "--fps", "20", "--baud", "115200"],
             2,
             &["--baud", "158000"],
         ),
         (&["run", "x.toml"], 2, &["unexpected argument 'x.toml'"]),
-        (&["replya"], 2, &["'replya'", "'replay'"]),
         (&["simulate", "--force", "1000"], 2, &["--force"]),
-        (&["simulate", "--fps", "nan"], 2, &["--fps"]),
-        (&["simulate", "--presses", "0"], 2, &["--presses"]),
         (&["demo", "--speed", "0.0001"], 2, &["--speed"]),
         (&record, 2, &["--label", "found \"\\u{202e}7\""]),
     ] {
@@ -331,19 +306,9 @@ fn check_refuses_what_run_would_refuse() {
     let bench = Bench::new();
     fs::write(bench.path("file"), "").unwrap();
     fs::create_dir(bench.path("directory")).unwrap();
-    let long = format!("{}.sock", "x".repeat(110));
     for (socket, more, key, found) in [
-        (long.as_str(), "", "path", "expected a path of at most 107"),
         ("directory", "", "path", "no socket"),
-        ("file", "", "path", "no socket"),
-        ("none/none/events.sock", "", "path", "in no directory"),
         ("file/events.sock", "", "path", "in no directory"),
-        (
-            "events.sock",
-            "control_path = \"directory\"\n",
-            "control_path",
-            "directory is no socket: remove it, or set another path",
-        ),
         (
             "events.sock",
             "control_group = \"no such\"\n",
@@ -359,16 +324,11 @@ fn check_refuses_what_run_would_refuse() {
         }
     }
     // The daemon runs without its disk and logs it. `check` warns the user beforehand.
-    for dir in ["file", "file/rec"] {
-        let record = format!("[record]\ndir = \"{dir}\"\n");
-        let config = bench.configure("bad.toml", "events.sock", &record);
-        let checked = hardnessd(&["check", "--config", config.to_str().unwrap()]);
-        let warning = String::from_utf8(checked.stderr).unwrap();
-        assert_eq!(checked.status.code(), Some(0), "{warning}");
-        for part in ["bad.toml: record.dir: cannot write to ", "Not a directory"] {
-            assert!(warning.contains(part), "{part} in {warning}");
-        }
-    }
+    let record = "[record]\ndir = \"file/rec\"\n";
+    let config = bench.configure("bad.toml", "events.sock", record);
+    let (code, _, warning) = run(&["check", "--config", config.to_str().unwrap()]);
+    let expected = "bad.toml: record.dir: cannot write to ";
+    assert!(code == 0 && warning.contains(expected), "{warning}");
     assert!(!bench.path("events.sock").exists());
     assert!(!bench.path("none").exists());
 }

@@ -8,6 +8,8 @@ use std::process::Command;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
+use hardnessd_core::recording::{Entry, Reader};
+
 use crate::bench::pair::Pair;
 use crate::bench::{BINARY, Bench, PATIENCE, Process, fails, start_on};
 
@@ -113,10 +115,7 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     assert!(right <= all && all >= 2, "{score}");
     session.ends(&format!("hrn-train fit {} --out own.onnx", own.display()));
 
-    let list = fs::read_to_string(own.join("session.csv")).unwrap();
-    assert!(list.contains("\n1,\"Yoga mat\",,4,"), "{list}");
-    assert!(list.contains("\n2,\"a \"\"b\"\", c\",,0,"), "{list}");
-    assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
+    assert_eq!(fs::read_dir(&own).unwrap().count(), 2);
     assert_collects(&bench, &own);
 
     // The next session continues, and a session without a press leaves no file.
@@ -124,7 +123,7 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     session.sees("object 3: its name: ");
     session.answer("q");
     session.ends("recorded 0 objects");
-    assert_eq!(fs::read_dir(&own).unwrap().count(), 3);
+    assert_eq!(fs::read_dir(&own).unwrap().count(), 2);
 }
 
 #[test]
@@ -153,8 +152,7 @@ fn a_reading_gives_the_level_and_no_line_of_the_log_cuts_through_a_question() {
     assert!(!between.contains("WARN"), "{between:?}");
     session.answer("q");
     session.ends("recorded 1 object in");
-    let list = fs::read_to_string(own.join("session.csv")).unwrap();
-    assert!(list.contains("\n1,\"foam\",65.5,2,"), "{list}");
+    assert!(own.join("001-foam.mcap").exists());
 }
 
 /// `hrn-train` accepts the recordings unchanged.
@@ -169,6 +167,13 @@ fn assert_collects(bench: &Bench, own: &Path) {
     let message = String::from_utf8_lossy(&collected.stderr);
     assert_eq!(collected.status.code(), Some(0), "{message}");
     assert!(out.exists());
+    let take = fs::File::open(own.join("001-yoga-mat.mcap")).unwrap();
+    let first = Reader::new(std::io::BufReader::new(take)).next().unwrap();
+    let Entry::State(state) = first.unwrap().entry else {
+        panic!("a recording begins with a state");
+    };
+    let labels = ["object", "name", "level"].map(|key| state.labels[key].as_str());
+    assert_eq!(labels, ["1", "Yoga mat", "4"]);
 }
 
 #[test]

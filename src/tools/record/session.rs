@@ -6,8 +6,8 @@
 
 use std::fs::{self, File};
 use std::future::Future;
-use std::io::{self, IsTerminal, Read, Seek, Write};
-use std::path::{Path, PathBuf};
+use std::io::{self, IsTerminal, Seek, Write};
+use std::path::Path;
 use std::pin::Pin;
 use std::time::Duration;
 
@@ -23,11 +23,6 @@ use crate::tools::exit::{Failure, IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label};
 use hardnessd_core::verdict::{Borders, Level};
-
-/// The list of what was recorded, in the directory of a session.
-const LIST: &str = "session.csv";
-/// The first line of the list.
-const HEADING: &str = "object,name,shore,level,presses,file\n";
 
 /// The time between two updates of the progress.
 const SHOWN_EVERY: Duration = Duration::from_millis(200);
@@ -120,7 +115,7 @@ enum Next {
 ///
 /// # Errors
 ///
-/// Fails as [`super::run`] does, or if there is no terminal or the list cannot be read or written.
+/// Fails as [`super::run`] does, or if there is no terminal or the directory cannot be read or written.
 pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
@@ -134,24 +129,37 @@ pub(super) async fn run(
                        --label instead";
         return Err(Failure::new(USAGE, problem));
     }
-    let mut list = List::open(directory).map_err(failed_at(directory))?;
+    let first = next_number(directory).map_err(failed_at(directory))?;
     let mut user = User::at_terminal(shutdown)?;
     print("One recording for each object. `q` ends the session.\n");
     let levels = setup.hrn.card().levels.clone();
-    let first = list.next;
-    let mut score = Score::default();
-    while let Some(object) = ask_for_object(&mut user, list.next, &levels).await {
+    let (mut number, mut score) = (first, Score::default());
+    while let Some(object) = ask_for_object(&mut user, number, &levels).await {
+        let path = directory.join(format!("{number:03}-{}.mcap", slug(&object.name)));
+        let mut labels = labels.clone();
+        labels.extend([
+            ("object".to_owned(), number.to_string()),
+            ("name".to_owned(), object.name.clone()),
+            ("level".to_owned(), object.level.to_string()),
+        ]);
+        labels.extend(
+            object
+                .shore
+                .clone()
+                .map(|shore| ("shore".to_owned(), shore)),
+        );
         let next = record_object(
-            &mut user, &object, labels, &setup, sockets, &mut list, &mut score,
+            &mut user, &object, &path, &labels, &setup, sockets, &mut score,
         )
         .await?;
+        number += u32::from(path.exists());
         // A late line would cut through the next question.
         log.flush();
         if !next {
             break;
         }
     }
-    let count = list.next - first;
+    let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
     print(&format!("\nrecorded {recorded} in this session\n"));
     if score.verdicts > 0 {
@@ -217,28 +225,19 @@ fn hardness<'a>(
     }
 }
 
-/// Records presses of one object, and again if the user asks for it. Returns `false` if the user
-/// quits.
+/// Records presses of one object, and again if the user asks for it. A recording without a press is removed.
+/// Returns `false` if the user quits.
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
+    path: &Path,
     labels: &Labels,
     setup: &Setup,
     sockets: Sockets,
-    list: &mut List,
     score: &mut Score,
 ) -> Result<bool, Failure> {
-    let path = list.path_of(object);
-    let failed = failed_at(&path);
-    let file = File::create_new(&path).map_err(&failed)?;
-    let mut labels = labels.clone();
-    labels.extend([
-        ("object".to_owned(), list.next.to_string()),
-        ("name".to_owned(), object.name.clone()),
-        ("level".to_owned(), object.level.to_string()),
-    ]);
-    let shore = object.shore.clone();
-    labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
+    let failed = failed_at(path);
+    let file = File::create_new(path).map_err(&failed)?;
     loop {
         print("do not touch the sensor until the zero is taken\n");
         let mut next = Next::KeepAndQuit;
@@ -249,7 +248,7 @@ async fn record_object(
                 next = wait_for_user(user, &mut counted, object, levels).await;
             };
             let (setup, file) = (setup.clone(), file.try_clone().map_err(&failed)?);
-            record(setup, sockets, &path, file, labels.clone(), progress, end).await
+            record(setup, sockets, path, file, labels.clone(), progress, end).await
         };
         clear();
         let Progress {
@@ -263,13 +262,12 @@ async fn record_object(
                 score.verdicts += verdicts;
                 score.right += right;
             }
-            list.add(object, presses).map_err(&failed)?;
             recorded?;
             return Ok(matches!(next, Next::Keep));
         }
         if recorded.is_err() || matches!(next, Next::KeepAndQuit) {
             // A recording without a press would stop `hrn-train collect`.
-            part::remove(&path, &file);
+            part::remove(path, &file);
         }
         recorded?;
         match next {
@@ -351,67 +349,17 @@ fn slug(name: &str) -> String {
     slug.trim_matches('-').to_owned()
 }
 
-/// `session.csv`: a line for each object. One session at a time writes it.
-struct List {
-    directory: PathBuf,
-    file: File,
-    /// The number of the next object.
-    next: u32,
-}
-
-impl List {
-    fn open(directory: &Path) -> io::Result<Self> {
-        fs::create_dir_all(directory)?;
-        let mut options = File::options();
-        let options = options.read(true).append(true).create(true);
-        let mut file = options.open(directory.join(LIST))?;
-        if let Err(fs::TryLockError::WouldBlock) = file.try_lock() {
-            return Err(io::Error::other("another session writes here: end it"));
-        }
-        let mut text = String::new();
-        file.read_to_string(&mut text)?;
-        if text.is_empty() {
-            file.write_all(HEADING.as_bytes())?;
-        } else if !text.starts_with(HEADING) {
-            return Err(io::Error::other(format!(
-                "{LIST} is not the list of a session"
-            )));
-        }
-        // A session that was killed lists nothing, and files that are listed may lie elsewhere now.
-        let listed = text.lines().filter_map(|line| line.split(',').next());
-        let mut numbers: Vec<u32> = listed.filter_map(|number| number.parse().ok()).collect();
-        for file in fs::read_dir(directory)? {
-            let name = file?.file_name();
-            let number = name.to_str().and_then(|name| name.split('-').next());
-            numbers.extend(number.and_then(|number| number.parse::<u32>().ok()));
-        }
-        Ok(Self {
-            directory: directory.to_owned(),
-            file,
-            next: numbers
-                .into_iter()
-                .max()
-                .map_or(1, |last| last.saturating_add(1)),
-        })
+/// The number of the next object in a directory: one more than the greatest that a file's name begins with.
+/// Makes the directory if it is missing.
+fn next_number(directory: &Path) -> io::Result<u32> {
+    fs::create_dir_all(directory)?;
+    let mut last = 0;
+    for file in fs::read_dir(directory)? {
+        let name = file?.file_name();
+        let number = name.to_str().and_then(|name| name.split('-').next());
+        last = last.max(number.and_then(|number| number.parse().ok()).unwrap_or(0));
     }
-
-    /// The path of the next object's recording.
-    fn path_of(&self, object: &Object) -> PathBuf {
-        let name = format!("{:03}-{}.mcap", self.next, slug(&object.name));
-        self.directory.join(name)
-    }
-
-    fn add(&mut self, object: &Object, presses: u64) -> io::Result<()> {
-        let path = self.path_of(object);
-        let file = path.file_name().unwrap_or_default().display();
-        let Object { name, shore, level } = object;
-        let (number, name) = (self.next, name.replace('"', "\"\""));
-        let shore = shore.as_deref().unwrap_or_default();
-        let line = format!("{number},\"{name}\",{shore},{level},{presses},{file}\n");
-        self.file.write_all(line.as_bytes())?;
-        self.next = number.saturating_add(1);
-        Ok(())
-    }
+    Ok(last.saturating_add(1))
 }
 
 fn failed_at(path: &Path) -> impl Fn(io::Error) -> Failure {
@@ -472,26 +420,10 @@ mod tests {
     #[test]
     fn a_session_goes_on_with_the_numbers_of_the_one_before() {
         let directory = tempfile::tempdir().unwrap();
-        let path = |name: &str| directory.path().join(name);
-        let mut list = List::open(directory.path()).unwrap();
-        assert_eq!(list.next, 1);
-        assert!(List::open(directory.path()).is_err(), "one at a time");
-        let object = Object {
-            name: "a \"b\", c".to_owned(),
-            shore: Some("63.5".to_owned()),
-            level: 2,
-        };
-        list.add(&object, 20).unwrap();
-        drop(list);
-        let text = fs::read_to_string(path(LIST)).unwrap();
-        let line = "1,\"a \"\"b\"\", c\",63.5,2,20,001-a--b---c.mcap\n";
-        assert_eq!(text, format!("{HEADING}{line}"));
-        // The list of a session that was killed lacks its last recording.
-        fs::write(path("007-foam.mcap"), "").unwrap();
-        assert_eq!(List::open(directory.path()).unwrap().next, 8);
-        fs::remove_file(path(LIST)).unwrap();
-        assert_eq!(List::open(directory.path()).unwrap().next, 8);
-        fs::write(path(LIST), "x,y\n").unwrap();
-        assert!(List::open(directory.path()).is_err());
+        assert_eq!(next_number(directory.path()).unwrap(), 1);
+        for name in ["007-foam.mcap", "002-wood.mcap", "notes.txt"] {
+            fs::write(directory.path().join(name), "").unwrap();
+        }
+        assert_eq!(next_number(directory.path()).unwrap(), 8);
     }
 }
