@@ -44,29 +44,6 @@ fn check_warns_of_what_the_model_or_the_film_does_not_know() {
 }
 
 #[test]
-fn sniff_writes_a_configuration_that_check_takes() {
-    let bench = Bench::new();
-    let _sensor = bench.sensor(&[]);
-    let [config, port] = ["sniffed.toml", "port"].map(|name| bench.path(name));
-    let [config, port] = [&config, &port].map(|path| path.to_str().unwrap());
-    let arguments = ["sniff", "--seconds", "4", "--port", port, "--out", config];
-    let (code, printed, message) = run(&arguments);
-    assert_eq!((code, printed.as_str()), (0, ""), "{message}");
-    assert!(message.contains("press the sensor"), "{message}");
-    let written = fs::read_to_string(config).unwrap();
-    let end = "[sensor.frame]\npreset = \"jx255n\"\n\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for \
-               your browser\n";
-    assert!(written.ends_with(end), "{written}");
-    let (code, printed, message) = run(&["check", "--config", config]);
-    assert_eq!(code, 0, "{message}{written}");
-    assert!(printed.contains("28x28 taxels in 790 bytes"), "{written}");
-    // The file now exists, and must not be overwritten.
-    let (code, _, message) = run(&arguments);
-    assert_eq!(code, 74, "{message}");
-    assert_eq!(fs::read_to_string(config).unwrap(), written);
-}
-
-#[test]
 fn the_control_socket_has_commands_of_its_own() {
     let bench = Bench::new();
     let _daemon = bench.daemon();

@@ -2,11 +2,9 @@
 //! answers, never panics, and takes a bounded time. `properties.rs` has the properties. `fuzz/`
 //! searches for bytes that break them, guided by coverage.
 
-use std::io::Cursor;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use hardnessd_core::recording::{Reader, recover};
 use hardnessd_core::test_support::of_a_press;
 use hardnessd_core::trial;
 use proptest::prelude::*;
@@ -63,18 +61,6 @@ fn kept(door: &str) -> Vec<Vec<u8>> {
         kept.push(recording());
     }
     kept
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(48))]
-    #[test]
-    fn of_a_damaged_recording_what_could_be_read_is_saved(damage in damage()) {
-        let bytes = damaged(&recording(), damage);
-        // The reader ends with the first error.
-        let read = Reader::new(bytes.as_slice()).filter(Result::is_ok).count();
-        let (_, good) = recover(Cursor::new(&bytes), Vec::new()).unwrap();
-        prop_assert!(Reader::new(good.as_slice()).count() >= read.min(1));
-    }
 }
 
 #[test]

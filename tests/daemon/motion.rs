@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use crate::bench::{Bench, Daemon, Subscriber, events, fails, get, recordings_in, run, timeless};
+use crate::bench::{Bench, Daemon, Subscriber, fails, get, recordings_in, run};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Reader};
 use serde_json::{Value, json};
@@ -96,23 +96,21 @@ fn positions_of_raw_bytes_come_from_a_table() {
 }
 
 #[test]
-fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_repeats_them() {
+fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course() {
     let bench = Bench::new();
     let model = "[model]\nearly_confidence = 0.5\n";
-    let record = "[record]\ndir = \"tape\"\nkeep_free_mb = 0\n";
-    let config = bench.configure("hardnessd.toml", "events.sock", &format!("{model}{record}"));
+    let config = bench.configure("hardnessd.toml", "events.sock", model);
     let text = fs::read_to_string(&config).unwrap();
     let arm = "frame_rate_hz = 20.0\narm = { stiffness_n_per_mm = 10.0, delay_ms = 34.3 }";
     fs::write(&config, text.replace("frame_rate_hz = 20.0", arm)).unwrap();
-    let mut daemon = Daemon::start(&config);
+    let _daemon = Daemon::start(&config);
     let mut subscriber = bench.subscriber();
     let control = bench.path("control.sock");
     let control = control.to_str().unwrap();
     // At 230,400 baud a frame takes 34.3 ms.
     let _sensor = bench.sensor(&["--material", "yoga-mat", "--motion", control]);
-    let mut finals = Vec::new();
-    let mut earlies = 0;
-    while finals.len() < 2 {
+    let (mut earlies, mut finals) = (0, 0);
+    while finals < 2 {
         let verdict = subscriber.until(&json!({"type": "hardness"}));
         assert_eq!(verdict["course"], "positions", "{verdict}");
         if verdict["phase"] == "early" {
@@ -123,38 +121,8 @@ fn a_robot_that_tells_its_positions_gets_verdicts_on_the_course_and_a_replay_rep
         // mat.
         let stiffness = verdict["stiffness_n_per_mm"].as_f64();
         let is_known = stiffness.is_some_and(|n_per_mm| (0.5..60.0).contains(&n_per_mm));
-        assert!(finals.is_empty() || is_known, "{verdict}");
-        finals.push(timeless(verdict));
+        assert!(finals == 0 || is_known, "{verdict}");
+        finals += 1;
     }
     assert!(earlies >= 1);
-    daemon.end();
-
-    // A black box may be beside it, if the machine was busy.
-    let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
-    let replay = |more: &[&str]| {
-        let command = [
-            "replay",
-            tape.to_str().unwrap(),
-            "--config",
-            config.to_str().unwrap(),
-        ];
-        let (code, replayed, message) = run(&[&command[..], more].concat());
-        assert_eq!(code, 0, "{message}");
-        replayed
-    };
-    let replayed = replay(&[]);
-    assert_eq!(replayed, replay(&["--speed", "1000"]));
-    let found: Vec<Value> = events(&replayed)
-        .into_iter()
-        .filter(|event| event["type"] == "hardness" && event["phase"] == "final")
-        .take(2)
-        .collect();
-    assert_eq!(found.len(), 2);
-    for (mut found, mut live) in found.into_iter().zip(finals) {
-        // Only the live numbers count the statuses before the first state of the recording.
-        for event in [&mut found, &mut live] {
-            event.as_object_mut().unwrap().remove("seq");
-        }
-        assert_eq!(found, live);
-    }
 }

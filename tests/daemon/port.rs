@@ -197,6 +197,9 @@ fn the_user_chooses_between_two_pictures() {
     let (code, toml, stderr) = run(&[&["sniff", &path], &known[..]].concat());
     assert_eq!(code, 0, "{stderr}");
     assert!(toml.ends_with("rows = 12\ncols = 8\n"), "{toml}");
+    // A file that exists is not overwritten.
+    let (code, _, _) = run(&[&["sniff", &path, "--out", &path], &known[..]].concat());
+    assert_eq!(code, 74);
     let (code, _, stderr) = run(&["sniff", &path, "--rows", "65"]);
     assert_eq!(code, 2, "{stderr}");
     assert!(stderr.contains("expected 1 to 64"), "{stderr}");

@@ -336,22 +336,6 @@ mod tests {
     }
 
     #[test]
-    fn a_line_is_found_whatever_the_present_settings() {
-        for settings in [tare::Settings::default(), uneven()] {
-            for exponent in [1.0, 1.5] {
-                let settings = tare::Settings {
-                    exponent,
-                    ..settings.clone()
-                };
-                let fit = fit((0.031, 1.0), &[5.0, 10.0, 20.0], &settings);
-                assert!((fit.newtons_per_count - 0.031).abs() < 1e-6, "{fit:?}");
-                assert_eq!(fit.exponent, 1.0);
-                assert!(fit.line_error < 1e-6 && (fit.alone[1] - fit.alone[0]) < 1e-6);
-            }
-        }
-    }
-
-    #[test]
     fn a_power_law_is_found_where_the_weights_can_say_it() {
         for settings in [tare::Settings::default(), uneven()] {
             let found = fit((0.01, 1.4), &[2.0, 5.0, 10.0, 20.0], &settings);

@@ -353,7 +353,7 @@ fn slug(name: &str) -> String {
 /// Makes the directory if it is missing.
 fn next_number(directory: &Path) -> io::Result<u32> {
     fs::create_dir_all(directory)?;
-    let mut last = 0;
+    let mut last: u32 = 0;
     for file in fs::read_dir(directory)? {
         let name = file?.file_name();
         let number = name.to_str().and_then(|name| name.split('-').next());
