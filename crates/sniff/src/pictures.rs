@@ -43,7 +43,10 @@ impl Presses {
             return None;
         }
         let over = |share: f64| least + share * (most - least);
-        let is_strong = |frame: &usize| f64::from(activity[*frame]) > over(STRONG).max(quarter);
+        // Three standard deviations of noise above its mean: the quarter lies two thirds of one below it, and
+        // the least some three.
+        let noise = (quarter + 2.0 * (quarter - least)).min(over(0.5));
+        let is_strong = |frame: &usize| f64::from(activity[*frame]) > over(STRONG).max(noise);
         let strong: Vec<usize> = (0..activity.len()).filter(is_strong).collect();
         let moments = |press: &[usize]| -> Vec<usize> {
             let most = press
