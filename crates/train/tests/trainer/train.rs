@@ -225,6 +225,15 @@ fn a_training_that_diverges_ends_where_it_does() {
 }
 
 #[test]
+fn the_recipe_for_own_presses_is_a_model_that_the_loader_reproduces() {
+    // A logarithmic image, and means beside the greatest values.
+    let trial = Trial::of("hrn", "own-recipe", "");
+    trial.train("");
+    let hrn = Hrn::load(&trial.read("hrn.onnx")).unwrap();
+    assert_eq!(hrn.card().method, "hrn");
+}
+
+#[test]
 fn a_discriminator_learns_from_unlabelled_samples_too() {
     let mut presses = read_one(&data().1).unwrap();
     // Two presses of each object become unlabelled, so the first presses of all are.
