@@ -19,8 +19,8 @@ pub(crate) struct Check {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum What {
-    /// A checksum of everything from this place on, which is then the beginning of a frame. It is
-    /// counted from the end of the cells of the frame before.
+    /// A checksum of everything from this place on, which is the beginning of a frame, or the end of its
+    /// mark. It is counted from the end of the cells of the frame before.
     From(Checksum, usize),
     /// A checksum of the cells.
     Cells(Checksum),
@@ -80,8 +80,10 @@ fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<
                 };
                 holds(spans, sum)
             };
-            let mut begins = (at.end..=length)
-                .filter(|&start| start == length || beside[start].constant().is_some());
+            // One of two bytes or more holds by chance nowhere. Others begin with the mark, or the cells.
+            let mut begins = (at.end..=length).filter(|&start| {
+                checksum.bytes() > 1 || start == length || beside[start].constant().is_some()
+            });
             let what = begins
                 .find(|&start| holds(start, false))
                 .map(|start| What::From(checksum, start))

@@ -61,14 +61,14 @@ pub(crate) fn of(bytes: &[u8]) -> Option<Coding> {
     if is_telnet(bytes) {
         return Some(Coding::Unreadable(TELNET));
     }
-    if doubles_ff(bytes) {
-        return Some(Coding::Doubled(TELNET));
-    }
     if let Some(escaped) = ESCAPED.iter().find(|escaped| escaped.is_in(bytes)) {
         return Some(escaped.what);
     }
     if is_cobs(bytes) {
         return Some(Coding::Packed(Framing::Cobs));
+    }
+    if doubles_ff(bytes) {
+        return Some(Coding::Doubled(TELNET));
     }
     if is_too_slow(bytes) {
         return Some(Coding::Unreadable(TOO_SLOW));

@@ -217,6 +217,9 @@ impl Parts<'_> {
             .and_then(|(_, _, begin)| begin)
             .or_else(|| self.beginning());
         let mark = match check {
+            Some((checksum, at, Some(begin))) if self.constant(begin).is_none() => {
+                at + checksum.bytes()..begin
+            }
             Some((checksum, at, _)) => {
                 let end = at + checksum.bytes();
                 end..self.constant_end(begin.unwrap_or(end).max(end))
@@ -229,6 +232,11 @@ impl Parts<'_> {
         if mark.is_empty() || mark.clone().any(|at| self.constant(at).is_none()) {
             return Vec::new();
         }
+        // What is not constant follows the mark.
+        let begin = begin.map(|at| match self.constant(at) {
+            None if check.is_some() => mark.start,
+            _ => at,
+        });
         let begin = begin.filter(|at| (mark.start..=mark.end).contains(at));
         let splits = begin.into_iter().chain(mark.start..=mark.end);
         let mut tried: Vec<(Settings, bool)> = splits
@@ -296,7 +304,13 @@ impl Parts<'_> {
             stride_bytes: (self.channels > 1).then_some(self.channels * number),
             footer_bytes: (footer > 0).then_some(FooterBytes::Each(footer)),
             checksum: Some(check.map_or(Checksum::None, |(checksum, ..)| checksum)),
-            checksum_over: matches!(check, Some((_, _, None))).then_some(ChecksumOver::Cells),
+            checksum_over: match check {
+                Some((_, _, None)) => Some(ChecksumOver::Cells),
+                Some((_, _, Some(begin))) if self.constant(begin).is_none() => {
+                    Some(ChecksumOver::AfterSync)
+                }
+                _ => None,
+            },
             rows: Some(self.array.rows),
             cols: Some(self.array.cols),
             ..Settings::default()

@@ -16,6 +16,8 @@ const STRONG: f64 = 0.12;
 const PRESSES: usize = 16;
 const PICTURES: usize = 4;
 const RESTS: usize = 15;
+/// The correlation from which numbers are alike.
+const ALIKE: f64 = 0.9;
 
 impl Presses {
     /// Finds the presses by how much each frame differs from rest. `None` if nothing presses in any.
@@ -80,6 +82,11 @@ impl Presses {
     /// The frames of all presses.
     pub(crate) fn frames(&self) -> impl Iterator<Item = usize> + '_ {
         self.presses.iter().flatten().copied()
+    }
+
+    /// Some frames in which nothing presses.
+    pub(crate) fn rest(&self) -> impl Iterator<Item = usize> + '_ {
+        self.rest.iter().copied()
     }
 
     /// About `most` of the presses with one picture each, for a first look.
@@ -221,6 +228,21 @@ impl Pictures {
         let all = self.presses.iter().flatten().map(|picture| &picture.change);
         all.max_by(|a, b| energy(a).total_cmp(&energy(b)))
             .map_or(&[], Vec::as_slice)
+    }
+
+    /// Whether the numbers of a taxel are so much alike that they are taxels beside each other: the
+    /// correlation of each with the next, in the strongest picture.
+    pub(crate) fn are_alike(&self, channels: usize) -> bool {
+        let (mut both, mut first, mut second) = (0.0_f64, 0.0_f64, 0.0_f64);
+        for taxel in self.strongest().chunks_exact(channels) {
+            for pair in taxel.windows(2) {
+                let [a, b] = [pair[0], pair[1]].map(|change| f64::from(change.abs()));
+                both += a * b;
+                first += a * a;
+                second += b * b;
+            }
+        }
+        both > ALIKE * (first * second).sqrt()
     }
 
     /// The pictures of each of so many interleaved numbers.

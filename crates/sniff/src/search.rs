@@ -40,6 +40,12 @@ const RANKED: usize = 6;
 const UNCHECKED: usize = 3;
 /// The most formats at a place, and the most arrays that are looked at closely.
 const MOST_FORMATS: usize = 8;
+/// The fewest bytes that show whether bytes are parts of longer numbers.
+const FEWEST_PARTS: usize = 64;
+/// The high half of a number of 24 bits is smaller.
+const HIGH_HALF: f32 = 256.0;
+/// One of so many numbers that wraps is no damage.
+const WRAPS: usize = 1000;
 const MOST_ARRAYS: usize = 40;
 /// Where a cell is so much more like one of the next but one than like its neighbour, a taxel has several
 /// numbers, and one number for each takes so many bits more.
@@ -211,7 +217,9 @@ impl Search<'_> {
                     model::rows(&pictures, cells, 1).iter().sum::<f64>() < alone
                 };
                 if cells < 2
-                    || format.channels > 1 && !pictures.split(format.channels).all(is_picture)
+                    || format.channels > 1
+                        && (pictures.are_alike(format.channels)
+                            || !pictures.split(format.channels).all(is_picture))
                 {
                     continue;
                 }
@@ -242,6 +250,71 @@ impl Search<'_> {
         little * MANY > all && little > LITTLE * much
     }
 
+    /// Whether numbers without a sign jump by more than half of their range: at rest, or as one of several
+    /// numbers of a taxel also in a press. They have a sign then, or are the low half of a longer number.
+    fn wraps(&self, place: &Place, format: Format) -> bool {
+        let cell = match format.cell {
+            Cell::U8 | Cell::I8 => Cell::U8,
+            Cell::U16le | Cell::I16le => Cell::U16le,
+            Cell::U16be | Cell::I16be => Cell::U16be,
+            _ => return false,
+        };
+        let half = 2.0_f32.powi(8 * cell.bytes() as i32 - 1);
+        let numbers =
+            |index| numbers::numbers(cell, self.frames.from(index, place.start, place.bytes));
+        let (mut all, mut jumps) = (0, 0);
+        let mut count = |a: &[f32], b: &[f32]| {
+            all += a.len();
+            jumps += a
+                .iter()
+                .zip(b)
+                .filter(|(a, b)| (*a - *b).abs() > half)
+                .count();
+        };
+        let rest: Vec<Vec<f32>> = self.presses.rest().map(numbers).collect();
+        for pair in rest.windows(2) {
+            count(&pair[0], &pair[1]);
+        }
+        if format.channels > 1 && cell.bytes() > 1 {
+            for index in self.presses.frames() {
+                count(&numbers(index), &numbers(index - 1));
+            }
+        }
+        jumps * WRAPS > all
+    }
+
+    /// Whether numbers are parts of longer ones: of two in a row, one is nearly always small and the other
+    /// is not, or of four bytes in a row, one is the same in all.
+    fn is_part(&self, place: &Place, format: Format) -> bool {
+        let frames = || {
+            let frames = self.presses.frames();
+            frames.map(|index| self.frames.from(index, place.start, place.bytes))
+        };
+        match format.cell.bytes() {
+            1 if place.bytes >= FEWEST_PARTS => (0..4).any(|phase| {
+                let bytes = || frames().flat_map(|bytes| bytes.iter().skip(phase).step_by(4));
+                let first = bytes().next();
+                bytes().all(|byte| Some(byte) == first)
+            }),
+            2 => {
+                let (mut all, mut large) = (0, [0; 2]);
+                for bytes in frames() {
+                    for pair in numbers::numbers(format.cell, bytes).chunks_exact(2) {
+                        all += 1;
+                        for (large, &number) in large.iter_mut().zip(pair) {
+                            let wrapped = if number >= 32_768.0 { 65_536.0 } else { 0.0 };
+                            *large += usize::from((number - wrapped).abs() >= HIGH_HALF);
+                        }
+                    }
+                }
+                // At the ends, a number may be another part of the frame.
+                let is_small = large.map(|large| 50 * large < all);
+                is_small[0] != is_small[1]
+            }
+            _ => false,
+        }
+    }
+
     /// The likeliest arrays at all places.
     fn candidates(&self, places: Vec<Place>, known: Known) -> Vec<Candidate> {
         // Which formats are likely depends on where a number of four bytes begins.
@@ -251,8 +324,13 @@ impl Search<'_> {
             let formats =
                 formats[place.start % 4].get_or_insert_with(|| self.formats(&place, known));
             for &mut format in formats {
+                let is_open = known.cell.is_none();
+                let wraps = is_open && self.wraps(&place, format);
+                let has_sign = || wraps || self.has_negative(&place, format);
                 if !place.bytes.is_multiple_of(format.bytes())
-                    || is_signed(format.cell) && !self.has_negative(&place, format)
+                    || is_open && self.is_part(&place, format)
+                    || is_signed(format.cell) && !has_sign()
+                    || !is_signed(format.cell) && wraps
                 {
                     continue;
                 }
@@ -360,7 +438,15 @@ impl Search<'_> {
     ) -> Result<Found, Failure> {
         let mut ranked: Vec<Ranked> = Vec::new();
         let mut tried: Vec<(Array, Format)> = Vec::new();
-        for candidate in candidates {
+        // A checksum holds in all frames by no chance.
+        let is_checked = |candidate: &&Candidate| candidate.place.check.is_some();
+        let is_one_checked = candidates.iter().any(|candidate| is_checked(&candidate));
+        let candidates = || {
+            candidates
+                .iter()
+                .filter(|one| !is_one_checked || is_checked(one))
+        };
+        for candidate in candidates() {
             let Candidate { array, format, .. } = *candidate;
             if ranked.len() == RANKED || tried.contains(&(array, format)) {
                 continue;
@@ -390,7 +476,7 @@ impl Search<'_> {
                 let mark = parts.mark().map_or(0, |mark| mark.len());
                 score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
             } else if !known.is_complete() {
-                cells = self.other_cells(candidate, candidates);
+                cells = self.other_cells(candidate, candidates());
             }
             let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
             let alone = self.score(&candidate.place, format, array, &pictures, &alone);
@@ -410,14 +496,18 @@ impl Search<'_> {
 
     /// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
     /// cells.
-    fn other_cells(&self, best: &Candidate, candidates: &[Candidate]) -> Option<String> {
+    fn other_cells<'a>(
+        &self,
+        best: &Candidate,
+        mut candidates: impl Iterator<Item = &'a Candidate>,
+    ) -> Option<String> {
         let is_other = |other: &&Candidate| {
             other.format == best.format
                 && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
                 && !best.score.is_surely_before(&other.score)
         };
         let around = |candidate: &Candidate| self.parts(candidate, None, 0).around();
-        if let Some(other) = candidates.iter().find(is_other)
+        if let Some(other) = candidates.find(is_other)
             && let Some(((before, after), (other_before, other_after))) =
                 around(best).zip(around(other))
         {
