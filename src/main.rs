@@ -1,7 +1,8 @@
 //! The daemon's binary: arguments, log, runtime, signals, exit codes.
 
 use std::future::Future;
-use std::io::{self, IsTerminal};
+use std::io::{self, IsTerminal, Write as _};
+use std::panic;
 use std::path::PathBuf;
 use std::pin::{Pin, pin};
 use std::process::ExitCode;
@@ -32,6 +33,15 @@ fn main() -> ExitCode {
     if let Some(code) = trial::entry() {
         return code;
     }
+    // Nothing here needs memory: where there is none, a backtrace would never end.
+    panic::set_hook(Box::new(|panic| {
+        let what = panic.payload_as_str().unwrap_or("a panic");
+        let _ = match panic.location() {
+            Some(place) => writeln!(io::stderr(), "hardnessd: {what} ({place})"),
+            None => writeln!(io::stderr(), "hardnessd: {what}"),
+        };
+        std::process::abort();
+    }));
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

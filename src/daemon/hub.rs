@@ -11,7 +11,7 @@
 mod cursor;
 mod history;
 mod log;
-mod quota;
+pub(super) mod quota;
 mod subscriber;
 mod tally;
 

@@ -10,6 +10,7 @@ mod lines;
 use std::fmt;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
+use std::sync::{LazyLock, Mutex, PoisonError};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -24,6 +25,7 @@ use tracing_subscriber::{Registry, reload};
 
 use self::lines::Lines;
 use super::Error;
+use super::hub::quota::LineQuota;
 use hardnessd_core::event::{Event, LinkState, Phase, PressState, Tared, name, round_3};
 use hardnessd_core::judge::Unjudged;
 use hardnessd_core::port::Port;
@@ -205,7 +207,7 @@ pub(crate) fn is_routine(event: &Event) -> bool {
     level_of(event) == Level::DEBUG
 }
 
-/// Logs that lines of a sensor were left out.
+/// Logs that lines of a sensor were left out, or of another sender.
 pub(crate) fn left_out(sensor: &str, lines: u64) {
     warn!(
         sensor,
@@ -288,14 +290,23 @@ pub(crate) fn unjudged(unjudged: &Unjudged) {
     );
 }
 
+/// Writes a line that somebody outside can cause again and again, unless there were too many of these.
+pub(crate) fn outside(way: &str, line: impl FnOnce()) {
+    static LINES: LazyLock<Mutex<LineQuota>> = LazyLock::new(Mutex::default);
+    let mut lines = LINES.lock().unwrap_or_else(PoisonError::into_inner);
+    lines.write(way, super::now().mono, false, line);
+}
+
 /// Logs that datagrams of `other` are ignored, because `sender` sends.
 pub(crate) fn other_sender(sender: SocketAddr, other: SocketAddr) {
-    warn!(%sender, %other, "ignored: another sender sends for this sensor, and one at a time may");
+    outside("udp", || {
+        warn!(%sender, %other, "ignored: another sender sends for this sensor, and one at a time may");
+    });
 }
 
 /// Logs that the other end of a port is a telnet server, which changes some bytes.
 pub(crate) fn telnet(port: &Port) {
-    warn!(%port, "{}", hardnessd_core::wire::TELNET);
+    outside("tcp", || warn!(%port, "{}", hardnessd_core::wire::TELNET));
 }
 
 /// Logs the context that a controller reports of its work.

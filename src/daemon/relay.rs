@@ -17,6 +17,7 @@ use tracing::warn;
 use super::Error;
 use super::client;
 use super::hub::{Hub, Line};
+use super::log;
 use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
@@ -41,7 +42,10 @@ impl PositionQueue {
     #[allow(dead_code, reason = "Foxglove says nothing of an arm")]
     pub(super) fn put(&self, positions: Positions) {
         if self.positions.try_send(positions).is_err() {
-            warn!(way = self.way, "positions come too fast and are dropped");
+            let way = self.way;
+            log::outside(way, || {
+                warn!(way, "positions come too fast and are dropped");
+            });
         }
     }
 }
@@ -126,7 +130,7 @@ impl Worker {
 async fn pass_on(way: &'static str, mut positions: mpsc::Receiver<Positions>, sensors: &Sensors) {
     while let Some(Positions { sensor, points }) = positions.recv().await {
         if let Err(refused) = client::move_arm(sensors, &sensor, &points).await {
-            warn!(way, sensor, %refused, "positions refused");
+            log::outside(way, || warn!(way, sensor, %refused, "positions refused"));
         }
     }
 }

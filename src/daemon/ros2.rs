@@ -26,6 +26,7 @@ use tracing::{info, warn};
 use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line};
+use super::log;
 use super::relay::{PositionQueue, Worker};
 use super::request::motion::{Positions, ReportedPoint};
 use hardnessd_core::event::{Event, FrameEvent, Status};
@@ -217,7 +218,10 @@ async fn take_positions(
         let taken = match positions.async_take().await {
             Ok((position, _)) => position.position(),
             Err(error) => {
-                warn!(sensor, %error, "found no position on ros2");
+                log::outside(
+                    "ros2",
+                    || warn!(sensor, %error, "found no position on ros2"),
+                );
                 continue;
             }
         };
@@ -226,10 +230,12 @@ async fn take_positions(
                 sensor: sensor.clone(),
                 points: vec![point],
             }),
-            None => warn!(
-                sensor,
-                "found a position on ros2 that is no number or no time"
-            ),
+            None => log::outside("ros2", || {
+                warn!(
+                    sensor,
+                    "found a position on ros2 that is no number or no time"
+                );
+            }),
         }
     }
 }

@@ -14,10 +14,10 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
 use super::hub::Hub;
-use super::log;
 use super::own::Store;
 use super::record::SensorRecorder;
 use super::serial::Source;
+use super::{log, request};
 use crate::maybe;
 use hardnessd_core::event::{Event, Phase, Status, Tared};
 use hardnessd_core::frame::Stamp;
@@ -34,7 +34,7 @@ pub(crate) enum Command {
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
     /// Repeat the controller's context in events. The answer comes when the pipeline has the
     /// context.
-    Context(Option<Value>, oneshot::Sender<()>),
+    Context(Option<Value>, oneshot::Sender<Result<(), String>>),
     /// Take positions of the arm that the robot reports. The answer comes when they are taken.
     Motion(Vec<Point>, oneshot::Sender<Result<(), StepBack>>),
     /// Write the last minute to a file. The answer is the path of the file.
@@ -116,7 +116,8 @@ pub(crate) async fn serve(
                 Some(Command::Tare(reply)) => {
                     match take(&mut pipeline, &mut recorder, Input::Tare, super::now()) {
                         Err(Refused::Tare(refusal)) => {
-                            log::tare(pipeline.sensor().name(), &Err(refusal));
+                            let line = || log::tare(pipeline.sensor().name(), &Err(refusal));
+                            hub.log().write(pipeline.sensor().name(), super::now().mono, line);
                             let _ = reply.send(Err(refusal));
                         }
                         _ => taring = Some(reply),
@@ -124,10 +125,15 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Context(context, reply)) => {
-                    log::context(pipeline.sensor().name(), context.as_ref());
-                    let input = Input::Context(context);
-                    taken(&mut pipeline, &mut recorder, input, super::now());
-                    let _ = reply.send(());
+                    let checked = check_truth(context.as_ref(), pipeline.hrn().card().levels.len());
+                    if checked.is_ok() {
+                        let name = pipeline.sensor().name();
+                        let line = || log::context(name, context.as_ref());
+                        hub.log().write(name, super::now().mono, line);
+                        let input = Input::Context(context);
+                        taken(&mut pipeline, &mut recorder, input, super::now());
+                    }
+                    let _ = reply.send(checked);
                     continue;
                 }
                 Some(Command::Motion(points, reply)) => {
@@ -170,9 +176,10 @@ pub(crate) async fn serve(
         if std::mem::replace(&mut frames, pipeline.frame_counts().0) < frames {
             link.proven();
         }
-        answer(&mut pipeline, &mut taring);
+        answer(&mut pipeline, &hub, &mut taring);
         for failed in pipeline.unjudged() {
-            hub.log().unjudged(&failed, super::now().mono);
+            let line = || log::unjudged(&failed);
+            hub.log().write(&failed.sensor, super::now().mono, line);
             unjudged += 1;
         }
         let is_final =
@@ -210,14 +217,39 @@ fn taken(
 /// Answers the client that requested a tare, when the outcome is known.
 fn answer(
     pipeline: &mut Pipeline,
+    hub: &Hub,
     taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
 ) {
     if let Some(outcome) = pipeline.retared() {
-        log::tare(pipeline.sensor().name(), &outcome);
+        let line = || log::tare(pipeline.sensor().name(), &outcome);
+        hub.log()
+            .write(pipeline.sensor().name(), super::now().mono, line);
         if let Some(reply) = taring.take() {
             // The client may have gone.
             let _ = reply.send(outcome);
         }
+    }
+}
+
+/// Checks the keys of a context that say what is pressed, for a model with so many levels.
+fn check_truth(context: Option<&Value>, levels: usize) -> Result<(), String> {
+    let Some(context) = context else {
+        return Ok(());
+    };
+    let is_level = |level: &Value| {
+        level
+            .as_u64()
+            .is_some_and(|level| (1..=levels as u64).contains(&level))
+    };
+    if let Some(found) = context.get("object").filter(|found| !found.is_string()) {
+        return Err(request::unusable("context.object", found, "a text"));
+    }
+    match context.get("level").filter(|found| !is_level(found)) {
+        Some(found) => {
+            let expected = format!("a level of the model: 1 to {levels}");
+            Err(request::unusable("context.level", found, &expected))
+        }
+        None => Ok(()),
     }
 }
 
@@ -240,4 +272,45 @@ pub(super) fn state(pipeline: &Pipeline, unjudged: u64) -> SensorState {
 /// The moment of a time of CLOCK_MONOTONIC, which is also the runtime's clock.
 fn moment(mono: Duration) -> Instant {
     Instant::now() + mono.saturating_sub(super::now().mono)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn the_truth_in_a_context_is_a_text_and_a_level_of_the_model() {
+        for (context, expected) in [
+            (json!({"object": "cup", "level": 4, "tag": 5}), None),
+            (
+                json!({"object": 5}),
+                Some("context.object: found 5, expected a text"),
+            ),
+            (
+                json!({"object": null}),
+                Some("context.object: found null, expected a text"),
+            ),
+            (
+                json!({"level": 0}),
+                Some("context.level: found 0, expected a level of the model: 1 to 4"),
+            ),
+            (
+                json!({"level": 5}),
+                Some("context.level: found 5, expected a level of the model: 1 to 4"),
+            ),
+            (
+                json!({"level": 1.5}),
+                Some("context.level: found 1.5, expected a level of the model: 1 to 4"),
+            ),
+            (
+                json!({"level": "2"}),
+                Some("context.level: found \"2\", expected a level of the model: 1 to 4"),
+            ),
+        ] {
+            let error = check_truth(Some(&context), 4).err();
+            assert_eq!(error.as_deref(), expected, "{context}");
+        }
+    }
 }

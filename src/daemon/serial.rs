@@ -59,6 +59,9 @@ const MOST_BYTES: f64 = 4.0;
 const BYTES_AT_ONCE: Duration = Duration::from_secs(5);
 /// The pause after each read of bytes that are not passed on.
 const OVERFLOW_PAUSE: Duration = Duration::from_millis(1);
+/// How often bytes that are not passed on are reported, so that a sensor that floods is not stale. This is
+/// also at most a third of the stale time.
+const REPORT_EVERY: Duration = Duration::from_millis(25);
 
 /// How often the settings of a serial line are compared while its sensor is stale.
 const COMPARE_EVERY: Duration = Duration::from_secs(1);
@@ -207,6 +210,8 @@ pub(crate) struct Link {
     allowance: Allowance,
     /// The number of bytes that were not passed on and not reported yet.
     skipped: u64,
+    /// From then on, they are reported.
+    report_at: Instant,
 }
 
 #[derive(Debug)]
@@ -264,6 +269,7 @@ impl Link {
             buffer: vec![0; bytes].into(),
             allowance: Allowance::default(),
             skipped: 0,
+            report_at: Instant::now(),
         }
     }
 
@@ -324,7 +330,12 @@ impl Link {
                             if !self.allowance.allows(at, time, BYTES_AT_ONCE) {
                                 self.skipped = (self.skipped + read as u64).min(u32::MAX.into());
                                 open.read_at = Some(now + OVERFLOW_PAUSE);
-                                continue;
+                                if now < self.report_at {
+                                    continue;
+                                }
+                                let every = REPORT_EVERY.min(self.settings.stale_after / 3);
+                                self.report_at = now + every;
+                                return Input::Skipped(std::mem::take(&mut self.skipped));
                             }
                             open.held = 0..read;
                             match std::mem::take(&mut self.skipped) {

@@ -5,7 +5,7 @@
 
 use std::fs::{self, DirBuilder, Permissions};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::{DirBuilderExt, FileTypeExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::UnixListener as StdListener;
 use std::path::{Path, PathBuf};
 
@@ -30,7 +30,12 @@ const BACKLOG: i32 = 4096;
 pub(crate) struct Socket {
     listener: UnixListener,
     path: PathBuf,
+    /// A file that another process put in the place of ours is not ours to remove.
+    identity: Identity,
 }
+
+/// The device and the inode of a file.
+type Identity = (u64, u64);
 
 impl Socket {
     /// Listens at `path`. A socket at which nobody listens is replaced. The file has `mode` and `group`
@@ -57,6 +62,7 @@ impl Socket {
         Ok(Self {
             listener: listen(path, mode, group).map_err(place.failed("listen"))?,
             path: path.to_owned(),
+            identity: identity(path).map_err(place.failed("find"))?,
         })
     }
 
@@ -76,7 +82,9 @@ impl Listener for Socket {
 
 impl Drop for Socket {
     fn drop(&mut self) {
-        let _ = fs::remove_file(&self.path);
+        if identity(&self.path).ok() == Some(self.identity) {
+            let _ = fs::remove_file(&self.path);
+        }
     }
 }
 
@@ -192,4 +200,27 @@ pub(crate) fn group(name: &str) -> Option<Gid> {
 fn socket() -> rustix::io::Result<OwnedFd> {
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
     rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)
+}
+
+fn identity(path: &Path) -> io::Result<Identity> {
+    let file = fs::symlink_metadata(path)?;
+    Ok((file.dev(), file.ino()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_file_that_another_process_put_in_its_place_stays() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("events.sock");
+        drop(Socket::bind("key", &path, 0o600, None).unwrap());
+        assert!(!path.exists());
+        let ours = Socket::bind("key", &path, 0o600, None).unwrap();
+        fs::rename(&path, directory.path().join("moved")).unwrap();
+        let _theirs = StdListener::bind(&path).unwrap();
+        drop(ours);
+        assert!(path.exists());
+    }
 }

@@ -24,6 +24,7 @@ use zenoh::{Session, Wait};
 use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
+use super::log;
 use super::relay::{PositionQueue, Worker};
 use super::request::{self, Request};
 use hardnessd_core::event::{self, Kind, Reply};
@@ -189,13 +190,20 @@ fn take_positions(sample: &Sample, queue: &PositionQueue) {
     let key = sample.key_expr();
     let bytes = sample.payload().to_bytes();
     if bytes.len() > LONGEST_VALUE_BYTES {
-        warn!(%key, "found {} bytes on zenoh, expected {LONGEST_VALUE_BYTES} at most", bytes.len());
+        let found = bytes.len();
+        log::outside("zenoh", || {
+            warn!(%key, "found {found} bytes on zenoh, expected {LONGEST_VALUE_BYTES} at most");
+        });
         return;
     }
     match request::parse(&bytes).request {
         Ok(Request::Motion(positions)) => queue.put(positions),
-        Ok(_) => warn!(%key, "found another request on zenoh, expected motion"),
-        Err(unusable) => warn!(%key, %unusable, "positions refused"),
+        Ok(_) => log::outside("zenoh", || {
+            warn!(%key, "found another request on zenoh, expected motion");
+        }),
+        Err(unusable) => log::outside("zenoh", || {
+            warn!(%key, %unusable, "positions refused");
+        }),
     }
 }
 

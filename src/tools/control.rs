@@ -30,7 +30,7 @@ pub struct Context {
     #[command(flatten)]
     target: Target,
     /// What presses and verdicts repeat from now on, such as tag=pick-17 or speed_mm_s=5. A value that is JSON
-    /// is sent as JSON, any other as text. Without any, the context is removed
+    /// is sent as JSON, any other as text. `level` may be the label of a level. Without any, the context is removed
     #[arg(value_name = "KEY=VALUE", value_parser = pair)]
     pairs: Vec<(String, Value)>,
 }
@@ -46,12 +46,13 @@ pub enum Command {
     Blackbox(Target),
 }
 
-/// Reads `KEY=VALUE`. A value that is JSON is taken as JSON, any other as text.
+/// Reads `KEY=VALUE`. A value that is JSON is taken as JSON, any other as text, and that of `object` always.
 fn pair(text: &str) -> Result<(String, Value), &'static str> {
     match text.split_once('=') {
         Some((key, value)) if !key.is_empty() => {
-            let value = serde_json::from_str(value).unwrap_or_else(|_| value.into());
-            Ok((key.to_owned(), value))
+            let json: Option<Value> = serde_json::from_str(value).ok();
+            let json = json.filter(|json| key != "object" || json.is_string());
+            Ok((key.to_owned(), json.unwrap_or_else(|| value.into())))
         }
         _ => Err("expected KEY=VALUE, such as tag=pick-17"),
     }
@@ -66,22 +67,27 @@ const ANSWER: Duration = Duration::from_secs(60);
 ///
 /// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
 pub async fn run(command: Command) -> Result<(), Failure> {
-    let (target, request) = match command {
+    let answer = match command {
         Command::Tare(target) => {
             let request = json!({"tare": target.sensor, "id": 1});
-            (target, request)
+            ask(target.socket, &request).await?
         }
         Command::Blackbox(target) => {
             let request = json!({"blackbox": target.sensor, "id": 1});
-            (target, request)
+            ask(target.socket, &request).await?
         }
         Command::Context(Context { target, pairs }) => {
+            let mut daemon = connect::control(target.socket).await?;
+            let hello: Value = serde_json::from_str(&daemon.next().await?).unwrap_or_default();
             let mut context: Map<String, Value> = pairs.into_iter().collect();
-            context.insert("sensor".to_owned(), target.sensor.clone().into());
-            (target, json!({"context": context, "id": 1}))
+            context.insert("sensor".to_owned(), target.sensor.into());
+            if let Some(level) = context.get_mut("level") {
+                name_level(level, &hello["model"]["levels"]);
+            }
+            exchange(&mut daemon, &json!({"context": context, "id": 1})).await?
         }
     };
-    let line = in_words(&ask(target.socket, &request).await?) + "\n";
+    let line = in_words(&answer) + "\n";
     super::print(line.as_bytes())?;
     Ok(())
 }
@@ -93,9 +99,20 @@ pub async fn run(command: Command) -> Result<(), Failure> {
 ///
 /// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
 pub(super) async fn ask(socket: Option<PathBuf>, request: &Value) -> Result<Value, Failure> {
-    let mut daemon = connect::control(socket).await?;
+    exchange(&mut connect::control(socket).await?, request).await
+}
+
+/// Replaces the label of one of the `levels` of a `hello` by its number.
+fn name_level(level: &mut Value, levels: &Value) {
+    let mut levels = levels.as_array().into_iter().flatten();
+    if let Some(named) = levels.find(|one| one["label"] == *level) {
+        *level = named["level"].clone();
+    }
+}
+
+async fn exchange(daemon: &mut Connection, request: &Value) -> Result<Value, Failure> {
     daemon.send(&request.to_string()).await?;
-    let answer = tokio::time::timeout(ANSWER, answer(&mut daemon)).await;
+    let answer = tokio::time::timeout(ANSWER, answer(daemon)).await;
     let mute = |_| Failure::new(FAILED, format!("no answer within {} s", ANSWER.as_secs()));
     let answer = answer.map_err(mute)??;
     if answer["type"] == "error" {
@@ -145,9 +162,25 @@ mod tests {
             ("at=[1,2]", json!([1, 2])),
             ("formula=a=b", json!("a=b")),
             ("empty=", json!("")),
+            ("object=5", json!("5")),
+            ("object=\"a b\"", json!("a b")),
         ] {
             assert_eq!(pair(text).unwrap().1, value, "{text}");
         }
         assert!(pair("=5").is_err() && pair("tag").is_err());
+    }
+
+    #[test]
+    fn a_level_may_be_named_by_its_label() {
+        let levels = json!([{"level": 1, "label": "hard"}, {"level": 2, "label": "firm"}]);
+        for (level, named) in [
+            (json!("firm"), json!(2)),
+            (json!(1), json!(1)),
+            (json!("2"), json!("2")),
+        ] {
+            let mut level = level;
+            name_level(&mut level, &levels);
+            assert_eq!(level, named);
+        }
     }
 }

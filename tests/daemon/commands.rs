@@ -7,6 +7,20 @@ use crate::bench::{BINARY, Bench, events, fails, on_a_terminal, run};
 use serde_json::{Value, json};
 
 #[test]
+fn without_memory_a_command_ends_and_prints_no_backtrace() {
+    let bench = Bench::new();
+    let config = bench.configure("hardnessd.toml", "events.sock", "");
+    for kib in (44_000..=60_000).step_by(2_000) {
+        let mut command = Command::new("sh");
+        let line = format!("ulimit -v {kib} && exec \"$0\" check --config \"$1\"");
+        command.args(["-c", &line, BINARY, config.to_str().unwrap()]);
+        let output = command.output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(!stderr.contains("panicked at"), "{kib} KiB: {stderr}");
+    }
+}
+
+#[test]
 fn check_warns_of_what_the_model_or_the_film_does_not_know() {
     let bench = Bench::new();
     let config = bench.path("odd.toml");
@@ -52,12 +66,12 @@ fn the_control_socket_has_commands_of_its_own() {
     let blackbox = [&["blackbox", "forearm"][..], &socket].concat();
     fails(&blackbox, 1, &["[record]"]);
     let control = |arguments: &[&str]| run(&[arguments, &socket].concat());
-    let (code, printed, _) = control(&["context", "forearm", "tag=pick-17", "speed_mm_s=5.5"]);
+    let (code, printed, _) = control(&["context", "forearm", "object=7", "level=firm"]);
     assert_eq!((code, printed.as_str()), (0, "done\n"));
     let _sensor = bench.sensor(&[]);
     let mut subscriber = bench.subscriber();
     let begun = subscriber.until(&json!({"type": "press", "state": "begin"}));
-    let context = json!({"sensor": "forearm", "tag": "pick-17", "speed_mm_s": 5.5});
+    let context = json!({"sensor": "forearm", "object": "7", "level": 2});
     assert_eq!(begun["context"], context);
     subscriber.until(&json!({"phase": "final"}));
     let (code, tared, message) = control(&["tare", "forearm"]);

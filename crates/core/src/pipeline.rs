@@ -208,7 +208,7 @@ impl Pipeline {
     fn opened(&mut self, at: Stamp) -> Vec<Event> {
         self.decoder.restart();
         self.chunks.clear();
-        self.link.opened(at.mono, self.decoder.received());
+        self.link.opened(at.mono);
         if self.link.was_lost() {
             return Vec::new();
         }
@@ -225,17 +225,24 @@ impl Pipeline {
         let mut events = self.tick(at);
         self.hold(bytes, at);
         self.link.last_bytes = Some(at.mono);
+        self.link.unframed = self.link.unframed.saturating_add(bytes.len() as u64);
         self.drain(at.mono, &mut events);
+        events.extend(self.renewed(at));
         events
     }
 
     /// Bytes came that nobody reads.
     fn skip(&mut self, bytes: u64, at: Stamp) -> Vec<Event> {
+        self.link.skipped(at.mono);
+        self.pace.skipped(at.mono);
         let mut events = self.tick(at);
         self.settle(at, &mut events);
         self.decoder.restart();
         self.decoder.skip(bytes);
         self.chunks.clear();
+        if self.link.is_live() {
+            events.extend(self.status_if_changed(at));
+        }
         events
     }
 
@@ -330,7 +337,7 @@ impl Pipeline {
                     if self.is_within_pace(stamp) {
                         self.take_frame(&frame, stamp, events);
                     } else {
-                        self.link.dropped(stamp);
+                        self.link.came(stamp);
                         events.extend(self.status_if_changed(stamp));
                     }
                 }

@@ -94,7 +94,7 @@ pub(in crate::daemon) async fn set_context(
     Context { sensor, context }: Context,
 ) -> Result<(), Refused> {
     let command = |reply| Command::Context(context, reply);
-    ask(sensors, "context.sensor", &sensor, command).await
+    ask(sensors, "context.sensor", &sensor, command).await?
 }
 
 /// Passes positions of the arm on to the task of `sensor`, which also records them. Positions from

@@ -48,7 +48,7 @@ pub(super) struct Cursor {
     /// Of each kind, the number of the first event since which it missed none.
     begun: Place,
     /// Of each kind, events that it had before a `since`, which does not give them again.
-    had: [Range<u64>; Kind::ALL.len()],
+    had: [Vec<Range<u64>>; Kind::ALL.len()],
     /// How many events the subscriber may be behind.
     allowed: u64,
     /// The events that it has missed since its last line. `None`: an unknown number.
@@ -125,7 +125,9 @@ impl Cursor {
 
     /// Whether the subscriber had this entry before a `since`.
     pub(super) fn has_had(&self, entry: &Entry) -> bool {
-        self.had[entry.kind as usize].contains(&entry.before.of(entry.kind))
+        let number = entry.before.of(entry.kind);
+        let mut had = self.had[entry.kind as usize].iter();
+        had.any(|had| had.contains(&number))
     }
 
     /// Passes `entry`, which the subscriber gets or has had. What it has missed before is lost.
@@ -139,6 +141,9 @@ impl Cursor {
         let missed = self.between(Place::default(), place);
         if missed > 0 {
             self.lost = self.lost.map(|lost| lost + missed);
+            Kind::NUMBERED
+                .into_iter()
+                .for_each(|kind| self.note_had(kind));
             self.begun = place;
         }
         for (next, place) in self.next.0.iter_mut().zip(place.0) {
@@ -180,18 +185,32 @@ impl Cursor {
     }
 
     fn note_had(&mut self, kind: Kind) {
-        let had = self.begun.of(kind)..self.next.of(kind);
-        if !had.is_empty() {
-            self.had[kind as usize] = had;
+        let mut had = self.begun.of(kind)..self.next.of(kind);
+        if !self.wants_kind(kind) || had.is_empty() {
+            return;
+        }
+        let ranges = &mut self.had[kind as usize];
+        ranges.retain(|other| {
+            let is_apart = other.end < had.start || had.end < other.start;
+            if !is_apart {
+                had = had.start.min(other.start)..had.end.max(other.end);
+            }
+            is_apart
+        });
+        ranges.push(had);
+    }
+
+    /// Forgets what the subscriber had before `oldest`, because nothing can give it again.
+    pub(super) fn forget_had(&mut self, oldest: Place) {
+        for kind in Kind::NUMBERED {
+            self.had[kind as usize].retain(|had| had.end > oldest.of(kind));
         }
     }
 
     /// Goes back to `place`, for numbered events. Frames go on where they are.
     pub(super) fn go_back(&mut self, place: Place, lost: Option<u64>, end: Place) {
         for kind in Kind::NUMBERED {
-            if self.wants_kind(kind) {
-                self.note_had(kind);
-            }
+            self.note_had(kind);
             self.next.0[kind as usize] = place.of(kind);
         }
         (self.begun, self.lost) = (place, lost);

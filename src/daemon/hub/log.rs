@@ -16,7 +16,6 @@ use crate::daemon::request::{Since, Subscription};
 use crate::daemon::sensor::SensorState;
 use crate::daemon::{log, now};
 use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply};
-use hardnessd_core::judge::Unjudged;
 
 /// The number of numbered events that are held for `since` (`docs/controller.md`).
 pub(super) const HELD: usize = 4096;
@@ -239,11 +238,9 @@ impl Log {
         });
     }
 
-    /// Logs that the model failed on a press.
-    pub(crate) fn unjudged(&mut self, failed: &Unjudged, now: Duration) {
-        let sensor = failed.sensor.as_str();
+    /// Writes a line about a sensor into the log of the daemon, unless that sensor has too many.
+    pub(crate) fn write(&mut self, sensor: &str, now: Duration, line: impl FnOnce()) {
         let of_sensor = self.sensors.entry(sensor.into()).or_default();
-        let line = || log::unjudged(failed);
         of_sensor.lines.write(sensor, now, false, line);
     }
 
@@ -405,6 +402,7 @@ impl Log {
         if cursor.has_all(end) {
             return Vec::new();
         }
+        cursor.forget_had(self.events.front().map_or(end, |entry| entry.before));
         let held = [&self.events, &self.frames].into_iter();
         let ahead = held.flat_map(|held| {
             let first = held.partition_point(|entry| cursor.has_passed(entry));

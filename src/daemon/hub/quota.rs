@@ -1,4 +1,4 @@
-//! How many lines of one sensor the log gets: fewer than 50 in a minute.
+//! How many lines of one sensor the log gets, or of all that is no sensor: fewer than 50 in a minute.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ const REPORT_EVERY: Duration = Duration::from_secs(60);
 
 /// The lines of one sensor in the log.
 #[derive(Debug, Default)]
-pub(super) struct LineQuota {
+pub(in crate::daemon) struct LineQuota {
     allowance: Allowance,
     /// The number of lines that were left out and not reported yet, and when the first one was.
     left_out: Option<(u64, Duration)>,
@@ -23,7 +23,7 @@ pub(super) struct LineQuota {
 impl LineQuota {
     /// Writes a line of `sensor`, unless there were too many. A line that is only for the level `debug`
     /// does not count.
-    pub(super) fn write(
+    pub(in crate::daemon) fn write(
         &mut self,
         sensor: &str,
         now: Duration,

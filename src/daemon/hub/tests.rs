@@ -119,20 +119,26 @@ impl Log {
     fn drain(&mut self, id: u64) -> Vec<String> {
         let mut drained = Vec::new();
         loop {
-            let lines = self.read(id);
+            let lines = self.lines(id);
             if lines.is_empty() {
                 return drained;
             }
-            drained.extend(lines.iter().map(|line| {
-                let event: Value = serde_json::from_str(line.json()).unwrap();
-                let number = match event["type"].as_str().unwrap() {
-                    "gap" => &event["lost"],
-                    "frame" => &event["frame"],
-                    _ => &event["seq"],
-                };
-                format!("{}:{number}", event["type"].as_str().unwrap())
-            }));
+            drained.extend(lines);
         }
+    }
+
+    /// The next batch of these lines.
+    fn lines(&mut self, id: u64) -> Vec<String> {
+        let lines = self.read(id).into_iter().map(|line| {
+            let event: Value = serde_json::from_str(line.json()).unwrap();
+            let number = match event["type"].as_str().unwrap() {
+                "gap" => &event["lost"],
+                "frame" => &event["frame"],
+                _ => &event["seq"],
+            };
+            format!("{}:{number}", event["type"].as_str().unwrap())
+        });
+        lines.collect()
     }
 }
 
@@ -256,6 +262,36 @@ fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
         log.drain(id),
         ["press:8", "press:9", "press:10", "press:12", "press:13"]
     );
+}
+
+#[test]
+fn a_second_since_before_the_end_of_the_first_gives_nothing_twice() {
+    let mut log = log();
+    let since = |log: &mut Log, id| {
+        log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
+            .unwrap();
+    };
+    // A batch holds fewer.
+    for _ in 0..600 {
+        log.publish_now(press("a"));
+    }
+    let id = log.joins(&Subscription::default());
+    log.publish_now(press("a"));
+    assert_eq!(log.drain(id), ["press:601"]);
+    since(&mut log, id);
+    let mut lines = log.lines(id);
+    assert!((1..600).contains(&lines.len()), "{}", lines.len());
+    since(&mut log, id);
+    lines.extend(log.drain(id));
+    assert_eq!(lines, numbers("press", 1..=600));
+    // What came after a gap and before it is not given again either.
+    for _ in 0..2 * QUEUE {
+        log.publish_now(press("a"));
+    }
+    let lines = log.drain(id);
+    assert_eq!(lines.len() as u64, 1 + QUEUE);
+    since(&mut log, id);
+    assert_eq!(log.drain(id), numbers("press", 602..=601 + QUEUE));
 }
 
 #[test]
@@ -493,4 +529,14 @@ fn a_sensor_that_floods_takes_no_place_from_the_others() {
         assert!(after.into_iter().all(|seq| got.contains(seq)));
         assert_eq!(got.len() as u64 + lost(&lines), 20 * 901 - since, "{since}");
     }
+}
+
+#[test]
+fn lines_about_a_sensor_have_one_allowance() {
+    let mut log = log();
+    let mut written = 0;
+    for ms in 0..60_000 {
+        log.write("a", Duration::from_millis(ms), || written += 1);
+    }
+    assert!((40..50).contains(&written), "{written}");
 }

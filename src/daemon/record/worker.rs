@@ -13,7 +13,7 @@ use tracing::{info, warn};
 
 use super::file::{MB, Open, blackboxes, create, has_room};
 use super::{Job, Load, MOST_BLACKBOX_MB, MOST_BLACKBOXES, Progress, Target};
-use crate::daemon::{Error, config};
+use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, LinkState, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Input;
@@ -365,7 +365,9 @@ impl Worker {
             Ok(path)
         };
         let path = written().map_err(|error| error.to_string())?;
-        info!(sensor = name, reason, path = %path.display(), "black box");
+        log::outside("black box", || {
+            info!(sensor = name, reason, path = %path.display(), "black box");
+        });
         Ok(path)
     }
 

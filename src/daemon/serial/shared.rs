@@ -24,8 +24,11 @@ const LEAST_TIMEOUT: Duration = Duration::from_millis(30);
 const MOST_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// After a request without an answer, no module that is silent is asked for this time. So silent modules
-/// take less than half of the time of the others.
+/// take less than half of the time of the others, however many they are.
 const REST: Duration = Duration::from_millis(150);
+/// The module itself rests twice as long after each further request without an answer, up to this time. So
+/// one that is silent for good takes a twentieth.
+const LONGEST_REST: Duration = Duration::from_secs(2);
 
 /// A sensor's share of a port.
 #[derive(Debug)]
@@ -73,8 +76,8 @@ struct Ask {
     on_the_line: Duration,
     /// How long an answer took of late.
     slowest: Option<Duration>,
-    /// Whether the last request had no answer.
-    is_silent: bool,
+    /// The last rest, if the last request had no answer.
+    rest: Option<Duration>,
 }
 
 /// Who is asked, and until when the answer may come.
@@ -107,40 +110,7 @@ pub(super) fn share(link: Link, settings: &[Settings]) -> Vec<Share> {
     let (ending, ended) = watch::channel(());
     let (members, inputs): (Vec<_>, Vec<_>) =
         settings.iter().map(|_| mpsc::channel(INPUTS)).unzip();
-    let now = Instant::now();
-    let mut asks: Vec<Ask> = Vec::new();
-    let mut listeners = Vec::new();
-    for (index, settings) in settings.iter().enumerate() {
-        let Some((request, every)) = &settings.request else {
-            listeners.push(index);
-            continue;
-        };
-        match asks.iter_mut().find(|ask| ask.request == *request) {
-            Some(ask) => {
-                ask.every = ask.every.min(*every);
-                ask.members.push(index);
-            }
-            None => asks.push(Ask {
-                request: request.clone(),
-                every: *every,
-                members: vec![index],
-                due: now,
-                on_the_line: settings.on_the_line,
-                slowest: None,
-                is_silent: false,
-            }),
-        }
-    }
-    let owner = Owner {
-        link,
-        members,
-        asks,
-        listeners,
-        asking: None,
-        last: None,
-        is_open: false,
-        may_try: now,
-    };
+    let owner = Owner::new(link, members, settings, Instant::now());
     tokio::spawn(async move {
         owner.serve(frames_in).await;
         drop(ending);
@@ -157,6 +127,47 @@ pub(super) fn share(link: Link, settings: &[Settings]) -> Vec<Share> {
 }
 
 impl Owner {
+    fn new(
+        link: Link,
+        members: Vec<mpsc::Sender<Input>>,
+        settings: &[Settings],
+        now: Instant,
+    ) -> Self {
+        let mut asks: Vec<Ask> = Vec::new();
+        let mut listeners = Vec::new();
+        for (index, settings) in settings.iter().enumerate() {
+            let Some((request, every)) = &settings.request else {
+                listeners.push(index);
+                continue;
+            };
+            match asks.iter_mut().find(|ask| ask.request == *request) {
+                Some(ask) => {
+                    ask.every = ask.every.min(*every);
+                    ask.members.push(index);
+                }
+                None => asks.push(Ask {
+                    request: request.clone(),
+                    every: *every,
+                    members: vec![index],
+                    due: now,
+                    on_the_line: settings.on_the_line,
+                    slowest: None,
+                    rest: None,
+                }),
+            }
+        }
+        Self {
+            link,
+            members,
+            asks,
+            listeners,
+            asking: None,
+            last: None,
+            is_open: false,
+            may_try: now,
+        }
+    }
+
     async fn serve(mut self, mut frames: mpsc::Receiver<usize>) {
         loop {
             let due = self.due();
@@ -167,7 +178,7 @@ impl Owner {
                         return;
                     };
                     self.link.proven();
-                    self.answered(member);
+                    self.answered(member, Instant::now());
                     continue;
                 }
                 () = maybe::until(due) => {
@@ -198,9 +209,9 @@ impl Owner {
 
     /// When there is something to do.
     fn due(&self) -> Option<Instant> {
-        let due = |ask: &Ask| match ask.is_silent {
-            true => ask.due.max(self.may_try),
-            false => ask.due,
+        let due = |ask: &Ask| match ask.rest {
+            Some(_) => ask.due.max(self.may_try),
+            None => ask.due,
         };
         match self.asking {
             _ if !self.is_open => None,
@@ -210,15 +221,17 @@ impl Owner {
     }
 
     /// A frame of a member came.
-    fn answered(&mut self, member: usize) {
+    fn answered(&mut self, member: usize, now: Instant) {
         let mut asks = self.asks.iter_mut().enumerate();
         let Some((index, ask)) = asks.find(|(_, ask)| ask.members.contains(&member)) else {
             return;
         };
         // Whoever sends is not silent, even if it is late.
-        ask.is_silent = false;
+        if ask.rest.take().is_some() {
+            ask.due = now;
+        }
         if let Some(asking) = self.asking.filter(|asking| asking.ask == index) {
-            let took = asking.since.elapsed();
+            let took = now.saturating_duration_since(asking.since);
             ask.slowest = Some(ask.slowest.unwrap_or_default().mul_f64(0.95).max(took));
             self.asking = None;
         }
@@ -227,13 +240,16 @@ impl Owner {
     /// Ends the wait for an answer, or asks the next one.
     fn ask(&mut self, now: Instant) {
         if let Some(asking) = self.asking.take() {
-            self.asks[asking.ask].is_silent = true;
+            let ask = &mut self.asks[asking.ask];
+            let rest = ask.rest.map_or(REST, |rest| LONGEST_REST.min(2 * rest));
+            ask.rest = Some(rest);
+            ask.due = now + rest;
             self.may_try = now + REST;
         }
         let may_try = self.may_try <= now;
         let asks = self.asks.iter_mut().enumerate();
         let next = asks
-            .filter(|(_, ask)| ask.due <= now && (may_try || !ask.is_silent))
+            .filter(|(_, ask)| ask.due <= now && (may_try || ask.rest.is_none()))
             .min_by_key(|(_, ask)| ask.due);
         let Some((index, ask)) = next else {
             return;
@@ -249,5 +265,45 @@ impl Owner {
             since: now,
             until: now + timeout,
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hardnessd_core::sensor::{Description, Sensor};
+
+    #[test]
+    fn a_module_that_is_silent_for_good_takes_a_twentieth_of_the_others_time() {
+        let settings = |request: &[u8]| {
+            let mut described = Description::default();
+            described.sensor.frame_rate_hz = 50.0;
+            described.sensor.port = "tcp://localhost:1".parse().unwrap();
+            Settings {
+                request: Some((request.to_vec(), Duration::from_millis(20))),
+                ..Settings::of(&Sensor::new(described).unwrap())
+            }
+        };
+        let both = [settings(b"1"), settings(b"2")];
+        let begin = Instant::now();
+        let port = "tcp://localhost:1".parse().unwrap();
+        let link = Link::new(&port, 115_200, both[0].clone());
+        let (member, _inputs) = mpsc::channel(INPUTS);
+        let mut owner = Owner::new(link, vec![member.clone(), member], &both, begin);
+        owner.is_open = true;
+        // The first module answers within 2 ms. The second one is silent, and answers once at the end.
+        let (mut answers, mut now) = (0, begin);
+        while now < begin + Duration::from_secs(30) {
+            now = now.max(owner.due().unwrap());
+            owner.ask(now);
+            if owner.asking.is_some_and(|asking| asking.ask == 0) {
+                now += Duration::from_millis(2);
+                owner.answered(0, now);
+                answers += 1;
+            }
+        }
+        assert!((1400..=1500).contains(&answers), "{answers}");
+        owner.answered(1, now);
+        assert!(owner.asks[1].rest.is_none() && owner.asks[1].due <= now);
     }
 }

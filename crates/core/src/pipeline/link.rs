@@ -15,6 +15,12 @@ use crate::tare::{Aim, Touch, TouchKind};
 /// the header of the next one is then whole.
 const PAUSE_PERIODS: f64 = 0.5;
 
+/// After the last frame of a live sensor, bytes that are not read keep it from being stale for this time.
+const SKIPPING: Duration = Duration::from_secs(10);
+
+/// A changed reason of a silent sensor is published at most so often.
+const RENEWED_EVERY: Duration = Duration::from_secs(10);
+
 /// The number of frames over which the frame rate is measured.
 pub(super) const RATE_FRAMES: usize = 32;
 
@@ -29,6 +35,12 @@ pub(super) struct Link {
     /// When the last bytes came that are not settled.
     pub(super) last_bytes: Option<Duration>,
     pub(super) last_frame: Option<Stamp>,
+    /// The number of bytes since the last frame, or since the port was opened.
+    #[serde(default)]
+    pub(super) unframed: u64,
+    /// When the reason of a silence was last renewed.
+    #[serde(default)]
+    renewed: Option<Duration>,
     /// State and reason of the last published status, and the kind of a touch.
     published: (LinkState, Option<String>, Option<TouchKind>),
 }
@@ -38,14 +50,12 @@ pub(super) struct Link {
 enum Port {
     /// The port is not open. The reason is that of the last try, or of the loss.
     Closed { reason: Option<String> },
-    /// The port has been open since then, and no frame has come yet. `received` is the number of bytes
-    /// that came before.
-    Opened { since: Duration, received: u64 },
-    /// The last frame came at this time.
+    /// The port has been open since then, and no frame has come yet.
+    Opened { since: Duration },
+    /// The last frame came at this time, or the last bytes that were skipped.
     Live { since: Duration },
-    /// The port is open, and no first frame came in time. `received` is the number of bytes that came
-    /// before it was opened.
-    Silent { received: u64 },
+    /// The port is open, and no first frame came in time.
+    Silent,
     /// The port is open, and silent after its last frame.
     Stale,
 }
@@ -59,6 +69,8 @@ impl Link {
             recent: VecDeque::with_capacity(RATE_FRAMES),
             last_bytes: None,
             last_frame: None,
+            unframed: 0,
+            renewed: None,
             published: (LinkState::Connecting, None, None),
         }
     }
@@ -71,11 +83,12 @@ impl Link {
         matches!(self.port, Port::Live { .. })
     }
 
-    /// The port is open. `received` is the number of bytes that came before.
-    pub(super) fn opened(&mut self, since: Duration, received: u64) {
+    /// The port is open.
+    pub(super) fn opened(&mut self, since: Duration) {
         self.last_bytes = None;
+        self.unframed = 0;
         if matches!(self.port, Port::Closed { .. }) {
-            self.port = Port::Opened { since, received };
+            self.port = Port::Opened { since };
         }
     }
 
@@ -86,10 +99,16 @@ impl Link {
         }
     }
 
-    /// A frame came. Returns when the one before it came.
+    /// A frame came, and was taken. Returns when the one before it came.
     pub(super) fn frame(&mut self, stamp: Stamp) -> Option<Stamp> {
+        self.came(stamp);
+        self.last_frame.replace(stamp)
+    }
+
+    /// A frame came. If it is dropped, it counts too for the state and the measured rate.
+    pub(super) fn came(&mut self, stamp: Stamp) {
         // A rate measured across a silence would be meaningless.
-        if matches!(self.port, Port::Silent { .. } | Port::Stale) {
+        if self.is_silent() {
             self.recent.clear();
         }
         if self.recent.len() >= RATE_FRAMES {
@@ -98,19 +117,28 @@ impl Link {
         self.recent.push_back(stamp.mono);
         self.port = Port::Live { since: stamp.mono };
         self.was_lost = false;
-        self.last_frame.replace(stamp)
+        self.unframed = 0;
     }
 
-    /// A frame came, and was dropped. It counts for the measured rate.
-    pub(super) fn dropped(&mut self, stamp: Stamp) {
-        self.recent.pop_front();
-        self.recent.push_back(stamp.mono);
+    /// Bytes came that nobody reads. They may be frames, if the last ones were.
+    pub(super) fn skipped(&mut self, at: Duration) {
+        let last = self.recent.back();
+        if let Port::Live { since } = &mut self.port
+            && last.is_some_and(|&last| at.saturating_sub(last) < SKIPPING)
+        {
+            *since = at;
+        }
+    }
+
+    /// Whether the port is open, and silent.
+    pub(super) fn is_silent(&self) -> bool {
+        matches!(self.port, Port::Silent | Port::Stale)
     }
 
     /// The silence has lasted until [`Self::stale_deadline`].
     pub(super) fn silent(&mut self) {
         self.port = match self.port {
-            Port::Opened { received, .. } => Port::Silent { received },
+            Port::Opened { .. } => Port::Silent,
             _ => Port::Stale,
         };
     }
@@ -132,7 +160,7 @@ impl Link {
     /// When a silence makes the link stale.
     fn stale_deadline(&self, sensor: &Sensor) -> Option<Duration> {
         match self.port {
-            Port::Opened { since, .. } => Some(since.saturating_add(sensor.late_after())),
+            Port::Opened { since } => Some(since.saturating_add(sensor.late_after())),
             Port::Live { since } => Some(since.saturating_add(sensor.stale_after())),
             _ => None,
         }
@@ -229,9 +257,9 @@ impl Pipeline {
                     tare().or_else(unreleased).or_else(too_fast),
                 )
             }
-            Port::Silent { received } => {
+            Port::Silent => {
                 let mut reason = no_frame_for(self.sensor.late_after());
-                if self.decoder.received() > *received {
+                if self.link.unframed > 0 {
                     let guess = || "is the baud rate or the layout wrong?".to_owned();
                     reason += ", but bytes come: ";
                     reason += &self.decoder.problem().unwrap_or_else(guess);
@@ -275,6 +303,24 @@ impl Pipeline {
         }
         self.link.published = (state, reason, kind);
         vec![Event::Status(self.status(at))]
+    }
+
+    /// A status, if the reason of a silence has changed because bytes came. Few bytes may be the beginning
+    /// of a frame.
+    pub(super) fn renewed(&mut self, at: Stamp) -> Vec<Event> {
+        let least = 2 * self.sensor.layout().max_frame_bytes() as u64;
+        let is_new = |last| at.mono.saturating_sub(last) < RENEWED_EVERY;
+        if !self.link.is_silent()
+            || self.link.unframed < least
+            || self.link.renewed.is_some_and(is_new)
+        {
+            return Vec::new();
+        }
+        let events = self.status_if_changed(at);
+        if !events.is_empty() {
+            self.link.renewed = Some(at.mono);
+        }
+        events
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {

@@ -26,6 +26,9 @@ pub(super) struct Pace {
     pub(super) dropped: u64,
     /// When the last frame was dropped, if the sensor is still said to be too fast.
     last_dropped: Option<Duration>,
+    /// When bytes were skipped last, if that is still said.
+    #[serde(default)]
+    last_skipped: Option<Duration>,
 }
 
 impl Pace {
@@ -36,18 +39,24 @@ impl Pace {
             self.last_dropped = Some(at);
             return false;
         }
-        let is_over = |last| at.saturating_sub(last) >= SAID_FOR;
-        if self.last_dropped.is_some_and(is_over) {
-            self.last_dropped = None;
+        for last in [&mut self.last_dropped, &mut self.last_skipped] {
+            *last = last.filter(|&last| at.saturating_sub(last) < SAID_FOR);
         }
         true
     }
 
-    /// Why frames are dropped, if some were within the last seconds.
+    /// Bytes of the port were skipped at `at`.
+    pub(super) fn skipped(&mut self, at: Duration) {
+        self.last_skipped = Some(at);
+    }
+
+    /// Why frames are missing, if some were dropped or bytes were skipped within the last seconds.
     pub(super) fn reason(&self, frame_rate_hz: f64) -> Option<String> {
-        self.last_dropped?;
         let most_hz = f64::from(MOST) * frame_rate_hz;
-        Some(format!("frames above {most_hz} Hz are dropped"))
+        let dropped = |_| format!("frames above {most_hz} Hz are dropped");
+        let skipped = |_| "more bytes come than are read: some are skipped".to_owned();
+        let dropped = self.last_dropped.map(dropped);
+        dropped.or_else(|| self.last_skipped.map(skipped))
     }
 }
 

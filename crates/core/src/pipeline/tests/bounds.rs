@@ -108,3 +108,47 @@ fn a_press_that_is_not_released_is_said_with_its_taxels() {
     );
     assert_eq!(play(&mut pipeline, 165, &vec![raw(0, 0); 3]), ["Live"]);
 }
+
+#[test]
+fn a_sensor_whose_bytes_are_skipped_is_live_as_long_as_its_frames_come() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let frame = bytes(&pipeline, &raw(0, 0));
+    let mut events = pipeline.opened(at(0));
+    let skip = |pipeline: &mut Pipeline, ms| pipeline.take(Input::Skipped(1_000), at(ms)).unwrap();
+    // The bytes of two seconds are skipped again and again.
+    for ms in (0..20_000).step_by(50) {
+        match ms % 2_000 {
+            0 => events.extend(pipeline.push(&frame, at(ms))),
+            _ => events.extend(skip(&mut pipeline, ms)),
+        }
+    }
+    let skipped = "Live (more bytes come than are read: some are skipped)";
+    assert_eq!(words(&events), ["Live", skipped]);
+    // Bytes without frames are no frames, and neither is a silence.
+    let events: Vec<Event> = (20_000..40_000)
+        .step_by(50)
+        .flat_map(|ms| skip(&mut pipeline, ms))
+        .collect();
+    assert_eq!(words(&events), ["Stale (no frame for 600 ms)"]);
+    let events = pipeline.push(&frame, at(55_000));
+    assert_eq!(words(&events), ["Live"]);
+    skip(&mut pipeline, 55_100);
+    let events = pipeline.tick(at(55_700));
+    assert_eq!(words(&events), ["Stale (no frame for 600 ms)"]);
+}
+
+#[test]
+fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    pipeline.opened(at(0));
+    let mut events = pipeline.tick(at(600));
+    for ms in (1_000..30_000).step_by(100) {
+        events.extend(pipeline.push(&[7; 100], at(ms)));
+    }
+    let silent = "Stale (no frame for 500 ms";
+    let bytes = "but bytes come: is the baud rate or the layout wrong?)";
+    assert_eq!(
+        words(&events),
+        [format!("{silent})"), format!("{silent}, {bytes}")]
+    );
+}
