@@ -35,7 +35,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::error::ErrorKind;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use tokio::sync::{mpsc, oneshot};
 
 use self::exit::{Fail, Failure};
@@ -64,7 +64,18 @@ pub fn usage(error: &clap::Error) -> ExitCode {
         return ExitCode::from(exit::USAGE);
     }
     if error.use_stderr() {
-        hardnessd_core::stderr_line!("hardnessd: {}", wording::of_usage(&error.to_string()));
+        let line = wording::of_usage(&error.to_string());
+        let given = match (error.kind(), error.get(ContextKind::InvalidArg)) {
+            (ErrorKind::UnknownArgument, Some(ContextValue::String(given))) => given,
+            _ => "",
+        };
+        // A configuration is never named without its option.
+        let is_configuration = given.ends_with(".toml") && !given.starts_with('-');
+        let tip = match is_configuration {
+            true => format!("; tip: --config {}", wording::cut(&wording::escaped(given))),
+            false => String::new(),
+        };
+        hardnessd_core::stderr_line!("hardnessd: {line}{tip}");
         return ExitCode::from(exit::USAGE);
     }
     match print(error.to_string().as_bytes()) {

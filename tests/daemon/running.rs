@@ -288,7 +288,11 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
             2,
             &["--baud", "158000"],
         ),
-        (&["run", "x.toml"], 2, &["unexpected argument 'x.toml'"]),
+        (
+            &["run", "x.toml"],
+            2,
+            &["unexpected argument 'x.toml'", "tip: --config x.toml"],
+        ),
         (&["simulate", "--force", "1000"], 2, &["--force"]),
         (&["demo", "--speed", "0.0001"], 2, &["--speed"]),
         (&record, 2, &["--label", "found \"\\u{202e}7\""]),

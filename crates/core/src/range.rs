@@ -6,7 +6,7 @@
 use std::fmt::{Debug, Display};
 
 use crate::frame::Pitch;
-use crate::wording::as_written;
+use crate::wording::{as_written, cut};
 
 /// A value that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -21,7 +21,8 @@ pub struct OutOfRange {
 impl OutOfRange {
     /// The error of a value `found` that does not fit.
     pub fn new(key: &str, found: impl Debug, expected: impl Display) -> Self {
-        Self::because(key, format_args!("found {found:?}, expected {expected}"))
+        let found = cut(&format!("{found:?}"));
+        Self::because(key, format_args!("found {found}, expected {expected}"))
     }
 
     /// The error of a value with this problem.

@@ -56,7 +56,7 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
         }
         cause = error.source();
     }
-    escaped(&without_numbers(&line))
+    with_cut_words(&escaped(&without_numbers(&line)))
 }
 
 /// Removes the numbers of the system's errors, such as ` (os error 2)`: the system's words are
@@ -89,12 +89,13 @@ pub fn of_usage(rendered: &str) -> String {
     let on_one_line = |part: &str| part.split_whitespace().collect::<Vec<_>>().join(" ");
     // A tip is a part of its own.
     let parts: Vec<String> = error.split("\n\n").map(on_one_line).collect();
-    escaped(parts.join("; ").trim_start_matches("error: "))
+    with_cut_words(&escaped(parts.join("; ").trim_start_matches("error: ")))
 }
 
 /// The error of a TOML text on one line: its place, the text's line there, and the parser's message.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
-    let message = in_words(&error.message().trim().replace('\n', ", "));
+    let message = error.message().trim().replace('\n', ", ");
+    let message = in_words(&with_cut_quotes(&with_cut_quotes(&message, '`'), '"'));
     let Some(span) = error.span() else {
         return message;
     };
@@ -103,6 +104,7 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let line = before.matches('\n').count() + 1;
     let column = before[line_start..].chars().count() + 1;
     let found = text[line_start..].lines().next().unwrap_or_default().trim();
+    let found = cut(found);
     format!("line {line}, column {column}, `{found}`: {message}")
 }
 
@@ -122,6 +124,9 @@ fn in_words(message: &str) -> String {
         ("a string", "a text in quotes"),
         ("a boolean", "true or false"),
     ];
+    if message == "invalid socket address syntax" {
+        return "expected ADDRESS:PORT, such as \"127.0.0.1:8256\"".to_owned();
+    }
     let Some((found, expected)) = message.split_once(", expected ") else {
         return message.to_owned();
     };
@@ -136,15 +141,51 @@ fn in_words(message: &str) -> String {
         return message.to_owned();
     };
     let likeness = |name: &String| strsim::jaro_winkler(&unknown, name);
-    let known = names(expected).into_iter();
-    match known.max_by(|a, b| likeness(a).total_cmp(&likeness(b))) {
-        Some(name) if likeness(&name) >= SIMILAR => format!("{found}: did you mean `{name}`?"),
+    let mut known = names(expected);
+    known.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)));
+    let is_as_near = |other: &String| likeness(&known[0]) - likeness(other) < AS_SIMILAR;
+    match known.first() {
+        Some(name) if likeness(name) >= SIMILAR && !known[1..].iter().any(is_as_near) => {
+            format!("{found}: did you mean `{name}`?")
+        }
         _ => message.to_owned(),
     }
 }
 
 /// Names with at least this Jaro-Winkler similarity count as similar.
 const SIMILAR: f64 = 0.75;
+/// Names whose similarities differ by less are as similar as each other.
+const AS_SIMILAR: f64 = 0.04;
+
+/// The most characters of its input that an error repeats in one piece.
+const LONGEST_PIECE: usize = 200;
+
+/// The beginning of a piece of input, if it is longer than an error repeats.
+pub fn cut(piece: &str) -> String {
+    match piece.char_indices().nth(LONGEST_PIECE) {
+        Some((end, _)) => format!("{}...", &piece[..end]),
+        None => piece.to_owned(),
+    }
+}
+
+/// A line whose words are cut. Long input, such as a path, is one word.
+fn with_cut_words(line: &str) -> String {
+    let cut_word = |word: &str| match word.strip_suffix(':') {
+        Some(word) => cut(word) + ":",
+        None => cut(word),
+    };
+    line.split(' ').map(cut_word).collect::<Vec<_>>().join(" ")
+}
+
+/// A text whose parts between two such marks are cut.
+fn with_cut_quotes(text: &str, mark: char) -> String {
+    let parts = text.split(mark).enumerate();
+    let parts = parts.map(|(place, part)| match place % 2 {
+        0 => part.to_owned(),
+        _ => cut(part),
+    });
+    parts.collect::<Vec<_>>().join(&mark.to_string())
+}
 
 /// Whether `text` looks the same wherever it is shown. It then has no control characters, and no
 /// characters that end a line or change the direction of the following text.
@@ -179,6 +220,7 @@ pub fn as_written(value: f32) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
     use std::io;
 
     use super::*;
@@ -258,6 +300,14 @@ mod tests {
                 "unknown variant `xml`, expected `text` or `json`",
             ),
             (
+                "unknown variant `crc-16`, expected one of `crc8`, `crc16-modbus`, `crc16-ccitt`, `crc32`",
+                "unknown variant `crc-16`, expected one of `crc8`, `crc16-modbus`, `crc16-ccitt`, `crc32`",
+            ),
+            (
+                "invalid socket address syntax",
+                "expected ADDRESS:PORT, such as \"127.0.0.1:8256\"",
+            ),
+            (
                 "invalid value: integer `-1`, expected u32",
                 "invalid value: integer `-1`, expected a whole number from 0 to 4294967295",
             ),
@@ -273,5 +323,27 @@ mod tests {
         assert!(error.starts_with("line 2, column "), "{error}");
         assert!(error.contains(", `b = [2`: "), "{error}");
         assert!(!of("é = 1\na b\n").contains('\n'));
+        for text in [format!("a = [{}", "1, ".repeat(5000)), "b ".repeat(5000)] {
+            let long = of(&text);
+            assert!(long.chars().count() < 400, "{long}");
+        }
+        let found = "c ".repeat(5000);
+        let error = toml::from_str::<BTreeMap<String, bool>>(&format!("a = \"{found}\""));
+        let long = of_toml("", &error.unwrap_err());
+        assert!(
+            long.ends_with("expected true or false") && long.len() < 400,
+            "{long}"
+        );
+    }
+
+    #[test]
+    fn an_error_repeats_no_long_input() {
+        let path = "é".repeat(5000);
+        let error = line(&io::Error::other(format!("{path}: cannot read")));
+        assert_eq!(error, format!("{}...: cannot read", "é".repeat(200)));
+        let usage = of_usage(&format!(
+            "error: unexpected argument '{path}' found\n\nUsage: x"
+        ));
+        assert!(usage.ends_with("... found") && usage.chars().count() < 300);
     }
 }

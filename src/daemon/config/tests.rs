@@ -53,6 +53,10 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             "robot = \"\\u202Eevil\"\n[[sensor]]\nport = \"p\"",
             &["robot: found \"\\u{202e}evil\"", "bidirectional characters"],
         ),
+        (
+            "[[sensor]]\nport = \"p\"\n[[level]]\nlabel = \"a\"\nshore = [0, 50]",
+            &["line 3: level: found 1 tables, expected none, or 2 to 16"],
+        ),
         ("[log]", &["no sensor: add a [[sensor]] with a port"]),
         (
             "[[sensor]]\nport = \"p\"\nbauds = 9",
@@ -88,7 +92,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             &[
                 "line 4, column 10",
                 "listen = \"here:8255\"",
-                "socket address",
+                "expected ADDRESS:PORT, such as \"127.0.0.1:8256\"",
             ],
         ),
         (
@@ -197,7 +201,7 @@ fn a_file_that_is_no_utf_8_is_a_bad_one_and_its_place_is_named() {
     let error = Config::load(&path).unwrap_err();
     let text = error.to_string();
     assert!(
-        text.contains("toml: invalid utf-8 sequence of 1 bytes from index 13"),
+        text.contains("toml: not a text file (no UTF-8 at byte 13)"),
         "{text}"
     );
     assert_eq!(error.exit_code(), CONFIG);
