@@ -262,8 +262,9 @@ impl Setup {
         }
     }
 
-    /// The keys of the configuration that are set and change no verdict of this model.
+    /// The keys that are written in the configuration and change no verdict of this model.
     pub fn without_effect(&self) -> Vec<String> {
+        let is_written = |key: &str| self.text.is_written(0, key);
         let Config { press, model, .. } = &self.config;
         let (press_default, model_default) =
             (press::Settings::default(), verdict::Settings::default());
@@ -278,11 +279,13 @@ impl Setup {
                 let arms = self.config.sensors.iter().filter(described);
                 let arms = arms.map(|sensor| format!("sensor.arm of {:?}", sensor.name));
                 let early = model.early_confidence != model_default.early_confidence;
+                let early = early && is_written("model.early_confidence");
                 let early = early.then(|| "model.early_confidence".to_owned());
                 arms.chain(early).chain(references).collect()
             }
             Format::Course { .. } => {
                 let settle = press.early_settle_s != press_default.early_settle_s;
+                let settle = settle && is_written("press.early_settle_s");
                 let settle = settle.then(|| "press.early_settle_s".to_owned());
                 settle.into_iter().chain(references).collect()
             }

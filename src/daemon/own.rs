@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::env;
+use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -16,6 +17,7 @@ use serde::{Deserialize, Serialize};
 use tracing::{debug, warn};
 
 use super::config::directory_of_service;
+use super::port::is_simulated;
 use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::judge::{OwnPresses, owner};
 use hardnessd_core::part::Part;
@@ -40,19 +42,23 @@ struct Kept {
 pub(super) struct Store {
     directory: Option<PathBuf>,
     changed: Option<Sender<(String, Kept)>>,
+    /// Whether the directory is the user's. It has no presses of simulated sensors, such as those of a demo.
+    is_of_user: bool,
 }
 
 impl Store {
     /// The store in the directory that systemd or the user's environment names.
     pub(super) fn of_environment() -> Result<Self, NoThread> {
-        let of_user = || {
-            let state = env::var_os("XDG_STATE_HOME").filter(|state| !state.is_empty())?;
-            Some(Path::new(&state).join("hardnessd"))
-        };
-        match directory_of_service("STATE_DIRECTORY").or_else(of_user) {
-            Some(directory) => Self::in_directory(directory),
-            None => Ok(Self::default()),
+        if let Some(directory) = directory_of_service("STATE_DIRECTORY") {
+            return Self::in_directory(directory);
         }
+        let Some(directory) = of_user(|variable| env::var_os(variable)) else {
+            return Ok(Self::default());
+        };
+        Ok(Self {
+            is_of_user: true,
+            ..Self::in_directory(directory)?
+        })
     }
 
     fn in_directory(directory: PathBuf) -> Result<Self, NoThread> {
@@ -62,6 +68,7 @@ impl Store {
         Ok(Self {
             directory: Some(directory),
             changed: Some(sender),
+            is_of_user: false,
         })
     }
 
@@ -88,6 +95,9 @@ impl Store {
         let (Some(changed), sensor) = (&self.changed, pipeline.sensor()) else {
             return;
         };
+        if self.is_of_user && is_simulated(&sensor.description().sensor.port) {
+            return;
+        }
         let kept = Kept {
             owner: owner(sensor, pipeline.hrn()),
             presses: pipeline.own_presses().clone().for_another_start(),
@@ -95,6 +105,14 @@ impl Store {
         // The thread ends only after all senders.
         let _ = changed.send((sensor.name().to_owned(), kept));
     }
+}
+
+/// The directory of a user's own state, by the XDG Base Directory Specification.
+fn of_user(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let named = |name| variable(name).filter(|value| !value.is_empty());
+    let home = || Some(Path::new(&named("HOME")?).join(".local/state"));
+    let state = named("XDG_STATE_HOME").map(PathBuf::from).or_else(home);
+    Some(state?.join("hardnessd"))
 }
 
 fn file_of(directory: &Path, sensor: &str) -> PathBuf {
@@ -161,6 +179,20 @@ mod tests {
 
     fn store(directory: &Path) -> Store {
         Store::in_directory(directory.to_owned()).unwrap()
+    }
+
+    #[test]
+    fn the_users_state_is_in_its_directory_or_below_the_home() {
+        for (state, home, expected) in [
+            (Some("/s"), Some("/h"), Some("/s/hardnessd")),
+            (Some(""), Some("/h"), Some("/h/.local/state/hardnessd")),
+            (None, Some("/h"), Some("/h/.local/state/hardnessd")),
+            (None, None, None),
+        ] {
+            let variable = |name: &str| if name == "HOME" { home } else { state };
+            let found = of_user(|name| variable(name).map(Into::into));
+            assert_eq!(found, expected.map(PathBuf::from));
+        }
     }
 
     #[test]

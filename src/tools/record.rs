@@ -29,9 +29,8 @@ use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
-use hardnessd_core::recording::{LabelError, Labels, check_label};
+use hardnessd_core::recording::{LabelError, Labels, check_label, misspelt};
 use hardnessd_core::stderr_line;
-use hardnessd_core::verdict::Level;
 use hardnessd_core::wording::escaped;
 
 /// What `--help` says below the options.
@@ -93,12 +92,15 @@ pub async fn run(
 ) -> Result<(), Failure> {
     let mut labels = Labels::new();
     for (key, value) in args.labels {
+        if let Some(known) = misspelt(&key) {
+            stderr_line!("warning: --label {key}: did you mean {known}?");
+        }
         if labels.insert(key.clone(), value).is_some() {
             let twice = format!("--label {key}: given twice: give it once");
             return Err(Failure::new(USAGE, twice));
         }
     }
-    check_level(&labels, &setup.hrn.card().levels)?;
+    check_level(&labels, &setup)?;
     let sockets = if args.sockets {
         Sockets::Configured
     } else {
@@ -256,29 +258,38 @@ async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell
     std::future::pending::<()>().await;
 }
 
-/// The most levels of a model of `hrn-train fit`.
-const MOST_LEVELS: u64 = 16;
-
 /// Checks the label `level`, which a data set is made from. A wrong level must be found before
-/// anything is pressed.
-fn check_level(labels: &Labels, levels: &[Level]) -> Result<(), Failure> {
-    // Levels of the user's own have names, or numbers up to 16. `hrn-train fit` takes both.
-    let is_level = |found: &str| match found.parse::<u64>() {
-        Ok(number) => number <= MOST_LEVELS,
-        Err(_) => found.starts_with(char::is_alphabetic),
-    };
-    let Some(found) = labels.get("level").filter(|found| !is_level(found)) else {
+/// anything is pressed. A name that the model does not have may be that of a level of the user's own, of which
+/// `hrn-train fit` makes a model.
+fn check_level(labels: &Labels, setup: &Setup) -> Result<(), Failure> {
+    let Some(found) = labels.get("level") else {
         return Ok(());
     };
-    let levels = levels.iter();
-    let levels: Vec<String> = levels
-        .map(|level| format!("{} ({})", level.level, level.label))
-        .collect();
+    let levels = &setup.hrn.card().levels;
+    let (is_known, may_be_own) = match found.parse::<usize>() {
+        Ok(number) => (number <= levels.len(), false),
+        Err(_) => (
+            levels
+                .iter()
+                .any(|level| level.label.eq_ignore_ascii_case(found)),
+            setup.config.levels.is_empty() && found.starts_with(char::is_alphabetic),
+        ),
+    };
+    if is_known {
+        return Ok(());
+    }
+    let shown = levels
+        .iter()
+        .map(|level| format!("{} ({})", level.level, level.label));
+    let shown: Vec<String> = shown.collect();
     let problem = format!(
-        "--label level: found {found:?}, expected a name, or a number from 0 (unlabelled) to {MOST_LEVELS}; \
-         the model's are {}",
-        levels.join(", ")
+        "--label level: found {found:?}, expected 0 (unlabelled), {}",
+        shown.join(", ")
     );
+    if may_be_own {
+        stderr_line!("warning: {problem}, or the name of a level of your own");
+        return Ok(());
+    }
     Err(Failure::new(USAGE, problem))
 }
 

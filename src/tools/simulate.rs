@@ -18,6 +18,7 @@ use super::live;
 use super::player::{self, Pace, Player};
 use super::robot::Robot;
 use crate::daemon::baud::BITS_A_BYTE;
+use crate::daemon::config::Unix;
 use crate::maybe;
 use crate::thread::spawn_thread;
 use hardnessd_core::exit::{IO, USAGE};
@@ -74,9 +75,9 @@ pub struct Args {
     #[arg(long, value_name = "B", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
     /// Control socket of a daemon, to which a simulated robot sends the positions of its first sensor's arm, 100 a
-    /// second
+    /// second. Without SOCKET, the one that a daemon started here has by default
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
-    motion: Option<PathBuf>,
+    motion: Option<Option<PathBuf>>,
     /// Play no presses: move the arm as a controller says on this new Unix socket
     #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]
     arm: Option<PathBuf>,
@@ -139,7 +140,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         Some(arm) => Box::new(arm.position()),
         None => Box::new(player.position()),
     };
-    let robot = args.motion.map(|socket| Robot { socket, position });
+    let robot = args.motion.map(|socket| Robot {
+        socket: socket.unwrap_or_else(|| Unix::default().control_path()),
+        position,
+    });
     let start = Instant::now();
     let (frames, start) = match &arm {
         Some(arm) => (arm.frames(settings, start)?, start + arm::SCAN),

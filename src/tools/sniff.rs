@@ -201,7 +201,7 @@ fn usual(hz: f64) -> f64 {
 /// The end of a configuration.
 const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for your browser\n";
 
-/// The part below `[sensor.frame]`, where the defaults would take the sensor at rest for a touch.
+/// The part below `[sensor.frame]`, with values where the defaults would take the sensor at rest for a touch.
 fn newtons(scale: &Scale) -> String {
     let mut text = String::new();
     let Scale {
@@ -211,9 +211,7 @@ fn newtons(scale: &Scale) -> String {
         most_counts,
         noise_counts,
     } = *scale;
-    if newtons_per_count.is_some() || tare_max_n.is_some() {
-        text += "\n[sensor.calibration]\n";
-    }
+    text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n";
     if let Some(newtons) = newtons_per_count {
         text += &format!(
             "newtons_per_count = {newtons:.6}  # a guess from counts up to {most_counts}: measure it with weights\n"

@@ -260,6 +260,9 @@ impl Daemon {
                 .args(["run", "--config"])
                 .arg(config)
                 .env("RUST_LOG", "info")
+                // Own presses of one test are none of another.
+                .env_remove("XDG_STATE_HOME")
+                .env_remove("HOME")
                 .stderr(Stdio::piped())
                 .spawn()
                 .unwrap(),

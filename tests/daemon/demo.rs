@@ -15,6 +15,8 @@ fn program(runtime: &Path) -> Command {
     let mut command = Command::new(BINARY);
     command.env("XDG_RUNTIME_DIR", runtime);
     command.env("TMPDIR", runtime);
+    command.env("HOME", runtime);
+    command.env_remove("XDG_STATE_HOME");
     command.env_remove("RUNTIME_DIRECTORY");
     command
 }
@@ -42,6 +44,8 @@ fn on_a_terminal_each_press_is_a_line_with_the_truth_beside_the_verdict() {
         );
     }
     assert!(lines[4].contains(" of 4 presses right"), "{shown}");
+    // Its presses are none of the user's sensors.
+    assert!(!bench.path(".local").exists());
 }
 
 /// One status from `tail`, with its exit code and its stderr.

@@ -134,7 +134,7 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     let [at, to] = [&config, &out].map(|path| path.to_str().unwrap());
     let command = ["record", "--config", at, "--out", to];
     // A label with a level that no model has is refused.
-    for level in ["level=17", "level=-1"] {
+    for level in ["level=5", "level=-1"] {
         let labelled = [&command[..], &["--label", level]].concat();
         fails(&labelled, 2, &["1 (hard), 2 (firm)"]);
     }
@@ -145,7 +145,14 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
         &["--label object: given twice"],
     );
     // Without anything to record, `record` says so and leaves no file.
-    let (code, _, message) = run(&command);
+    let own = ["--label", "level=ripe", "--label", "levl=2"];
+    let (code, _, message) = run(&[&command[..], &own].concat());
+    for part in [
+        "--label levl: did you mean level?",
+        "or the name of a level of your own",
+    ] {
+        assert!(message.contains(part), "{message}");
+    }
     assert!(code == 69 && !message.contains("recorded"), "{message}");
     assert!(!out.exists());
 

@@ -92,6 +92,7 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
         ("its level (hard, firm, soft, very-soft)", "7x"),
         ("found \"7x\", expected a Shore OO reading", "Very-Soft"),
     ]);
+    session.sees("the zero is taken: press now");
     session.sees("verdict: ");
     session.sees(", you said very-soft; ");
     session.sees(" of 1 right");

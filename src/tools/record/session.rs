@@ -291,7 +291,7 @@ async fn wait_for_user(
         let known = levels.iter().find(|known| known.level == level);
         known.map_or("no level", |known| known.label.as_str())
     };
-    let mut shown = 0;
+    let (mut shown, mut is_tared) = (0, false);
     loop {
         let Progress {
             frames,
@@ -309,6 +309,10 @@ async fn wait_for_user(
                 level => format!(", you said {}; {right} of {verdicts} right", label(level)),
             };
             print(&format!("\r\x1b[Kverdict: {said}{beside}\n"));
+        }
+        if tared > 0 && !is_tared {
+            is_tared = true;
+            print("\r\x1b[Kthe zero is taken: press now\n");
         }
         let line = if frames == 0 {
             "waiting for the sensor".to_owned()

@@ -69,9 +69,32 @@ pub fn check_label(key: &str, value: &str) -> Result<(), LabelError> {
     }
 }
 
+/// The keys of labels that mean something to `hrn-train` and `identify`.
+const KEYS: [&str; 6] = ["level", "object", "shore", "material", "reference", "name"];
+
+/// The known key that a key is one typing error away from.
+pub fn misspelt(key: &str) -> Option<&'static str> {
+    let is_near = |known: &&str| strsim::osa_distance(key, known) == 1;
+    KEYS.into_iter().find(is_near)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_key_with_one_typing_error_is_known_again() {
+        for (key, known) in [
+            ("levl", Some("level")),
+            ("lvele", None),
+            ("lveel", Some("level")),
+            ("Shore", Some("shore")),
+            ("level", None),
+            ("note", None),
+        ] {
+            assert_eq!(misspelt(key), known, "{key}");
+        }
+    }
 
     #[test]
     fn a_label_that_its_reader_could_not_use_is_refused() {
