@@ -21,7 +21,7 @@ use self::candidate::Candidate;
 use self::comparison::{Compared, Comparison, Outcome};
 pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
-use crate::data::collect::{self, Settings, Unnumbered};
+use crate::data::collect::{self, LeaveOut, Settings, Unnumbered};
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
 use crate::model::export::{Exported, Learnt, validation};
@@ -63,8 +63,9 @@ pub struct Fitted {
 pub enum Written {
     /// An ONNX model.
     Model(Vec<u8>),
-    /// References for the built-in model, and its levels where they are not its own.
-    References(Vec<u8>, Option<Vec<Level>>),
+    /// References for the built-in model, unless the daemon would not use them, and its levels where they
+    /// are not its own.
+    References(Option<Vec<u8>>, Option<Vec<Level>>),
 }
 
 /// Compares the candidates and makes the best one.
@@ -107,9 +108,22 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
     let unloaded = control.ok_or_else(|| "only recordings have it".to_owned());
     let control = compare(UNLOADED, unloaded.as_ref())?;
     bar.finish_and_clear();
+    let built_in = match &candidates[0].1 {
+        Ok(Candidate::BuiltIn(hrn)) => Some(hrn),
+        _ => None,
+    };
+    let references = built_in
+        .map(|hrn| candidate::references(hrn, &presses, &places))
+        .transpose()?;
+    let is_used = match (built_in, &references) {
+        (Some(hrn), Some(references)) => !hrn.identified_by(references)?.1.are_worse(),
+        _ => false,
+    };
+    let references = references.filter(|_| is_used);
     let comparison = Comparison {
         presses: &presses,
         places: &places,
+        has_references: references.is_some(),
         candidates: compared,
         control,
     };
@@ -118,10 +132,10 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
     let chosen = choice.writes.map(|place| (place, &candidates[place]));
     let written = match chosen {
         Some((_, (_, Ok(Candidate::BuiltIn(hrn))))) => {
-            let own = candidate::references(hrn, &presses, &places)?;
+            let own = references.map(|own| references::write(&own)).transpose()?;
             let levels = hrn.card().levels.clone();
             let levels = Some(levels).filter(|levels| *levels != papers_levels());
-            Some(Written::References(references::write(&own)?, levels))
+            Some(Written::References(own, levels))
         }
         Some((place, (name, Ok(candidate)))) => {
             let judged = comparison.candidates[place].outcome(choice.division);
@@ -186,9 +200,11 @@ fn read(request: &Request) -> anyhow::Result<Presses> {
             true => Layout::OverTime,
             false => Layout::Frames,
         },
-        skip_unusable: false,
+        leave_out: LeaveOut::WithoutPress,
     };
-    let mut all = collect::collect(&recordings, None, &settings)?.into_presses(&levels);
+    let collection = collect::collect(&recordings, None, &settings)?;
+    collection.say_left_out();
+    let mut all = collection.into_presses(&levels);
     all.join(sets)?;
     Ok(all)
 }

@@ -120,8 +120,8 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let settings = recipe.settings(profile, parts.train.len(), &given)?;
     check(recipe, &presses, &parts)?;
     let findings = Findings::of(&presses, Some(labels));
-    hardnessd_core::stderr_part!("{}", wording::lines(&findings.to_string()));
     let findings = findings.usable()?;
+    hardnessd_core::stderr_part!("{}", wording::lines(&findings.to_string()));
     export::check_sources(&presses.sources)?;
 
     let description = Description {

@@ -20,13 +20,14 @@ use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Map, Value, json};
 
-use self::capture::{Pressed, Said};
+use self::capture::{NoPress, Pressed, Said};
 use crate::data::presses::{self, Layout, Press, Presses, file, read_one};
 use crate::data::source::{COLLECTOR, Kind, MOST_LEVELS, Source};
 use crate::exit::unreadable;
 use hardnessd_core::recording::{FileKind, Labels, MAGIC};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{Hrn, Level, sha256_hex};
+use hardnessd_core::wording;
 use hardnessd_simulator::Split;
 
 /// How an `.npz` file begins: it is a zip archive.
@@ -41,6 +42,17 @@ pub enum Unnumbered {
     One,
     /// Each is an object of its own.
     Each,
+}
+
+/// The recordings that are left out. Any other one that cannot be used ends the collection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LeaveOut {
+    /// None.
+    None,
+    /// Those without a press.
+    WithoutPress,
+    /// All that cannot be used.
+    Unusable,
 }
 
 /// How recordings become presses.
@@ -62,8 +74,18 @@ pub struct Settings {
     pub split: Split,
     /// Whether all frames of a press are wanted, or only the chosen one.
     pub layout: Layout,
-    /// Whether recordings that cannot be used are left out. Otherwise the first one ends the collection.
-    pub skip_unusable: bool,
+    /// Which recordings are left out.
+    pub leave_out: LeaveOut,
+}
+
+impl Settings {
+    fn leaves_out(&self, error: &anyhow::Error) -> bool {
+        match self.leave_out {
+            LeaveOut::None => false,
+            LeaveOut::WithoutPress => error.is::<NoPress>(),
+            LeaveOut::Unusable => true,
+        }
+    }
 }
 
 /// Collects recordings, after the presses of the data set `earlier` if there is one. The presses are in the order
@@ -88,7 +110,7 @@ pub fn collect(
     let bar = bar.with_style(style.expect("the template is right"));
     for path in paths {
         match collection.add(path, settings) {
-            Err(error) if settings.skip_unusable => collection.left_out.push(error),
+            Err(error) if settings.leaves_out(&error) => collection.left_out.push(error),
             added => added?,
         }
         bar.inc(1);
@@ -236,6 +258,13 @@ impl Collection {
             meta,
             ..Self::default()
         })
+    }
+
+    /// Says on stderr which recordings were left out, and why.
+    pub fn say_left_out(&self) {
+        for left_out in &self.left_out {
+            hardnessd_core::stderr_line!("left out: {}", wording::line(left_out.as_ref()));
+        }
     }
 
     /// The number of presses.

@@ -65,11 +65,14 @@ impl Findings {
     ///
     /// # Errors
     ///
-    /// Returns the first error.
+    /// Returns all errors as one.
     pub fn usable(self) -> anyhow::Result<Self> {
-        match self.errors.first() {
-            Some(first) => bail!("the data cannot mean what their labels say: {first}"),
-            None => Ok(self),
+        match self.errors.is_empty() {
+            true => Ok(self),
+            false => bail!(
+                "the data cannot mean what their labels say: {}",
+                self.errors.join("; ")
+            ),
         }
     }
 

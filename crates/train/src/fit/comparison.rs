@@ -33,7 +33,7 @@ pub struct Report {
     pub best: Option<String>,
     /// What the best one was chosen by.
     pub chosen_by: Option<Division>,
-    /// `model` or `references`; null if nothing is written.
+    /// `model` or `references`; null if nothing is written. The built-in model may be the best one as it is.
     pub writes: Option<&'static str>,
     /// Counts of the best candidate; rows are the truth, columns the verdict.
     pub confusion: Vec<Vec<u64>>,
@@ -232,6 +232,8 @@ pub(super) struct Choice {
 pub(super) struct Comparison<'a> {
     pub(super) presses: &'a Presses,
     pub(super) places: &'a [usize],
+    /// Whether the daemon uses these presses as references of the built-in model.
+    pub(super) has_references: bool,
     pub(super) candidates: Vec<Compared>,
     pub(super) control: Compared,
 }
@@ -240,6 +242,13 @@ impl Comparison<'_> {
     /// The choice: by new objects, or where nothing there is better than guessing, by later presses.
     pub(super) fn choice(&self) -> Choice {
         let has_built_in = self.candidates[0].row.left_out.is_none();
+        let of_built_in = match self.has_references {
+            true => "these presses become references of the built-in model",
+            false => {
+                "use it as it is. As its references these presses make verdicts on each other worse, so the daemon \
+                 would not use them, and they are not written"
+            }
+        };
         let mut remarks = self.remarks_on_objects();
         for division in [Division::NewObjects, Division::LaterPresses] {
             let Some(best) = self.best(division) else {
@@ -287,15 +296,11 @@ impl Comparison<'_> {
             }
             let is_ahead = |lead: Estimate| lead.low() > 0.0;
             let writes = if has_built_in && best == 0 {
-                remarks.push(
-                    "the built-in model is the best one, so these presses become its references"
-                        .to_owned(),
-                );
+                remarks.push(format!("the built-in model is the best one: {of_built_in}"));
                 0
             } else if has_built_in && !lead(&self.candidates[0]).is_none_or(is_ahead) {
                 remarks.push(format!(
-                    "{name} is not better than the built-in model by more than chance, so these presses become \
-                     references of the built-in model"
+                    "{name} is not better than the built-in model by more than chance: {of_built_in}"
                 ));
                 0
             } else {
@@ -308,14 +313,15 @@ impl Comparison<'_> {
                 remarks,
             };
         }
-        let remark = match has_built_in {
-            true => {
-                "no candidate is shown to be of use: these presses become references of \
-                     the built-in model, and more presses may show more"
-            }
-            false => "no candidate is shown to be of use: press more objects of each level",
-        };
-        remarks.push(remark.to_owned());
+        let none = "no candidate is shown to be of use";
+        remarks.push(match (self.has_references, has_built_in) {
+            (true, _) => format!("{none}: {of_built_in}, and more presses may show more"),
+            (false, true) => format!(
+                "{none}, and as references of the built-in model these presses make verdicts on each other worse: \
+                 press more objects of each level"
+            ),
+            (false, false) => format!("{none}: press more objects of each level"),
+        });
         let division = match self.best(Division::NewObjects) {
             Some(_) => Division::NewObjects,
             None => Division::LaterPresses,
@@ -323,7 +329,7 @@ impl Comparison<'_> {
         Choice {
             best: self.best(division),
             division,
-            writes: has_built_in.then_some(0),
+            writes: self.has_references.then_some(0),
             remarks,
         }
     }
@@ -419,9 +425,9 @@ impl Comparison<'_> {
             controls: vec![guessing, self.control.row.clone()],
             best: best.map(|best| best.row.name.clone()),
             chosen_by: best.map(|_| choice.division),
-            writes: choice.writes.map(|place| match place {
-                0 => "references",
-                _ => "model",
+            writes: choice.writes.and_then(|place| match place {
+                0 => self.has_references.then_some("references"),
+                _ => Some("model"),
             }),
             confusion,
             wrong,

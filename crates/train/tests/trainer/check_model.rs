@@ -8,8 +8,8 @@ use crate::hrn_train;
 
 fn check(path: &Path) -> (Option<i32>, String) {
     let output = hrn_train(&["check-model", path.to_str().unwrap()]);
-    let lines = String::from_utf8(output.stdout).unwrap();
-    (output.status.code(), lines)
+    let lines = [output.stdout, output.stderr].concat();
+    (output.status.code(), String::from_utf8(lines).unwrap())
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn all_errors_of_a_file_are_said_at_once() {
     graph.output[0].name = "result".to_owned();
     std::fs::write(&path, model.encode_to_vec()).unwrap();
     let (code, lines) = check(&path);
-    assert_eq!(code, Some(78), "{lines}");
+    assert_eq!((code, lines.lines().count()), (Some(78), 1), "{lines}");
     for part in [
         "pitch_mm",
         "hrn.range",

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Output;
 
 use hardnessd_core::frame::Pitch;
-use hardnessd_core::recording::Labels;
+use hardnessd_core::recording::{Labels, MAGIC};
 use hardnessd_core::sensor::Description;
 use hardnessd_core::test_support::of_a_labelled_press;
 use hardnessd_core::verdict::{Card, Hrn};
@@ -387,6 +387,13 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     let out = desk.path("own.npz");
     let none = desk.path("none.mcap");
     let zeros = desk.write("zeros.bin", [0; 100]);
+    // An MCAP file of another program: a header, the end of its data and a footer.
+    let (header, end, footer) = ([1, 8], [15, 4], [2, 20]);
+    let records = [header, end, footer].map(|[kind, length]| {
+        let length_bytes = u64::from(length).to_le_bytes();
+        [&[kind][..], &length_bytes, &vec![0; usize::from(length)]].concat()
+    });
+    let foreign = desk.write("foreign.mcap", [MAGIC, &records.concat(), MAGIC].concat());
     let empty = desk.write("empty/notes.txt", "pressed by hand");
     let archive = desk.write("archive.npz", "PK\x03\x04");
     let wrong = desk.recording("wrong.mcap", &["level=99"]);
@@ -401,6 +408,12 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
         (&out, &["--level", "17", FIXTURE], 2, "17"),
         (&out, &["--level", "1", text(&none)], 66, "none.mcap"),
         (&out, &["--level", "1", text(&zeros)], 1, "no press"),
+        (
+            &out,
+            &["--level", "1", text(&foreign)],
+            1,
+            "found no state of a sensor",
+        ),
         (&out, &[text(&archive)], 1, "is a data set, not a recording"),
         (
             &out,

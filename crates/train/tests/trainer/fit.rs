@@ -7,6 +7,7 @@ use std::path::Path;
 use hardnessd_core::frame::Array;
 use hardnessd_core::references;
 use hardnessd_core::verdict::{Format, Hrn, ModelFrame};
+use hardnessd_simulator::Split;
 use hrn_train::data::presses::{self, Layout, Press, Presses};
 use serde_json::{Value, json};
 
@@ -105,13 +106,64 @@ fn presses_that_tell_nothing_become_references() {
     // Each column has every level.
     let objects = [(1, 0), (1, 2), (2, 0), (2, 2), (3, 0), (3, 2)];
     write(&path("d.npz"), &objects, &PAPERS);
-    let text = succeed_in(directory.path(), "fit d.npz --out m.onnx");
+    fs::write(path("unpressed.bin"), [0; 100]).unwrap();
+    let output = hrn_train_in(directory.path(), "fit d.npz unpressed.bin --out m.onnx");
+    let (text, errors) = (String::from_utf8_lossy(&output.stdout), errors(&output));
+    assert!(
+        errors.contains("left out: unpressed.bin: no press found"),
+        "{errors}"
+    );
     assert!(text.contains("these presses become references"), "{text}");
     assert!(!path("m.onnx").exists());
     let references = references::read(&fs::read(path("m.npz")).unwrap()).unwrap();
     assert_eq!(references.len(), 30, "all presses");
     let line = format!("references = \"{}\"", path("m.npz").display());
     assert!(text.contains(&line), "{text}");
+}
+
+#[test]
+fn references_that_the_daemon_would_not_use_are_not_written() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    let simulate =
+        "simulate --sequences --objects 3 --test-objects 1 --presses 4 --shapes flat --out s.npz";
+    succeed_in(directory.path(), simulate);
+    let mut presses = Presses::read(&[path("s.npz")]).unwrap();
+    // Levels that have nothing to do with the hardness.
+    for (number, press) in (0_u8..).zip(&mut presses.all) {
+        let level = (u32::from(number) * 7 / 3 % 4) as u8 + 1;
+        (press.level, press.shore, press.split) = (level, None, Split::Train);
+    }
+    let file = File::create(path("d.npz")).unwrap();
+    let meta = presses::meta(&path("s.npz")).unwrap();
+    presses::write(file, &presses, Layout::OverTime, &meta).unwrap();
+    let output = hrn_train_in(directory.path(), "fit d.npz --out m.onnx");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(text.contains("make verdicts on each other worse"), "{text}");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(!path("m.npz").exists() && !path("m.onnx").exists());
+}
+
+#[test]
+fn the_model_has_the_ending_of_one_and_its_sibling_is_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let refused = |out: &str, code: i32, expected: &str| {
+        let output = hrn_train_in(directory.path(), &format!("fit d.npz --out {out}"));
+        let errors = errors(&output);
+        assert_eq!(output.status.code(), Some(code), "{errors}");
+        assert!(errors.contains(expected), "{errors}");
+    };
+    refused(
+        "m.txt",
+        2,
+        "--out: found m.txt, expected a name that ends with .onnx",
+    );
+    fs::write(directory.path().join("m.npz"), "").unwrap();
+    refused(
+        "m.onnx",
+        74,
+        "--out m.onnx: references would be written beside it",
+    );
 }
 
 #[test]

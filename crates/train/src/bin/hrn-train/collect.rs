@@ -8,8 +8,7 @@ use anyhow::{Context as _, bail};
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
-use hardnessd_core::wording;
-use hrn_train::data::collect::{self, Settings, Unnumbered};
+use hrn_train::data::collect::{self, LeaveOut, Settings, Unnumbered};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::source::papers_levels;
 use hrn_train::run::disk::lock;
@@ -40,12 +39,13 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
             true => Layout::OverTime,
             false => Layout::Frames,
         },
-        skip_unusable: arguments.skip_unusable,
+        leave_out: match arguments.skip_unusable {
+            true => LeaveOut::Unusable,
+            false => LeaveOut::None,
+        },
     };
     let collection = collect::collect(&captures, earlier, &settings)?;
-    for left_out in &collection.left_out {
-        hardnessd_core::stderr_line!("left out: {}", wording::line(left_out.as_ref()));
-    }
+    collection.say_left_out();
     let left_out = collection.left_out.len();
     if left_out == captures.len() {
         bail!("no recording can be used");

@@ -4,9 +4,11 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
+use hardnessd_core::exit::USAGE;
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Borders, Level};
+use hrn_train::exit::coded;
 use hrn_train::fit::{self, Division, Estimate, Fitted, Report, Request, Row, Written};
 
 use super::arguments::Fit;
@@ -21,10 +23,20 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
         Some(config) => (first_sensor(config)?, levels(config)?),
         None => (Sensor::new(Description::default())?, None),
     };
-    let references = arguments.out.with_extension("npz");
-    for out in [&arguments.out, &references] {
-        check_new(out)?;
+    let out = arguments.out.display();
+    if arguments
+        .out
+        .extension()
+        .is_none_or(|ending| ending != "onnx")
+    {
+        let text = format!("--out: found {out}, expected a name that ends with .onnx");
+        return Err(coded(USAGE, text));
     }
+    check_new(&arguments.out)?;
+    let references = arguments.out.with_extension("npz");
+    check_new(&references).with_context(|| {
+        format!("--out {out}: references would be written beside it: name another --out")
+    })?;
     let request = Request {
         data: arguments.data.clone(),
         sensor: sensor.clone(),
@@ -49,17 +61,23 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
             format!("[model]\npath = {path}\n")
         }
         Some(Written::References(bytes, levels)) => {
-            write(&references, &bytes)?;
             let own = levels
                 .as_deref()
                 .map(of_levels)
                 .transpose()?
                 .unwrap_or_default();
-            let path = shown(&references);
-            format!("references = {path}   # in the table of the [[sensor]]\n{own}")
+            let line = match bytes {
+                Some(bytes) => {
+                    write(&references, &bytes)?;
+                    let path = shown(&references);
+                    format!("references = {path}   # in the table of the [[sensor]]\n")
+                }
+                None => String::new(),
+            };
+            line + &own
         }
     };
-    if arguments.json {
+    if arguments.json || lines.is_empty() {
         return Ok(text);
     }
     Ok(format!(

@@ -57,7 +57,7 @@ fn main() -> ExitCode {
         Command::Compare(plan) => compare::compare(&plan),
         Command::Evaluate(arguments) => models::evaluate(&arguments),
         Command::Export { run, out } => models::export_run(&run, &out),
-        Command::CheckModel { model, fps } => return models::check_model(&model, fps),
+        Command::CheckModel { model, fps } => models::check_model(&model, fps),
         Command::Inspect { model } => models::inspect(&model),
     };
     match done.and_then(|account| Ok(print(&account)?)) {

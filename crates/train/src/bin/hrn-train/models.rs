@@ -1,7 +1,6 @@
 //! The commands on a model file: `evaluate`, `export`, `inspect` and `check-model`.
 
 use std::path::Path;
-use std::process::ExitCode;
 
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Hrn, Verdict};
@@ -13,7 +12,6 @@ use hrn_train::model::verdicts::{self, Given};
 
 use super::account;
 use super::arguments::Evaluate;
-use super::exit_code;
 use super::files::{check_new, load, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
@@ -143,32 +141,23 @@ pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
     Ok(account::of_model(path, &load(path)?.0))
 }
 
-/// Checks a model file. The lines of the check are the output of the command, so they go to stdout
-/// even if the model does not pass. The time limit for a verdict follows from the frame rate.
-pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> ExitCode {
-    let checked = read(path).and_then(|bytes| {
-        // Try to run it as the daemon does, with its memory and time.
-        let most = trial::verdict_most(frame_rate_hz);
-        let problem = trial::load(&bytes, Some(most)).err();
-        let lines = match &problem {
-            None => format!(
-                "{}: a model that hardnessd loads, for sensors of up to {frame_rate_hz} frames/s\n",
-                path.display()
+/// Checks a model file. The time limit for a verdict follows from the frame rate.
+pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> anyhow::Result<String> {
+    let bytes = read(path)?;
+    let shown = path.display();
+    // Try to run it as the daemon does, with its memory and time.
+    let most = trial::verdict_most(frame_rate_hz);
+    match trial::load(&bytes, Some(most)) {
+        Ok(_) => Ok(format!(
+            "{shown}: a model that hardnessd loads, for sensors of up to {frame_rate_hz} frames/s\n"
+        )),
+        Err(problem) => Err(coded(
+            exit::CONFIG,
+            format_args!(
+                "{shown}: {}; `python3 -m hardnessd.adopt IN.onnx --out M.onnx` mends names, shapes and metadata of \
+                 a model of one frame; docs/formats.md has the format",
+                wording::line(&problem)
             ),
-            Some(problem) => format!(
-                "{problem}\n`python3 -m hardnessd.adopt IN.onnx --out M.onnx` mends names, shapes and metadata of a \
-                 model of one frame; docs/formats.md has the format\n"
-            ),
-        };
-        super::print(&lines)?;
-        Ok(problem.is_none())
-    });
-    match checked {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::from(exit::CONFIG),
-        Err(error) => {
-            hardnessd_core::stderr_line!("hrn-train: {}", wording::line(error.as_ref()));
-            ExitCode::from(exit_code(&error))
-        }
+        )),
     }
 }

@@ -135,6 +135,13 @@ pub(super) fn labels(bytes: &[u8]) -> Labels {
     labels.next().unwrap_or_default()
 }
 
+/// A recording has no press.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "no press found: was the sensor pressed, and is this its layout? `hardnessd replay` shows what is in a recording"
+)]
+pub(super) struct NoPress;
+
 /// What is in a recording: its presses, labels and pitch.
 pub(super) struct Pressed {
     pub(super) judged: Vec<Judged>,
@@ -162,11 +169,9 @@ impl Pressed {
             selection.take(pipeline.end_of_recording(None), NOT_LOOKED_AT, &none);
             Labels::new()
         };
-        ensure!(
-            !selection.presses.is_empty(),
-            "no press found: was the sensor pressed, and is this its layout? `hardnessd replay` shows what is in a \
-             recording"
-        );
+        if selection.presses.is_empty() {
+            return Err(NoPress.into());
+        }
         // A recording with a press has a sensor.
         let expected = sensors.first().map_or(PITCH_MM, grid_mm);
         for found in sensors.iter().map(grid_mm) {
@@ -216,6 +221,10 @@ fn play(
     for note in playback.left_out() {
         hardnessd_core::stderr_line!("warning: {note}");
     }
+    ensure!(
+        !sensors.is_empty(),
+        "found no state of a sensor, expected a recording of hardnessd"
+    );
     // A press that is still under way gets no verdict.
     selection.take(playback.end(), NOT_LOOKED_AT, &none);
     Ok(playback.labels())
