@@ -395,6 +395,15 @@ def _shown(address: Address) -> str:
     return "{}:{}".format(*address) if isinstance(address, tuple) else os.fspath(address)
 
 
+def _explained(error: OSError, address: Address) -> OSError:
+    """The error of a failed connection, which the system says without the address."""
+    if error.errno is not None:
+        error.filename = _shown(address)
+    if error.errno in (errno.ENOENT, errno.ECONNREFUSED):
+        error.strerror = f"{os.strerror(error.errno)}: start `hardnessd run`, or name its socket"
+    return error
+
+
 def _silence(address: Address, seconds: float) -> str:
     """What to say where a connection is open, but no line came."""
     if isinstance(_destination(address), str):
@@ -436,10 +445,7 @@ class Connection:
             why = f"no answer within {patience_s:g} s"
             raise TimeoutError(errno.ETIMEDOUT, why, _shown(address)) from error
         except OSError as error:
-            # The system does not name the address in its message.
-            if error.errno is not None:
-                error.filename = _shown(address)
-            raise
+            raise _explained(error, address)
         self.socket.settimeout(timeout_s)
         self._timeout_s = timeout_s
         self._bytes = bytearray()
@@ -750,7 +756,10 @@ class AsyncClient(_Subscriber):
             if isinstance(destination, str)
             else asyncio.open_connection(*destination, limit=LONGEST_LINE_BYTES)
         )
-        reader, writer = await asyncio.wait_for(connecting, HELLO_S)
+        try:
+            reader, writer = await asyncio.wait_for(connecting, HELLO_S)
+        except OSError as error:
+            raise _explained(error, self._found)
         self._deadline = time.monotonic() + HELLO_S
         try:
             if not isinstance(destination, str):

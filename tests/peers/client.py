@@ -30,6 +30,7 @@ from bench import PATIENCE_S, Bench, wait_for
 
 ROOT = pathlib.Path(__file__).parents[2]
 ONE_FILE = ROOT / "clients/python/hardnessd.py"
+NOBODY = "No such file or directory: start `hardnessd run`, or name its socket"
 
 
 class Events(list):
@@ -256,7 +257,7 @@ def program(bench):
             assert ended.returncode == code and said in ended.stderr, (arguments, ended)
             assert "Traceback" not in ended.stderr, ended
         nobody = done(bench.path("nobody.sock"), "--timeout", "0.5").stdout
-        assert nobody == f"-- disconnected: {bench.path('nobody.sock')}: No such file or directory --\n", nobody
+        assert nobody == f"-- disconnected: {bench.path('nobody.sock')}: {NOBODY} --\n", nobody
         piped = subprocess.run(
             ["bash", "-c", '"$@" | head -n 1; echo "${PIPESTATUS[0]}"', "-", *start, events, "--types", "frame"],
             capture_output=True, text=True, timeout=60,
@@ -290,7 +291,12 @@ def finds_the_socket(bench):
             own = os.path.join(user, "hardnessd/events.sock")
             assert hardnessd.default_address() == own
             client = iter(hardnessd.Client())
-            assert next(client) == {"type": "disconnected", "reason": f"{own}: No such file or directory"}
+            assert next(client) == {"type": "disconnected", "reason": f"{own}: {NOBODY}"}
+            try:
+                hardnessd.Control(own)
+                raise AssertionError("nobody is there")
+            except FileNotFoundError as error:
+                assert str(error) == f"[Errno 2] {NOBODY}: {own!r}", error
             # One that a dead daemon left behind is not chosen where another answers.
             dead = socket.socket(socket.AF_UNIX)
             dead.bind(own)
