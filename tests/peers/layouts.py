@@ -1,0 +1,178 @@
+#!/usr/bin/env python3
+"""Streams of boards that nobody knows, through `sniff` and the daemon's own decoder.
+
+    PYTHON tests/peers/layouts.py target/debug/hardnessd [--streams N] [--seed S]
+
+A generator that shares no code with the product: arrays, cells, marks, counters, lengths, checksums, SLIP, COBS and
+text by chance, with rests and noise, pressed at a few places. Claims: the share that is right, and that hardly any is
+sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames.
+"""
+
+import argparse
+import collections
+import json
+import pathlib
+import struct
+import subprocess
+import sys
+import tempfile
+import tomllib
+import zlib
+
+import numpy as np
+
+GRIDS = [
+    (4, 4), (5, 12), (6, 9), (8, 8), (10, 10), (12, 32), (16, 16), (16, 32), (20, 24), (28, 28), (32, 32), (64, 64)
+]
+# numpy's type, and full scale.
+CELLS = {
+    "u8": ("u1", 255), "i8": ("i1", 127), "u16le": ("<u2", 4095), "u16be": (">u2", 4095), "i16le": ("<i2", 8000),
+    "i16be": (">i2", 8000), "i32le": ("<i4", 100_000), "f32le": ("<f4", 20), "f32be": (">f4", 20),
+}
+FRAMINGS = ["marked"] * 5 + ["slip", "cobs", "text"]
+# The share that must be right, and the share that may be sure and wrong.
+RIGHT, WRONG = 0.85, 0.02
+
+
+def crc(data, bits, polynomial, value, is_reflected):
+    """A CRC of 8 or 16 bits, bit by bit."""
+    top, mask = 1 << (bits - 1), (1 << bits) - 1
+    for byte in data:
+        value ^= byte if is_reflected else byte << (bits - 8)
+        for _ in range(8):
+            if is_reflected:
+                value = value >> 1 ^ (polynomial if value & 1 else 0)
+            else:
+                value = (value << 1 ^ (polynomial if value & top else 0)) & mask
+    return value
+
+
+def xor(data):
+    value = 0
+    for byte in data:
+        value ^= byte
+    return value
+
+
+CHECKSUMS = {
+    "none": lambda data: b"",
+    "sum8": lambda data: bytes([sum(data) & 0xFF]),
+    "xor8": lambda data: bytes([xor(data)]),
+    "lrc8": lambda data: bytes([-sum(data) & 0xFF]),
+    "sum16": lambda data: struct.pack("<H", sum(data) & 0xFFFF),
+    "crc8": lambda data: bytes([crc(data, 8, 0x07, 0, False)]),
+    "crc16-modbus": lambda data: struct.pack("<H", crc(data, 16, 0xA001, 0xFFFF, True)),
+    "crc16-ccitt": lambda data: struct.pack("<H", crc(data, 16, 0x1021, 0xFFFF, False)),
+    "crc32": lambda data: struct.pack("<I", zlib.crc32(data)),
+}
+
+
+def slip(data):
+    return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+
+
+def cobs(data):
+    out = b""
+    for block in data.split(b"\0"):
+        while len(block) >= 254:
+            out, block = out + b"\xff" + block[:254], block[254:]
+        out += bytes([len(block) + 1]) + block
+    return out + b"\0"
+
+
+def pressed(rng, rows, cols, frames, rate_hz, full):
+    """[frames, rows, cols]: what presses add."""
+    load, at = np.zeros((frames, rows, cols)), int(1.5 * rate_hz) + 8
+    row, col = np.mgrid[:rows, :cols]
+    while at < frames - 45:
+        length = int(rng.integers(8, min(40, int(1.5 * rate_hz) + 9)))
+        centre = rng.uniform(0.2, 0.8, 2) * (rows, cols)
+        width = rng.uniform(0.08, 0.22) * min(rows, cols) + 0.7
+        shape = np.exp(-((row - centre[0]) ** 2 + (col - centre[1]) ** 2) / (2 * width**2))
+        ramp = np.arange(1, length + 1) / (0.3 * length)
+        load[at : at + length] += rng.uniform(0.25, 0.85) * full * np.multiply.outer(
+            np.clip(np.minimum(ramp, ramp[::-1]), 0, 1), shape
+        )
+        at += length + int(rng.integers(8, 20) + 0.3 * rate_hz)
+    return load
+
+
+def stream(seed):
+    """What was sent in words, and the bytes."""
+    rng = np.random.default_rng(seed)
+    rows, cols = GRIDS[rng.integers(len(GRIDS))]
+    cell, framing = str(rng.choice(list(CELLS))), str(rng.choice(FRAMINGS))
+    numbers, full = CELLS[cell]
+    rate_hz = int(rng.choice([10, 20, 30, 50, 100]))
+    frames = int(np.clip(15 * rate_hz, 120, 400))
+    mark = bytes(rng.integers(1, 255, rng.integers(2, 5)).tolist())
+    header, length, tail = (int(rng.integers(n)) for n in (5, 4, 3))
+    checksum = str(rng.choice(list(CHECKSUMS)))
+    is_signed = not cell.startswith("u")
+    rest = rng.uniform(0, 0.12) if not is_signed or rng.random() < 0.5 else rng.uniform(-0.02, 0.02)
+    rest = full * (rest + rng.normal(0, 0.01, (rows, cols)) * (rng.random() < 0.6))
+    noise = full * rng.uniform(0, 0.006)
+    load, out, began = pressed(rng, rows, cols, frames, rate_hz, full), b"", int(rng.integers(1 << 20))
+    for frame in range(frames):
+        value = rest + load[frame] + rng.normal(0, noise, (rows, cols))
+        if framing == "text":
+            separator = " ,"[seed % 2]
+            counts = np.clip(np.round(value * (10 if full < 50 else 1)), 0, 4095).astype(int)
+            out += ("\n".join(separator.join(map(str, row)) for row in counts) + "\n\n").encode()
+            continue
+        if not cell.startswith("f"):
+            value = np.clip(np.round(value), -full if is_signed else 0, full)
+        clock_ms = began + frame * 1000 // rate_hz
+        headers = [b"", bytes([frame & 0xFF]), struct.pack("<H", frame), struct.pack("<I", clock_ms), b"\x01\x02"]
+        body = headers[header] + value.astype(numbers).tobytes()
+        if framing == "marked":
+            lengths = [b"", b"", struct.pack("<H", len(body)), struct.pack(">H", len(body))]
+            body = mark + lengths[length] + body
+            out += body + CHECKSUMS[checksum](body) + (b"\r\n" if tail == 0 else b"")
+        else:
+            out += {"slip": slip, "cobs": cobs}[framing](body + CHECKSUMS[checksum](body))
+    sent = {"rows": rows, "cols": cols, "cell": cell, "framing": framing, "checksum": checksum, "frames": frames}
+    return sent, out[int(rng.integers(40)) :]
+
+
+def judged(binary, directory, sent, data):
+    """`right`, `wrong` or `not sure`, and what was said."""
+    capture, config = directory / "capture.bin", directory / "found.toml"
+    capture.write_bytes(data)
+    config.unlink(missing_ok=True)
+    done = subprocess.run([binary, "sniff", capture, "--out", config], capture_output=True, text=True)
+    if done.returncode != 0:
+        return "not sure", done.stderr.strip()
+    found = tomllib.loads(config.read_text())["sensor"][0]["frame"]
+    cell = "text" if found.get("preset") in ("csv", "flexitac") else found.get("cell", "u8")
+    wanted = "text" if sent["framing"] == "text" else sent["cell"]
+    # A signed cell that is never below 0 is read without its sign.
+    is_cell = cell == wanted or cell.replace("u", "i", 1) == wanted.replace("u", "i", 1)
+    played = subprocess.run([binary, "replay", capture, "--config", config, "--json"], capture_output=True, text=True)
+    frames = json.loads(played.stdout.splitlines()[-1])["frames"] if played.stdout else 0
+    is_array = (found["rows"], found["cols"]) == (sent["rows"], sent["cols"])
+    is_right = is_array and is_cell and frames >= 0.95 * sent["frames"] - 2
+    return "right" if is_right else "wrong", json.dumps(found)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("binary", type=pathlib.Path)
+    parser.add_argument("--streams", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    counts = collections.Counter()
+    with tempfile.TemporaryDirectory() as directory:
+        for seed in range(given.seed, given.seed + given.streams):
+            sent, data = stream(seed)
+            said, why = judged(given.binary.resolve(), pathlib.Path(directory), sent, data)
+            counts[said] += 1
+            if said != "right":
+                print(f"{seed}: {said}: {json.dumps(sent)}: {why[:300]}", flush=True)
+    print(dict(counts))
+    is_as_claimed = counts["right"] >= RIGHT * given.streams and counts["wrong"] <= WRONG * given.streams
+    sys.exit(not is_as_claimed)
+
+
+if __name__ == "__main__":
+    main()
