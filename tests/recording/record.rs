@@ -206,11 +206,13 @@ fn killed_at_any_moment_less_than_a_second_is_lost() {
         let found = entries(&good);
         let last = found.iter().rfind(|found| is_bytes(found)).unwrap();
         losses.push(before.saturating_sub(last.at.mono));
-        // Nothing is missing in between, or a frame would be damaged.
+        // Nothing is missing in between, or a frame would be damaged. One may be at the beginning: the sensor
+        // sends while nobody reads.
         let events = replay(&good);
         let end = events.last().unwrap();
         assert_eq!(end["reason"], "end of recording");
-        assert_eq!(end["frames_damaged"], 0, "{end} in round {round}");
+        let damaged = end["frames_damaged"].as_u64().unwrap();
+        assert!(damaged <= 1, "{end} in round {round}");
     }
     // A busy machine writes some rounds late.
     losses.sort();
