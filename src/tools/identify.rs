@@ -26,7 +26,7 @@ use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
 use hardnessd_core::verdict::{
-    Borders, Course, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress, Tried,
+    Borders, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress, TimeSeries, Tried,
 };
 
 /// Arguments of `identify`.
@@ -248,13 +248,13 @@ fn of_files(
 }
 
 /// The greatest force of a press, in newtons.
-fn greatest_n(course: &Course) -> f64 {
+fn greatest_n(course: &TimeSeries) -> f64 {
     let forces = course.moments.iter().map(|moment| moment.frame.force_n());
     forces.fold(0.0, f64::max)
 }
 
 /// At most `most` of the presses, evenly up to the hardest: presses of unlike force tell most.
-fn spread(mut courses: Vec<Course>, most: usize) -> Vec<Course> {
+fn spread(mut courses: Vec<TimeSeries>, most: usize) -> Vec<TimeSeries> {
     courses.sort_by(|a, b| greatest_n(a).total_cmp(&greatest_n(b)));
     let (found, wanted) = (courses.len(), most.min(courses.len()));
     let places = (1..=wanted).map(|number| number * found / wanted - 1);
@@ -278,7 +278,7 @@ fn labelled(labels: &Labels, path: &Path) -> Result<What, Failure> {
 }
 
 fn made_of(
-    courses: Vec<Course>,
+    courses: Vec<TimeSeries>,
     piece: Piece,
     path: &Path,
     sensor: &Sensor,
@@ -298,7 +298,7 @@ fn of_recording(
     path: &Path,
     sensor: &str,
     hrn: Arc<Hrn>,
-) -> Result<(Vec<Course>, Labels), Failure> {
+) -> Result<(Vec<TimeSeries>, Labels), Failure> {
     let read = || -> anyhow::Result<_> {
         let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
         playback.keep_courses();
@@ -379,8 +379,8 @@ mod tests {
     use super::*;
     use hardnessd_core::verdict::{ModelFrame, Sample, TAXELS};
 
-    fn press(newtons: f32) -> Course {
-        Course {
+    fn press(newtons: f32) -> TimeSeries {
+        TimeSeries {
             moments: vec![Sample {
                 time_s: 0.0,
                 approach_mm: None,

@@ -24,7 +24,7 @@ use crate::motion::Track;
 use crate::press::{ContactFrame, FrameAt, SoFar};
 use crate::sensor::Sensor;
 use crate::verdict::{
-    COURSE_FRAMES, Course, Format, Hrn, ModelError, ReferenceKinds, Resampling, Verdict,
+    COURSE_FRAMES, Format, Hrn, ModelError, ReferenceKinds, Resampling, TimeSeries, Verdict,
 };
 
 /// The number of frames in contact that an early verdict on the course needs.
@@ -73,7 +73,7 @@ pub struct Judge {
     /// The missing verdicts that are not fetched yet.
     pub(crate) unjudged: Vec<Unjudged>,
     /// The courses of presses that ended and are not fetched yet, if they are kept.
-    pub(crate) courses: Option<Vec<Course>>,
+    pub(crate) courses: Option<Vec<TimeSeries>>,
 }
 
 /// What a judge keeps from one press to the next. A recording holds it.
@@ -241,7 +241,7 @@ impl Judge {
     fn keep_own(
         &mut self,
         pressed: PressedAt,
-        course: &Course,
+        course: &TimeSeries,
         peak: &ContactFrame,
         now: Circumstances<'_>,
     ) -> Result<(), ModelError> {

@@ -28,7 +28,7 @@ use crate::motion::Track;
 use crate::press::{Abort, Change, End, FrameAt, Marks, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
-use crate::verdict::{Course, Hrn};
+use crate::verdict::{Hrn, TimeSeries};
 use crate::wire::{Decoded, Decoder};
 
 /// The source of the frames' times.
@@ -159,7 +159,7 @@ impl Pipeline {
     }
 
     /// The kept courses that were not returned yet.
-    pub fn courses(&mut self) -> Vec<Course> {
+    pub fn courses(&mut self) -> Vec<TimeSeries> {
         let kept = self.judge.courses.as_mut();
         kept.map(std::mem::take).unwrap_or_default()
     }

@@ -13,8 +13,8 @@ use zip::ZipArchive;
 use crate::npy::Header;
 use crate::npz::Writer;
 use crate::verdict::{
-    COLS, COURSE_FRAMES, Course, MOST_REFERENCES, ModelFrame, Piece, ROWS, ReferencePress, Sample,
-    TAXELS,
+    COLS, COURSE_FRAMES, MOST_REFERENCES, ModelFrame, Piece, ROWS, ReferencePress, Sample, TAXELS,
+    TimeSeries,
 };
 
 /// The newtons on a taxel, without the sign.
@@ -93,7 +93,7 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
             }
         };
         references.push(ReferencePress {
-            course: Course {
+            course: TimeSeries {
                 moments: (first..first + length).map(moment).collect(),
                 arm_n_per_mm: arm_n_per_mm[number] as f32,
             },
@@ -226,7 +226,7 @@ mod tests {
             }
         };
         ReferencePress {
-            course: Course {
+            course: TimeSeries {
                 moments: (0..frames).map(moment).collect(),
                 arm_n_per_mm: 12.5,
             },

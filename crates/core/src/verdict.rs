@@ -27,7 +27,7 @@ use tract_onnx::prelude::*;
 pub use self::card::{
     Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Limits, Range, TAIL,
 };
-pub use self::course::{COURSE_FRAMES, Course, Extents, Sample, extents};
+pub use self::course::{COURSE_FRAMES, Extents, Sample, TimeSeries, extents};
 pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
 use self::file::{File, Outputs};
 pub use self::file::{check_levels, check_line};
@@ -248,7 +248,7 @@ impl Hrn {
     /// Returns an error if an output is NaN or infinite, the inference library fails, or the model takes
     /// frames of another array.
     pub fn judge(&self, frame: &ModelFrame) -> Result<Verdict, ModelError> {
-        self.judge_course(&Course {
+        self.judge_course(&TimeSeries {
             moments: vec![Sample {
                 time_s: 0.0,
                 approach_mm: None,
@@ -338,7 +338,7 @@ impl Hrn {
     /// # Panics
     ///
     /// Panics if the course has no frame.
-    pub fn judge_course(&self, course: &Course) -> Result<Verdict, ModelError> {
+    pub fn judge_course(&self, course: &TimeSeries) -> Result<Verdict, ModelError> {
         self.judge_beside(course, &self.references)
     }
 
@@ -353,7 +353,7 @@ impl Hrn {
     /// Panics as [`Self::judge_course`] does.
     pub fn judge_course_with(
         &self,
-        course: &Course,
+        course: &TimeSeries,
         own: &References,
     ) -> Result<(Verdict, ReferenceKinds), ModelError> {
         let references = self.references.and(own, self.most_references());
@@ -363,7 +363,7 @@ impl Hrn {
 
     fn judge_beside(
         &self,
-        course: &Course,
+        course: &TimeSeries,
         references: &References,
     ) -> Result<Verdict, ModelError> {
         let moments = &course.moments;

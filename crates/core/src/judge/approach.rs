@@ -111,7 +111,7 @@ impl<'a> PressWithApproach<'a> {
         arm_n_per_mm: Option<f64>,
         most: usize,
         resampling: &Resampling,
-    ) -> verdict::Course {
+    ) -> verdict::TimeSeries {
         let begin = self.frames[0].moment.stamp.mono;
         let moment = |place: usize| {
             let frame = self.frames[place];
@@ -124,7 +124,7 @@ impl<'a> PressWithApproach<'a> {
         };
         let places = thinned(self.frames.len(), self.best, most);
         let is_known = self.source != ApproachSource::None;
-        verdict::Course {
+        verdict::TimeSeries {
             moments: places.into_iter().map(moment).collect(),
             arm_n_per_mm: arm_n_per_mm.filter(|_| is_known).unwrap_or(0.0) as f32,
         }

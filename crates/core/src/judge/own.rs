@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::sensor::Sensor;
-use crate::verdict::{Course, Hrn, ModelError, Piece, ReferencePress, References};
+use crate::verdict::{Hrn, ModelError, Piece, ReferencePress, References, TimeSeries};
 
 /// The fewest presses that are used.
 const LEAST: usize = 6;
@@ -90,7 +90,7 @@ impl OwnPresses {
     /// Returns the errors of [`Hrn::judge`].
     pub fn references_of(
         hrn: &Hrn,
-        courses: &[Course],
+        courses: &[TimeSeries],
         most: usize,
     ) -> Result<References, ModelError> {
         let mut own = Self::default();
@@ -105,7 +105,7 @@ impl OwnPresses {
         &mut self,
         press: PressedAt,
         hrn: &Hrn,
-        course: &Course,
+        course: &TimeSeries,
         most: usize,
     ) -> Result<(), ModelError> {
         let is_new = press.in_a_row <= MOST_IN_A_ROW;
@@ -116,7 +116,7 @@ impl OwnPresses {
         }
     }
 
-    fn keep(&mut self, hrn: &Hrn, course: &Course, most: usize) -> Result<(), ModelError> {
+    fn keep(&mut self, hrn: &Hrn, course: &TimeSeries, most: usize) -> Result<(), ModelError> {
         let most = most.min(hrn.most_references());
         if most == 0 {
             return Ok(());

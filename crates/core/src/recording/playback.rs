@@ -10,7 +10,7 @@ use crate::judge::Unjudged;
 use crate::motion::Track;
 use crate::pipeline::Pipeline;
 use crate::press::Abort;
-use crate::verdict::{Course, Hrn, ModelError};
+use crate::verdict::{Hrn, ModelError, TimeSeries};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -91,7 +91,7 @@ impl Playback {
     }
 
     /// The kept courses of a sensor that were not returned yet. A state of the sensor forgets them.
-    pub fn courses(&mut self, sensor: &str) -> Vec<Course> {
+    pub fn courses(&mut self, sensor: &str) -> Vec<TimeSeries> {
         let mut players = self.players.iter_mut();
         let player = players.find(|player| player.pipeline.sensor().name() == sensor);
         player

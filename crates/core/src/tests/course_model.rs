@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::graph::{indices, int, ints, node, number, value};
-use crate::verdict::{CheckedCourse, Course, CourseCheck, ModelFrame, Sample};
+use crate::verdict::{CheckedCourse, CourseCheck, ModelFrame, Sample, TimeSeries};
 
 /// How far the last three logits are below the others.
 const NEVER: f32 = 50.0;
@@ -125,7 +125,7 @@ fn check(most: usize) -> CourseCheck {
                 frame,
             }
         });
-        let course = Course {
+        let course = TimeSeries {
             moments: moments.collect(),
             arm_n_per_mm: 3.0 * (number % 3) as f32,
         };
@@ -143,7 +143,7 @@ fn check(most: usize) -> CourseCheck {
 }
 
 /// The probabilities of the model, computed without it.
-pub(crate) fn judged(course: &Course) -> Vec<f32> {
+pub(crate) fn judged(course: &TimeSeries) -> Vec<f32> {
     let moments = &course.moments;
     let sum: f32 = moments.iter().filter_map(|moment| moment.approach_mm).sum();
     let forces = moments.iter().map(|moment| moment.frame.force_n() as f32);

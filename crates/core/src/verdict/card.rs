@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::course::{Course, Extents};
+use super::course::{Extents, TimeSeries};
 use super::error::ModelError;
 use super::parts::PARTS;
 use super::probabilities::argmax;
@@ -89,7 +89,7 @@ impl Range {
     }
 
     /// Whether a press may be one of the range of the presses. An unknown number may.
-    pub fn holds(&self, course: &Course) -> bool {
+    pub fn holds(&self, course: &TimeSeries) -> bool {
         let pairs = self.of_presses().into_iter().zip(course.extents());
         pairs.into_iter().all(|pair| match pair {
             (Some([least, most]), Some([low, high])) => low <= most && least <= high,
@@ -268,7 +268,7 @@ pub struct CourseCheck {
 pub struct CheckedCourse {
     /// The course of the press.
     #[serde(flatten)]
-    pub course: Course,
+    pub course: TimeSeries,
     /// `[L]`: the trainer's probabilities.
     pub probabilities: Vec<f32>,
     /// The trainer's Shore hardness: value, low and high. `None` for a model that gives none.

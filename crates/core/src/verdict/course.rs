@@ -45,7 +45,7 @@ pub struct Sample {
 /// ```
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(into = "Written", try_from = "Written")]
-pub struct Course {
+pub struct TimeSeries {
     /// The frames in contact, from the one that began the press, ascending in time.
     pub moments: Vec<Sample>,
     /// The stiffness of the arm. 0 if it is unknown.
@@ -96,7 +96,7 @@ pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
     [last, period, speed, furthest.map(exactly), arm]
 }
 
-impl Course {
+impl TimeSeries {
     /// The numbers that `hrn.range` may bound.
     pub fn extents(&self) -> Extents {
         let moment = |moment: &Sample| (moment.time_s, moment.approach_mm);
@@ -115,8 +115,8 @@ pub(super) struct Written {
     frames: Vec<String>,
 }
 
-impl From<Course> for Written {
-    fn from(course: Course) -> Self {
+impl From<TimeSeries> for Written {
+    fn from(course: TimeSeries) -> Self {
         let moments = course.moments.iter();
         Self {
             time_s: moments.clone().map(|moment| moment.time_s).collect(),
@@ -127,7 +127,7 @@ impl From<Course> for Written {
     }
 }
 
-impl TryFrom<Written> for Course {
+impl TryFrom<Written> for TimeSeries {
     type Error = String;
 
     fn try_from(written: Written) -> Result<Self, String> {

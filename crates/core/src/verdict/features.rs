@@ -7,7 +7,7 @@
 
 use std::ops::Range;
 
-use super::course::{Course, Sample};
+use super::course::{Sample, TimeSeries};
 use super::grid::{COLS, ModelFrame, ROWS};
 use crate::line;
 use crate::press::Phases;
@@ -273,7 +273,7 @@ impl From<&Sample> for Moment {
     }
 }
 
-impl Course {
+impl TimeSeries {
     /// The features of the press.
     ///
     /// # Panics

@@ -5,7 +5,7 @@
 
 use tract_onnx::prelude::*;
 
-use super::course::{Course, Sample};
+use super::course::{Sample, TimeSeries};
 use super::features::FEATURES;
 use super::grid::{COLS, ROWS, TAXELS};
 use super::references::{PIECE, Piece, References};
@@ -37,7 +37,7 @@ pub(super) struct Lengths {
 
 /// What a model of courses judges.
 pub(super) struct Query<'a> {
-    pub(super) course: &'a Course,
+    pub(super) course: &'a TimeSeries,
     /// The pressed piece, if the press is to become a reference.
     pub(super) piece: Option<Piece>,
     pub(super) references: &'a References,

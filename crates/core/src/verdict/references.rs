@@ -10,7 +10,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::course::Course;
+use super::course::TimeSeries;
 
 /// The most presses that a sensor may have as references.
 pub const MOST_REFERENCES: usize = 64;
@@ -71,7 +71,7 @@ impl Piece {
 pub struct ReferencePress {
     /// The press.
     #[serde(flatten)]
-    pub course: Course,
+    pub course: TimeSeries,
     /// The piece.
     pub piece: Piece,
 }

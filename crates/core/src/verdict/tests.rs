@@ -62,7 +62,7 @@ fn changed(bytes: &[u8], change: impl FnOnce(&mut pb::ModelProto)) -> Vec<u8> {
 
 /// Four frames, or fewer or more, at 5 frames/s. The arm goes 1 mm from frame to frame, and is of
 /// 7.5 N/mm.
-fn course(length: usize, approach: bool) -> Course {
+fn course(length: usize, approach: bool) -> TimeSeries {
     let moments = (0..length).map(|place| {
         let mut frame = ModelFrame::default();
         frame.newtons[500..510].fill(0.3 * (1 + place) as f32);
@@ -72,7 +72,7 @@ fn course(length: usize, approach: bool) -> Course {
             frame,
         }
     });
-    Course {
+    TimeSeries {
         moments: moments.collect(),
         arm_n_per_mm: 7.5,
     }

@@ -14,7 +14,7 @@ use std::path::Path;
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Course, Level, ModelFrame, ROWS, Resampling, Sample, parts,
+    COLS, COURSE_FRAMES, Level, ModelFrame, ROWS, Resampling, Sample, TimeSeries, parts,
 };
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Reference, Split};
 
@@ -350,13 +350,13 @@ impl Presses {
     }
 
     /// The course of a press as the daemon would give it to a model: from the frame that began it.
-    pub fn course(&self, press: usize) -> Course {
+    pub fn course(&self, press: usize) -> TimeSeries {
         let moment = |row: usize| Sample {
             time_s: self.time_s[row],
             approach_mm: self.approach_mm[row],
             frame: self.frames.frame(row),
         };
-        Course {
+        TimeSeries {
             moments: self.rows(press).map(moment).collect(),
             arm_n_per_mm: self.all[press].arm_n_per_mm,
         }

@@ -8,7 +8,9 @@ use crate::data::presses::Presses;
 use crate::learn::course::piece;
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
-use hardnessd_core::verdict::{Course, Format, Hrn, Piece, ReferencePress, References, Verdict};
+use hardnessd_core::verdict::{
+    Format, Hrn, Piece, ReferencePress, References, TimeSeries, Verdict,
+};
 use hardnessd_simulator::random::Stream;
 
 /// The references of its sensor that a model is given beside a press.
@@ -105,7 +107,7 @@ fn own_presses(
     of_sensor: &[usize],
     count: usize,
 ) -> anyhow::Result<[References; 2]> {
-    let mut of_half: [Vec<Course>; 2] = Default::default();
+    let mut of_half: [Vec<TimeSeries>; 2] = Default::default();
     let mut order = of_sensor.to_vec();
     Stream::new(0, "own presses").shuffle(&mut order);
     let mut of_object = BTreeMap::<Option<u32>, u32>::new();
@@ -119,7 +121,7 @@ fn own_presses(
         }
     }
     let [first, second] = of_half;
-    let references = |courses: &[Course]| OwnPresses::references_of(hrn, courses, count);
+    let references = |courses: &[TimeSeries]| OwnPresses::references_of(hrn, courses, count);
     Ok([references(&first)?, references(&second)?])
 }
 
