@@ -284,7 +284,8 @@ impl Search<'_> {
     }
 
     /// Whether numbers are parts of longer ones: of two in a row, one is nearly always small and the other
-    /// is not, or of four bytes in a row, one is the same in all.
+    /// is not, or of four bytes in a row, one is nearly always the same. At the ends, a number may be another
+    /// part of the frame.
     fn is_part(&self, place: &Place, format: Format) -> bool {
         let frames = || {
             let frames = self.presses.frames();
@@ -293,8 +294,9 @@ impl Search<'_> {
         match format.cell.bytes() {
             1 if place.bytes >= FEWEST_PARTS => (0..4).any(|phase| {
                 let bytes = || frames().flat_map(|bytes| bytes.iter().skip(phase).step_by(4));
-                let first = bytes().next();
-                bytes().all(|byte| Some(byte) == first)
+                let usual = bytes().nth(1);
+                let others = bytes().filter(|&byte| Some(byte) != usual).count();
+                50 * others < bytes().count()
             }),
             2 => {
                 let (mut all, mut large) = (0, [0; 2]);
@@ -307,7 +309,6 @@ impl Search<'_> {
                         }
                     }
                 }
-                // At the ends, a number may be another part of the frame.
                 let is_small = large.map(|large| 50 * large < all);
                 is_small[0] != is_small[1]
             }
