@@ -27,14 +27,14 @@ pub struct Sample {
 /// The built-in model judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Course, Sample, Hrn, ModelFrame};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame, Sample, TimeSeries};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
 ///     let mut frame = ModelFrame::default();
 ///     frame.newtons[400..404].fill(newtons);
 ///     Sample { time_s, approach_mm: Some(approach_mm), frame }
 /// };
-/// let course = Course {
+/// let course = TimeSeries {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
 ///     arm_n_per_mm: 10.0,
 /// };
