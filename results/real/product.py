@@ -54,11 +54,14 @@ class Product:
         self.fits += 1
         parts, model = self.collected(recorded, learn), f"fit{self.fits}.onnx"
         report = json.loads(self.call("hrn-train", "fit", *parts, "--out", model, "--json"))
-        self.account = f"  fit wrote {report['writes']} ({report['best']}); what it expected:\n"
+        self.account = f"  fit wrote {report['writes'] or 'nothing'} ({report['best']}); what it expected:\n"
         self.account += "\n".join(map(of_row, report["candidates"] + report["controls"]))
         name = f"fit{self.fits}"
         if report["writes"] == "model":
             self.configure(name, self.sensor, f'[model]\npath = "{model}"\n')
+        elif report["writes"] is None:
+            # The built-in model is as good.
+            self.configure(name, self.sensor)
         else:
             references = f'references = "{name}.npz"\n'
             sensor = self.sensor.replace("[sensor.frame]", references + "[sensor.frame]")
