@@ -3,6 +3,7 @@
 //! In: the file as ONNX's own messages. Out: the model's description, or all that breaks the format.
 //! Nothing here runs the model.
 
+use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -357,6 +358,20 @@ impl<'a> Metadata<'a> {
         Some(entry.value.as_str())
     }
 
+    fn check_once(&self) -> Result<(), ModelError> {
+        let mut seen = BTreeSet::new();
+        let twice = self.0.iter().find(|entry| !seen.insert(&entry.key));
+        match twice {
+            Some(entry) => {
+                let key = shown(&entry.key);
+                Err(ModelError::new(format!(
+                    "model metadata: found {key} twice, expected it once"
+                )))
+            }
+            None => Ok(()),
+        }
+    }
+
     fn text(&self, key: &str) -> Result<&'a str, ModelError> {
         let missing = || ModelError::new(format!("model metadata `{key}` is missing"));
         self.find(key).ok_or_else(missing)
@@ -407,8 +422,9 @@ fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
     let lines = ["hrn.method", "hrn.data", "hrn.validation"];
     let [method, data, validation] = lines.map(|key| problems.keep(metadata.line(key)));
     let metrics = problems.keep(metrics(metadata));
-    let range = problems.keep(range(metadata));
+    problems.keep(metadata.check_once());
     let format = format?;
+    let range = problems.keep(range(metadata, &format));
     let grid = problems.keep(grid(metadata, &format));
     let conformal = problems.keep(match &*format {
         "1" => Ok(None),
@@ -462,8 +478,13 @@ fn metrics(metadata: &Metadata<'_>) -> Result<serde_json::Value, ModelError> {
     metadata.json(key, "JSON")
 }
 
-fn range(metadata: &Metadata<'_>) -> Result<Range, ModelError> {
-    let range = metadata.json("hrn.range", "trained force and area")?;
+fn range(metadata: &Metadata<'_>, format: &str) -> Result<Range, ModelError> {
+    let key = "hrn.range";
+    let range: Range = metadata.json(key, "trained force and area")?;
+    if format == "1" && range.of_presses().iter().any(Option::is_some) {
+        let expected = "`force_n` and `contact_area_taxels` alone: the others are of format 3";
+        return Err(ModelError::of_key(key, format!("{range:?}"), expected));
+    }
     check_range(&range)?;
     Ok(range)
 }

@@ -133,6 +133,18 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         ("`hrn.format`: found \"2\", expected \"1\" or \"3\"", |p| {
             set(p, "hrn.format", "2");
         }),
+        ("model metadata: found \"hrn.data\" twice", |p| {
+            let entry = p
+                .metadata_props
+                .iter()
+                .find(|entry| entry.key == "hrn.data");
+            let entry = entry.unwrap().clone();
+            p.metadata_props.push(entry);
+        }),
+        ("`hrn.range`: found Range", |p| {
+            let add = |range: &mut Value| range["duration_s"] = serde_json::json!([0.5, 2.0]);
+            edit(p, "hrn.range", add);
+        }),
         ("`hrn.pitch_mm`: found -1, expected", |p| {
             set(p, "hrn.pitch_mm", "-1");
         }),
