@@ -40,15 +40,20 @@ fn presses_on_wood_say_the_arms_stiffness_and_delay() {
     // The default sensor of the bench presses hard plastic first.
     let more = ["--material", "wood", "--motion", control];
     let _sensor = bench.sensor(&more);
-    let (code, text, errors) = ran(&mut calibrate(&bench, &["--presses", "4"]));
-    assert_eq!(code, 0, "{errors}");
     // The simulated arm has 10 N/mm. The cover in series and the sensor's own scale make it less or
-    // a little more, and so do frames that a busy machine delays.
-    let n_per_mm = value(&text, "stiffness_n_per_mm");
-    assert!((7.0..14.0).contains(&n_per_mm), "{text}");
-    // A frame takes 34.3 ms at 230,400 baud. A busy machine adds to it.
-    let delay_ms = value(&text, "delay_ms");
-    assert!((15.0..200.0).contains(&delay_ms), "{text}");
+    // a little more. A frame takes 34.3 ms at 230,400 baud.
+    let is_right = |text: &String| {
+        (8.0..12.0).contains(&value(text, "stiffness_n_per_mm"))
+            && (15.0..90.0).contains(&value(text, "delay_ms"))
+    };
+    let tried = || {
+        let (code, text, errors) = ran(&mut calibrate(&bench, &["--presses", "4"]));
+        assert_eq!(code, 0, "{errors}");
+        text
+    };
+    // A busy machine delays the frames of a try.
+    let text = (0..3).map(|_| tried()).find(is_right);
+    let text = text.expect("one of three tries is right");
     // The output is a configuration.
     let lines = text
         .split_once("\n\n")

@@ -89,13 +89,16 @@ fn six_floods_take_nothing_from_a_good_sensor() {
     let mut good = peers.pop().unwrap();
     let playing = thread::spawn(move || {
         let begin = Instant::now();
+        let (mut last, mut longest) = (begin, Duration::ZERO);
         for number in 0..FRAMES as u32 {
             // A press of half a second every two seconds.
             let bytes = if number % 100 >= 75 { &pressed } else { &free };
             good.write_all(bytes).unwrap();
+            longest = longest.max(last.elapsed());
+            last = Instant::now();
             thread::sleep((PERIOD * (number + 1)).saturating_sub(begin.elapsed()));
         }
-        good
+        (good, longest)
     });
 
     let mut received = Received::default();
@@ -124,7 +127,7 @@ fn six_floods_take_nothing_from_a_good_sensor() {
             break line;
         }
     };
-    drop(playing.join().unwrap());
+    let (_, longest) = playing.join().unwrap();
     daemon.end();
     for flood in floods {
         flood.join().unwrap();
@@ -134,8 +137,12 @@ fn six_floods_take_nothing_from_a_good_sensor() {
         let is_of = |line: &&str| line.contains(&format!("sensor=\"{sensor}\""));
         log.lines().filter(is_of).count()
     };
-    // A busy machine may once delay the good sender itself.
-    assert!(received.stale <= 1, "{received:?}");
+    // A busy machine may delay the good sender itself.
+    let may_be_stale = longest > 3 * PERIOD;
+    assert!(
+        may_be_stale || received.stale == 0,
+        "{received:?}, {longest:?}"
+    );
     assert_eq!(received.missing, 0, "{received:?}");
     for number in 1..=FLOODS {
         let lines = lines(&format!("flood{number}"));

@@ -192,32 +192,32 @@ fn the_readmes_demonstration_has_the_verdicts_that_it_shows() {
     let place = tempfile::tempdir().unwrap();
     // The reader ends it with Ctrl-C.
     let script = format!("{} --presses 4 2>/dev/null", command.words.join(" "));
-    let output = run(&script, place.path());
-    let verdicts: Vec<(&str, f64)> = events(&output)
-        .into_iter()
-        .filter(|event| event["phase"] == "final")
-        .map(|event| {
-            let probabilities = event["probabilities"].as_array().unwrap().iter();
-            let probabilities: Vec<f32> = probabilities
-                .map(|share| share.as_f64().unwrap() as f32)
-                .collect();
-            let force_n = event["force_n"].as_f64().unwrap();
-            (LABELS[argmax(&probabilities).0], force_n)
-        })
-        .collect();
     let shown: Vec<&str> = shown
         .lines()
         .filter_map(|line| line.split_once("->"))
         .map(|(_, verdict)| verdict)
         .collect();
-    assert_eq!((shown.len(), verdicts.len()), (4, 4));
-    // A busy machine delays frames, which may turn a close verdict.
-    let is_as_shown = |(shown, (label, force_n)): &(&&str, &(&str, f64))| {
-        let words: Vec<&str> = shown.split_whitespace().collect();
-        let newtons = words.iter().position(|&word| word == "N").unwrap() - 1;
-        let shown_n: f64 = words[newtons].parse().unwrap();
-        words.contains(label) && (shown_n - force_n).abs() < 0.5
+    let is_as_shown = || {
+        let output = run(&script, place.path());
+        // Frames that are late move a probability by some points, and may add a level to a set or take one
+        // from it. The likeliest level stays.
+        let verdicts: Vec<(&str, String)> = events(&output)
+            .into_iter()
+            .filter(|event| event["phase"] == "final")
+            .map(|event| {
+                let probabilities = event["probabilities"].as_array().unwrap().iter();
+                let probabilities: Vec<f32> = probabilities
+                    .map(|share| share.as_f64().unwrap() as f32)
+                    .collect();
+                let force = format!("{:.1} N", event["force_n"].as_f64().unwrap());
+                (LABELS[argmax(&probabilities).0], force)
+            })
+            .collect();
+        assert_eq!((shown.len(), verdicts.len()), (4, 4));
+        shown.iter().zip(verdicts).all(|(shown, (label, force))| {
+            shown.split_whitespace().any(|word| word == label) && shown.contains(&force)
+        })
     };
-    let as_shown = shown.iter().zip(&verdicts).filter(is_as_shown).count();
-    assert!(as_shown >= 3, "{shown:?}: {verdicts:?}");
+    // A busy machine delays the frames of a try.
+    assert!((0..3).any(|_| is_as_shown()), "{shown:?}");
 }
