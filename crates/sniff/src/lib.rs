@@ -14,6 +14,7 @@ mod period;
 mod columns;
 mod checks;
 mod places;
+mod cells;
 mod layout;
 mod scale;
 mod found;

@@ -7,6 +7,7 @@ use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::Cell;
 
 use crate::Capture;
+use crate::cells::Cells;
 use crate::checks::{self, Check};
 use crate::columns::{Columns, Kind};
 use crate::found::{Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
@@ -14,7 +15,7 @@ use crate::layout::{Parts, Proposal};
 use crate::model::{
     self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, Score, UNUSED_DIGIT_BITS,
 };
-use crate::numbers::{self, CELLS, is_float, is_signed};
+use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
 use crate::pictures::{Pictures, Presses, middle, some};
 use crate::places::{Place, places};
@@ -29,9 +30,6 @@ const PLACE_BYTES: usize = 60_000;
 const MARGIN: usize = 16;
 /// How many bytes are looked at first.
 const COARSE_BYTES: usize = 32_000;
-/// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
-const MANY: usize = 10;
-const LITTLE: usize = 4;
 /// The most bytes of a mark that look like cells at rest.
 const MOST_RESTING: usize = 4;
 /// As many arrays are decoded: the mark of a known board counts only then.
@@ -40,12 +38,6 @@ const RANKED: usize = 6;
 const UNCHECKED: usize = 3;
 /// The most formats at a place, and the most arrays that are looked at closely.
 const MOST_FORMATS: usize = 8;
-/// The fewest bytes that show whether bytes are parts of longer numbers.
-const FEWEST_PARTS: usize = 64;
-/// The high half of a number of 24 bits is smaller.
-const HIGH_HALF: f32 = 256.0;
-/// One of so many numbers that wraps is no damage.
-const WRAPS: usize = 1000;
 const MOST_ARRAYS: usize = 40;
 /// Where a cell is so much more like one of the next but one than like its neighbour, a taxel has several
 /// numbers, and one number for each takes so many bits more.
@@ -234,88 +226,6 @@ impl Search<'_> {
         found.into_iter().map(|(_, format)| format).collect()
     }
 
-    /// Whether numbers are below 0, as those of a signed format are: many, and by little. Large numbers
-    /// without a sign are few, and pass through the least ones.
-    fn has_negative(&self, place: &Place, format: Format) -> bool {
-        let quarter = 2.0_f32.powi(8 * format.cell.bytes() as i32 - 2);
-        let (mut all, mut little, mut much) = (0, 0, 0);
-        for index in self.presses.frames() {
-            let bytes = self.frames.from(index, place.start, place.bytes);
-            for number in numbers::numbers(format.cell, bytes) {
-                all += usize::from(number != 0.0);
-                little += usize::from((-quarter..0.0).contains(&number));
-                much += usize::from(number < -quarter);
-            }
-        }
-        little * MANY > all && little > LITTLE * much
-    }
-
-    /// Whether numbers without a sign jump by more than half of their range: at rest, or as one of several
-    /// numbers of a taxel also in a press. They have a sign then, or are the low half of a longer number.
-    fn wraps(&self, place: &Place, format: Format) -> bool {
-        let cell = match format.cell {
-            Cell::U8 | Cell::I8 => Cell::U8,
-            Cell::U16le | Cell::I16le => Cell::U16le,
-            Cell::U16be | Cell::I16be => Cell::U16be,
-            _ => return false,
-        };
-        let half = 2.0_f32.powi(8 * cell.bytes() as i32 - 1);
-        let numbers =
-            |index| numbers::numbers(cell, self.frames.from(index, place.start, place.bytes));
-        let (mut all, mut jumps) = (0, 0);
-        let mut count = |a: &[f32], b: &[f32]| {
-            all += a.len();
-            jumps += a
-                .iter()
-                .zip(b)
-                .filter(|(a, b)| (*a - *b).abs() > half)
-                .count();
-        };
-        let rest: Vec<Vec<f32>> = self.presses.rest().map(numbers).collect();
-        for pair in rest.windows(2) {
-            count(&pair[0], &pair[1]);
-        }
-        if format.channels > 1 && cell.bytes() > 1 {
-            for index in self.presses.frames() {
-                count(&numbers(index), &numbers(index - 1));
-            }
-        }
-        jumps * WRAPS > all
-    }
-
-    /// Whether numbers are parts of longer ones: of two in a row, one is nearly always small and the other
-    /// is not, or of four bytes in a row, one is nearly always the same. At the ends, a number may be another
-    /// part of the frame.
-    fn is_part(&self, place: &Place, format: Format) -> bool {
-        let frames = || {
-            let frames = self.presses.frames();
-            frames.map(|index| self.frames.from(index, place.start, place.bytes))
-        };
-        match format.cell.bytes() {
-            1 if place.bytes >= FEWEST_PARTS => (0..4).any(|phase| {
-                let bytes = || frames().flat_map(|bytes| bytes.iter().skip(phase).step_by(4));
-                let usual = bytes().nth(1);
-                let others = bytes().filter(|&byte| Some(byte) != usual).count();
-                50 * others < bytes().count()
-            }),
-            2 => {
-                let (mut all, mut large) = (0, [0; 2]);
-                for bytes in frames() {
-                    for pair in numbers::numbers(format.cell, bytes).chunks_exact(2) {
-                        all += 1;
-                        for (large, &number) in large.iter_mut().zip(pair) {
-                            let wrapped = if number >= 32_768.0 { 65_536.0 } else { 0.0 };
-                            *large += usize::from((number - wrapped).abs() >= HIGH_HALF);
-                        }
-                    }
-                }
-                let is_small = large.map(|large| 50 * large < all);
-                is_small[0] != is_small[1]
-            }
-            _ => false,
-        }
-    }
-
     /// The likeliest arrays at all places.
     fn candidates(&self, places: Vec<Place>, known: Known) -> Vec<Candidate> {
         // Which formats are likely depends on where a number of four bytes begins.
@@ -325,13 +235,14 @@ impl Search<'_> {
             let formats =
                 formats[place.start % 4].get_or_insert_with(|| self.formats(&place, known));
             for &mut format in formats {
-                let is_open = known.cell.is_none();
-                let wraps = is_open && self.wraps(&place, format);
-                let has_sign = || wraps || self.has_negative(&place, format);
+                let cells = Cells {
+                    frames: self.frames,
+                    presses: &self.presses,
+                    start: place.start,
+                    bytes: place.bytes,
+                };
                 if !place.bytes.is_multiple_of(format.bytes())
-                    || is_open && self.is_part(&place, format)
-                    || is_signed(format.cell) && !has_sign()
-                    || !is_signed(format.cell) && wraps
+                    || !cells.may_be(format.cell, format.channels, known.cell.is_some())
                 {
                     continue;
                 }

@@ -1,0 +1,126 @@
+//! Whether numbers at a place may be cells of a type, by the values that they take.
+//!
+//! In: frames in which something presses or rests, a place, and a type. Out: yes or no. A cell is no
+//! number without a sign if it wraps below 0, and no part of a longer number.
+
+use hardnessd_core::wire::Cell;
+
+use crate::numbers::{self, is_signed};
+use crate::period::Frames;
+use crate::pictures::Presses;
+
+/// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
+const MANY: usize = 10;
+const LITTLE: usize = 4;
+/// One of so many numbers that wraps is no damage.
+const WRAPS: usize = 1000;
+/// The fewest bytes that show whether bytes are parts of longer numbers.
+const FEWEST_PARTS: usize = 64;
+/// The high half of a number of 24 bits is smaller.
+const HIGH_HALF: f32 = 256.0;
+/// All but one of so many are nearly all. At the ends of a place may be other parts of the frame.
+const NEARLY_ALL: usize = 50;
+
+/// The bytes at a place of each frame.
+pub(crate) struct Cells<'a> {
+    pub(crate) frames: &'a Frames<'a>,
+    pub(crate) presses: &'a Presses,
+    pub(crate) start: usize,
+    pub(crate) bytes: usize,
+}
+
+impl<'a> Cells<'a> {
+    /// Whether they may be taxels of so many numbers of this type. Of a type that the user knows, only the
+    /// sign is asked.
+    pub(crate) fn may_be(&self, cell: Cell, channels: usize, is_known: bool) -> bool {
+        if is_known {
+            return !is_signed(cell) || self.has_negative(cell);
+        }
+        let wraps = self.wraps(cell, channels);
+        let is_sign_right = match is_signed(cell) {
+            true => wraps || self.has_negative(cell),
+            false => !wraps,
+        };
+        is_sign_right && !self.is_part(cell)
+    }
+
+    fn of_frame(&self, index: usize) -> &'a [u8] {
+        self.frames.from(index, self.start, self.bytes)
+    }
+
+    fn pressed(&self) -> impl Iterator<Item = &'a [u8]> + '_ {
+        self.presses.frames().map(|index| self.of_frame(index))
+    }
+
+    /// Whether numbers are below 0, as those of a signed type are: many, and by little. Large numbers without
+    /// a sign are few, and pass through the least ones.
+    fn has_negative(&self, cell: Cell) -> bool {
+        let quarter = 2.0_f32.powi(8 * cell.bytes() as i32 - 2);
+        let (mut all, mut little, mut much) = (0, 0, 0);
+        for number in self
+            .pressed()
+            .flat_map(|bytes| numbers::numbers(cell, bytes))
+        {
+            all += usize::from(number != 0.0);
+            little += usize::from((-quarter..0.0).contains(&number));
+            much += usize::from(number < -quarter);
+        }
+        little * MANY > all && little > LITTLE * much
+    }
+
+    /// Whether numbers without a sign jump by more than half of their range: at rest, or as one of several
+    /// numbers of a taxel also in a press. They have a sign then, or are the low half of a longer number.
+    fn wraps(&self, cell: Cell, channels: usize) -> bool {
+        let cell = match cell {
+            Cell::U8 | Cell::I8 => Cell::U8,
+            Cell::U16le | Cell::I16le => Cell::U16le,
+            Cell::U16be | Cell::I16be => Cell::U16be,
+            _ => return false,
+        };
+        let half = 2.0_f32.powi(8 * cell.bytes() as i32 - 1);
+        let numbers = |index| numbers::numbers(cell, self.of_frame(index));
+        let rest: Vec<usize> = self.presses.rest().collect();
+        let mut pairs: Vec<[usize; 2]> = rest.array_windows().copied().collect();
+        if channels > 1 && cell.bytes() > 1 {
+            pairs.extend(self.presses.frames().map(|index| [index - 1, index]));
+        }
+        let (mut all, mut jumps) = (0, 0);
+        for [a, b] in pairs.into_iter().map(|pair| pair.map(numbers)) {
+            all += a.len();
+            let is_jump = |&(a, b): &(&f32, &f32)| (a - b).abs() > half;
+            jumps += a.iter().zip(&b).filter(is_jump).count();
+        }
+        jumps * WRAPS > all
+    }
+
+    /// Whether numbers are parts of longer ones: of four bytes in a row one is nearly always the same, or of
+    /// two numbers in a row one is nearly always small, and the other is not.
+    fn is_part(&self, cell: Cell) -> bool {
+        match cell.bytes() {
+            1 if self.bytes >= FEWEST_PARTS => (0..4).any(|phase| {
+                let bytes = || {
+                    self.pressed()
+                        .flat_map(|bytes| bytes.iter().skip(phase).step_by(4))
+                };
+                let usual = bytes().nth(1);
+                let others = bytes().filter(|&byte| Some(byte) != usual).count();
+                NEARLY_ALL * others < bytes().count()
+            }),
+            2 => {
+                let (mut all, mut large) = (0, [0; 2]);
+                for bytes in self.pressed() {
+                    for pair in numbers::numbers(cell, bytes).chunks_exact(2) {
+                        all += 1;
+                        for (large, &number) in large.iter_mut().zip(pair) {
+                            let wrapped = if number >= 32_768.0 { 65_536.0 } else { 0.0 };
+                            *large += usize::from((number - wrapped).abs() >= HIGH_HALF);
+                        }
+                    }
+                }
+                let [first, second] = large.map(|large| NEARLY_ALL * large < all);
+                first != second
+            }
+            _ => false,
+        }
+    }
+}
