@@ -23,8 +23,8 @@ use hardnessd_core::references as known;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{
-    Cell, Checksum, ChecksumOver, Decoder, FooterBytes, Framing, HexBytes, Layout, LengthField,
-    Packets, Preset, Settings,
+    Cell, Checksum, ChecksumOver, Decoder, Framing, HexBytes, Layout, LengthField, Packets, Preset,
+    Settings,
 };
 
 /// How long the daemon may take to answer.
@@ -99,7 +99,7 @@ fn layout(choices: &mut Choices) -> Option<Layout> {
         settings.sync = Some(HexBytes(choices.bytes(4)));
         settings.tail = Some(HexBytes(choices.bytes(4)));
         settings.header_bytes = Some(usize::from(choices.byte() % 5));
-        settings.footer_bytes = Some(FooterBytes::Each(usize::from(choices.byte() % 5)));
+        settings.footer_bytes = Some(usize::from(choices.byte() % 5));
         settings.length = Some(choices.of(&[LengthField::None, LengthField::U16be]));
         settings.checksum = Some(choices.of(&[Checksum::None, Checksum::Sum8, Checksum::Crc32Be]));
     }

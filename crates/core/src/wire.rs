@@ -25,7 +25,5 @@ mod decoder;
 pub use self::checksum::{Checksum, ChecksumOver};
 pub use self::decoder::{Damage, Decoded, Decoder, Place, TELNET, is_telnet};
 pub use self::layout::Layout;
-pub use self::settings::{
-    Cell, FooterBytes, Framing, HexBytes, LengthField, Order, Packets, Preset, Settings,
-};
+pub use self::settings::{Cell, Framing, HexBytes, LengthField, Order, Packets, Preset, Settings};
 pub use self::text::is_separator;

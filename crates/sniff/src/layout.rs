@@ -7,8 +7,7 @@ use std::ops::Range;
 
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{
-    Cell, Checksum, ChecksumOver, Decoder, FooterBytes, HexBytes, Layout, LengthField, Preset,
-    Settings,
+    Cell, Checksum, ChecksumOver, Decoder, HexBytes, Layout, LengthField, Preset, Settings,
 };
 
 use crate::checks::What;
@@ -302,7 +301,7 @@ impl Parts<'_> {
             header_bytes: (header > 0).then_some(header),
             cell: Some(self.cell),
             stride_bytes: (self.channels > 1).then_some(self.channels * number),
-            footer_bytes: (footer > 0).then_some(FooterBytes::Each(footer)),
+            footer_bytes: (footer > 0).then_some(footer),
             checksum: Some(check.map_or(Checksum::None, |(checksum, ..)| checksum)),
             checksum_over: match check {
                 Some((_, _, None)) => Some(ChecksumOver::Cells),

@@ -102,7 +102,11 @@ impl Pipeline {
             kept.forget_own();
         }
         let mut next = Self::new(sensor, Arc::clone(&hrn), self.clock);
-        next.decoder = next.decoder.after(self.decoder.place());
+        let place = Place {
+            in_sync: next.decoder.place().in_sync,
+            ..self.decoder.place()
+        };
+        next.decoder = Decoder::at(next.sensor.layout().clone(), place);
         next.tracker.resume(self.tracker.presses());
         next.judge = Judge::with(hrn, kept, self.judge.track);
         next.context = self.context;

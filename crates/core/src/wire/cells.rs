@@ -17,15 +17,6 @@ impl Cell {
         }
     }
 
-    /// The bits of a cell that is a whole number without a sign.
-    pub(super) fn bits(self) -> Option<u32> {
-        match self {
-            Cell::U8 => Some(u8::MAX.into()),
-            Cell::U16le | Cell::U16be => Some(u16::MAX.into()),
-            _ => None,
-        }
-    }
-
     /// The least and the largest number that the cell can hold, of whole numbers.
     pub(super) fn range(self) -> Option<(f32, f32)> {
         match self {
@@ -55,20 +46,21 @@ impl Cell {
         }
     }
 
-    /// Appends the number. One beyond the range of the cell becomes the end of the range.
-    pub(super) fn write(self, number: f32, out: &mut Vec<u8>) {
+    /// Writes the number to the first bytes of `b`. One beyond the range of the cell becomes the end of
+    /// the range.
+    pub(super) fn write(self, number: f32, b: &mut [u8]) {
         let whole = number.round();
         match self {
-            Cell::I8 => out.push((whole as i8).cast_unsigned()),
-            Cell::U8 => out.push(whole as u8),
-            Cell::I16le => out.extend((whole as i16).to_le_bytes()),
-            Cell::I16be => out.extend((whole as i16).to_be_bytes()),
-            Cell::U16le => out.extend((whole as u16).to_le_bytes()),
-            Cell::U16be => out.extend((whole as u16).to_be_bytes()),
-            Cell::I32le => out.extend((whole as i32).to_le_bytes()),
-            Cell::I32be => out.extend((whole as i32).to_be_bytes()),
-            Cell::F32le => out.extend(number.to_le_bytes()),
-            Cell::F32be => out.extend(number.to_be_bytes()),
+            Cell::I8 => b[0] = (whole as i8).cast_unsigned(),
+            Cell::U8 => b[0] = whole as u8,
+            Cell::I16le => b[..2].copy_from_slice(&(whole as i16).to_le_bytes()),
+            Cell::I16be => b[..2].copy_from_slice(&(whole as i16).to_be_bytes()),
+            Cell::U16le => b[..2].copy_from_slice(&(whole as u16).to_le_bytes()),
+            Cell::U16be => b[..2].copy_from_slice(&(whole as u16).to_be_bytes()),
+            Cell::I32le => b[..4].copy_from_slice(&(whole as i32).to_le_bytes()),
+            Cell::I32be => b[..4].copy_from_slice(&(whole as i32).to_be_bytes()),
+            Cell::F32le => b[..4].copy_from_slice(&number.to_le_bytes()),
+            Cell::F32be => b[..4].copy_from_slice(&number.to_be_bytes()),
         }
     }
 }

@@ -1,9 +1,8 @@
 //! Checksums of serial sensors.
 
-use crc::{
-    Algorithm, CRC_8_SMBUS, CRC_16_IBM_3740, CRC_16_MODBUS, CRC_16_XMODEM, CRC_32_ISO_HDLC, Crc,
-    Table,
-};
+use std::collections::BTreeMap;
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 /// A checksum. Its bytes are sent low byte first, or high byte first in the forms that end with
@@ -53,7 +52,7 @@ enum Method {
     Sum,
     Negated,
     Xor,
-    Crc(&'static Crc<u32, Table<16>>),
+    Crc(&'static Crc),
 }
 
 impl Checksum {
@@ -91,84 +90,154 @@ impl Checksum {
         }
     }
 
-    /// The checksum of `bytes`.
-    pub fn of(self, bytes: &[u8]) -> u32 {
-        match self.method() {
-            Method::Crc(crc) => crc.checksum(bytes),
-            method => self.finished(method.after(0, bytes)),
-        }
-    }
-
     /// The checksum of `bytes` as it is sent. Only the first [`Self::bytes`] of the result count.
     pub fn sent(self, bytes: &[u8]) -> [u8; 4] {
-        self.written(self.of(bytes))
-    }
-
-    fn written(self, sum: u32) -> [u8; 4] {
-        match self.is_big_endian() {
-            true => (sum << (32 - 8 * self.bytes())).to_be_bytes(),
-            false => sum.to_le_bytes(),
-        }
-    }
-
-    /// The checksum of bytes whose state is `state`.
-    fn finished(self, state: u32) -> u32 {
-        let value = match self.method() {
-            Method::Negated => state.wrapping_neg(),
-            Method::Sum | Method::Xor => state,
-            Method::Crc(crc) => state ^ crc.algorithm.xorout,
+        let method = self.method();
+        let begin = match method {
+            Method::Crc(crc) => crc.init,
+            Method::Sum | Method::Negated | Method::Xor => 0,
         };
-        match self.bytes() {
-            0 => 0,
-            bytes => value & (u32::MAX >> (32 - 8 * bytes)),
+        let after = |state, &byte: &u8| method.after(state, byte);
+        self.finished(bytes.iter().fold(begin, after))
+    }
+
+    /// The checksum of bytes with this state after the last one, as it is sent.
+    fn finished(self, state: u32) -> [u8; 4] {
+        let sum = match self.method() {
+            Method::Sum | Method::Xor => state,
+            Method::Negated => state.wrapping_neg(),
+            Method::Crc(crc) => crc.finished(state),
+        };
+        match (self.bytes(), self.is_big_endian()) {
+            (0, _) => [0; 4],
+            (bytes, true) => (sum << (32 - 8 * bytes)).to_be_bytes(),
+            (bytes, false) => (sum & (u32::MAX >> (32 - 8 * bytes))).to_le_bytes(),
         }
     }
 }
 
 impl Method {
-    /// The state after `bytes`, if it was `state` before them. A state begins with 0.
-    fn after(self, state: u32, bytes: &[u8]) -> u32 {
+    /// The state after `byte`, if it was `state` before.
+    fn after(self, state: u32, byte: u8) -> u32 {
         match self {
-            Method::Sum | Method::Negated => bytes
-                .iter()
-                .fold(state, |sum, &byte| sum.wrapping_add(byte.into())),
-            Method::Xor => bytes.iter().fold(state, |xor, &byte| xor ^ u32::from(byte)),
-            Method::Crc(crc) => {
-                let mut digest = crc.digest_with_initial(mirrored(crc.algorithm, state));
-                digest.update(bytes);
-                digest.finalize() ^ crc.algorithm.xorout
-            }
+            Method::Sum | Method::Negated => state.wrapping_add(byte.into()),
+            Method::Xor => state ^ u32::from(byte),
+            Method::Crc(crc) => crc.after(state, byte),
         }
     }
 }
 
-/// An initial value as a state, or a state as an initial value: the crate reverses the bits of an
-/// initial value for an algorithm that is reflected.
-fn mirrored(algorithm: &Algorithm<u32>, value: u32) -> u32 {
-    match algorithm.refin {
-        true => value.reverse_bits() >> (32 - algorithm.width),
-        false => value,
+/// A CRC. Its states are polynomials whose lowest bit is that of the highest power, as in algorithms
+/// that are reflected.
+struct Crc {
+    width: u32,
+    /// The polynomial, in the order of bits of the states.
+    polynomial: u32,
+    /// The state before the first byte. It reads the same in both orders of bits, and so does `xorout`.
+    init: u32,
+    xorout: u32,
+    /// Whether the lowest bit of a byte comes first.
+    is_reflected: bool,
+    /// The state after each byte, if it was 0 before.
+    table: [u32; 256],
+}
+
+impl Crc {
+    /// The CRC with these parameters of the catalogue of CRCs.
+    const fn new(width: u32, polynomial: u32, init: u32, xorout: u32, is_reflected: bool) -> Self {
+        let polynomial = polynomial.reverse_bits() >> (32 - width);
+        let mut table = [0; 256];
+        let mut byte = 0;
+        while byte < table.len() {
+            let mut state = byte as u32;
+            let mut bit = 0;
+            while bit < 8 {
+                state = times_x(state, polynomial);
+                bit += 1;
+            }
+            table[byte] = state;
+            byte += 1;
+        }
+        Self {
+            width,
+            polynomial,
+            init,
+            xorout,
+            is_reflected,
+            table,
+        }
+    }
+
+    fn after(&self, state: u32, byte: u8) -> u32 {
+        let byte = match self.is_reflected {
+            true => byte,
+            false => byte.reverse_bits(),
+        };
+        self.table[usize::from(state as u8 ^ byte)] ^ (state >> 8)
+    }
+
+    fn finished(&self, state: u32) -> u32 {
+        let sum = match self.is_reflected {
+            true => state,
+            false => state.reverse_bits() >> (32 - self.width),
+        };
+        sum ^ self.xorout
+    }
+
+    /// The product of two states, modulo the polynomial.
+    fn product(&self, one: u32, mut other: u32) -> u32 {
+        let mut product = 0;
+        for bit in (0..self.width).rev() {
+            if one >> bit & 1 == 1 {
+                product ^= other;
+            }
+            other = times_x(other, self.polynomial);
+        }
+        product
+    }
+
+    /// What a state is multiplied by in `length` bytes of 0: x to the power of their bits.
+    fn power(&self, length: usize) -> u32 {
+        let one = 1 << (self.width - 1);
+        let (mut power, mut square) = (one, times_x(one, self.polynomial));
+        let mut exponent = 8 * length;
+        while exponent > 0 {
+            if exponent & 1 == 1 {
+                power = self.product(power, square);
+            }
+            square = self.product(square, square);
+            exponent >>= 1;
+        }
+        power
     }
 }
+
+const fn times_x(state: u32, polynomial: u32) -> u32 {
+    match state & 1 {
+        0 => state >> 1,
+        _ => (state >> 1) ^ polynomial,
+    }
+}
+
+static CRC8: Crc = Crc::new(8, 0x07, 0, 0, false);
+static MODBUS: Crc = Crc::new(16, 0x8005, 0xFFFF, 0, true);
+static CCITT: Crc = Crc::new(16, 0x1021, 0xFFFF, 0, false);
+static XMODEM: Crc = Crc::new(16, 0x1021, 0, 0, false);
+static CRC32: Crc = Crc::new(32, 0x04C1_1DB7, u32::MAX, u32::MAX, true);
 
 /// The checksums of stretches of the same bytes. Stretches that overlap cost no more than the bytes
 /// they cover together, however many there are: a search through damaged bytes takes a time in
 /// proportion to their number.
 ///
 /// The state of a stretch is that after its end, less what the state before its beginning has become
-/// by its end. Of a CRC, the latter is a linear function of the bits of the state, for each length
-/// another one, as in `crc32_combine` of zlib.
+/// by its end, as in `crc32_combine` of zlib.
 pub(super) struct Sums<'a> {
     checksum: Checksum,
     bytes: &'a [u8],
-    /// The end of the stretches so far, as long as none overlap.
-    end: usize,
-    /// From where on `states` are known.
-    from: usize,
-    /// The state after each of the bytes from `from` on. Empty as long as no stretches overlap.
+    /// The state before the first byte and after each one, from 0 on.
     states: Vec<u32>,
-    /// For each length so far, what becomes of each bit of a state.
-    shifts: Vec<(usize, Vec<u32>)>,
+    /// What a state is multiplied by in stretches of these lengths.
+    powers: BTreeMap<usize, u32>,
 }
 
 impl<'a> Sums<'a> {
@@ -176,54 +245,28 @@ impl<'a> Sums<'a> {
         Self {
             checksum,
             bytes,
-            end: 0,
-            from: 0,
-            states: Vec::new(),
-            shifts: Vec::new(),
+            states: vec![0],
+            powers: BTreeMap::new(),
         }
     }
 
-    /// The checksum of `bytes[start..end]`, as it is sent. No later stretch may begin before the
-    /// first one that overlaps another.
-    pub(super) fn sent(&mut self, start: usize, end: usize) -> [u8; 4] {
-        if self.states.is_empty() {
-            if start >= self.end {
-                self.end = end;
-                return self.checksum.sent(&self.bytes[start..end]);
-            }
-            self.from = start;
-            self.states.push(0);
-        }
+    /// The checksum of the bytes `stretch`, as it is sent.
+    pub(super) fn sent(&mut self, stretch: Range<usize>) -> [u8; 4] {
         let method = self.checksum.method();
-        for at in self.from + self.states.len() - 1..end {
-            let last = self.states[self.states.len() - 1];
-            self.states.push(method.after(last, &self.bytes[at..=at]));
+        for at in self.states.len() - 1..stretch.end {
+            let after = method.after(self.states[at], self.bytes[at]);
+            self.states.push(after);
         }
-        let (before, after) = (self.states[start - self.from], self.states[end - self.from]);
-        let state = match method {
+        let (before, after) = (self.states[stretch.start], self.states[stretch.end]);
+        self.checksum.finished(match method {
             Method::Sum | Method::Negated => after.wrapping_sub(before),
             Method::Xor => after ^ before,
             Method::Crc(crc) => {
-                let begin = before ^ mirrored(crc.algorithm, crc.algorithm.init);
-                after ^ self.shifted(crc, begin, end - start)
+                let power = self.powers.entry(stretch.len());
+                let power = power.or_insert_with_key(|&length| crc.power(length));
+                after ^ crc.product(*power, before ^ crc.init)
             }
-        };
-        self.checksum.written(self.checksum.finished(state))
-    }
-
-    /// What becomes of a state by `length` bytes of 0.
-    fn shifted(&mut self, crc: &'static Crc<u32, Table<16>>, state: u32, length: usize) -> u32 {
-        if !self.shifts.iter().any(|(known, _)| *known == length) {
-            let zeros = vec![0; length];
-            let bits = 0..crc.algorithm.width;
-            let of_bit = |bit| Method::Crc(crc).after(1_u32 << bit, &zeros);
-            self.shifts.push((length, bits.map(of_bit).collect()));
-        }
-        let known = self.shifts.iter().find(|(known, _)| *known == length);
-        let of_bits = known.map_or(&[][..], |(_, of_bits)| of_bits);
-        let set = of_bits.iter().enumerate();
-        set.filter(|(bit, _)| state >> bit & 1 == 1)
-            .fold(0, |shifted, (_, of_bit)| shifted ^ of_bit)
+        })
     }
 }
 
@@ -239,33 +282,6 @@ pub enum ChecksumOver {
     /// From the first byte of the first cell to the last byte of the last cell.
     Cells,
 }
-
-/// The same algorithm for states of 32 bits.
-macro_rules! wide {
-    ($algorithm:expr) => {
-        Algorithm {
-            width: $algorithm.width,
-            poly: $algorithm.poly as u32,
-            init: $algorithm.init as u32,
-            refin: $algorithm.refin,
-            refout: $algorithm.refout,
-            xorout: $algorithm.xorout as u32,
-            check: $algorithm.check as u32,
-            residue: $algorithm.residue as u32,
-        }
-    };
-}
-
-const CRC8_ALGORITHM: Algorithm<u32> = wide!(CRC_8_SMBUS);
-const MODBUS_ALGORITHM: Algorithm<u32> = wide!(CRC_16_MODBUS);
-const CCITT_ALGORITHM: Algorithm<u32> = wide!(CRC_16_IBM_3740);
-const XMODEM_ALGORITHM: Algorithm<u32> = wide!(CRC_16_XMODEM);
-
-static CRC8: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC8_ALGORITHM);
-static MODBUS: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&MODBUS_ALGORITHM);
-static CCITT: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CCITT_ALGORITHM);
-static XMODEM: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&XMODEM_ALGORITHM);
-static CRC32: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
 
 #[cfg(test)]
 mod tests {
@@ -289,7 +305,12 @@ mod tests {
     #[test]
     fn check_values_are_those_of_the_crc_catalogue() {
         for (checksum, expected) in CHECKED {
-            assert_eq!(checksum.of(b"123456789"), expected, "{checksum:?}");
+            let sent = checksum.sent(b"123456789");
+            let found = match checksum.is_big_endian() {
+                true => u32::from_be_bytes(sent),
+                false => u32::from_le_bytes(sent),
+            };
+            assert_eq!(found, expected, "{checksum:?}");
         }
     }
 
@@ -301,7 +322,7 @@ mod tests {
             for start in (0..200).step_by(3) {
                 for length in [150, 40] {
                     let expected = checksum.sent(&bytes[start..start + length]);
-                    let found = sums.sent(start, start + length);
+                    let found = sums.sent(start..start + length);
                     assert_eq!(found, expected, "{checksum:?} from {start}");
                 }
             }

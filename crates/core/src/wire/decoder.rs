@@ -28,6 +28,9 @@ pub struct Place {
     pub decoded: u64,
     /// The number of bytes that belonged to no whole frame.
     pub skipped: u64,
+    /// The number of bytes up to the end of the last whole frame, or up to the last restart.
+    #[serde(default)]
+    pub framed: u64,
     /// Whether the next byte follows the end of a frame.
     pub in_sync: bool,
 }
@@ -69,10 +72,7 @@ pub struct Decoder {
     /// The damaged candidates that were not returned yet.
     damaged: u64,
     lines: Lines,
-    /// Where the stream began, and where its last frame ended.
-    begin: u64,
-    last_end: u64,
-    /// Whether the stream began with options of telnet.
+    /// Whether the bytes since the last frame or restart began with options of telnet.
     is_telnet: bool,
 }
 
@@ -82,6 +82,7 @@ impl Decoder {
         let place = Place {
             decoded: 0,
             skipped: 0,
+            framed: 0,
             in_sync: layout.begins_in_sync(),
         };
         Self::at(layout, place)
@@ -96,22 +97,8 @@ impl Decoder {
             settled: false,
             damaged: 0,
             lines: Lines::default(),
-            begin: place.decoded,
-            last_end: place.decoded,
             is_telnet: false,
             layout,
-        }
-    }
-
-    /// The same decoder, whose stream begins where another one ended.
-    #[must_use]
-    pub(crate) fn after(self, place: Place) -> Self {
-        let in_sync = self.place.in_sync;
-        Self {
-            place: Place { in_sync, ..place },
-            begin: place.decoded,
-            last_end: place.decoded,
-            ..self
         }
     }
 
@@ -122,7 +109,7 @@ impl Decoder {
             return;
         }
         self.settled = false;
-        if self.received() == self.begin {
+        if self.unframed() == 0 {
             self.is_telnet = is_telnet(bytes);
         }
         self.bytes.drain(..self.start);
@@ -144,7 +131,7 @@ impl Decoder {
         self.pass(self.pending().len());
         self.settled = false;
         self.place.in_sync = self.layout.begins_in_sync();
-        self.begin = self.place.decoded;
+        self.place.framed = self.place.decoded;
         self.lines = Lines::default();
         self.is_telnet = false;
     }
@@ -167,28 +154,30 @@ impl Decoder {
                 in_sync: self.place.in_sync,
             };
             let pending = &self.bytes[self.start..];
-            match self.layout.scan(pending, context, &mut self.lines) {
-                Scan::Wait => return None,
-                Scan::Skip { bytes, damaged } => {
-                    self.pass(bytes);
-                    self.damaged = damaged;
-                }
-                Scan::Frame { bytes, frame } => {
-                    self.start += bytes;
-                    self.lines.pass(bytes);
-                    self.place.decoded += bytes as u64;
-                    self.place.in_sync = true;
-                    self.last_end = self.place.decoded;
-                    let end = self.place.decoded;
-                    return Some(Ok(Decoded { frame, end }));
-                }
+            let Scan {
+                bytes,
+                frame,
+                damaged,
+            } = self.layout.scan(pending, context, &mut self.lines);
+            if bytes == 0 {
+                return None;
             }
+            self.damaged = damaged;
+            let Some(frame) = frame else {
+                self.pass(bytes);
+                continue;
+            };
+            self.advance(bytes);
+            self.place.in_sync = true;
+            let end = self.place.decoded;
+            self.place.framed = end;
+            return Some(Ok(Decoded { frame, end }));
         }
     }
 
     /// Why the bytes since the last frame are none, if that shows.
     pub fn problem(&self) -> Option<String> {
-        if self.received() - self.last_end < 2 * self.layout.min_frame_bytes() as u64 {
+        if self.unframed() < 2 * self.layout.min_frame_bytes() as u64 {
             return None;
         }
         let telnet = || TELNET.to_owned();
@@ -199,6 +188,11 @@ impl Decoder {
     /// The number of bytes taken in since the start.
     pub fn received(&self) -> u64 {
         self.place.decoded + self.pending().len() as u64
+    }
+
+    /// The number of bytes taken in since the last frame or restart.
+    pub(crate) fn unframed(&self) -> u64 {
+        self.received().saturating_sub(self.place.framed)
     }
 
     /// The number of bytes that belonged to no whole frame.
@@ -222,10 +216,14 @@ impl Decoder {
         if self.settled && self.start + count == self.bytes.len() {
             self.place.in_sync |= self.layout.is_in_sync_after_pause();
         }
+        self.place.skipped += count as u64;
+        self.advance(count);
+    }
+
+    fn advance(&mut self, count: usize) {
         self.start += count;
         self.lines.pass(count);
         self.place.decoded += count as u64;
-        self.place.skipped += count as u64;
     }
 }
 

@@ -70,8 +70,8 @@ impl Layout {
             keys.order.unwrap_or_default(),
             keys.invert.unwrap_or_default(),
         );
-        // The bits of a cell that may carry the count, and its range, if these are known.
-        let (form, bits, range) = if settings.preset().is_text() {
+        // The range of a cell, if it is known.
+        let (form, range) = if settings.preset().is_text() {
             let heading = keys.heading.clone().unwrap_or_default().into_bytes();
             check(
                 "heading",
@@ -79,11 +79,17 @@ impl Layout {
                 heading.len() <= MOST_HEADING_BYTES && !heading.contains(&b'\n'),
                 "at most 64 bytes on one line",
             )?;
-            (Form::Text(Text { heading }), Some(u32::MAX), None)
+            (Form::Text(Text { heading }), None)
         } else {
             let fixed = Box::new(Fixed::new(&keys, array)?);
-            let cell = keys.cell.unwrap_or_default();
-            (Form::Fixed(fixed), cell.bits(), cell.range())
+            (Form::Fixed(fixed), keys.cell.unwrap_or_default().range())
+        };
+        // The bits of a cell that may carry the count.
+        let is_text = matches!(form, Form::Text(_));
+        let bits = match range {
+            _ if is_text => Some(u32::MAX),
+            Some((0.0, most)) => Some(most as u32),
+            _ => None,
         };
         if let Some(mask) = keys.mask {
             let bits = bits.ok_or_else(|| {
@@ -93,7 +99,6 @@ impl Layout {
             within("mask", mask, (1, bits), "for this cell")?;
         }
         // A text has no widest number, so it can only be inverted by a mask that is written.
-        let is_text = matches!(form, Form::Text(_));
         let mask = keys.mask.or(bits.filter(|_| invert && !is_text));
         let full_scale = match (mask, range) {
             (Some(mask), _) => Some(mask as f32),

@@ -2,37 +2,31 @@
 
 use crate::frame::RawFrame;
 
-/// The answer of a search.
-pub(super) enum Scan {
-    /// More bytes are needed to know.
-    Wait,
-    /// No frame begins in the first `bytes` bytes.
-    Skip {
-        /// The number of bytes.
-        bytes: usize,
-        /// How many candidates among them look like a frame, and so count as a damaged one.
-        damaged: u64,
-    },
-    /// The first `bytes` bytes are a frame.
-    Frame {
-        /// The number of bytes.
-        bytes: usize,
-        /// The frame.
-        frame: RawFrame,
-    },
+/// The answer of a search: what the first bytes are.
+pub(super) struct Scan {
+    /// The number of bytes. Without any, more must come to know.
+    pub(super) bytes: usize,
+    /// The frame that these bytes are. Without one, no frame begins in them.
+    pub(super) frame: Option<RawFrame>,
+    /// How many candidates among the bytes look like a frame, and so count as a damaged one.
+    pub(super) damaged: u64,
 }
 
 impl Scan {
-    /// These bytes belong to no frame and do not look like one.
-    pub(super) fn noise(bytes: usize) -> Self {
-        Self::Skip { bytes, damaged: 0 }
+    pub(super) fn found(bytes: usize, frame: RawFrame) -> Self {
+        Self {
+            bytes,
+            frame: Some(frame),
+            damaged: 0,
+        }
     }
 
-    /// Passes over `bytes`. Without any, more must come.
+    /// Passes over `bytes`.
     pub(super) fn past(bytes: usize, damaged: u64) -> Self {
-        match bytes {
-            0 => Self::Wait,
-            bytes => Self::Skip { bytes, damaged },
+        Self {
+            bytes,
+            frame: None,
+            damaged,
         }
     }
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::checksum::{Checksum, ChecksumOver};
 use crate::frame::MOST_SIDE;
-use crate::range::{Range, Ranged, from_to};
+use crate::range::{Range, from_to};
 
 /// Ready-made layouts. `presets.toml` has their keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -80,8 +80,8 @@ crate::settings! {
         pub mask: Option<u32>;
         /// Whether the count is `mask` minus the cell, or minus the cell where there is no mask.
         pub invert: Option<bool>;
-        /// The number of bytes that are skipped after the cells.
-        pub footer_bytes: Option<FooterBytes>, in SKIPPED_BYTES;
+        /// The number of bytes that are skipped after the last cell.
+        pub footer_bytes: Option<usize>, in SKIPPED_BYTES;
         /// The checksum.
         pub checksum: Option<Checksum>;
         /// The bytes that the checksum covers.
@@ -114,40 +114,8 @@ const SIDES: Range = from_to((1.0, MOST_SIDE as f64), "");
 /// which a board may send beside the one that is read.
 const SKIPPED_BYTES: Range = from_to((0.0, 8192.0), "");
 
-/// The number of bytes that are skipped after the cells.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "expected a number of bytes, or a list with a number for each packet"
-)]
-pub enum FooterBytes {
-    /// The same number in each packet.
-    Each(usize),
-    /// A number for each packet.
-    Of(Vec<usize>),
-}
-
-impl Default for FooterBytes {
-    fn default() -> Self {
-        Self::Each(0)
-    }
-}
-
-impl Ranged for FooterBytes {
-    fn numbers(&self) -> Vec<f64> {
-        match self {
-            Self::Each(bytes) => bytes.numbers(),
-            Self::Of(list) => list.iter().map(|&bytes| bytes as f64).collect(),
-        }
-    }
-
-    fn shown(&self, number: f64) -> String {
-        format!("{number} bytes")
-    }
-}
-
 /// The `[sensor.frame.packets]` table: a frame that is sent in several packets. Each packet has the
-/// parts of a frame, and an equal share of the cells.
+/// parts of a frame but the footer bytes, which are in the last one, and an equal share of the cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Packets {

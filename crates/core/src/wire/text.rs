@@ -164,7 +164,7 @@ pub(super) fn scan(
         // at once are cut in the same way.
         let cut = lines.cut(end, most_kept, heading.is_empty());
         if cut > 0 {
-            return Scan::noise(cut);
+            return Scan::past(cut, 0);
         }
         let found = match heading.is_empty() {
             true => on_line(cells, bytes, start..end, lines, most_kept),
@@ -185,7 +185,7 @@ pub(super) fn scan(
             }
             Found::Frame { start: 0, frame } => {
                 lines.refused = None;
-                return Scan::Frame { bytes: end, frame };
+                return Scan::found(end, frame);
             }
             // The line is read again when the bytes before the frame are gone.
             Found::Frame { start: bytes, .. } | Found::Nothing(bytes) => {

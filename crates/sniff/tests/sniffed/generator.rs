@@ -169,14 +169,8 @@ pub(crate) fn case(seed: u64) -> Case {
         } else {
             &bytes[start..]
         };
-        let sum = checksum.of(covered);
+        let sum = checksum.sent(covered);
         let total: u32 = frame.counts.iter().map(|&count| count as u32).sum();
-        let is_be = matches!(checksum, Checksum::Crc16CcittBe | Checksum::Crc32Be);
-        let sum = if is_be {
-            (sum << (32 - 8 * checksum.bytes())).to_be_bytes()
-        } else {
-            sum.to_le_bytes()
-        };
         bytes.extend(&sum[..checksum.bytes()]);
         match unknown_sum {
             0 => bytes.extend((total as u16).to_le_bytes()),
