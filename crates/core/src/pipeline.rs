@@ -15,7 +15,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde_json::Value;
 
 pub use self::at_rest::AtRest;
 pub use self::input::{Input, Refused};
@@ -23,9 +22,9 @@ use self::link::Link;
 use self::pace::Pace;
 use crate::event::{Event, FrameEvent, Press, PressState, Tared};
 use crate::frame::{Frame, RawFrame, Stamp};
-use crate::judge::{Circumstances, Judge, OwnPresses, Unjudged};
+use crate::judge::{Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
-use crate::press::{Abort, Change, End, FrameAt, Marks, PressTracker, Thresholds};
+use crate::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, TimeSeries};
@@ -43,7 +42,7 @@ pub enum Clock {
 /// The state of one sensor.
 #[derive(Debug)]
 pub struct Pipeline {
-    sensor: Sensor,
+    sensor: Arc<Sensor>,
     clock: Clock,
     decoder: Decoder,
     tare: Tare,
@@ -52,7 +51,6 @@ pub struct Pipeline {
     link: Link,
     /// The taxels in contact when the last press timed out, in words.
     unreleased: Option<String>,
-    context: Option<Value>,
     frames: u64,
     frames_damaged: u64,
     pace: Pace,
@@ -95,20 +93,19 @@ impl Pipeline {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     pub fn new(sensor: Sensor, hrn: Arc<Hrn>, clock: Clock) -> Self {
-        let described = sensor.description();
+        let sensor = Arc::new(sensor);
         let layout = sensor.layout();
         Self {
             tare: Tare::new(
-                &described.sensor.calibration,
+                sensor.calibration(),
                 layout.array(),
                 contact(sensor.thresholds()),
             ),
             tracker: PressTracker::new(sensor.thresholds().clone()),
-            judge: Judge::new(hrn),
+            judge: Judge::new(Arc::clone(&sensor), hrn),
             decoder: Decoder::new(layout.clone()),
             link: Link::new(),
             unreleased: None,
-            context: None,
             frames: 0,
             frames_damaged: 0,
             pace: Pace::default(),
@@ -166,7 +163,7 @@ impl Pipeline {
 
     /// The own presses of the sensor.
     pub fn own_presses(&self) -> &OwnPresses {
-        self.judge.kept().own()
+        &self.judge.kept().own
     }
 
     /// Takes over own presses of the sensor that an earlier pipeline collected.
@@ -205,29 +202,26 @@ impl Pipeline {
     ///
     /// Of a port that was lost, a status follows only with a frame, or when the frame is late: a port
     /// that is lost again as soon as it is open would be two statuses each time.
-    fn opened(&mut self, at: Stamp) -> Vec<Event> {
+    fn opened(&mut self, at: Stamp) -> Option<Event> {
         self.decoder.restart();
         self.chunks.clear();
         self.link.opened(at.mono);
-        if self.link.was_lost() {
-            return Vec::new();
+        match self.link.was_lost() {
+            true => None,
+            false => self.status_if_changed(at),
         }
-        self.status_if_changed(at)
-    }
-
-    /// The port could not be opened. A changed reason is a status, also of a sensor that is lost.
-    fn unavailable(&mut self, reason: String, at: Stamp) -> Vec<Event> {
-        self.link.unavailable(reason);
-        self.status_if_changed(at)
     }
 
     fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
         let mut events = self.tick(at);
         self.hold(bytes, at);
         self.link.last_bytes = Some(at.mono);
-        self.link.unframed = self.link.unframed.saturating_add(bytes.len() as u64);
         self.drain(at.mono, &mut events);
-        events.extend(self.renewed(at));
+        // Few bytes may be the beginning of a frame.
+        let least = 2 * self.sensor.layout().max_frame_bytes() as u64;
+        if self.link.is_silent() && self.decoder.unframed() >= least {
+            events.extend(self.status_if_changed(at));
+        }
         events
     }
 
@@ -237,7 +231,6 @@ impl Pipeline {
         self.pace.skipped(at.mono);
         let mut events = self.tick(at);
         self.settle(at, &mut events);
-        self.decoder.restart();
         self.decoder.skip(bytes);
         self.chunks.clear();
         if self.link.is_live() {
@@ -292,16 +285,15 @@ impl Pipeline {
         self.link.lost(reason);
         self.tare.give_up(RetareError::NotLive);
         events.extend(self.status_if_changed(at));
-        events.extend(self.abort(Abort::Lost));
+        self.abort(End::Lost, &mut events);
         events
     }
 
     /// Ends a press under way without a verdict.
-    pub(crate) fn abort(&mut self, reason: Abort) -> Option<Event> {
-        let change = self.tracker.abort(reason)?;
-        let mut events = Vec::new();
-        self.publish(change, &mut events);
-        events.pop()
+    pub(crate) fn abort(&mut self, end: End, events: &mut Vec<Event>) {
+        if let Some(change) = self.tracker.abort(end) {
+            self.publish(change, events);
+        }
     }
 
     /// Call this when the recording ended. Pending bytes are settled, and the last status has the
@@ -309,9 +301,8 @@ impl Pipeline {
     pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
         let mut events = Vec::new();
         self.settle(at.unwrap_or(EPOCH), &mut events);
-        events.extend(self.abort(Abort::EndOfRecording));
-        let reason = Abort::EndOfRecording.reason().to_owned();
-        self.link.ended(reason);
+        self.abort(End::EndOfRecording, &mut events);
+        self.link.ended("end of recording".to_owned());
         let at = at.or(self.link.last_frame).unwrap_or(EPOCH);
         // The rest of the bytes never became a frame, so count them as skipped.
         self.decoder.restart();
@@ -387,16 +378,17 @@ impl Pipeline {
         let frame = self.tare.apply(raw);
         // During a tare on request, presses are tracked with the old baseline.
         let tared = !matches!(self.tare.aim(), Some(Aim::First { .. }));
-        let changes = if tared {
-            let marks = self.marks(raw, &frame);
-            self.tracker.push(&frame, marks, at)
-        } else {
-            Vec::new()
+        let change = match tared {
+            true => self.tracker.push(&frame, self.marks(raw, &frame), at),
+            false => None,
         };
         if self.tracker.is_pressed() {
             self.tare.give_up(RetareError::Pressed);
         }
-        if changes.iter().any(is_timeout) {
+        if let Some(Change::End {
+            end: End::Timeout, ..
+        }) = &change
+        {
             let threshold_n = self.sensor.thresholds().contact_threshold_n;
             self.unreleased = Some(link::in_contact(&frame, threshold_n));
         }
@@ -407,9 +399,10 @@ impl Pipeline {
         }
         self.tare.observe(raw);
         events.extend(self.status_if_changed(stamp));
-        let approach_mm = self.tracker.began().and_then(|began| {
+        let approach_mm = self.tracker.so_far().and_then(|press| {
             let delay_ms = self.sensor.arm().delay_ms;
-            self.judge.track.latest(began, stamp.mono, delay_ms)
+            let track = &self.judge.track;
+            track.latest(press.began(), stamp.mono, delay_ms)
         });
         let threshold_n = self.sensor.thresholds().contact_threshold_n;
         let contact_area_taxels = frame.contact_area_taxels(threshold_n);
@@ -429,60 +422,40 @@ impl Pipeline {
             tared,
             approach_mm,
         }));
-        for change in changes {
+        if let Some(change) = change {
             self.publish(change, events);
         }
-        if let Some((press, frames)) = self.tracker.so_far() {
-            let now = Circumstances {
-                sensor: &self.sensor,
-                context: self.context.as_ref(),
-                state: self.state().0,
-                is_live: self.clock == Clock::Arrival,
-                arrival: self.arrival,
-            };
-            events.extend(self.judge.look(press, frames, now).map(Event::Hardness));
+        let now = self.moment();
+        let press = self.tracker.so_far();
+        let early = press.and_then(|press| self.judge.early(press, now));
+        events.extend(early.map(Event::Hardness));
+    }
+
+    /// What a verdict must know of this moment.
+    fn moment(&self) -> Moment {
+        Moment {
+            state: self.state().0,
+            is_live: self.clock == Clock::Arrival,
+            arrival: self.arrival,
         }
     }
 
     /// Adds the events of a change.
     fn publish(&mut self, change: Change, events: &mut Vec<Event>) {
-        let now = Circumstances {
-            sensor: &self.sensor,
-            context: self.context.as_ref(),
-            state: self.state().0,
-            is_live: self.clock == Clock::Arrival,
-            arrival: self.arrival,
-        };
         match change {
             Change::Begin { press, at } => {
-                self.judge.begin(now);
+                self.judge.begin();
                 events.push(self.press(press, PressState::Begin, at, 1, None));
             }
-            Change::Settled { press } => {
-                events.extend(self.judge.settled(&press, now).map(Event::Hardness));
-            }
-            Change::End {
-                press,
-                last,
-                frames,
-                end,
-            } => {
-                let verdict = self.judge.end(&press, last, now);
-                let reason = match end {
-                    End::Release => None,
-                    End::Timeout => Some("timeout"),
+            Change::End { press, end } => {
+                let now = self.moment();
+                let (state, verdict) = match end.is_judged() {
+                    true => (PressState::End, self.judge.end(&press, now)),
+                    false => (PressState::Aborted, None),
                 };
-                events.push(self.press(press.press(), PressState::End, last, frames, reason));
+                let (last, frames) = (press.last(), press.frames());
+                events.push(self.press(press.press(), state, last, frames, end.reason()));
                 events.extend(verdict.map(Event::Hardness));
-            }
-            Change::Aborted {
-                press,
-                last,
-                frames,
-                reason,
-            } => {
-                let reason = Some(reason.reason());
-                events.push(self.press(press, PressState::Aborted, last, frames, reason));
             }
         }
     }
@@ -504,7 +477,7 @@ impl Pipeline {
             frame: at.frame,
             reason,
             frames,
-            context: self.context.clone(),
+            context: self.judge.context.clone(),
         })
     }
 
@@ -526,16 +499,6 @@ impl Pipeline {
             is_edge && newtons >= threshold_n
         })
     }
-}
-
-fn is_timeout(change: &Change) -> bool {
-    matches!(
-        change,
-        Change::End {
-            end: End::Timeout,
-            ..
-        }
-    )
 }
 
 /// The moment before the first frame of a recording without times.

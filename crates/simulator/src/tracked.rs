@@ -41,17 +41,14 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        for change in tracker.push(frame, Marks::default(), at) {
-            match change {
-                Change::Begin { .. } if best.is_some() => return None,
-                Change::Begin { .. } | Change::Settled { .. } => {}
-                Change::End {
-                    end: End::Release,
-                    press,
-                    ..
-                } => best = Some(press.peak().moment.frame as usize),
-                Change::End { .. } | Change::Aborted { .. } => return None,
-            }
+        match tracker.push(frame, Marks::default(), at) {
+            Some(Change::Begin { .. }) if best.is_some() => return None,
+            None | Some(Change::Begin { .. }) => {}
+            Some(Change::End {
+                end: End::Release,
+                press,
+            }) => best = Some(press.peak().moment.frame as usize),
+            Some(Change::End { .. }) => return None,
         }
         let area = frame.contact_area_taxels(settings.contact_threshold_n);
         if tracker.is_pressed() && area >= settings.end_area_taxels {

@@ -6,6 +6,7 @@ use crate::event::{ApproachSource, Phase};
 use crate::line::Sums;
 use crate::motion::{self, SPEEDS_MM_S, Track};
 use crate::press::{ContactFrame, Phases, SoFar, thinned};
+use crate::sensor::Sensor;
 use crate::verdict::parts::parts;
 use crate::verdict::{self, COURSE_FRAMES, Resampling};
 
@@ -38,32 +39,43 @@ impl<'a> PressWithApproach<'a> {
         delay_ms: f64,
         speed_mm_s: Option<f64>,
     ) -> Self {
-        let (frames, best) = press.until(Duration::MAX);
-        let mut known = Self {
-            approach_mm: vec![None; frames.len()],
-            frames,
-            best,
-            source: ApproachSource::None,
-        };
-        let moments = known.moments();
+        let mut frames = press.spread();
+        let moments: Vec<Duration> = frames.iter().map(|f| f.moment.stamp.mono).collect();
         let (begin, last) = (moments[0], moments[moments.len() - 1]);
-        if track.has_recent(last, delay_ms) {
-            if let Some(approach_mm) = track.approach(begin, &moments, delay_ms) {
-                known.approach_mm = approach_mm;
-                known.source = ApproachSource::Positions;
-            }
-            // The latest positions may still be on their way. The final verdict does not wait for
-            // them.
-            return match phase {
-                Phase::Early => known.cut(press),
-                Phase::Final => known.or_nothing(),
-            };
+        let sends = track.has_recent(last, delay_ms);
+        let known = if sends {
+            track.approach(begin, &moments, delay_ms)
+        } else {
+            let forces_n = forces_n(&frames);
+            speed_mm_s.map(|speed_mm_s| approach_by_speed(speed_mm_s, &moments, &forces_n))
+        };
+        let mut approach_mm = known.unwrap_or_default();
+        // The latest positions may still be on their way. An early verdict leaves out the frames after the
+        // last one whose approach is known. The final verdict does not wait.
+        let last_known = approach_mm.iter().rposition(Option::is_some);
+        let may_wait = sends && phase == Phase::Early;
+        if let (Some(last_known), true) = (last_known, may_wait) {
+            frames.truncate(last_known + 1);
         }
-        if let Some(speed_mm_s) = speed_mm_s {
-            known.approach_mm = approach_by_speed(speed_mm_s, &moments, &known.forces_n());
-            known.source = ApproachSource::Speed;
+        let best = press.best_of(&frames);
+        let is_known = match may_wait {
+            true => !approach_mm.is_empty(),
+            false => is_informative(&approach_mm, best),
+        };
+        if !is_known {
+            approach_mm.clear();
         }
-        known.or_nothing()
+        approach_mm.resize(frames.len(), None);
+        Self {
+            best,
+            approach_mm,
+            frames,
+            source: match (is_known, sends) {
+                (false, _) => ApproachSource::None,
+                (true, true) => ApproachSource::Positions,
+                (true, false) => ApproachSource::Speed,
+            },
+        }
     }
 
     /// The best frame.
@@ -71,82 +83,52 @@ impl<'a> PressWithApproach<'a> {
         self.frames[self.best]
     }
 
-    fn moments(&self) -> Vec<Duration> {
-        let moments = self.frames.iter().map(|frame| frame.moment.stamp.mono);
-        moments.collect()
-    }
-
-    fn forces_n(&self) -> Vec<f64> {
-        self.frames.iter().map(|frame| frame.force_n).collect()
-    }
-
-    /// Forgets an approach that says nothing.
-    fn or_nothing(mut self) -> Self {
-        if !is_informative(&self.approach_mm, self.best) {
-            self.approach_mm.fill(None);
-            self.source = ApproachSource::None;
-        }
-        self
-    }
-
-    /// Leaves out the frames after the last one whose approach is known.
-    fn cut(self, so_far: &'a SoFar) -> Self {
-        let Some(last) = self.approach_mm.iter().rposition(Option::is_some) else {
-            return self;
-        };
-        let (frames, best) = so_far.until(self.frames[last].moment.stamp.mono);
-        let mut approach_mm = self.approach_mm;
-        approach_mm.truncate(frames.len());
-        Self {
-            frames,
-            best,
-            approach_mm,
-            source: self.source,
-        }
+    /// The places of at most `most` frames, each with its time since the first one.
+    fn thinned(&self, most: usize) -> impl Iterator<Item = (usize, f32)> {
+        let moment = |place: usize| self.frames[place].moment.stamp.mono;
+        let places = thinned(self.frames.len(), self.best, most).into_iter();
+        places.map(move |place| {
+            let since = moment(place).saturating_sub(moment(0));
+            (place, since.as_secs_f32())
+        })
     }
 
     /// The course for a model of `most` frames.
     pub(super) fn course(
         &self,
-        arm_n_per_mm: Option<f64>,
+        sensor: &Sensor,
         most: usize,
         resampling: &Resampling,
     ) -> verdict::TimeSeries {
-        let begin = self.frames[0].moment.stamp.mono;
-        let moment = |place: usize| {
-            let frame = self.frames[place];
-            let since = frame.moment.stamp.mono.saturating_sub(begin);
-            verdict::Sample {
-                time_s: since.as_secs_f32(),
-                approach_mm: self.approach_mm[place].map(|mm| mm as f32),
-                frame: resampling.apply(&frame.frame),
-            }
+        let sample = |(place, time_s): (usize, f32)| verdict::Sample {
+            time_s,
+            approach_mm: self.approach_mm[place].map(|mm| mm as f32),
+            frame: resampling.apply(&self.frames[place].frame),
         };
-        let places = thinned(self.frames.len(), self.best, most);
         let is_known = self.source != ApproachSource::None;
+        let arm_n_per_mm = sensor.arm().stiffness_n_per_mm.filter(|_| is_known);
         verdict::TimeSeries {
-            moments: places.into_iter().map(moment).collect(),
-            arm_n_per_mm: arm_n_per_mm.filter(|_| is_known).unwrap_or(0.0) as f32,
+            moments: self.thinned(most).map(sample).collect(),
+            arm_n_per_mm: arm_n_per_mm.unwrap_or(0.0) as f32,
         }
     }
 
     /// The press on the array's own grid, for a model of parts: of the frames that a model of courses
     /// would get.
     pub(super) fn parts(&self) -> Vec<f32> {
-        let begin = self.frames[0].moment.stamp.mono;
-        let places = thinned(self.frames.len(), self.best, COURSE_FRAMES.1);
-        let moment = |place: usize| {
-            let frame = self.frames[place];
-            let since = frame.moment.stamp.mono.saturating_sub(begin);
-            (since.as_secs_f32(), &frame.frame.newtons[..])
-        };
-        parts(&places.into_iter().map(moment).collect::<Vec<_>>())
+        let taxels = |place: usize| &self.frames[place].frame.newtons[..];
+        let moments = self.thinned(COURSE_FRAMES.1);
+        parts(
+            &moments
+                .map(|(place, time_s)| (time_s, taxels(place)))
+                .collect::<Vec<_>>(),
+        )
     }
 
     /// The slope of force against indentation at the end of loading, in N/mm, by least squares.
     pub(super) fn stiffness_n_per_mm(&self, arm_n_per_mm: Option<f64>) -> Option<f64> {
         let arm_n_per_mm = arm_n_per_mm?;
-        let Phases { loaded, .. } = Phases::of(&self.forces_n());
+        let Phases { loaded, .. } = Phases::of(&forces_n(&self.frames));
         let enough = END_SHARE * self.frames[loaded].force_n;
         let steep = self.frames[..=loaded]
             .iter()
@@ -160,6 +142,10 @@ impl<'a> PressWithApproach<'a> {
         });
         slope(&end.collect::<Vec<_>>())
     }
+}
+
+fn forces_n(frames: &[&ContactFrame]) -> Vec<f64> {
+    frames.iter().map(|frame| frame.force_n).collect()
 }
 
 /// Whether an approach is known at two frames up to the best one, or up to the second frame if the

@@ -9,6 +9,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::approach::PressWithApproach;
+use crate::press::ContactFrame;
 use crate::sensor::Sensor;
 use crate::verdict::{Hrn, ModelError, Piece, ReferencePress, References, TimeSeries};
 
@@ -61,9 +63,14 @@ impl OwnPresses {
     pub(super) fn next(
         &self,
         object: Option<String>,
-        times: [Duration; 2],
-        centre_mm: [f64; 2],
+        press: &PressWithApproach<'_>,
+        sensor: &Sensor,
     ) -> PressedAt {
+        let moment = |frame: &ContactFrame| frame.moment.stamp.mono;
+        let times = [press.frames[0], press.frames[press.frames.len() - 1]].map(moment);
+        let pitch = sensor.calibration().pitch_mm;
+        let (row, col) = press.best().frame.centre();
+        let centre_mm = [row * pitch.rows_mm, col * pitch.cols_mm];
         let is_same = |before: &PressedAt| match (&before.object, &object) {
             (Some(before), Some(now)) => before == now,
             (None, None) => {

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::{Clock, Link, Pace, Pipeline};
 use crate::frame::{Array, Stamp};
-use crate::judge::{self, Judge};
+use crate::judge::{self, OwnPresses};
 use crate::sensor::Sensor;
 use crate::verdict::Hrn;
 use crate::wire::{Decoder, HexBytes, Place};
@@ -44,7 +44,6 @@ impl AtRest {
             && self.decoder.decoded < MOST_BYTES
             && self.tare.is_usable(array)
             && self.motion.is_usable()
-            && self.judge.is_usable()
     }
 
     /// The controller's context.
@@ -71,7 +70,7 @@ impl Pipeline {
             frames_damaged: self.frames_damaged,
             pace: self.pace.clone(),
             presses: self.tracker.presses(),
-            context: self.context.clone(),
+            context: self.judge.context.clone(),
             link: self.link.clone(),
             decoder: self.decoder.place(),
             pending: self.pending(),
@@ -99,17 +98,16 @@ impl Pipeline {
         self.decoder.restart();
         let mut kept = self.judge.kept_for(&hrn);
         if judge::owner(&sensor, &hrn) != judge::owner(&self.sensor, self.hrn()) {
-            kept.forget_own();
+            kept.own = OwnPresses::default();
         }
-        let mut next = Self::new(sensor, Arc::clone(&hrn), self.clock);
+        let mut next = Self::new(sensor, hrn, self.clock);
         let place = Place {
             in_sync: next.decoder.place().in_sync,
             ..self.decoder.place()
         };
         next.decoder = Decoder::at(next.sensor.layout().clone(), place);
         next.tracker.resume(self.tracker.presses());
-        next.judge = Judge::with(hrn, kept, self.judge.track);
-        next.context = self.context;
+        next.judge = next.judge.after(kept, self.judge.track, self.judge.context);
         (next.frames, next.frames_damaged) = (self.frames, self.frames_damaged);
         next.pace = self.pace;
         next
@@ -117,16 +115,16 @@ impl Pipeline {
 
     /// A pipeline of `sensor` that continues from a usable state.
     pub(crate) fn resumed(sensor: Sensor, hrn: Arc<Hrn>, state: AtRest) -> Self {
-        let mut pipeline = Self::new(sensor, Arc::clone(&hrn), Clock::Arrival);
+        let mut pipeline = Self::new(sensor, hrn, Clock::Arrival);
         pipeline.decoder = Decoder::at(pipeline.sensor.layout().clone(), state.decoder);
         for (at, HexBytes(bytes)) in state.pending {
             pipeline.hold(&bytes, at);
         }
         pipeline.tare.resume(state.tare);
         pipeline.tracker.resume(state.presses);
-        pipeline.judge = Judge::with(hrn, state.judge, state.motion.into());
+        let track = state.motion.into();
+        pipeline.judge = pipeline.judge.after(state.judge, track, state.context);
         pipeline.link = state.link;
-        pipeline.context = state.context;
         pipeline.frames = state.frames;
         pipeline.frames_damaged = state.frames_damaged;
         pipeline.pace = state.pace;

@@ -6,7 +6,7 @@ use super::Pipeline;
 use crate::event::Event;
 use crate::frame::Stamp;
 use crate::motion::{Point, StepBack};
-use crate::press::Abort;
+use crate::press::End;
 use crate::tare::RetareError;
 
 /// One thing that happens to a pipeline. Nothing else changes what a pipeline does.
@@ -80,26 +80,23 @@ impl Pipeline {
     ///
     /// Returns [`Refused`] for a tare that cannot be taken and for positions that step back in time.
     pub fn take(&mut self, input: Input, at: Stamp) -> Result<Vec<Event>, Refused> {
-        Ok(match input {
-            Input::Opened => self.opened(at),
-            Input::Unavailable(reason) => self.unavailable(reason, at),
-            Input::Bytes(bytes) => self.push(&bytes, at),
-            Input::Skipped(bytes) => self.skip(bytes, at),
-            Input::Tick => self.tick(at),
-            Input::Lost(reason) => self.lost(reason, at),
-            Input::Shutdown => self.abort(Abort::Shutdown).into_iter().collect(),
-            Input::Tare => {
-                self.retare()?;
-                Vec::new()
+        let mut events = Vec::new();
+        match input {
+            Input::Opened => events.extend(self.opened(at)),
+            // A changed reason is a status, also of a sensor that is lost.
+            Input::Unavailable(reason) => {
+                self.link.unavailable(reason);
+                events.extend(self.status_if_changed(at));
             }
-            Input::Context(context) => {
-                self.context = context;
-                Vec::new()
-            }
-            Input::Motion(points) => {
-                self.judge.track.push(&points)?;
-                Vec::new()
-            }
-        })
+            Input::Bytes(bytes) => events = self.push(&bytes, at),
+            Input::Skipped(bytes) => events = self.skip(bytes, at),
+            Input::Tick => events = self.tick(at),
+            Input::Lost(reason) => events = self.lost(reason, at),
+            Input::Shutdown => self.abort(End::Shutdown, &mut events),
+            Input::Tare => self.retare()?,
+            Input::Context(context) => self.judge.context = context,
+            Input::Motion(points) => self.judge.track.push(&points)?,
+        }
+        Ok(events)
     }
 }

@@ -18,9 +18,6 @@ const PAUSE_PERIODS: f64 = 0.5;
 /// After the last frame of a live sensor, bytes that are not read keep it from being stale for this time.
 const SKIPPING: Duration = Duration::from_secs(10);
 
-/// A changed reason of a silent sensor is published at most so often.
-const RENEWED_EVERY: Duration = Duration::from_secs(10);
-
 /// The number of frames over which the frame rate is measured.
 pub(super) const RATE_FRAMES: usize = 32;
 
@@ -35,12 +32,6 @@ pub(super) struct Link {
     /// When the last bytes came that are not settled.
     pub(super) last_bytes: Option<Duration>,
     pub(super) last_frame: Option<Stamp>,
-    /// The number of bytes since the last frame, or since the port was opened.
-    #[serde(default)]
-    pub(super) unframed: u64,
-    /// When the reason of a silence was last renewed.
-    #[serde(default)]
-    renewed: Option<Duration>,
     /// State and reason of the last published status, and the kind of a touch.
     published: (LinkState, Option<String>, Option<TouchKind>),
 }
@@ -69,8 +60,6 @@ impl Link {
             recent: VecDeque::with_capacity(RATE_FRAMES),
             last_bytes: None,
             last_frame: None,
-            unframed: 0,
-            renewed: None,
             published: (LinkState::Connecting, None, None),
         }
     }
@@ -86,7 +75,6 @@ impl Link {
     /// The port is open.
     pub(super) fn opened(&mut self, since: Duration) {
         self.last_bytes = None;
-        self.unframed = 0;
         if matches!(self.port, Port::Closed { .. }) {
             self.port = Port::Opened { since };
         }
@@ -117,7 +105,6 @@ impl Link {
         self.recent.push_back(stamp.mono);
         self.port = Port::Live { since: stamp.mono };
         self.was_lost = false;
-        self.unframed = 0;
     }
 
     /// Bytes came that nobody reads. They may be frames, if the last ones were.
@@ -259,7 +246,7 @@ impl Pipeline {
             }
             Port::Silent => {
                 let mut reason = no_frame_for(self.sensor.late_after());
-                if self.link.unframed > 0 {
+                if self.decoder.unframed() > 0 {
                     let guess = || "is the baud rate or the layout wrong?".to_owned();
                     reason += ", but bytes come: ";
                     reason += &self.decoder.problem().unwrap_or_else(guess);
@@ -294,33 +281,15 @@ impl Pipeline {
     /// A status, if the state or its reason have changed since the last one. So is one if a tare meets
     /// what rests on the sensor after what varied. The numbers of a touch differ with every try, and
     /// what rests varies when it is taken away.
-    pub(super) fn status_if_changed(&mut self, at: Stamp) -> Vec<Event> {
+    pub(super) fn status_if_changed(&mut self, at: Stamp) -> Option<Event> {
         let (state, reason) = self.state();
         let kind = self.touch().map(|touch| touch.kind);
         let (known_state, known_reason, known_kind) = &self.link.published;
         if (*known_state, known_reason) == (state, &reason) && kind <= *known_kind {
-            return Vec::new();
+            return None;
         }
         self.link.published = (state, reason, kind);
-        vec![Event::Status(self.status(at))]
-    }
-
-    /// A status, if the reason of a silence has changed because bytes came. Few bytes may be the beginning
-    /// of a frame.
-    pub(super) fn renewed(&mut self, at: Stamp) -> Vec<Event> {
-        let least = 2 * self.sensor.layout().max_frame_bytes() as u64;
-        let is_new = |last| at.mono.saturating_sub(last) < RENEWED_EVERY;
-        if !self.link.is_silent()
-            || self.link.unframed < least
-            || self.link.renewed.is_some_and(is_new)
-        {
-            return Vec::new();
-        }
-        let events = self.status_if_changed(at);
-        if !events.is_empty() {
-            self.link.renewed = Some(at.mono);
-        }
-        events
+        Some(Event::Status(self.status(at)))
     }
 
     fn measured_rate_hz(&self) -> Option<f64> {

@@ -31,6 +31,10 @@ fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
 }
 
+fn judge_by(pipeline: &mut Pipeline, hrn: Arc<Hrn>) {
+    pipeline.judge = Judge::new(Arc::clone(&pipeline.sensor), hrn);
+}
+
 fn at(millis: u64) -> Stamp {
     let mono = Duration::from_millis(1000 + millis);
     Stamp {
@@ -96,7 +100,7 @@ fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String>
 #[test]
 fn a_press_gives_begin_end_and_a_final_verdict() {
     let mut pipeline = pipeline(Preset::Jx255n);
-    assert!(pipeline.opened(at(0)).is_empty(), "still connecting");
+    assert_eq!(pipeline.opened(at(0)), None, "still connecting");
     assert_eq!(play(&mut pipeline, 1, &vec![raw(0, 0); 5]), ["Live"]);
     let press = [raw(4, 10), raw(9, 20), raw(5, 30), raw(0, 0), raw(0, 0)];
     assert_eq!(
@@ -251,7 +255,7 @@ fn how_long_a_live_sensor_may_be_silent_follows_from_its_rate_or_its_table() {
 fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
     let mut pipeline = pipeline(Preset::Jx255n);
     play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-    pipeline.context = Some(serde_json::json!({"tag": "x"}));
+    pipeline.judge.context = Some(serde_json::json!({"tag": "x"}));
     play(&mut pipeline, 5, &vec![raw(5, 50); 2]);
     let stopped = pipeline.take(Input::Shutdown, at(1400)).unwrap();
     assert_eq!(words(&stopped), ["Aborted 1 (shutdown)"]);
@@ -266,7 +270,7 @@ fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
     assert_eq!(status.bytes_skipped, skipped + 3);
     assert_eq!(play(&mut next, 8, &vec![raw(0, 0); 6]), ["Live"]);
     assert_eq!(play(&mut next, 14, &vec![raw(5, 50); 2]), ["Begin 2"]);
-    assert_eq!(next.context, Some(serde_json::json!({"tag": "x"})));
+    assert_eq!(next.judge.context, Some(serde_json::json!({"tag": "x"})));
 }
 
 #[test]
@@ -472,7 +476,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         let range = serde_json::json!({"force_n": range, "contact_area_taxels": [9, 10]});
         entry.value = range.to_string();
         let hrn = Hrn::load(&file.encode_to_vec()).unwrap();
-        pipeline.judge = Judge::new(Arc::new(hrn));
+        judge_by(&mut pipeline, Arc::new(hrn));
         play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
         let mut held = RawFrame::default();
         // Three by three taxels in the middle.
@@ -531,7 +535,7 @@ fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
     let bias = weights.find(|tensor| tensor.name == "head.bias").unwrap();
     bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
     let failing = Hrn::read(&file.encode_to_vec()).unwrap();
-    pipeline.judge = Judge::new(Arc::new(failing));
+    judge_by(&mut pipeline, Arc::new(failing));
     let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
     assert_eq!(play(&mut pipeline, 5, &press), ["Begin 1", "End 1"]);
     let told = pipeline.unjudged();
@@ -579,13 +583,13 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
         object.map(|object| (object.name, object.presses))
     };
     assert_eq!(judged(&mut pipeline, 5), None, "no object is named");
-    pipeline.context = Some(serde_json::json!({"object": "cup"}));
+    pipeline.judge.context = Some(serde_json::json!({"object": "cup"}));
     assert_eq!(judged(&mut pipeline, 9), Some(("cup".to_owned(), 1)));
-    pipeline.context = Some(serde_json::json!({"object": 7}));
+    pipeline.judge.context = Some(serde_json::json!({"object": 7}));
     assert_eq!(judged(&mut pipeline, 13), Some(("7".to_owned(), 1)));
     let state = pipeline.at_rest().unwrap();
     let mut next = Pipeline::resumed(pipeline.sensor().clone(), test_support::hrn(), state);
-    next.context = Some(serde_json::json!({"object": "cup"}));
+    next.judge.context = Some(serde_json::json!({"object": "cup"}));
     assert_eq!(judged(&mut next, 17), Some(("cup".to_owned(), 2)));
     // The same model goes on with its objects.
     let mut next = next

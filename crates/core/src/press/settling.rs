@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::Thresholds;
+use super::{ContactFrame, Thresholds};
 
 /// The latest frames whose area and force are all near the largest ones so far.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -15,17 +15,22 @@ pub(super) struct Settling {
 
 /// The contact of one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Load {
-    pub(super) at: Duration,
-    pub(super) contact_area_taxels: u32,
-    pub(super) force_n: f64,
+struct Load {
+    at: Duration,
+    contact_area_taxels: u32,
+    force_n: f64,
 }
 
 impl Settling {
     /// Adds a frame. Returns true if area and force have stayed near their largest values so far,
     /// over at least `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a
     /// verdict.
-    pub(super) fn push(&mut self, load: Load, thresholds: &Thresholds) -> bool {
+    pub(super) fn push(&mut self, frame: &ContactFrame, thresholds: &Thresholds) -> bool {
+        let load = Load {
+            at: frame.moment.stamp.mono,
+            contact_area_taxels: frame.contact_area_taxels,
+            force_n: frame.force_n,
+        };
         self.most_area = self.most_area.max(load.contact_area_taxels);
         self.most_force_n = self.most_force_n.max(load.force_n);
         self.near.push_back(load);

@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use super::*;
 
 /// A frame of `area` taxels sharing `force_n`.
@@ -19,44 +21,34 @@ fn moment(frame: u64, rate_hz: u64) -> FrameAt {
 }
 
 /// Tracks `loads` and writes each change as a letter with its frame: b begin, s settled, e end, t
-/// timeout, x aborted.
+/// timeout, x without a verdict.
 fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String {
     let mut tracker = PressTracker::new(settings.clone());
     let mut text = Vec::new();
+    let mut was_settled = false;
     for (number, &(area, force_n)) in (0..).zip(loads) {
-        for change in tracker.push(
-            &frame(area, force_n),
-            Marks::default(),
-            moment(number, rate_hz),
-        ) {
-            text.push(match change {
-                Change::Begin { press, at } => format!("b{press}@{}", at.frame),
-                Change::Settled { press } => format!("s@{number}:{}", press.peak().moment.frame),
-                Change::End {
-                    last,
-                    frames,
-                    end,
-                    press,
-                } => format!(
-                    "{}@{number}:last{} n{frames} peak{}",
-                    if end == End::Release { 'e' } else { 't' },
-                    last.frame,
-                    press.peak().moment.frame
-                ),
-                Change::Aborted {
-                    last,
-                    frames,
-                    reason,
-                    ..
-                } => {
-                    format!(
-                        "x@{number}:last{} n{frames} {}",
-                        last.frame,
-                        reason.reason()
-                    )
-                }
-            });
-        }
+        let (frame, at) = (frame(area, force_n), moment(number, rate_hz));
+        let change = tracker.push(&frame, Marks::default(), at);
+        let settled = tracker.so_far().filter(|press| press.is_settled());
+        let peak = settled.map(|press| press.peak().moment.frame);
+        text.extend(
+            peak.filter(|_| !was_settled)
+                .map(|peak| format!("s@{number}:{peak}")),
+        );
+        was_settled = peak.is_some();
+        text.extend(change.map(|change| match change {
+            Change::Begin { press, at } => format!("b{press}@{}", at.frame),
+            Change::End { press, end } => {
+                let letter = match end {
+                    End::Release => 'e',
+                    End::Timeout => 't',
+                    _ => 'x',
+                };
+                let (last, frames) = (press.last().frame, press.frames());
+                let peak = press.peak().moment.frame;
+                format!("{letter}@{number}:last{last} n{frames} peak{peak}")
+            }
+        }));
     }
     text.join(" ")
 }
@@ -87,7 +79,7 @@ fn a_press_runs_from_its_begin_area_to_its_release() {
             // A press of one frame is short.
             (
                 &[(3, 1.), FREE, FREE, (3, 1.)],
-                "b1@0 x@2:last0 n1 short b2@3",
+                "b1@0 x@2:last0 n1 peak0 b2@3",
             ),
             // Ties of area go to the force, then to the earlier frame.
             (
@@ -118,7 +110,7 @@ fn a_press_runs_from_its_begin_area_to_its_release() {
 #[test]
 fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
     let mut tracker = PressTracker::new(Thresholds::default());
-    let mut changes = Vec::new();
+    let mut ended = None;
     // In f32, the second force is greater by 7e-9 N.
     let counts = [[2_u8, 5, 6], [3, 4, 6], [0; 3], [0; 3]];
     for (number, counts) in (0..).zip(counts) {
@@ -126,13 +118,12 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
         for (newtons, count) in frame.newtons.iter_mut().zip(counts) {
             *newtons = 0.04 * f32::from(count);
         }
-        changes.extend(tracker.push(&frame, Marks::default(), moment(number, 5)));
+        ended = tracker.push(&frame, Marks::default(), moment(number, 5));
     }
-    let ended = changes.into_iter().find_map(|change| match change {
-        Change::End { press, .. } => Some(press),
-        _ => None,
-    });
-    assert_eq!(ended.unwrap().peak().moment.frame, 0);
+    let Some(Change::End { press, .. }) = ended else {
+        panic!("{ended:?}");
+    };
+    assert_eq!(press.peak().moment.frame, 0);
 }
 
 #[test]
@@ -158,7 +149,7 @@ fn a_held_press_times_out_once_and_waits_for_release() {
         min_frames: 9,
         ..Thresholds::default()
     };
-    check(&settings, &[(&[TOUCH; 4], "b1@0 s@2:0 x@2:last2 n3 short")]);
+    check(&settings, &[(&[TOUCH; 4], "b1@0 x@2:last2 n3 peak0")]);
 }
 
 #[test]
@@ -216,20 +207,55 @@ fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_tim
         max_seconds: 0.2,
         ..Thresholds::default()
     });
-    assert_eq!(tracker.abort(Abort::Lost), None);
+    assert_eq!(tracker.abort(End::Lost), None);
     push(&mut tracker, 0);
-    assert!(matches!(
-        tracker.abort(Abort::Lost),
-        Some(Change::Aborted {
-            press: 1,
-            frames: 1,
-            reason: Abort::Lost,
-            ..
-        })
-    ));
+    let Some(Change::End { press, end }) = tracker.abort(End::Lost) else {
+        panic!("the press goes on");
+    };
+    assert_eq!((press.press(), press.frames(), end), (1, 1, End::Lost));
     assert!(!tracker.is_pressed());
     push(&mut tracker, 1);
     push(&mut tracker, 2);
-    assert_eq!(tracker.abort(Abort::Lost), None, "it timed out");
-    assert_eq!(push(&mut tracker, 3), []);
+    assert_eq!(tracker.abort(End::Lost), None, "it timed out");
+    assert_eq!(push(&mut tracker, 3), None);
+}
+
+/// A press whose frames have these contact areas.
+fn of_areas(areas: impl IntoIterator<Item = u32>) -> SoFar {
+    let mut frames = (0..).zip(areas).map(|(number, area)| ContactFrame {
+        moment: moment(number, 100),
+        frame: Arc::new(Frame::default()),
+        marks: Marks::default(),
+        contact_area_taxels: area,
+        force_n: 1.0,
+    });
+    let mut press = SoFar::new(1, frames.next().unwrap());
+    frames.for_each(|frame| press.push(frame));
+    press
+}
+
+#[test]
+fn first_best_and_last_are_held_and_the_rest_is_even() {
+    for count in [1, 2, 511, 512, 513, 1024, 1025, 5000] {
+        let best = count / 3;
+        let press = of_areas((0..count).map(|number| if number == best { 9 } else { 5 }));
+        let frames = press.spread();
+        let numbers: Vec<u64> = frames.iter().map(|frame| frame.moment.frame).collect();
+        assert_eq!(numbers[press.best_of(&frames)], best, "{count}");
+        assert_eq!((numbers[0], numbers.last()), (0, Some(&(count - 1))));
+        assert_eq!((press.last().frame, press.frames()), (count - 1, count));
+        assert!(numbers.is_sorted_by(|one, next| one < next));
+        assert!(numbers.len() >= 256.min(count as usize) && numbers.len() <= 514);
+        let widest = numbers.windows(2).map(|pair| pair[1] - pair[0]).max();
+        assert!(widest.unwrap_or(1) <= count.div_ceil(256), "{count}");
+    }
+}
+
+#[test]
+fn the_best_frame_of_a_part_is_the_best_until_then() {
+    let press = of_areas([3, 5, 5, 4, 8, 8, 2]);
+    let frames = press.spread();
+    for (length, best) in [(1, 0), (2, 1), (4, 1), (5, 4), (7, 4)] {
+        assert_eq!(press.best_of(&frames[..length]), best);
+    }
 }

@@ -9,7 +9,7 @@ use crate::frame::Stamp;
 use crate::judge::Unjudged;
 use crate::motion::Track;
 use crate::pipeline::Pipeline;
-use crate::press::Abort;
+use crate::press::End;
 use crate::verdict::{Hrn, ModelError, TimeSeries};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
@@ -160,7 +160,9 @@ impl Playback {
                     Some(known) => {
                         let mut before = std::mem::replace(known, player).pipeline;
                         // A press under way has lost its end with the missing entries.
-                        before.abort(Abort::EndOfRecording).into_iter().collect()
+                        let mut events = Vec::new();
+                        before.abort(End::EndOfRecording, &mut events);
+                        events
                     }
                     None => {
                         if let Some((_, to)) = self.left_out.get_mut(sensor) {

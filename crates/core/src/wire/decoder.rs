@@ -128,16 +128,17 @@ impl Decoder {
 
     /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
-        self.pass(self.pending().len());
-        self.settled = false;
-        self.place.in_sync = self.layout.begins_in_sync();
+        self.skip(0);
         self.place.framed = self.place.decoded;
         self.lines = Lines::default();
         self.is_telnet = false;
     }
 
-    /// Counts bytes that came and that nobody reads. Call it after [`Self::restart`].
+    /// Counts bytes that came and that nobody reads. The next bytes do not continue the pending ones.
     pub(crate) fn skip(&mut self, bytes: u64) {
+        self.pass(self.pending().len());
+        self.settled = false;
+        self.place.in_sync = self.layout.begins_in_sync();
         self.place.decoded = self.place.decoded.saturating_add(bytes);
         self.place.skipped = self.place.skipped.saturating_add(bytes);
     }

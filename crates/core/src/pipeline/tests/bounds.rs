@@ -13,7 +13,7 @@ fn status(events: &[Event]) -> Option<&Status> {
 fn frames_above_twice_the_rate_are_dropped_counted_and_said_once() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let frame = bytes(&pipeline, &raw(0, 0));
-    let mut events = pipeline.opened(at(0));
+    let mut events = Vec::from_iter(pipeline.opened(at(0)));
     // 100 frames/s of a sensor of 5.
     for ms in (0..60_000).step_by(10) {
         events.extend(pipeline.push(&frame, at(ms)));
@@ -113,7 +113,7 @@ fn a_press_that_is_not_released_is_said_with_its_taxels() {
 fn a_sensor_whose_bytes_are_skipped_is_live_as_long_as_its_frames_come() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let frame = bytes(&pipeline, &raw(0, 0));
-    let mut events = pipeline.opened(at(0));
+    let mut events = Vec::from_iter(pipeline.opened(at(0)));
     let skip = |pipeline: &mut Pipeline, ms| pipeline.take(Input::Skipped(1_000), at(ms)).unwrap();
     // The bytes of two seconds are skipped again and again.
     for ms in (0..20_000).step_by(50) {

@@ -14,7 +14,7 @@ fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipel
         change(described);
     });
     let hrn = Hrn::load(&course_model(8, more)).unwrap();
-    pipeline.judge = Judge::new(Arc::new(hrn));
+    judge_by(&mut pipeline, Arc::new(hrn));
     play(&mut pipeline, 1, &vec![raw(0, 0); 5]);
     pipeline
 }
@@ -113,7 +113,7 @@ fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
         let mut pipeline = tared(&[], |described| {
             described.sensor.arm.speed_mm_s = configured;
         });
-        pipeline.context = context;
+        pipeline.judge.context = context;
         let found = judged(&mut pipeline, |_| Vec::new());
         // At 5 mm/s, this is the sum of 0, 1, 2, 3 and again 3 mm.
         assert_eq!(given(&found[1]), [value, 5.0, 10.0]);
@@ -122,7 +122,7 @@ fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
     }
     // A context may be any JSON.
     let mut pipeline = tared(&[], |_| {});
-    pipeline.context = Some(json!({"speed_mm_s": "fast"}));
+    pipeline.judge.context = Some(json!({"speed_mm_s": "fast"}));
     let found = judged(&mut pipeline, |_| Vec::new());
     assert_eq!(found[1].course, Some(ApproachSource::None));
 }
@@ -138,7 +138,7 @@ fn where_the_approach_is_unknown_nothing_is_said_of_the_arm() {
         let _ = pipeline.judge.track.push(&points);
     };
     let speed_beside_positions = |pipeline: &mut Pipeline| {
-        pipeline.context = Some(json!({"speed_mm_s": 5.0}));
+        pipeline.judge.context = Some(json!({"speed_mm_s": 5.0}));
         let _ = pipeline.judge.track.push(&positions(1000, 1500));
     };
     let prepare: [fn(&mut Pipeline); 4] = [|_| {}, late, jump, speed_beside_positions];
@@ -283,7 +283,7 @@ fn a_long_press_is_thinned() {
 fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
     let found = |reported: &[Point], arm_n_per_mm| {
         let mut pipeline = tared(&[], |d| d.sensor.arm.stiffness_n_per_mm = arm_n_per_mm);
-        pipeline.judge = Judge::new(test_support::hrn());
+        judge_by(&mut pipeline, test_support::hrn());
         pipeline.judge.track.push(reported).unwrap();
         let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
         let found = verdicts(feed(&mut pipeline, 6, &held));
