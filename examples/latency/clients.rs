@@ -2,23 +2,17 @@
 
 use std::fmt;
 use std::io;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::task::JoinSet;
 
-use crate::sensors::{Sent, now_ns, number};
-use crate::server::Place;
-use crate::{Args, Failure, Kind, What};
-
-/// How long the server may take to start, and to answer a client.
-const PATIENCE: Duration = Duration::from_secs(30);
-/// The text before the forces of a frame.
-pub(crate) const FORCES: &str = "\"newtons\":[";
+use crate::sensors::{Sent, now_ns};
+use crate::{Args, Kind, PATIENCE, What};
 
 /// The record of all clients.
 #[derive(Default)]
@@ -32,6 +26,10 @@ pub(crate) struct Received {
 }
 
 impl Received {
+    pub(crate) fn ready(&self) -> usize {
+        self.ready.load(Relaxed)
+    }
+
     /// Measures the events that are sent from now on.
     pub(crate) fn begin(&self) {
         self.since_ns.store(now_ns(), Relaxed);
@@ -79,22 +77,10 @@ impl fmt::Display for Figures {
     }
 }
 
-/// Waits until all clients are connected.
-pub(crate) fn wait(received: &Received, clients: usize) -> Result<(), Failure> {
-    let start = Instant::now();
-    while received.ready.load(Relaxed) < clients {
-        if start.elapsed() > PATIENCE {
-            return Err("the server does not answer all clients".into());
-        }
-        sleep(Duration::from_millis(5));
-    }
-    Ok(())
-}
-
 /// Reads until the server ends. Returns the problem, if there was one.
 pub(crate) fn listen(
     args: &Args,
-    place: &Place,
+    place: &Result<u16, PathBuf>,
     sent: &Arc<Sent>,
     received: &Arc<Received>,
 ) -> Option<String> {
@@ -111,45 +97,42 @@ pub(crate) fn listen(
             let (args, place) = (args.clone(), place.clone());
             let (sent, received) = (Arc::clone(sent), Arc::clone(received));
             clients.spawn(async move {
-                let start = Instant::now();
-                loop {
-                    let done = match &place {
-                        Place::Unix(path) => match UnixStream::connect(path).await {
-                            Ok(stream) => client(&args, stream, &sent, &received).await,
-                            Err(error) => Err(error),
-                        },
-                        Place::Tcp(port) => match TcpStream::connect(("127.0.0.1", *port)).await {
-                            Ok(stream) => client(&args, stream, &sent, &received).await,
-                            Err(error) => Err(error),
-                        },
-                    };
-                    let is_not_there = done.as_ref().is_err_and(|error| {
-                        use io::ErrorKind::{ConnectionRefused, NotFound, WouldBlock};
-                        [ConnectionRefused, NotFound, WouldBlock].contains(&error.kind())
-                    });
-                    if !is_not_there || start.elapsed() > PATIENCE {
-                        return done;
-                    }
-                    tokio::time::sleep(Duration::from_millis(20)).await;
-                }
+                let stream = connect(&place).await?;
+                client(&args, stream, &sent, &received).await
             });
         }
-        let mut problem = None;
-        while let Some(done) = clients.join_next().await {
-            match done {
-                Ok(Ok(())) => {}
-                Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionReset => {}
-                Ok(Err(error)) => problem = Some(error.to_string()),
-                Err(error) => problem = Some(error.to_string()),
-            }
-        }
-        problem
+        let ends = clients.join_all().await;
+        let problems = ends.into_iter().filter_map(Result::err);
+        let mut problems = problems.filter(|end| end.kind() != io::ErrorKind::ConnectionReset);
+        problems.next().map(|problem| problem.to_string())
     })
 }
 
-async fn client<S: AsyncRead + AsyncWrite + Unpin>(
+trait Duplex: AsyncRead + AsyncWrite + Send + Unpin {}
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> Duplex for S {}
+
+/// Connects as soon as the server listens.
+async fn connect(place: &Result<u16, PathBuf>) -> io::Result<Box<dyn Duplex>> {
+    let start = Instant::now();
+    loop {
+        let stream: io::Result<Box<dyn Duplex>> = match place {
+            Ok(port) => TcpStream::connect(("127.0.0.1", *port))
+                .await
+                .map(|stream| Box::new(stream) as _),
+            Err(path) => UnixStream::connect(path)
+                .await
+                .map(|stream| Box::new(stream) as _),
+        };
+        if stream.is_ok() || start.elapsed() > PATIENCE {
+            return stream;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+async fn client(
     args: &Args,
-    mut stream: S,
+    mut stream: Box<dyn Duplex>,
     sent: &Sent,
     received: &Received,
 ) -> io::Result<()> {
@@ -157,7 +140,6 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
         (Kind::Gpsd, _) => b"?WATCH={\"enable\":true,\"json\":true};\n",
         (Kind::Hardnessd, What::Frame) => b"{\"subscribe\":[\"frame\"]}\n",
         (Kind::Hardnessd, What::Verdict) => b"{\"subscribe\":[\"hardness\"]}\n",
-        (Kind::Bare, _) => b"",
     };
     stream.write_all(request).await?;
     let (mut unread, mut is_ready) = (Vec::new(), false);
@@ -174,7 +156,7 @@ async fn client<S: AsyncRead + AsyncWrite + Unpin>(
         while let Some(end) = rest.iter().position(|&byte| byte == b'\n') {
             let sent = match args.server {
                 Kind::Gpsd => fix(&rest[..end]).and_then(|cycle| sent.frame(0, cycle)),
-                _ => sent_at(args.event, &rest[..end], sent),
+                Kind::Hardnessd => sent_at(args.event, &rest[..end], sent),
             };
             if let Some(sent) = sent {
                 received.add(sent, now);
@@ -194,10 +176,7 @@ fn sent_at(what: What, line: &[u8], sent: &Sent) -> Option<u64> {
     match what {
         What::Frame => {
             head.starts_with("{\"type\":\"frame\"").then_some(())?;
-            let (_, forces) = head.split_once(FORCES)?;
-            let mut forces = forces.split(',').map(str::parse);
-            let mut force = || forces.next()?.ok();
-            sent.frame(sensor, number(&[force()?, force()?, force()?]))
+            sent.frame(sensor, value(head, "\"frame\":")?)
         }
         What::Verdict => {
             head.contains("\"phase\":\"final\"").then_some(())?;

@@ -5,9 +5,8 @@
 //!
 //! It plays sensors to a daemon of its own and reads with as many clients as you ask for. It prints
 //! percentiles, the number of lost events, and the daemon's processor time and memory. `--server
-//! gpsd` does the same with gpsd and NMEA sentences. `--server bare` uses a process that only
-//! copies bytes, as the lower bound. Start the example with `chrt --rr 20`, so that a busy machine
-//! delays the daemon and not the measurement.
+//! gpsd` does the same with gpsd and NMEA sentences. Start the example with `chrt --rr 20`, so that a
+//! busy machine delays the daemon and not the measurement.
 
 mod clients;
 #[path = "../../src/tools/pty/pair.rs"]
@@ -18,7 +17,7 @@ mod server;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::thread;
+use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use clap::{Parser, ValueEnum};
@@ -30,6 +29,8 @@ type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 /// The time for which everything runs before the measurement begins.
 const WARM: Duration = Duration::from_secs(2);
+/// How long the server may take to start, to open the sensors, and to answer a client.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 #[derive(Parser, Clone)]
 struct Args {
@@ -54,7 +55,7 @@ struct Args {
     /// What is measured
     #[arg(long, value_enum, default_value_t = What::Frame)]
     event: What,
-    /// Over TCP, and not a Unix socket
+    /// Over TCP, and not a Unix socket; always with gpsd
     #[arg(long)]
     tcp: bool,
     /// How the server is scheduled
@@ -66,16 +67,12 @@ struct Args {
     /// More lines of the daemon's configuration
     #[arg(long, default_value = "")]
     configuration: String,
-    /// Copy bytes from this device to a client; --server bare starts this program again with it
-    #[arg(long, hide = true)]
-    copy: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Kind {
     Hardnessd,
     Gpsd,
-    Bare,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -95,12 +92,7 @@ enum Scheduling {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
-    let done = match &args.copy {
-        Some(device) => server::copy(device, &args),
-        None => measure(&args),
-    };
-    match done {
+    match measure(&Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("latency: {error}");
@@ -109,32 +101,29 @@ fn main() -> ExitCode {
     }
 }
 
-/// Raises the limit of descriptors: each sensor needs two and each client one, more than most
-/// systems allow at first.
-fn raise_descriptors() {
+fn measure(args: &Args) -> Result<(), Failure> {
+    // Each sensor needs two descriptors and each client one, more than most systems allow at first.
     let limit = rustix::process::getrlimit(Resource::Nofile);
     let raised = Rlimit {
         current: limit.maximum,
         ..limit
     };
     let _ = rustix::process::setrlimit(Resource::Nofile, raised);
-}
-
-fn measure(args: &Args) -> Result<(), Failure> {
-    raise_descriptors();
     let length = WARM + Duration::from_secs_f64(args.seconds);
     let sensors = Sensors::plug(args, length)?;
-    let server = Server::start(args, &sensors.devices())?;
+    let devices = sensors.devices();
+    let server = Server::start(args, &devices)?;
     let (received, sent) = (Arc::new(clients::Received::default()), sensors.sent());
     let listeners = thread::spawn({
-        let (args, place) = (args.clone(), server.place());
+        let (args, place) = (args.clone(), server.place.clone());
         let (sent, received) = (Arc::clone(&sent), Arc::clone(&received));
         move || clients::listen(&args, &place, &sent, &received)
     });
-    clients::wait(&received, args.clients)?;
-    server.opens(args.sensors)?;
+    wait("answer all clients", || received.ready() == args.clients)?;
+    wait("open the sensors", || server.has_opened(&devices))?;
+    sleep(Duration::from_millis(500));
     let player = thread::spawn(move || sensors.play(length));
-    thread::sleep(WARM);
+    sleep(WARM);
     received.begin();
     let (before, start) = (server.processor_time()?, Instant::now());
     // The sensors stay plugged in until all events are read.
@@ -142,10 +131,10 @@ fn measure(args: &Args) -> Result<(), Failure> {
     let taken = start.elapsed();
     let busy = server.processor_time()?.saturating_sub(before);
     // Wait for the last events, which are on their way.
-    thread::sleep(Duration::from_millis(300));
+    sleep(Duration::from_millis(300));
     let memory = server.anonymous_kb()?;
     drop(server);
-    let problems = listeners.join().map_err(|_| "the clients stopped")?;
+    let problem = listeners.join().map_err(|_| "the clients stopped")?;
     let figures = received.figures(args, &sent);
     let frames = args.sensors as f64 * args.rate * taken.as_secs_f64();
     println!(
@@ -164,5 +153,17 @@ fn measure(args: &Args) -> Result<(), Failure> {
         100.0 * busy.as_secs_f64() / taken.as_secs_f64(),
         late.as_secs_f64() * 1e3,
     );
-    problems.map_or(Ok(()), |problem| Err(problem.into()))
+    problem.map_or(Ok(()), |problem| Err(problem.into()))
+}
+
+/// Waits until the server has done something.
+fn wait(what: &str, is_done: impl Fn() -> bool) -> Result<(), Failure> {
+    let start = Instant::now();
+    while !is_done() {
+        if start.elapsed() > PATIENCE {
+            return Err(format!("the server does not {what}").into());
+        }
+        sleep(Duration::from_millis(5));
+    }
+    Ok(())
 }

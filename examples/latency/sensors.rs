@@ -17,8 +17,6 @@ use crate::{Args, Failure, Kind, What};
 /// load.
 const CYCLE: usize = 40;
 const LOADED: usize = 20;
-/// The default of the daemon's configuration.
-const NEWTONS_PER_COUNT: f64 = 0.04;
 /// The number of bytes of an NMEA cycle: about as many as of a frame.
 const SENTENCES: usize = 791;
 
@@ -106,6 +104,12 @@ impl Sensors {
             cols: Some(self.side),
             ..Settings::default()
         })?;
+        // All sensors send the same frames.
+        let [mut rest, mut loaded] = [false, true].map(|is_loaded| {
+            let mut bytes = Vec::new();
+            layout.encode(&frame(self.side, is_loaded), &mut bytes);
+            bytes
+        });
         let start = Instant::now();
         let period = Duration::from_secs_f64(1.0 / self.rate);
         let count = self.pairs.len();
@@ -115,16 +119,9 @@ impl Sensors {
             if due >= start + length {
                 break;
             }
-            // All sensors send the same frames.
-            let encode = |is_loaded| {
-                let mut bytes = Vec::new();
-                match self.kind {
-                    Kind::Gpsd => bytes.extend(sentences(number).as_bytes()),
-                    _ => layout.encode(&frame(self.side, number, is_loaded), &mut bytes),
-                }
-                bytes
-            };
-            let (rest, loaded) = (encode(false), encode(true));
+            if self.kind == Kind::Gpsd {
+                [rest, loaded] = [(); 2].map(|()| sentences(number).into_bytes());
+            }
             for (sensor, pair) in self.pairs.iter().enumerate() {
                 // The sensors of one machine do not send at the same moment, so spread them over
                 // the period.
@@ -148,35 +145,16 @@ impl Sensors {
     }
 }
 
-/// Frame `number` of an array of `side` rows and columns. Its first taxels carry the number. They
-/// are too few for a contact. The load is on a seventh of the rows and of the columns.
-fn frame(side: usize, number: i32, is_loaded: bool) -> RawFrame {
-    let array = Array {
-        rows: side,
-        cols: side,
-    };
-    let mut frame = RawFrame::zero(array);
-    for (count, byte) in frame.counts.iter_mut().zip(number.to_le_bytes()) {
-        *count = byte.into();
-    }
-    if is_loaded {
-        let loaded = side * 3 / 7..side * 4 / 7;
-        for row in loaded.clone() {
-            for col in loaded.clone() {
-                frame.counts[array.place(row, col)] = 60.0;
-            }
-        }
+/// A frame of an array of `side` rows and columns. The load is on a seventh of the rows and of the
+/// columns.
+fn frame(side: usize, is_loaded: bool) -> RawFrame {
+    let (rows, cols) = (side, side);
+    let mut frame = RawFrame::zero(Array { rows, cols });
+    let loaded = side * 3 / 7..side * 4 / 7;
+    for row in loaded.clone().filter(|_| is_loaded) {
+        frame.counts[row * side..][loaded.clone()].fill(60.0);
     }
     frame
-}
-
-/// The number in the first forces of a frame, which are in newtons.
-pub(crate) fn number(forces: &[f64; 3]) -> usize {
-    let byte = |force: f64| (force / NEWTONS_PER_COUNT).round() as usize;
-    forces
-        .iter()
-        .rev()
-        .fold(0, |number, &force| number << 8 | byte(force))
 }
 
 /// One cycle of a GPS receiver, a hundredth of a second after the previous one.

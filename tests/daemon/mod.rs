@@ -16,6 +16,7 @@ mod publish;
 mod running;
 mod sensors;
 mod shipped;
+mod soak;
 mod stdout;
 mod subscribe;
 #[cfg(feature = "watch")]

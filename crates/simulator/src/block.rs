@@ -11,9 +11,9 @@
 
 use std::f64::consts::PI;
 
-use super::contact::Column;
+use super::fourier::Convolver;
 use super::kernel::confined_compliance;
-use super::object::FlatFace;
+use super::object::{Axes, FlatFace};
 
 /// Poisson's ratio of the layer that carries the short waves. Short waves depend on the plane-strain
 /// modulus only, and with this ratio an even load sinks in evenly.
@@ -28,8 +28,7 @@ const LEAST_HEIGHT: f64 = 0.25;
 const SIDE: f64 = 0.58;
 const REACH: f64 = 0.2;
 
-/// A block under a load, apart from its modulus.
-#[derive(Debug, Clone, Copy)]
+/// A block under a sensor, apart from its modulus.
 pub(super) struct Block {
     /// The sides of the face, mm. Those of a round one are the square's of the same area.
     sides_mm: [f64; 2],
@@ -37,11 +36,39 @@ pub(super) struct Block {
     radius_mm: Option<f64>,
     /// The height that yields, mm.
     height_mm: f64,
+    /// The axes of the face on the whole sensor.
+    pub(super) axes: Axes,
+    /// The factor on a cell's pressure and on its displacement, over the whole sensor. 0 beside the
+    /// block.
+    pub(super) factor: Vec<f32>,
+    /// What the block yields as a column: mm under an even pressure of 1 MPa, for Young's modulus 1.
+    compliance: f64,
+}
+
+/// A block under a window of the sensor.
+pub(super) struct Standing<'a> {
+    pub(super) block: &'a Block,
+    /// Spectrum of the short waves' influence, mm per MPa.
+    pub(super) spectrum: &'a [f32],
+    /// The block's factor on the window.
+    pub(super) factor: Vec<f32>,
+    /// The axes on the window.
+    pub(super) axes: Axes,
+    /// The factor on the compliance for Young's modulus 1.
+    pub(super) unit: f64,
 }
 
 impl Block {
-    /// A block with this face. `None` for one so low that it is a layer.
-    pub(super) fn new(face: FlatFace, height_mm: f64) -> Option<Self> {
+    /// A block with this face on `width` x `width` cells, of Poisson's ratio `nu`, on a core with this
+    /// compliance. `None` for one so low that it is a layer.
+    pub(super) fn new(
+        face: FlatFace,
+        height_mm: f64,
+        nu: f64,
+        core: f64,
+        axes: Axes,
+        width: usize,
+    ) -> Option<Self> {
         let (sides_mm, radius_mm) = match face {
             FlatFace::Rectangle { sides_mm } => (sides_mm, None),
             FlatFace::Round { radius_mm } => {
@@ -50,11 +77,22 @@ impl Block {
             }
         };
         let narrow_mm = sides_mm[0].min(sides_mm[1]);
-        (height_mm > LEAST_HEIGHT * narrow_mm).then_some(Self {
+        if height_mm <= LEAST_HEIGHT * narrow_mm {
+            return None;
+        }
+        let mut block = Self {
             sides_mm,
             radius_mm,
             height_mm,
-        })
+            axes,
+            factor: Vec::new(),
+            compliance: 0.0,
+        };
+        block.compliance = block.column(nu) + core;
+        let cells = 0..width * width;
+        let factor = cells.map(|k| block.factor_at(axes.at(k / width, k % width)));
+        block.factor = factor.collect();
+        Some(block)
     }
 
     /// The height of the layer that carries the short waves, mm.
@@ -63,9 +101,7 @@ impl Block {
         (LOCAL_HEIGHT.0 * self.height_mm).min(LOCAL_HEIGHT.1 * narrow_mm)
     }
 
-    /// The factor on a cell's pressure and on its displacement, at (`u`, `v`) from the middle. 0 beside
-    /// the block.
-    pub(super) fn factor(&self, u: f64, v: f64) -> f32 {
+    fn factor_at(&self, [u, v]: [f64; 2]) -> f32 {
         let reach = REACH * self.local_mm();
         let held = |at: f64, side: f64| {
             let near = |distance: f64| SIDE * (-distance.max(0.0) / reach).exp();
@@ -82,13 +118,12 @@ impl Block {
         (1.0 / share.sqrt()) as f32
     }
 
-    /// The column: what the block yields beyond its short waves, for Young's modulus 1 and Poisson's
-    /// ratio `nu`.
+    /// What the block yields beyond its short waves, for Young's modulus 1 and Poisson's ratio `nu`.
     ///
     /// With free sides the modulus is E. It rises to the confined modulus M with the shape factor S
     /// (loaded over free area of a block bonded at both ends, twice as high), first as `E (1 + 2 S^2)`
     /// (Gent and Lindley 1959).
-    pub(super) fn column(&self, nu: f64) -> Column {
+    fn column(&self, nu: f64) -> f64 {
         let [a, b] = self.sides_mm;
         let shape = a * b / (4.0 * (a + b) * self.height_mm);
         // E* = E / (1 - nu^2), and M = E* / confined_compliance.
@@ -97,11 +132,48 @@ impl Block {
         let gent = 2.0 * shape * shape;
         let modulus = 1.0 + gent * held / (gent + held);
         let local = self.local_mm() * confined_compliance(LOCAL_NU) / plane_strain;
-        Column {
-            compliance: (self.height_mm / modulus - local).max(0.0),
-            area_mm2: a * b,
-            // The second moments of a rectangle over its area.
-            moments_mm2: [a * a / 12.0, b * b / 12.0],
+        (self.height_mm / modulus - local).max(0.0)
+    }
+}
+
+impl Standing<'_> {
+    /// Adds the displacement under a pressure to `displacement`.
+    pub(super) fn displace(
+        &self,
+        convolver: &mut Convolver,
+        pressure_mpa: &[f32],
+        displacement: &mut [f32],
+    ) {
+        let width = convolver.width;
+        let loaded: Vec<f32> = (pressure_mpa.iter().zip(&self.factor))
+            .map(|(p, s)| p * s)
+            .collect();
+        let mut sunk = vec![0.0; loaded.len()];
+        convolver.convolve(self.spectrum, &loaded, &mut sunk);
+        // The force over the area, and the moments over the second moments of the face.
+        let mut means = [0.0; 3];
+        for (k, &pressure) in pressure_mpa.iter().enumerate() {
+            if pressure != 0.0 {
+                let [u, v] = self.axes.at(k / width, k % width);
+                let pressure = f64::from(pressure);
+                means[0] += pressure;
+                means[1] += pressure * u;
+                means[2] += pressure * v;
+            }
+        }
+        let [cos, sin] = self.axes.across;
+        let cell_mm2 = cos * cos + sin * sin;
+        let [a, b] = self.block.sides_mm;
+        let unit = self.unit * self.block.compliance * cell_mm2 / (a * b);
+        let even = unit * means[0];
+        let along_u = unit * means[1] / (a * a / 12.0);
+        let along_v = unit * means[2] / (b * b / 12.0);
+        for (k, displacement) in displacement.iter_mut().enumerate() {
+            let factor = self.factor[k];
+            if factor > 0.0 {
+                let [u, v] = self.axes.at(k / width, k % width);
+                *displacement += factor * sunk[k] + (even + along_u * u + along_v * v) as f32;
+            }
         }
     }
 }
@@ -121,6 +193,13 @@ mod tests {
         sides_mm: [SIDE_MM; 2],
     };
 
+    fn cover(young_mpa: f64, thickness_mm: f64) -> Cover {
+        Cover {
+            young_mpa,
+            thickness_mm,
+        }
+    }
+
     /// A smooth elastic body with this face, on the ground under the middle of the sensor.
     fn body(face: FlatFace, height_mm: f64, young_mpa: f64, nu: f64, tilt: f64) -> Specimen {
         let substance = Substance {
@@ -135,7 +214,11 @@ mod tests {
             CELL_MM,
             &mut Stream::new(1, "block"),
         );
-        let pose = Pose::LEVEL.tilted(tilt);
+        let pose = Pose {
+            turn_rad: 0.0,
+            shift_mm: [0.0; 2],
+            tilt: [tilt, 0.0],
+        };
         let face = Face::block(face, height_mm, 0.2);
         Specimen::new(substance, young_mpa, &face, &pose, &patch)
     }
@@ -161,7 +244,7 @@ mod tests {
 
     #[test]
     fn a_soft_block_is_a_column_and_carries_an_even_load() {
-        let mut bench = Bench::under(Cover::of(1e4));
+        let mut bench = Bench::under(cover(1e4, 1.0));
         for (height_mm, young_mpa, nu) in [(42.0, 0.5, 0.3), (42.0, 0.2, 0.1), (20.0, 1.0, 0.49)] {
             let specimen = body(SQUARE, height_mm, young_mpa, nu, 0.0);
             let (approach_mm, [middle, rim]) = pressed(&mut bench, &specimen, 8.0);
@@ -181,10 +264,6 @@ mod tests {
 
     #[test]
     fn a_rigid_block_carries_its_load_at_the_rim_of_a_soft_cover() {
-        let cover = |young_mpa, thickness_mm| Cover {
-            young_mpa,
-            thickness_mm,
-        };
         let steel = body(SQUARE, 20.0, 2e5, 0.3, 0.0);
         let soft = body(SQUARE, 20.0, 0.3, 0.3, 0.0);
         let mut bench = Bench::under(cover(2.0, 8.0));
@@ -220,7 +299,7 @@ mod tests {
 
     #[test]
     fn a_sheet_on_the_ground_is_a_layer() {
-        let mut bench = Bench::under(Cover::of(1e4));
+        let mut bench = Bench::under(cover(1e4, 1.0));
         let specimen = body(SQUARE, 2.0, 0.5, 0.3, 0.0);
         let (approach_mm, _) = pressed(&mut bench, &specimen, 8.0);
         let even = 8.0 / (SIDE_MM * SIDE_MM) * 2.0 * confined_compliance(0.3) * (1.0 - 0.09) / 0.5;
@@ -232,7 +311,7 @@ mod tests {
         // Tilted by less than the load can level, a column has strain linear over its face.
         let (height_mm, young_mpa) = (42.0, 0.2);
         let tilt = 0.1;
-        let mut bench = Bench::under(Cover::of(1e4));
+        let mut bench = Bench::under(cover(1e4, 1.0));
         let specimen = body(SQUARE, height_mm, young_mpa, 0.1, tilt);
         let (_, [middle, rim]) = pressed(&mut bench, &specimen, 10.0);
         let mean = 10.0 / (SIDE_MM * SIDE_MM);

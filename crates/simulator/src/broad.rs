@@ -6,44 +6,22 @@
 //! ranges have such a number near their middle.
 
 use super::durometer::{self, Durometer};
-use super::level::{self, Borders, LEVELS, level_of};
+use super::level::level_of;
 use super::material::{Body, Material};
 use super::substance::{Creep, Law, Substance, Texture};
 use crate::random::{Stream, log_even};
 
-/// A law that materials are drawn from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LawName {
-    /// An elastic solid.
-    Solid,
-    /// An elastic solid that flows.
-    Plastic,
-    /// A foam, with a plateau of stress where its cells buckle.
-    Foam,
-    /// A thin soft layer on a stiff core.
-    Layered,
-}
+/// The names of the laws' materials in a data set, where `foam` alone is a named material: elastic
+/// solids, solids that flow, foams, and thin soft layers on a stiff core.
+pub(super) const LAWS: [&str; 4] = [
+    "broad-solid",
+    "broad-plastic",
+    "broad-foam",
+    "broad-layered",
+];
 
-impl LawName {
-    /// All four laws.
-    pub const ALL: [LawName; 4] = [
-        LawName::Solid,
-        LawName::Plastic,
-        LawName::Foam,
-        LawName::Layered,
-    ];
-
-    /// The name of the law's materials in a data set, where `foam` alone is a named material.
-    pub fn material_name(self) -> &'static str {
-        match self {
-            LawName::Solid => "broad-solid",
-            LawName::Plastic => "broad-plastic",
-            LawName::Foam => "broad-foam",
-            LawName::Layered => "broad-layered",
-        }
-    }
-}
-
+/// The softest and the hardest reading of the objects that are drawn by their Shore hardness.
+const SHORE: (f64, f64) = (15.0, 95.0);
 /// Share of level 1's objects that is drawn by the modulus.
 const STIFF_SHARE: f64 = 0.5;
 /// Range of the moduli of objects drawn by the modulus, MPa, log-uniform.
@@ -72,68 +50,68 @@ const LONGEST_MM: (f64, f64) = (8.0, 40.0);
 const HURST: (f64, f64) = (0.4, 0.9);
 const ANISOTROPY: (f64, f64) = (1.0, 2.0);
 
-/// Draws an object's material.
-///
-/// The Shore hardness is uniform from 15 to 95, except for the gaps that `borders` leaves. Half of
-/// level 1 is stiffer than the durometer can distinguish well. There the modulus is log-uniform and
-/// the Shore hardness is the durometer's reading. A soft law whose reading falls into another level
-/// is drawn again. The stiff half has no layered objects, because a layer is the soft part of its
-/// object.
-pub(super) fn draw(borders: Borders, stream: &mut Stream) -> Body {
-    let shore = level::draw_shore(borders, stream);
-    let level = level_of(shore);
-    if level == 1 && stream.uniform() < STIFF_SHARE {
-        return stiff(borders, stream);
-    }
-    let law = LawName::ALL[stream.below(LawName::ALL.len())];
-    let substance = substance(law, shore, stream);
-    Body {
-        substance,
-        young_mpa: Durometer::new(&substance).young_mpa(shore),
-        shore,
-        level,
-        material: material_index(law),
+/// Draws what an object of this material is made of; of a random material without one.
+pub(super) fn body_of(material: Option<Material>, stream: &mut Stream) -> Body {
+    match material {
+        Some(material) => Body::named(material, stream),
+        None => draw(stream),
     }
 }
 
-fn stiff(borders: Borders, stream: &mut Stream) -> Body {
-    const LAWS: [LawName; 3] = [LawName::Solid, LawName::Plastic, LawName::Foam];
-    let (least, _) = LEVELS[0].shore(borders);
+/// Draws an object's material.
+///
+/// The Shore hardness is uniform from 15 to 95. Half of level 1 is stiffer than the durometer can
+/// distinguish well. There the modulus is log-uniform and the Shore hardness is the durometer's
+/// reading. A soft law whose reading falls into another level is drawn again. The stiff half has no
+/// layered objects, because a layer is the soft part of its object.
+fn draw(stream: &mut Stream) -> Body {
+    let (softest, hardest) = SHORE;
+    let shore = hardest - (hardest - softest) * stream.uniform();
+    if level_of(shore) == 1 && stream.uniform() < STIFF_SHARE {
+        return stiff(stream);
+    }
+    let law = stream.below(LAWS.len());
+    let substance = substance(law, shore, stream);
+    let young_mpa = Durometer::new(&substance).young_mpa(shore);
+    body(law, substance, young_mpa, shore)
+}
+
+fn stiff(stream: &mut Stream) -> Body {
     loop {
-        let law = LAWS[stream.below(LAWS.len())];
+        let law = stream.below(LAWS.len() - 1);
         let young_mpa = log_even(STIFF_MPA, stream);
         let substance = substance(law, 100.0, stream);
         let shore = Durometer::new(&substance).reading(young_mpa);
-        if shore > least {
-            return Body {
-                substance,
-                young_mpa,
-                shore,
-                level: level_of(shore),
-                material: material_index(law),
-            };
+        if level_of(shore) == 1 {
+            return body(law, substance, young_mpa, shore);
         }
     }
 }
 
-/// Index of a law among the materials' names, after the eight named materials.
-fn material_index(law: LawName) -> u8 {
-    Material::ALL.len() as u8 + law as u8
+fn body(law: usize, substance: Substance, young_mpa: f64, shore: f64) -> Body {
+    Body {
+        substance,
+        young_mpa,
+        shore,
+        level: level_of(shore),
+        material: (Material::ALL.len() + law) as u8,
+    }
 }
 
-fn substance(law: LawName, shore: f64, stream: &mut Stream) -> Substance {
-    let nu = even(NU[law as usize], stream);
+/// Draws the properties of a material with the law of this index.
+fn substance(law: usize, shore: f64, stream: &mut Stream) -> Substance {
+    let nu = even(NU[law], stream);
     let law = match law {
-        LawName::Solid => Law::Solid,
-        LawName::Plastic => Law::Plastic {
+        0 => Law::Solid,
+        1 => Law::Plastic {
             hardness: log_even(HARDNESS, stream),
         },
-        LawName::Foam => Law::Foam {
+        2 => Law::Foam {
             exponent: even(EXPONENT, stream),
             plateau: log_even(PLATEAU, stream),
             strain: even(STRAIN, stream),
         },
-        LawName::Layered => {
+        _ => {
             let (least, most) = THICKNESS_MM;
             let least = least.max(LAYER_PER_DEPTH * durometer::depth_mm(shore));
             Law::Layered {
@@ -170,35 +148,27 @@ mod tests {
     #[test]
     fn a_durometer_reads_what_a_drawn_object_is_labelled_with() {
         let mut stream = Stream::new(2, "labels");
-        for borders in [Borders::Touching, Borders::Gaps] {
-            for _ in 0..32 {
-                let body = draw(borders, &mut stream);
-                let read = Durometer::new(&body.substance).reading(body.young_mpa);
-                assert!((read - body.shore).abs() < 0.1, "reads {read}: {body:?}");
-                assert_eq!(body.level, level_of(body.shore));
-                let range = &LEVELS[usize::from(body.level) - 1];
-                let (least, most) = range.shore(borders);
-                let most = if range.level == 1 { 100.0 } else { most };
-                assert!(least < body.shore && body.shore <= most, "{body:?}");
-            }
+        for _ in 0..32 {
+            let body = draw(&mut stream);
+            let read = Durometer::new(&body.substance).reading(body.young_mpa);
+            assert!((read - body.shore).abs() < 0.1, "reads {read}: {body:?}");
+            assert_eq!(body.level, level_of(body.shore));
         }
     }
 
     #[test]
     fn shore_and_laws_are_even_and_half_of_level_1_is_stiff() {
         let mut stream = Stream::new(3, "broad");
-        let bodies: Vec<Body> = (0..400)
-            .map(|_| draw(Borders::Touching, &mut stream))
-            .collect();
+        let bodies: Vec<Body> = (0..400).map(|_| draw(&mut stream)).collect();
         let count = |is: &dyn Fn(&Body) -> bool| bodies.iter().filter(|body| is(body)).count();
         // Of 80 degrees, 20 are in each of these ranges.
         for from in [15.0, 30.0, 50.0] {
             let within = count(&|body| from < body.shore && body.shore <= from + 20.0);
             assert!((70..130).contains(&within), "{within} from {from}");
         }
-        for law in LawName::ALL {
-            let own = count(&|body| body.material == material_index(law));
-            assert!((60..135).contains(&own), "{law:?}: {own} of 400");
+        for (material, law) in (8..).zip(LAWS) {
+            let own = count(&|body| body.material == material);
+            assert!((60..135).contains(&own), "{law}: {own} of 400");
         }
         // Level 1 is 25 of 80, and half of it is stiff. Of that half,
         // log(3000 / 100) / log(3000 / 5), or 53 %, has a modulus above 100 MPa.

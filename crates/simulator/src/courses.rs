@@ -126,14 +126,6 @@ pub struct Sample {
     pub approach_mm: f32,
 }
 
-/// The condition that stops the arm.
-#[derive(Clone, Copy)]
-enum Stop {
-    Force(f64),
-    /// The arm stops at this distance in mm beyond the touch, or at the greatest force.
-    Position(f64),
-}
-
 /// How far an arm that stops by position goes beyond the touch, log-uniform.
 const TRAVEL_MM: [f64; 2] = [1.0, 10.0];
 /// The least force of an arm that stops by position.
@@ -147,7 +139,9 @@ const HOLD_FRAMES: f64 = 3.0;
 pub(super) struct Plan {
     posture: usize,
     pose: Stream,
-    stop: Stop,
+    /// The force at which the arm stops, or the distance beyond the touch.
+    force_n: f64,
+    travel_mm: Option<f64>,
     /// Where an arm that stops by position stops at the latest.
     highest_force_n: f64,
     pub(super) arm: Arm,
@@ -189,13 +183,8 @@ impl Plan {
         } else {
             highest
         };
-        let force = Stop::Force(force_n);
-        let position = Stop::Position(log_even(TRAVEL_MM, stream));
-        let stop = if stream.uniform() < 0.5 {
-            force
-        } else {
-            position
-        };
+        let travel_mm = log_even(TRAVEL_MM, stream);
+        let stops_by_force = stream.uniform() < 0.5;
         let arm = Arm {
             n_per_mm: log_even(arm_n_per_mm, stream),
             speed_mm_s: log_even(SPEED_MM_S, stream),
@@ -209,7 +198,8 @@ impl Plan {
         Self {
             posture,
             pose: stream.child(0),
-            stop,
+            force_n,
+            travel_mm: (!stops_by_force).then_some(travel_mm),
             highest_force_n,
             arm,
             hold_s: stream.range(least, most).max(HOLD_FRAMES * period_s),
@@ -271,18 +261,15 @@ impl Subject {
             young_mpa,
             ..
         } = self.body;
-        let face = self.object.face(plan.posture);
+        let face = self.object.faces[plan.posture];
         let mut roughness = self.draws.body.child(1).child(plan.posture as u64);
         let patch = draw_patch(&substance.texture, face.roughness, &mut roughness);
         let pose = Pose::draw(&face, &mut plan.pose.clone());
         let specimen = Specimen::new(substance, young_mpa, &face, &pose, &patch);
         let noise = self.draws.body.child(4).child(press);
-        let mut force_n = match plan.stop {
-            Stop::Force(force_n) => force_n,
-            Stop::Position(travel_mm) => {
-                bench.force_at(&specimen, plan.arm, travel_mm, plan.highest_force_n)
-            }
-        };
+        let mut force_n = plan.travel_mm.map_or(plan.force_n, |travel_mm| {
+            bench.force_at(&specimen, plan.arm, travel_mm, plan.highest_force_n)
+        });
         for attempt in 0..TRIES as u64 {
             let mut noise = noise.child(attempt);
             // One solve shows whether the press is worth the forty solves of a course.
@@ -353,7 +340,7 @@ impl Plan {
             .map(|number| first_s + f64::from(number) * period_s)
             .take_while(|&time_s| time_s < last_s)
             .map(|time_s| {
-                let forces = felt.taxels_n(time_s);
+                let (_, forces) = felt.at(time_s);
                 let film_n = film.advance(&sensor.design, &forces, period_s);
                 (time_s, sensor.felt(&sensor.read(&film_n, gain, noise)))
             })

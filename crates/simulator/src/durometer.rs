@@ -3,10 +3,9 @@
 //! At the durometer's depths (up to 1.8 radii), small-strain theory is only a convention for
 //! labelling. The convention is the same for every material.
 
-use super::contact::{self, Fields, Local, Problem};
-use super::fourier::Convolver;
+use super::contact::{Local, Problem, Solver};
 use super::kernel::{self, Layer};
-use super::substance::{Law, Substance};
+use super::substance::Substance;
 
 /// Radius of the OO indenter's hemisphere, mm (ASTM D2240).
 const RADIUS_MM: f64 = 1.19;
@@ -35,20 +34,19 @@ pub(super) struct Durometer {
     local: Local<'static>,
     gap_mm: Vec<f32>,
     spectrum: Vec<f32>,
-    convolver: Convolver,
-    fields: Fields,
+    solver: Solver,
     pressure: Vec<f32>,
 }
 
 impl Durometer {
     pub(super) fn new(substance: &Substance) -> Self {
-        let mut convolver = Convolver::new(WIDTH);
+        let mut solver = Solver::new(WIDTH);
         let compliance = substance.compliance_ratio(READ_S);
         let unit = CELL_MM / substance.plane_strain(1.0) * compliance;
         let layer = substance
             .layer(PIECE_MM)
             .map(|(base, height_mm)| (Layer::new(substance.nu, base), height_mm / CELL_MM));
-        let spectrum = convolver.spectrum(|i, j| {
+        let spectrum = solver.convolver.spectrum(|i, j| {
             let (x, y) = (i as f64, j as f64);
             unit * match &layer {
                 Some((layer, height)) => layer.influence(x, y, *height),
@@ -68,32 +66,20 @@ impl Durometer {
                 }
             })
             .collect();
-        let local = match substance.law {
-            Law::Solid | Law::Layered { .. } => Local::None,
-            Law::Plastic { hardness } => Local::Flow {
-                hardness_mpa: hardness,
-                time_s: READ_S,
-            },
-            Law::Foam {
-                exponent,
-                plateau,
-                strain,
-            } => Local::Foam {
-                plateau_mpa: plateau,
-                exponent,
-                strain,
-                height_mm: PIECE_MM,
-                factor: compliance,
-                history_mpa: &[],
-            },
+        let local = Local {
+            law: substance.law,
+            young_mpa: 1.0,
+            height_mm: PIECE_MM,
+            factor: compliance,
+            history_mpa: &[],
+            time_s: READ_S,
         };
         Self {
             local,
             pressure: vec![0.0; gap_mm.len()],
             gap_mm,
             spectrum,
-            convolver,
-            fields: Fields::default(),
+            solver,
         }
     }
 
@@ -105,38 +91,17 @@ impl Durometer {
         spring_force_n(shore) / self.force_n(depth_mm(shore))
     }
 
-    /// The durometer's reading for Young's modulus `young_mpa`; 0 if the indenter sinks in to the
-    /// end.
+    /// The durometer's reading for Young's modulus `young_mpa`, by bisection; 0 if the indenter sinks in
+    /// to the end.
     pub(super) fn reading(&mut self, young_mpa: f64) -> f64 {
-        // `excess` is how much deeper the indenter is than at reading `shore`. The Illinois method
-        // finds its root between 0 and 100.
-        let mut excess =
-            |shore: f64| self.approach_mm(spring_force_n(shore) / young_mpa) - depth_mm(shore);
         let (mut low, mut high) = (0.0, 100.0);
-        let (mut at_low, mut at_high) = (excess(low), excess(high));
-        if at_low >= 0.0 {
-            return 0.0;
-        }
-        let mut last_was_low = None;
         while high - low > SHORE_TOLERANCE {
-            let shore = (low * at_high - high * at_low) / (at_high - at_low);
-            let at = excess(shore);
-            if at.abs() < SHORE_TOLERANCE * depth_mm(99.0) {
-                return shore;
-            }
-            let is_low = at < 0.0;
-            if is_low {
-                (low, at_low) = (shore, at);
-                at_high *= if last_was_low == Some(true) { 0.5 } else { 1.0 };
+            let shore = 0.5 * (low + high);
+            if self.approach_mm(spring_force_n(shore) / young_mpa) < depth_mm(shore) {
+                low = shore;
             } else {
-                (high, at_high) = (shore, at);
-                at_low *= if last_was_low == Some(false) {
-                    0.5
-                } else {
-                    1.0
-                };
+                high = shore;
             }
-            last_was_low = Some(is_low);
         }
         0.5 * (low + high)
     }
@@ -169,19 +134,14 @@ impl Durometer {
             cell_mm: CELL_MM,
             tolerance: FORCE_TOLERANCE,
         };
-        contact::solve(
-            &mut self.convolver,
-            &mut self.fields,
-            &problem,
-            &mut self.pressure,
-        )
-        .approach_mm
+        self.solver.solve(&problem, &mut self.pressure).approach_mm
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::material::Material;
+    use super::super::substance::Law;
     use super::*;
 
     #[test]

@@ -15,14 +15,21 @@ pub(super) fn half_space(x: f64, y: f64) -> f64 {
     (term(xp, yp, ym) - term(xm, yp, ym) + term(yp, xp, xm) - term(ym, xp, xm)) / PI
 }
 
-/// The base that a layer is bonded to.
+/// The half-space that a layer is bonded to.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Base {
+pub(super) struct Base {
+    /// Poisson's ratio.
+    pub(super) nu: f64,
+    /// The ratio of the shear moduli, layer to base.
+    pub(super) shear_ratio: f64,
+}
+
+impl Base {
     /// A rigid base.
-    Rigid,
-    /// An elastic half-space: the base's Poisson's ratio, and the ratio of the shear moduli, layer
-    /// to base.
-    Elastic { nu: f64, shear_ratio: f64 },
+    pub(super) const RIGID: Self = Self {
+        nu: 0.0,
+        shear_ratio: 0.0,
+    };
 }
 
 /// Influence of a layer bonded to a base, in free space.
@@ -65,7 +72,7 @@ impl Layer {
             .map(|k| {
                 nodes
                     .iter()
-                    .map(|&(x, w)| w * bessel_j0(x * STEP * k as f64))
+                    .map(|&(x, w)| w * libm::j0(x * STEP * k as f64))
                     .sum()
             })
             .collect();
@@ -78,11 +85,7 @@ impl Layer {
     /// Displacement at offset (`x`, `y`) cells on a layer `height` cells thick.
     pub(super) fn influence(&self, x: f64, y: f64, height: f64) -> f64 {
         if x.hypot(y) > REACH * height {
-            return if self.base == 0.0 {
-                0.0
-            } else {
-                self.base * half_space(x, y)
-            };
+            return self.base * half_space(x, y);
         }
         // The smooth part varies over one layer height, so a thin layer needs its mean over the
         // cell.
@@ -112,85 +115,24 @@ const REACH: f64 = 12.0;
 /// phi.
 const STEP: f64 = 0.01;
 
-/// S(x) of the bonded layer, with x = q h and k = 3 - 4 nu. On a rigid base
-/// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`. On an elastic one, with the
-/// ratio m of the shear moduli, layer to base, and k' of the base (O'Sullivan and King 1988):
+/// S(x) of the bonded layer, with x = q h, k = 3 - 4 nu, the ratio m of the shear moduli, layer to
+/// base, and k' of the base (O'Sullivan and King 1988):
 /// `S = [1 + 4 c x e - l c e^2] / [1 - (l + c + 4 c x^2) e + l c e^2]`, `e = exp(-2x)`,
-/// `c = (m - 1) / (m + k)`, `l = (m k' - k) / (m k' + 1)`.
+/// `c = (m - 1) / (m + k)`, `l = (m k' - k) / (m k' + 1)`. On a rigid base this is
+/// `S = [k sinh 2x - 2x] / [k cosh 2x + (k^2 + 1) / 2 + 2 x^2]`.
 fn layer_ratio(x: f64, nu: f64, base: Base) -> f64 {
     let k = 3.0 - 4.0 * nu;
-    match base {
-        Base::Rigid => {
-            (k * (2.0 * x).sinh() - 2.0 * x)
-                / (k * (2.0 * x).cosh() + 0.5 * (k * k + 1.0) + 2.0 * x * x)
-        }
-        Base::Elastic { nu, shear_ratio } => {
-            let own = shear_ratio * (3.0 - 4.0 * nu);
-            let (c, l) = (
-                (shear_ratio - 1.0) / (shear_ratio + k),
-                (own - k) / (own + 1.0),
-            );
-            let e = (-2.0 * x).exp();
-            (1.0 + 4.0 * c * x * e - l * c * e * e)
-                / (1.0 - (l + c + 4.0 * c * x * x) * e + l * c * e * e)
-        }
-    }
+    let m = base.shear_ratio;
+    let own = m * (3.0 - 4.0 * base.nu);
+    let (c, l) = ((m - 1.0) / (m + k), (own - k) / (own + 1.0));
+    let e = (-2.0 * x).exp();
+    (1.0 + 4.0 * c * x * e - l * c * e * e) / (1.0 - (l + c + 4.0 * c * x * x) * e + l * c * e * e)
 }
 
 /// E* K(0) / h = E* / M: the layer's compliance under uniform pressure, M the confined modulus.
 pub(super) fn confined_compliance(nu: f64) -> f64 {
     // E* = E / (1 - nu^2), M = E (1 - nu) / ((1 + nu) (1 - 2 nu)).
     (1.0 - 2.0 * nu) / ((1.0 - nu) * (1.0 - nu))
-}
-
-/// Bessel function J0 by Abramowitz and Stegun 9.4.1 and 9.4.3 (error below 1e-7).
-fn bessel_j0(x: f64) -> f64 {
-    let x = x.abs();
-    if x < 3.0 {
-        let s = (x / 3.0).powi(2);
-        return poly(
-            s,
-            &[
-                1.0,
-                -2.249_999_7,
-                1.265_620_8,
-                -0.316_386_6,
-                0.044_447_9,
-                -0.003_944_4,
-                0.000_21,
-            ],
-        );
-    }
-    let s = 3.0 / x;
-    let amplitude = poly(
-        s,
-        &[
-            0.797_884_56,
-            -0.000_000_77,
-            -0.005_527_4,
-            -0.000_095_12,
-            0.001_372_37,
-            -0.000_728_05,
-            0.000_144_76,
-        ],
-    );
-    let phase = x + poly(
-        s,
-        &[
-            -std::f64::consts::FRAC_PI_4,
-            -0.041_663_97,
-            -0.000_039_54,
-            0.002_625_73,
-            -0.000_541_25,
-            -0.000_293_33,
-            0.000_135_58,
-        ],
-    );
-    amplitude * phase.cos() / x.sqrt()
-}
-
-fn poly(x: f64, coefficients: &[f64]) -> f64 {
-    coefficients.iter().rev().fold(0.0, |sum, &c| sum * x + c)
 }
 
 #[cfg(test)]
@@ -211,7 +153,7 @@ mod tests {
     #[test]
     fn layer_sums_to_its_confined_compliance() {
         for (nu, height) in [(0.45, 1.143), (0.1, 6.0), (0.25, 10.0), (0.15, 0.8)] {
-            let layer = Layer::new(nu, Base::Rigid);
+            let layer = Layer::new(nu, Base::RIGID);
             let reach = (REACH * height) as i32 + 1;
             let mut sum = 0.0;
             for i in -reach..=reach {
@@ -227,36 +169,12 @@ mod tests {
         }
     }
 
-    #[test]
-    fn layer_ratio_has_both_limits() {
-        let ratio = |x| layer_ratio(x, 0.3, Base::Rigid);
-        assert!((ratio(12.0) - 1.0).abs() < 1e-6);
-        let x = 1e-4;
-        assert!((ratio(x) * 2.0 / x / confined_compliance(0.3) - 1.0).abs() < 1e-3);
-    }
-
     /// A core of Poisson's ratio 0.3, whose E is `core` times the E of a layer of Poisson's ratio
     /// `nu`.
     fn core(nu: f64, core: f64) -> Base {
-        Base::Elastic {
+        Base {
             nu: 0.3,
             shear_ratio: 1.3 / ((1.0 + nu) * core),
-        }
-    }
-
-    #[test]
-    fn a_layer_is_its_core_when_thin_and_itself_when_thick() {
-        for (nu, ratio) in [(0.45, 20.0), (0.2, 500.0), (0.3, 0.1)] {
-            let layer = Layer::new(nu, core(nu, ratio));
-            // E* of the layer over E* of the core.
-            let compliance = (1.0 - 0.3_f64.powi(2)) / (1.0 - nu * nu) / ratio;
-            assert!((layer.base / compliance - 1.0).abs() < 1e-12);
-            for (x, y) in [(3.0, 0.0), (5.0, 9.0)] {
-                let thin = layer.influence(x, y, 0.02);
-                assert!((thin / (compliance * half_space(x, y)) - 1.0).abs() < 1e-2);
-                let thick = layer.influence(x, y, 1e5);
-                assert!((thick / half_space(x, y) - 1.0).abs() < 1e-2, "{thick}");
-            }
         }
     }
 
@@ -266,7 +184,7 @@ mod tests {
             Layer::new(0.3, core(0.3, 1.0)),
             Layer::new(0.4, core(0.4, 1e9)),
         );
-        let rigid = Layer::new(0.4, Base::Rigid);
+        let rigid = Layer::new(0.4, Base::RIGID);
         for (x, y) in [(0.0, 0.0), (2.0, 1.0), (9.0, 4.0), (40.0, 3.0)] {
             let half_space = half_space(x, y);
             assert!((same.influence(x, y, 3.0) / half_space - 1.0).abs() < 1e-6);

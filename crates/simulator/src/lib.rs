@@ -36,10 +36,9 @@ mod courses;
 mod sequence;
 mod rig;
 
-pub use broad::LawName;
 pub use courses::{BroadSensors, CourseSettings, LabelledCourse, Sample, SensorDesigns, courses};
 pub use dataset::{LabelledSample, dataset};
-pub use level::{Borders, LEVELS, LevelRange, level_of};
+pub use level::{LEVELS, LevelRange, level_of};
 pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::{Family, Shapes};
@@ -56,7 +55,7 @@ pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
 pub fn material_names(materials: Materials) -> Vec<&'static str> {
     let mut names = Material::ALL.map(Material::name).to_vec();
     if materials == Materials::Broad {
-        names.extend(LawName::ALL.map(LawName::material_name));
+        names.extend(broad::LAWS);
     }
     names
 }

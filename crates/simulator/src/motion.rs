@@ -46,6 +46,12 @@ impl Motion {
         let withdrawing = self.top_mm - self.speed_mm_s * (time_s - self.load_s - self.hold_s);
         loading.min(self.top_mm).min(withdrawing).max(-CLEARANCE_MM)
     }
+
+    /// The time after the touch at which a loading arm is this far beyond it, at most that at which it
+    /// stops.
+    pub(super) fn loading_s(&self, approach_mm: f64) -> f64 {
+        self.load_s + ((approach_mm - self.top_mm) / self.speed_mm_s).min(0.0)
+    }
 }
 
 /// The arm's motion in a sequence of presses, around the last press and the next.
@@ -69,33 +75,5 @@ impl Approach {
             (speed_mm_s * (time_s - touch_s)).min(0.0)
         });
         last.max(next)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_arm_comes_holds_and_goes() {
-        let motion = Motion {
-            top_mm: 3.0,
-            load_s: 0.6,
-            hold_s: 1.0,
-            speed_mm_s: 5.0,
-        };
-        for (time_s, expected) in [
-            (-9.0, -2.0),
-            (-0.1, -0.5),
-            (0.0, 0.0),
-            (0.3, 1.5),
-            (0.6, 3.0),
-            (1.6, 3.0),
-            (1.7, 2.5),
-            (9.0, -2.0),
-        ] {
-            let found = motion.approach_mm(time_s);
-            assert!((found - expected).abs() < 1e-9, "{time_s} s: {found} mm");
-        }
     }
 }

@@ -1,14 +1,13 @@
 //! One specimen under the sensor: from gap and force to pressure and taxel forces.
 //!
-//! A [`Bench`] holds values that are costly to make and shared by presses: FFT plans, kernels, work
-//! fields. It never changes a result: a fresh bench gives the same bytes.
+//! A [`Bench`] holds values that are costly to make and shared by presses: FFT plans and kernels. It
+//! never changes a result: a fresh bench gives the same bytes.
 
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use super::block::{Block, LOCAL_NU};
-use super::contact::{self, Axes, Column, Contact, Fields, Local, Problem, Standing, TOLERANCE};
-use super::fourier::Convolver;
+use super::block::{Block, LOCAL_NU, Standing};
+use super::contact::{Contact, Local, Problem, Solver, TOLERANCE};
 use super::kernel::{self, Base, Layer};
 use super::object::{Face, Pose};
 use super::substance::{Law, Substance, Texture};
@@ -46,15 +45,6 @@ impl Default for Cover {
 }
 
 impl Cover {
-    /// A cover as thick as that of the JX255N.
-    #[cfg(test)]
-    pub(super) fn of(young_mpa: f64) -> Self {
-        Self {
-            young_mpa,
-            ..Self::default()
-        }
-    }
-
     /// A guess at the compliance under a contact of this radius, mm per MPa: that of a layer, or of a
     /// half-space if the cover is thick.
     fn compliance(self, radius_mm: f64) -> f64 {
@@ -74,18 +64,9 @@ pub(super) struct Specimen {
     /// The layer that bears the load; `None` for a half-space.
     layer: Option<LayerKey>,
     /// What a block with free sides has beyond its layer.
-    block: Option<Blocked>,
+    block: Option<Block>,
     /// Whether the face is flat.
     pub(super) is_flat: bool,
-}
-
-/// A block under the sensor.
-struct Blocked {
-    /// See [`Block::factor`], `[CELLS, CELLS]`.
-    factor: Vec<f32>,
-    /// For Young's modulus 1 MPa.
-    column: Column,
-    axes: Axes,
 }
 
 /// Draws the roughness of one posture's face.
@@ -107,12 +88,11 @@ pub(super) struct Bench {
     pub(super) cover: Cover,
     widths: BTreeMap<usize, Width>,
     layers: Vec<((f64, Base), Layer)>,
-    fields: Fields,
     combined: Vec<f32>,
 }
 
 struct Width {
-    convolver: Convolver,
+    solver: Solver,
     half_space: Rc<Vec<f32>>,
     cover: Vec<f32>,
     /// The spectra of the last few layers, because the presses of one posture follow each other.
@@ -159,34 +139,15 @@ impl Specimen {
         self.substance.plane_strain(self.young_mpa)
     }
 
-    /// The local law at one step. Creep gives `factor` and `history_mpa`, and flow uses `time_s`.
-    fn local<'a>(&self, factor: f64, history_mpa: &'a [f32], time_s: f64) -> Local<'a> {
-        match self.substance.law {
-            Law::Solid | Law::Layered { .. } => Local::None,
-            Law::Plastic { hardness } => Local::Flow {
-                hardness_mpa: hardness * self.young_mpa,
-                time_s,
-            },
-            Law::Foam {
-                exponent,
-                plateau,
-                strain,
-            } => Local::Foam {
-                plateau_mpa: plateau * self.young_mpa,
-                exponent,
-                strain,
-                height_mm: self.height_mm,
-                factor,
-                history_mpa,
-            },
-        }
-    }
-
-    /// The flow over a step of `time_s` for a plastic specimen, and no local law for any other.
-    pub(super) fn flow(&self, time_s: f64) -> Local<'static> {
-        match self.substance.law {
-            Law::Plastic { .. } => self.local(1.0, &[], time_s),
-            Law::Solid | Law::Foam { .. } | Law::Layered { .. } => Local::None,
+    /// The local law at one step: see [`Local`].
+    pub(super) fn local<'a>(&self, factor: f64, history_mpa: &'a [f32], time_s: f64) -> Local<'a> {
+        Local {
+            law: self.substance.law,
+            young_mpa: self.young_mpa,
+            height_mm: self.height_mm,
+            factor,
+            history_mpa,
+            time_s,
         }
     }
 
@@ -195,11 +156,20 @@ impl Specimen {
         on_window(&self.gap_mm, window)
     }
 
-    /// The factors of a block on a window; empty if there is none.
-    fn factor_on(&self, window: Window) -> Vec<f32> {
-        self.block
-            .as_ref()
-            .map_or_else(Vec::new, |block| on_window(&block.factor, window))
+    /// The block on a window, with `unit` times its influence for Young's modulus 1 and `spectrum`.
+    fn standing<'a>(
+        &'a self,
+        window: Window,
+        spectrum: &'a [f32],
+        unit: f64,
+    ) -> Option<Standing<'a>> {
+        self.block.as_ref().map(|block| Standing {
+            block,
+            spectrum,
+            factor: on_window(&block.factor, window),
+            axes: block.axes.from(window.corner),
+            unit,
+        })
     }
 
     /// A guess at the contact under `force_n`: cells with a gap below this depth close.
@@ -286,14 +256,14 @@ fn bearing(
     young_mpa: f64,
     face: &Face,
     pose: &Pose,
-) -> (Option<LayerKey>, Option<Blocked>) {
+) -> (Option<LayerKey>, Option<Block>) {
     let key = |nu, base, height_mm: f64| LayerKey {
         nu,
         base,
         height: height_mm / CELL_MM,
     };
-    let own = |(base, height_mm)| key(substance.nu, base, height_mm);
-    let layer = substance.layer(face.height_mm).map(own);
+    let layer = substance.layer(face.height_mm);
+    let layer = layer.map(|(base, height_mm)| key(substance.nu, base, height_mm));
     let Some(flat) = face.flat else {
         return (layer, None);
     };
@@ -304,49 +274,16 @@ fn bearing(
         }
         _ => (face.height_mm, 0.0),
     };
-    let block = Block::new(flat, yields_mm).filter(|_| young_mpa < STIFF_MPA);
-    let Some(block) = block else {
-        return (
-            layer.or(Some(key(substance.nu, Base::Rigid, yields_mm))),
-            None,
-        );
-    };
     let axes = pose.axes(CELLS, CELL_MM);
-    let factor = (0..CELLS * CELLS).map(|k| {
-        let [u, v] = axes.at(k / CELLS, k % CELLS);
-        block.factor(u, v)
-    });
-    let mut column = block.column(substance.nu);
-    column.compliance += core;
-    let blocked = Blocked {
-        factor: factor.collect(),
-        column,
-        axes,
-    };
-    (
-        Some(key(LOCAL_NU, Base::Rigid, block.local_mm())),
-        Some(blocked),
-    )
-}
-
-impl Blocked {
-    /// The block on a window, with `unit` times its influence for Young's modulus 1 and `spectrum`.
-    fn on<'a>(
-        &self,
-        window: Window,
-        factor: &'a [f32],
-        spectrum: &'a [f32],
-        unit: f64,
-    ) -> Standing<'a> {
-        let first = self.axes.at(window.corner.0, window.corner.1);
-        Standing {
-            spectrum,
-            factor,
-            column: Column {
-                compliance: unit * self.column.compliance,
-                ..self.column
-            },
-            axes: Axes { first, ..self.axes },
+    let block = Block::new(flat, yields_mm, substance.nu, core, axes, CELLS);
+    match block.filter(|_| young_mpa < STIFF_MPA) {
+        Some(block) => {
+            let layer = key(LOCAL_NU, Base::RIGID, block.local_mm());
+            (Some(layer), Some(block))
+        }
+        None => {
+            let whole = key(substance.nu, Base::RIGID, yields_mm);
+            (layer.or(Some(whole)), None)
         }
     }
 }
@@ -357,38 +294,11 @@ impl Window {
         self.width == CELLS
     }
 
-    /// A field of the window `from`, laid onto this one. It is 0 where `from` has no cells.
-    pub(super) fn relaid(self, field: &[f32], from: Self) -> Vec<f32> {
-        let mut laid = vec![0.0; self.width * self.width];
-        for (k, &value) in field.iter().enumerate() {
-            let row = (from.corner.0 + k / from.width).checked_sub(self.corner.0);
-            let column = (from.corner.1 + k % from.width).checked_sub(self.corner.1);
-            if let (Some(row), Some(column)) = (row, column)
-                && row.max(column) < self.width
-            {
-                laid[row * self.width + column] = value;
-            }
-        }
-        laid
-    }
-
     /// The next wider window for the same contact, if there is one.
     pub(super) fn wider(self, specimen: &Specimen, cover: Cover, force_n: f64) -> Option<Self> {
         let depth_mm = specimen.closing_depth_mm(cover, force_n);
         (!self.is_whole()).then(|| specimen.window_around(depth_mm, self.width + 1))
     }
-}
-
-/// The force, creep and flow of one solve.
-#[derive(Clone, Copy)]
-pub(super) struct Step<'a> {
-    pub(super) force_n: f64,
-    /// The object's compliance over its instantaneous compliance.
-    pub(super) factor: f64,
-    /// The part of the effective pressure that earlier steps left; empty if there is none.
-    pub(super) history_mpa: &'a [f32],
-    /// Time over which flow acts.
-    pub(super) time_s: f64,
 }
 
 impl Default for Bench {
@@ -405,7 +315,6 @@ impl Bench {
             cover,
             widths: BTreeMap::new(),
             layers: Vec::new(),
-            fields: Fields::default(),
             combined: Vec::new(),
         }
     }
@@ -427,15 +336,11 @@ impl Bench {
                 .iter()
                 .map(|&gap| (depth_mm as f32 - gap).max(0.0))
                 .collect();
-            let step = Step {
-                force_n,
-                // Under a linear ramp, the mean age of the load is half the ramp. Flow with the
-                // fourth power of the pressure counts a fifth of the ramp.
-                factor: specimen.substance.compliance_ratio(hold_s + 0.5 * ramp_s),
-                history_mpa: &[],
-                time_s: hold_s + 0.2 * ramp_s,
-            };
-            let contact = self.solve(specimen, window, &gap, step, &mut pressure);
+            // Under a linear ramp, the mean age of the load is half the ramp. Flow with the fourth
+            // power of the pressure counts a fifth of the ramp.
+            let factor = specimen.substance.compliance_ratio(hold_s + 0.5 * ramp_s);
+            let local = specimen.local(factor, &[], hold_s + 0.2 * ramp_s);
+            let contact = self.solve(specimen, window, &gap, force_n, local, &mut pressure);
             if window.is_whole() || !touches_border(&pressure, window.width) {
                 return (window, pressure, contact);
             }
@@ -449,37 +354,31 @@ impl Bench {
         specimen: &Specimen,
         window: Window,
         gap_mm: &[f32],
-        step: Step,
+        force_n: f64,
+        local: Local,
         pressure_mpa: &mut [f32],
     ) -> Contact {
-        let object = self.object_spectrum(specimen, window.width);
-        let held = self
-            .widths
-            .get_mut(&window.width)
-            .expect("object_spectrum has made the width");
-        let unit = (step.factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
+        let mut combined = std::mem::take(&mut self.combined);
+        let (held, object) = self.set_up(specimen, window.width);
+        let unit = (local.factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
         let influence = object.iter().map(|&o| unit * o);
-        self.combined.clear();
-        let factor = specimen.factor_on(window);
-        let (spectrum, block) = match &specimen.block {
-            Some(block) => {
-                self.combined.extend(influence);
-                let unit = step.factor / specimen.young_mpa;
-                let standing = block.on(window, &factor, &self.combined, unit);
-                (&held.cover, Some(standing))
-            }
-            None => {
-                let both = influence.zip(&held.cover).map(|(o, &cover)| o + cover);
-                self.combined.extend(both);
-                (&self.combined, None)
-            }
-        };
+        combined.clear();
+        if specimen.block.is_some() {
+            combined.extend(influence);
+        } else {
+            combined.extend(influence.zip(&held.cover).map(|(o, &cover)| o + cover));
+        }
+        let block = specimen.standing(window, &combined, local.factor / specimen.young_mpa);
         let problem = Problem {
             gap_mm,
-            spectrum,
+            spectrum: if block.is_some() {
+                &held.cover
+            } else {
+                &combined
+            },
             block,
-            local: specimen.local(step.factor, step.history_mpa, step.time_s),
-            force_n: step.force_n,
+            local,
+            force_n,
             cell_mm: CELL_MM,
             tolerance: if specimen.is_flat {
                 FLAT_TOLERANCE
@@ -487,12 +386,9 @@ impl Bench {
                 TOLERANCE
             },
         };
-        contact::solve(
-            &mut held.convolver,
-            &mut self.fields,
-            &problem,
-            pressure_mpa,
-        )
+        let contact = held.solver.solve(&problem, pressure_mpa);
+        self.combined = combined;
+        contact
     }
 
     /// Displacement in mm of the object alone under an effective pressure.
@@ -502,64 +398,50 @@ impl Bench {
         window: Window,
         pressure_mpa: &[f32],
     ) -> Vec<f32> {
-        let object = self.object_spectrum(specimen, window.width);
-        let held = self
-            .widths
-            .get_mut(&window.width)
-            .expect("object_spectrum has made the width");
+        let (held, object) = self.set_up(specimen, window.width);
+        let convolver = &mut held.solver.convolver;
         let mut displacement = vec![0.0; pressure_mpa.len()];
         let unit = (CELL_MM / specimen.plane_strain_mpa()) as f32;
-        match &specimen.block {
-            Some(block) => {
-                let factor = specimen.factor_on(window);
-                let spectrum: Vec<f32> = object.iter().map(|&o| unit * o).collect();
-                let standing = block.on(window, &factor, &spectrum, 1.0 / specimen.young_mpa);
-                let work = self.fields.work.each_mut();
-                standing.displace(&mut held.convolver, work, pressure_mpa, &mut displacement);
-            }
-            None => {
-                held.convolver
-                    .convolve(&object, pressure_mpa, &mut displacement);
-                displacement.iter_mut().for_each(|u| *u *= unit);
-            }
+        let spectrum: Vec<f32> = object.iter().map(|&o| unit * o).collect();
+        match specimen.standing(window, &spectrum, 1.0 / specimen.young_mpa) {
+            Some(block) => block.displace(convolver, pressure_mpa, &mut displacement),
+            None => convolver.convolve(&spectrum, pressure_mpa, &mut displacement),
         }
         displacement
     }
 
-    /// The object's spectrum for E* = 1 and lengths in cells.
-    fn object_spectrum(&mut self, specimen: &Specimen, width: usize) -> Rc<Vec<f32>> {
-        if !self.widths.contains_key(&width) {
-            let layer = self.layer(COVER_NU, Base::Rigid);
-            let made = Width::new(width, &self.layers[layer].1, self.cover);
-            self.widths.insert(width, made);
-        }
+    /// What solves windows of this width, and the object's spectrum for E* = 1 and lengths in cells.
+    fn set_up(&mut self, specimen: &Specimen, width: usize) -> (&mut Width, Rc<Vec<f32>>) {
+        let layers = &mut self.layers;
+        let held = self.widths.entry(width).or_insert_with(|| {
+            let layer = layer_of(layers, COVER_NU, Base::RIGID);
+            Width::new(width, layer, self.cover)
+        });
         let Some(key) = specimen.layer else {
-            return Rc::clone(&self.widths[&width].half_space);
+            let half_space = Rc::clone(&held.half_space);
+            return (held, half_space);
         };
-        let recent = &self.widths[&width].recent;
-        if let Some((_, spectrum)) = recent.iter().find(|(held, _)| *held == key) {
-            return Rc::clone(spectrum);
-        }
-        let at = self.layer(key.nu, key.base);
-        let layer = &self.layers[at].1;
-        let held = self.widths.get_mut(&width).expect("made above");
-        let spectrum = Rc::new(
-            held.convolver
-                .spectrum(|i, j| layer.influence(i as f64, j as f64, key.height)),
-        );
-        keep(&mut held.recent, (key, Rc::clone(&spectrum)), RECENT);
-        spectrum
+        let recent = held.recent.iter().find(|(recent, _)| *recent == key);
+        let spectrum = recent.map(|(_, spectrum)| Rc::clone(spectrum));
+        let spectrum = spectrum.unwrap_or_else(|| {
+            let layer = layer_of(layers, key.nu, key.base);
+            let influence = |i, j| layer.influence(i as f64, j as f64, key.height);
+            let made = Rc::new(held.solver.convolver.spectrum(influence));
+            keep(&mut held.recent, (key, Rc::clone(&made)), RECENT);
+            made
+        });
+        (held, spectrum)
     }
+}
 
-    /// The index in `layers` of the layer of this kind, which is made if it is missing.
-    fn layer(&mut self, nu: f64, base: Base) -> usize {
-        let kind = (nu, base);
-        let held = self.layers.iter().position(|(held, _)| *held == kind);
-        held.unwrap_or_else(|| {
-            keep(&mut self.layers, (kind, Layer::new(nu, base)), LAYERS);
-            self.layers.len() - 1
-        })
-    }
+/// The layer of this kind, which is made if it is missing.
+fn layer_of(layers: &mut Vec<((f64, Base), Layer)>, nu: f64, base: Base) -> &Layer {
+    let held = layers.iter().position(|(held, _)| *held == (nu, base));
+    let at = held.unwrap_or_else(|| {
+        keep(layers, ((nu, base), Layer::new(nu, base)), LAYERS);
+        layers.len() - 1
+    });
+    &layers[at].1
 }
 
 /// Adds to a list of the last `most` items.
@@ -572,13 +454,14 @@ fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
 
 impl Width {
     fn new(width: usize, layer: &Layer, cover: Cover) -> Self {
-        let mut convolver = Convolver::new(width);
+        let mut solver = Solver::new(width);
+        let convolver = &mut solver.convolver;
         let half_space = Rc::new(convolver.spectrum(|i, j| kernel::half_space(i as f64, j as f64)));
         let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / cover.young_mpa;
         let height = cover.thickness_mm / CELL_MM;
         let cover = convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height));
         Self {
-            convolver,
+            solver,
             half_space,
             cover,
             recent: Vec::new(),
@@ -624,7 +507,10 @@ mod tests {
         // A smooth solid ball under a cover that hardly yields obeys a^3 = 3 F R / (4 E*), with the
         // compliance after creep. A sphere is steeper than Hertz's paraboloid, which changes a by
         // 1 % where a is a quarter of R.
-        let mut bench = Bench::under(Cover::of(1e4));
+        let mut bench = Bench::under(Cover {
+            young_mpa: 1e4,
+            ..Cover::default()
+        });
         let rubber = Material::Rubber.properties().substance;
         for (radius, young_mpa, force_n) in [
             (12.0, 2.0, 10.0),

@@ -120,7 +120,10 @@ mod tests {
 
     #[test]
     fn the_mean_sum_of_many_calibrated_broad_sensors_is_the_force() {
-        let mut bench = Bench::under(Cover::of(1.0));
+        let mut bench = Bench::under(Cover {
+            young_mpa: 1.0,
+            ..Cover::default()
+        });
         let all = weights(&mut bench);
         // Pieces that are no weights.
         let mut pieces = Vec::new();

@@ -168,19 +168,13 @@ impl Sensor {
         for (k, counts) in raw.counts.iter_mut().enumerate() {
             let (row, column) = array.position(k);
             let own = forces_n[k];
-            let mut near = 0.0;
-            if row > 0 {
-                near += forces_n[k - array.cols];
-            }
-            if row + 1 < array.rows {
-                near += forces_n[k + array.cols];
-            }
-            if column > 0 {
-                near += forces_n[k - 1];
-            }
-            if column + 1 < array.cols {
-                near += forces_n[k + 1];
-            }
+            let neighbours = [
+                (row > 0).then(|| k - array.cols),
+                (row + 1 < array.rows).then_some(k + array.cols),
+                (column > 0).then(|| k - 1),
+                (column + 1 < array.cols).then_some(k + 1),
+            ];
+            let near: f32 = neighbours.into_iter().flatten().map(|k| forces_n[k]).sum();
             // Force through the cover can close a taxel. Crosstalk along the lines cannot, and an
             // open taxel reads nothing. Otherwise 25 N on one point would draw a cross.
             let pressed = own + design.crosstalk_neighbour * near;

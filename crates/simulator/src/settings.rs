@@ -4,7 +4,6 @@ use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
-use super::level::Borders;
 use super::object::Shapes;
 use super::sensor::SensorProfile;
 
@@ -26,8 +25,6 @@ pub struct DatasetSettings {
     pub seed: u64,
     /// The materials of the objects.
     pub materials: Materials,
-    /// Whether broad materials avoid the levels' borders.
-    pub borders: Borders,
     /// The number of objects of each training material. Broad materials have four times as many
     /// objects, each of a material of its own.
     pub objects: u32,
@@ -53,7 +50,6 @@ impl Default for DatasetSettings {
         Self {
             seed: 0,
             materials: Materials::Named,
-            borders: Borders::Touching,
             objects: 50,
             test_objects: 5,
             all_test: false,

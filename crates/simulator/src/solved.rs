@@ -6,7 +6,7 @@
 //! the element's update is exact.
 
 use super::motion::{Arm, Motion};
-use super::press::{Bench, Specimen, Step, Window, touches_border};
+use super::press::{Bench, Specimen, Window, touches_border};
 use super::sensor::Grid;
 use super::substance::Law;
 
@@ -20,18 +20,22 @@ pub(super) struct SolvedPress {
     pub(super) motion: Motion,
 }
 
-#[derive(Clone)]
+/// A solved moment.
 struct SolvedStep {
     time_s: f64,
     force_n: f64,
-    /// Pressure on the window, MPa; empty without contact.
+    /// Pressure on the window, MPa.
     pressure: Vec<f32>,
+    /// Position z of the sensor's carrier, mm.
+    travel_mm: f64,
+    /// Radius of the contact.
+    radius_mm: f64,
 }
 
 /// A press as the taxels of a grid feel it.
 pub(super) struct FeltPress {
-    /// Times and taxel forces in newtons. Forces are linear between them.
-    moments: Vec<(f64, Vec<f32>)>,
+    /// Times, the force and those of the taxels in newtons. Forces are linear between them.
+    moments: Vec<(f64, f64, Vec<f32>)>,
 }
 
 /// The number of forces solved while loading, and while unloading. With twice as many, less of the
@@ -58,32 +62,23 @@ impl SolvedPress {
         force_n: f64,
         hold_s: f64,
     ) -> Self {
-        let levels = if specimen.is_flat {
-            FLAT_LEVELS
-        } else {
-            LEVELS
-        };
         // The contact is largest at the end of the hold, when everything has crept.
         let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
         loop {
-            let mut at = State::new(specimen, window);
-            let mut run = Run {
-                bench,
-                specimen,
-                arm,
-                at: &mut at,
-            };
-            run.load(force_n, levels);
-            let (top_mm, load_s) = (run.at.travel_mm, run.at.time_s);
+            let mut run = Run::new(bench, specimen, arm, window);
+            run.load(force_n);
+            let SolvedStep {
+                travel_mm, time_s, ..
+            } = *run.last();
             run.hold(hold_s);
-            run.unload(levels);
-            let State { moments, fits, .. } = at;
+            run.unload();
+            let (moments, fits) = (run.moments, run.fits);
             match window.wider(specimen, bench.cover, force_n) {
                 Some(wider) if !fits => window = wider,
                 _ => {
                     let motion = Motion {
-                        top_mm,
-                        load_s,
+                        top_mm: travel_mm,
+                        load_s: time_s,
                         hold_s,
                         speed_mm_s: arm.speed_mm_s,
                     };
@@ -106,7 +101,7 @@ impl SolvedPress {
     pub(super) fn felt(&self, grid: &Grid) -> FeltPress {
         let moment = |step: &SolvedStep| {
             let taxels_n = grid.taxel_forces(&step.pressure, self.window);
-            (step.time_s, taxels_n)
+            (step.time_s, step.force_n, taxels_n)
         };
         FeltPress {
             moments: self.moments.iter().map(moment).collect(),
@@ -115,87 +110,127 @@ impl SolvedPress {
 }
 
 impl FeltPress {
-    /// The taxel forces in newtons `time_s` after the touch; zero before and after the press.
-    pub(super) fn taxels_n(&self, time_s: f64) -> Vec<f32> {
-        let after = self.moments.partition_point(|&(at_s, _)| at_s <= time_s);
+    /// The force of the press and those of the taxels in newtons, `time_s` after the touch; zero before and
+    /// after the press.
+    pub(super) fn at(&self, time_s: f64) -> (f64, Vec<f32>) {
+        let after = self.moments.partition_point(|&(at_s, ..)| at_s <= time_s);
         if after == 0 || after == self.moments.len() {
-            let taxels = self.moments.first().map_or(0, |(_, taxels)| taxels.len());
-            return vec![0.0; taxels];
+            return (0.0, vec![0.0; self.moments[0].2.len()]);
         }
-        let ((a_s, a), (b_s, b)) = (&self.moments[after - 1], &self.moments[after]);
-        let part = ((time_s - a_s) / (b_s - a_s)) as f32;
-        a.iter().zip(b).map(|(a, b)| a + part * (b - a)).collect()
+        let ((a_s, a_n, a), (b_s, b_n, b)) = (&self.moments[after - 1], &self.moments[after]);
+        let part = (time_s - a_s) / (b_s - a_s);
+        let taxels = a.iter().zip(b).map(|(a, b)| a + part as f32 * (b - a));
+        (a_n + part * (b_n - a_n), taxels.collect())
     }
 }
 
 /// A press while it is computed, step by step.
-pub(super) struct Run<'a> {
-    pub(super) bench: &'a mut Bench,
-    pub(super) specimen: &'a Specimen,
-    pub(super) arm: Arm,
-    pub(super) at: &'a mut State,
-}
-
-/// How far a press has come.
-pub(super) struct State {
-    pub(super) window: Window,
+struct Run<'a> {
+    bench: &'a mut Bench,
+    specimen: &'a Specimen,
+    arm: Arm,
+    window: Window,
     gap_mm: Vec<f32>,
     /// State of each Kelvin element, MPa.
     crept: Vec<Vec<f32>>,
-    /// The displacement left by flow, mm; empty if there is none.
+    /// The displacement left by flow, mm.
     flowed_mm: Vec<f32>,
-    pub(super) pressure: Vec<f32>,
-    pub(super) force_n: f64,
-    /// Position z of the sensor's carrier, mm.
-    travel_mm: f64,
-    time_s: f64,
+    /// The moments so far. The first is the touch.
     moments: Vec<SolvedStep>,
     fits: bool,
 }
 
-/// A step that is solved but not yet taken.
-struct Trial {
-    force_n: f64,
-    time_s: f64,
-    pressure: Vec<f32>,
-    travel_mm: f64,
-    radius_mm: f64,
-}
-
-impl State {
-    /// Before the touch.
-    pub(super) fn new(specimen: &Specimen, window: Window) -> Self {
+impl<'a> Run<'a> {
+    fn new(bench: &'a mut Bench, specimen: &'a Specimen, arm: Arm, window: Window) -> Self {
         let cells = window.width * window.width;
-        let touch = SolvedStep {
-            time_s: 0.0,
-            force_n: 0.0,
-            pressure: Vec::new(),
-        };
+        let creep = specimen.substance.creep();
         Self {
+            bench,
+            specimen,
+            arm,
             window,
             gap_mm: specimen.gap_on(window),
-            crept: specimen
-                .substance
-                .creep()
-                .map(|_| vec![0.0; cells])
-                .collect(),
-            flowed_mm: Vec::new(),
-            pressure: vec![0.0; cells],
-            force_n: 0.0,
-            travel_mm: 0.0,
-            time_s: 0.0,
-            moments: vec![touch],
+            crept: creep.map(|_| vec![0.0; cells]).collect(),
+            flowed_mm: vec![0.0; cells],
+            moments: vec![SolvedStep {
+                time_s: 0.0,
+                force_n: 0.0,
+                pressure: vec![0.0; cells],
+                travel_mm: 0.0,
+                radius_mm: 0.0,
+            }],
             fits: true,
         }
     }
-}
 
-impl State {
+    fn last(&self) -> &SolvedStep {
+        self.moments.last().expect("the touch is there")
+    }
+
+    /// The forces between the touch and `top_n`, at which a press is solved.
+    fn levels(&self, top_n: f64) -> impl DoubleEndedIterator<Item = f64> + use<> {
+        let count = match self.specimen.is_flat {
+            true => FLAT_LEVELS,
+            false => LEVELS,
+        };
+        (1..=count).map(move |level| top_n * (f64::from(level) / f64::from(count)).powf(SPACING))
+    }
+
+    fn load(&mut self, force_n: f64) {
+        // Of the first step we only know that it is short. The later guesses are the length of the
+        // step before.
+        let mut guess_s = 0.05;
+        for goal_n in self.levels(force_n) {
+            guess_s = self.step_to_force(goal_n, guess_s, 1.0);
+        }
+    }
+
+    fn unload(&mut self) {
+        let mut guess_s = 0.05;
+        for goal_n in self.levels(self.last().force_n).rev().skip(1) {
+            guess_s = self.step_to_force(goal_n, guess_s, -1.0);
+        }
+        // The press ends where the sensor leaves the surface, with its creep and dents at that
+        // time.
+        let (gap, _) = self.effective_gap(0.0);
+        let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
+        let last = self.last();
+        let last_s = ((last.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
+        let end = SolvedStep {
+            time_s: last.time_s + last_s,
+            force_n: 0.0,
+            pressure: vec![0.0; gap.len()],
+            travel_mm: end_mm,
+            radius_mm: 0.0,
+        };
+        self.moments.push(end);
+    }
+
+    /// Moves in `direction` until the force is `goal_n`, and returns the time that this took. It depends on
+    /// the travel, and the travel, through creep, on the time. Two or three rounds settle both.
+    fn step_to_force(&mut self, goal_n: f64, guess_s: f64, direction: f64) -> f64 {
+        let (before_mm, before_s) = (self.last().travel_mm, self.last().time_s);
+        let mut time_s = guess_s.max(LEAST_STEP_S);
+        let mut guess = self.guess(goal_n);
+        for round in 1.. {
+            let mut step = self.attempt(goal_n, time_s, guess);
+            let needed_s =
+                (direction * (step.travel_mm - before_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
+            if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
+                step.time_s = before_s + needed_s;
+                self.take(step, needed_s);
+                break;
+            }
+            time_s = needed_s;
+            guess = step.pressure;
+        }
+        self.last().time_s - before_s
+    }
+
     /// A guess at the pressure under `force_n`: each cell goes on as between the last two moments.
     fn guess(&self, force_n: f64) -> Vec<f32> {
-        let mut guess = self.pressure.clone();
-        if let [.., before, last] = self.moments.as_slice()
-            && before.pressure.len() == guess.len()
+        let mut guess = self.last().pressure.clone();
+        if let [_, .., before, last] = self.moments.as_slice()
             && before.force_n != last.force_n
         {
             let part = ((force_n - last.force_n) / (last.force_n - before.force_n)) as f32;
@@ -205,78 +240,23 @@ impl State {
         }
         guess
     }
-}
-
-impl Run<'_> {
-    fn load(&mut self, force_n: f64, levels: u32) {
-        // Of the first step we only know that it is short. The later guesses are the length of the
-        // step before.
-        let mut guess_s = 0.05;
-        for level in 1..=levels {
-            let goal = force_n * (f64::from(level) / f64::from(levels)).powf(SPACING);
-            let before_s = self.at.time_s;
-            self.step_to_force(goal, guess_s, 1.0);
-            guess_s = self.at.time_s - before_s;
-        }
-    }
-
-    fn unload(&mut self, levels: u32) {
-        let top = self.at.force_n;
-        let mut guess_s = 0.05;
-        for level in (1..levels).rev() {
-            let goal = top * (f64::from(level) / f64::from(levels)).powf(SPACING);
-            let before_s = self.at.time_s;
-            self.step_to_force(goal, guess_s, -1.0);
-            guess_s = self.at.time_s - before_s;
-        }
-        // The press ends where the sensor leaves the surface, with its creep and dents at that
-        // time.
-        let (gap, _) = self.effective_gap(0.0);
-        let end_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
-        let last_s = ((self.at.travel_mm - end_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
-        self.at.moments.push(SolvedStep {
-            time_s: self.at.time_s + last_s,
-            force_n: 0.0,
-            pressure: Vec::new(),
-        });
-    }
-
-    /// Moves in `direction` until the force is `goal_n`. The time of the step depends on the
-    /// travel, and the travel, through creep, on the time. Two or three rounds settle both.
-    fn step_to_force(&mut self, goal_n: f64, guess_s: f64, direction: f64) {
-        let mut time_s = guess_s.max(LEAST_STEP_S);
-        let mut guess = self.at.guess(goal_n);
-        for round in 1.. {
-            let trial = self.attempt(goal_n, time_s, guess);
-            let needed_s = (direction * (trial.travel_mm - self.at.travel_mm)
-                / self.arm.speed_mm_s)
-                .max(LEAST_STEP_S);
-            if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
-                return self.take(Trial {
-                    time_s: needed_s,
-                    ..trial
-                });
-            }
-            time_s = needed_s;
-            guess = trial.pressure;
-        }
-    }
 
     /// Keeps z for `hold_s`, with forces from the secant method on `z(F)`.
     fn hold(&mut self, hold_s: f64) {
-        let keep_mm = self.at.travel_mm;
-        let start_s = self.at.time_s;
-        let count = self.at.moments.len();
+        let (keep_mm, start_s) = (self.last().travel_mm, self.last().time_s);
         let mut slope = {
-            let (a, b) = (&self.at.moments[count - 2], &self.at.moments[count - 1]);
+            let [.., a, b] = self.moments.as_slice() else {
+                unreachable!("a press is held after it was loaded");
+            };
             self.arm.speed_mm_s * (b.time_s - a.time_s) / (b.force_n - a.force_n)
         };
         let step = if self.specimen.is_flat { FLAT_HOLDS } else { 1 };
         let until = HOLD_S.iter().copied().step_by(step);
         let until = until.take_while(|&at| at < hold_s - 0.01);
         for at in until.chain([hold_s]) {
-            let time_s = start_s + at - self.at.time_s;
-            let mut trial = self.attempt(self.at.force_n, time_s, self.at.pressure.clone());
+            let last = self.last();
+            let time_s = start_s + at - last.time_s;
+            let mut trial = self.attempt(last.force_n, time_s, last.pressure.clone());
             for _ in 0..4 {
                 let off = trial.travel_mm - keep_mm;
                 if (off / slope).abs() < HOLD_TOLERANCE * trial.force_n {
@@ -290,103 +270,25 @@ impl Run<'_> {
                     slope = seen;
                 }
             }
-            self.take(trial);
-        }
-    }
-
-    /// Moves the carrier to `goal_mm` in `time_s`, into the object or away from it. Keeps no moment.
-    pub(super) fn move_to(&mut self, goal_mm: f64, time_s: f64) {
-        let (gap, _) = self.effective_gap(time_s);
-        let touch_mm = f64::from(gap.iter().copied().fold(f32::INFINITY, f32::min));
-        let depth_mm = goal_mm - touch_mm;
-        if depth_mm > 0.0 {
-            let trial = self.force_at_depth(touch_mm, depth_mm, time_s);
-            if touches_border(&trial.pressure, self.at.window.width)
-                && let Some(wider) =
-                    (self.at.window).wider(self.specimen, self.bench.cover, trial.force_n)
-            {
-                self.widen(wider);
-                return self.move_to(goal_mm, time_s);
-            }
-            self.take(trial);
-        } else if self.at.time_s > 0.0 {
-            self.take(Trial {
-                force_n: 0.0,
-                time_s,
-                pressure: vec![0.0; self.at.pressure.len()],
-                travel_mm: goal_mm,
-                radius_mm: 0.0,
-            });
-        }
-        self.at.moments.clear();
-    }
-
-    /// Seeks the force that brings the carrier `depth_mm` beyond `touch_mm`, where the object would be
-    /// touched: by the secant method on ln F against the logarithm of the depth, where the contact is
-    /// nearly a power law.
-    fn force_at_depth(&mut self, touch_mm: f64, depth_mm: f64, time_s: f64) -> Trial {
-        let depth_of = |trial: &Trial| (trial.travel_mm - touch_mm).max(LEAST_DEPTH_MM);
-        let before_mm = self.at.travel_mm - touch_mm;
-        let mut power = 1.5;
-        let mut next_n = if self.at.force_n > 0.0 && before_mm > LEAST_DEPTH_MM {
-            self.at.force_n * (depth_mm / before_mm).powf(power)
-        } else {
-            0.3 * self.arm.n_per_mm * depth_mm
-        };
-        let mut trial = self.attempt(next_n.max(LEAST_FORCE_N), time_s, self.at.pressure.clone());
-        for _ in 0..MOST_TRIALS {
-            let off = (depth_mm / depth_of(&trial)).ln();
-            next_n = (trial.force_n * (power * off).clamp(-2.0, 2.0).exp()).max(LEAST_FORCE_N);
-            if (next_n / trial.force_n).ln().abs() < FORCE_TOLERANCE {
-                break;
-            }
-            let (force_before, depth_before) = (trial.force_n, depth_of(&trial));
-            trial = self.attempt(next_n, time_s, trial.pressure);
-            let seen = (trial.force_n / force_before).ln() / (depth_of(&trial) / depth_before).ln();
-            if (0.2..5.0).contains(&seen) {
-                power = seen;
-            }
-        }
-        trial
-    }
-
-    /// Goes on with the same press on a wider window.
-    fn widen(&mut self, window: Window) {
-        let from = std::mem::replace(&mut self.at.window, window);
-        self.at.gap_mm = self.specimen.gap_on(window);
-        let crept = self.at.crept.iter_mut();
-        for field in crept.chain([&mut self.at.flowed_mm, &mut self.at.pressure]) {
-            if !field.is_empty() {
-                *field = window.relaid(field, from);
-            }
+            self.take(trial, time_s);
         }
     }
 
     /// Solves a step of `time_s` that ends at `force_n`, from a guess at the pressure.
-    fn attempt(&mut self, force_n: f64, time_s: f64, mut pressure: Vec<f32>) -> Trial {
+    fn attempt(&mut self, force_n: f64, time_s: f64, mut pressure: Vec<f32>) -> SolvedStep {
         let (gap, history) = self.effective_gap(time_s);
-        let factor = 1.0
-            + self
-                .specimen
-                .substance
-                .creep()
-                .map(|c| c.j * share(time_s, c.tau_s))
-                .sum::<f64>();
-        let step = Step {
-            force_n,
-            factor,
-            history_mpa: &history,
-            time_s,
-        };
+        let creep = self.specimen.substance.creep();
+        let factor = 1.0 + creep.map(|c| c.j * share(time_s, c.tau_s)).sum::<f64>();
+        let (specimen, window) = (self.specimen, self.window);
+        let local = specimen.local(factor, &history, time_s);
         let contact = self
             .bench
-            .solve(self.specimen, self.at.window, &gap, step, &mut pressure);
-        let travel_mm = contact.approach_mm + force_n / self.arm.n_per_mm;
-        Trial {
+            .solve(specimen, window, &gap, force_n, local, &mut pressure);
+        SolvedStep {
+            time_s: self.last().time_s + time_s,
             force_n,
-            time_s,
             pressure,
-            travel_mm,
+            travel_mm: contact.approach_mm + force_n / self.arm.n_per_mm,
             radius_mm: contact.radius_mm,
         }
     }
@@ -394,71 +296,56 @@ impl Run<'_> {
     /// The gap with the creep and flow that earlier steps leave after another `time_s`, and the
     /// remaining part of the effective pressure, which the foam's law needs separately.
     fn effective_gap(&mut self, time_s: f64) -> (Vec<f32>, Vec<f32>) {
-        let mut gap = self.at.gap_mm.clone();
-        for (gap, &flowed) in gap.iter_mut().zip(&self.at.flowed_mm) {
+        let mut gap = self.gap_mm.clone();
+        for (gap, &flowed) in gap.iter_mut().zip(&self.flowed_mm) {
             *gap += flowed;
         }
-        if self.at.time_s == 0.0 {
+        let last = self.last();
+        if last.time_s == 0.0 {
             return (gap, Vec::new());
         }
         let mut history = vec![0.0_f32; gap.len()];
-        for (creep, crept) in self.specimen.substance.creep().zip(&self.at.crept) {
+        for (creep, crept) in self.specimen.substance.creep().zip(&self.crept) {
             let (kept, old) = left(time_s, creep.tau_s);
             let (kept, old) = ((creep.j * kept) as f32, (creep.j * old) as f32);
-            for ((history, &crept), &pressure) in
-                history.iter_mut().zip(crept).zip(&self.at.pressure)
+            for ((history, &crept), &pressure) in history.iter_mut().zip(crept).zip(&last.pressure)
             {
                 *history += kept * crept + old * pressure;
             }
         }
         let displacement = self
             .bench
-            .displacement(self.specimen, self.at.window, &history);
+            .displacement(self.specimen, self.window, &history);
         for (gap, u) in gap.iter_mut().zip(displacement) {
             *gap += u;
         }
         (gap, history)
     }
 
-    fn take(&mut self, trial: Trial) {
-        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.at.crept) {
-            let (kept, old) = left(trial.time_s, creep.tau_s);
-            let new = share(trial.time_s, creep.tau_s) as f32;
+    /// Goes on to this moment, `time_s` after the last one.
+    fn take(&mut self, step: SolvedStep, time_s: f64) {
+        let last = self.moments.last().expect("the touch is there");
+        for (creep, crept) in self.specimen.substance.creep().zip(&mut self.crept) {
+            let (kept, old) = left(time_s, creep.tau_s);
+            let new = share(time_s, creep.tau_s) as f32;
             let (kept, old) = (kept as f32, old as f32);
-            for ((crept, &before), &now) in
-                crept.iter_mut().zip(&self.at.pressure).zip(&trial.pressure)
+            for ((crept, &before), &now) in crept.iter_mut().zip(&last.pressure).zip(&step.pressure)
             {
                 *crept = kept * *crept + old * before + new * now;
             }
         }
         if let Law::Plastic { .. } = self.specimen.substance.law {
-            self.at.flowed_mm.resize(trial.pressure.len(), 0.0);
-            let flow = self.specimen.flow(trial.time_s);
-            for (flowed, &pressure) in self.at.flowed_mm.iter_mut().zip(&trial.pressure) {
-                *flowed += flow.displacement_mm(pressure, trial.radius_mm);
+            let flow = self.specimen.local(1.0, &[], time_s);
+            for (k, (flowed, &pressure)) in
+                self.flowed_mm.iter_mut().zip(&step.pressure).enumerate()
+            {
+                *flowed += flow.at(k, pressure, step.radius_mm).0;
             }
         }
-        self.at.fits &=
-            self.at.window.is_whole() || !touches_border(&trial.pressure, self.at.window.width);
-        self.at.pressure = trial.pressure;
-        self.at.force_n = trial.force_n;
-        self.at.travel_mm = trial.travel_mm;
-        self.at.time_s += trial.time_s;
-        self.at.moments.push(SolvedStep {
-            time_s: self.at.time_s,
-            force_n: self.at.force_n,
-            pressure: self.at.pressure.clone(),
-        });
+        self.fits &= self.window.is_whole() || !touches_border(&step.pressure, self.window.width);
+        self.moments.push(step);
     }
 }
-
-/// The least force of a contact, N, and the least depth that its power law is followed to, mm.
-const LEAST_FORCE_N: f64 = 1e-3;
-const LEAST_DEPTH_MM: f64 = 1e-5;
-/// Tolerance of the force that belongs to a position, as a part of the force, and the most solves after the
-/// first to reach it.
-const FORCE_TOLERANCE: f64 = 3e-3;
-const MOST_TRIALS: u32 = 5;
 
 /// The least length of a step, so that time advances even where creep runs ahead of the motion.
 const LEAST_STEP_S: f64 = 1e-3;

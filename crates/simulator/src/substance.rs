@@ -76,9 +76,9 @@ impl Substance {
     pub(super) fn layer(&self, height_mm: f64) -> Option<(Base, f64)> {
         match self.law {
             Law::Solid | Law::Plastic { .. } => None,
-            Law::Foam { .. } => Some((Base::Rigid, height_mm)),
+            Law::Foam { .. } => Some((Base::RIGID, height_mm)),
             Law::Layered { thickness_mm, core } => {
-                let base = Base::Elastic {
+                let base = Base {
                     nu: CORE_NU,
                     shear_ratio: (1.0 + CORE_NU) / ((1.0 + self.nu) * core),
                 };

@@ -75,12 +75,13 @@ const WRONG_SHARE: f64 = 0.5;
 const ARM_ERROR: f64 = 0.15;
 
 /// One cover with the objects that are pressed on it.
-#[derive(Clone, Copy)]
 struct Place {
     split: Split,
     number: u32,
     /// Number of the cover over both splits.
     index: u32,
+    /// The objects with their numbers.
+    units: Vec<(u32, Unit)>,
 }
 
 impl SensorDesigns {
@@ -96,27 +97,22 @@ impl SensorDesigns {
 impl BroadSensors {
     /// The covers that objects are pressed on.
     fn places(&self, of: &DatasetSettings) -> Vec<Place> {
-        let train = self.covers.min(of.objects);
-        let test = self.test_covers.min(of.test_objects);
-        let of_split = |split, first, count| {
-            (0..count).map(move |number| Place {
+        let units: Vec<(u32, Unit)> = (0..).zip(units(of)).collect();
+        let train = (0..self.covers.min(of.objects)).map(|n| (Split::Train, self.covers, n));
+        let test = 0..self.test_covers.min(of.test_objects);
+        let test = test.map(|n| (Split::Test, self.test_covers, n));
+        let places = (0..).zip(train.chain(test));
+        let places = places.map(|(index, (split, covers, number))| {
+            let is_on = |unit: &Unit| unit.split == split && unit.number % covers == number;
+            let own = units.iter().filter(|(_, unit)| is_on(unit));
+            Place {
                 split,
                 number,
-                index: first + number,
-            })
-        };
-        of_split(Split::Train, 0, train)
-            .chain(of_split(Split::Test, train, test))
-            .collect()
-    }
-
-    /// Whether a unit's object is pressed on this cover.
-    fn is_on(&self, place: Place, unit: Unit) -> bool {
-        let covers = match place.split {
-            Split::Train => self.covers,
-            Split::Test => self.test_covers,
-        };
-        unit.split == place.split && unit.number % covers == place.number
+                index,
+                units: own.copied().collect(),
+            }
+        });
+        places.collect()
     }
 }
 
@@ -127,14 +123,11 @@ impl CourseSettings {
         let Some(sensors) = &self.sensors else {
             return of.samples();
         };
-        let units = units(of);
-        let places = sensors.places(of);
-        let objects = |place: &Place| {
-            let own = units.iter().filter(|&&unit| sensors.is_on(*place, unit));
-            own.count() as u64
+        let contacts = |place: Place| {
+            place.units.len() as u64 * u64::from(of.presses) + 2 * u64::from(REFERENCES)
         };
-        let contacts = |place| objects(place) * u64::from(of.presses) + 2 * u64::from(REFERENCES);
-        places.iter().map(contacts).sum::<u64>() * u64::from(sensors.electronics)
+        let contacts = sensors.places(of).into_iter().map(contacts);
+        contacts.sum::<u64>() * u64::from(sensors.electronics)
     }
 
     /// The names that a press's `material` indexes.
@@ -152,8 +145,8 @@ pub(super) fn courses(
     threads: usize,
     progress: impl Fn(usize) + Sync,
 ) -> Vec<LabelledCourse> {
-    let units = units(&settings.objects);
     let places = sensors.places(&settings.objects);
+    let objects = units(&settings.objects).len() as u32;
     let done = AtomicUsize::new(0);
     let progress = || progress(done.fetch_add(1, Ordering::Relaxed) + 1);
     shared_out(
@@ -162,11 +155,9 @@ pub(super) fn courses(
         || (),
         |(), _, place| {
             let mut station = Station::draw(settings, sensors, place);
-            let mut made = station.references(units.len() as u32, &progress);
-            for (object, &unit) in (0_u32..).zip(&units) {
-                if sensors.is_on(place, unit) {
-                    made.extend(station.object(object, unit, &progress));
-                }
+            let mut made = station.references(objects, &progress);
+            for (object, unit) in &place.units {
+                made.extend(station.object(*object, unit, &progress));
             }
             made
         },
@@ -174,9 +165,9 @@ pub(super) fn courses(
 }
 
 /// One cover on its arm, with the electronics under it.
-struct Station {
-    settings: CourseSettings,
-    place: Place,
+struct Station<'a> {
+    settings: &'a CourseSettings,
+    place: &'a Place,
     draws: Stream,
     bench: Bench,
     arm_n_per_mm: f64,
@@ -214,8 +205,8 @@ impl Electronics {
     }
 }
 
-impl Station {
-    fn draw(settings: &CourseSettings, sensors: &BroadSensors, place: Place) -> Self {
+impl<'a> Station<'a> {
+    fn draw(settings: &'a CourseSettings, sensors: &BroadSensors, place: &'a Place) -> Self {
         let name = match place.split {
             Split::Train => "train covers",
             Split::Test => "test covers",
@@ -253,7 +244,7 @@ impl Station {
             }
         };
         Self {
-            settings: *settings,
+            settings,
             place,
             arm_n_per_mm,
             ball_mm: log_even(BALL_MM, &mut own),
@@ -264,7 +255,7 @@ impl Station {
     }
 
     fn plan(&self, stream: &mut Stream) -> Plan {
-        Plan::draw(&self.settings, [self.arm_n_per_mm; 2], stream)
+        Plan::draw(self.settings, [self.arm_n_per_mm; 2], stream)
     }
 
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
@@ -307,7 +298,7 @@ impl Station {
 
     /// The presses of one object. A press that only some of the electronics see is in the data set
     /// for these.
-    fn object(&mut self, object: u32, unit: Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
+    fn object(&mut self, object: u32, unit: &Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let flat_share = self.settings.flat_share();
         let subject = Subject::draw(&self.settings.objects, unit, flat_share);
         let mut made = Vec::new();

@@ -168,27 +168,6 @@ impl Design {
         5.0 * f64::from(self.lag_s)
     }
 
-    /// This design with taxels of another pitch on the same area. The forces of a taxel grow with
-    /// its area.
-    #[cfg(test)]
-    pub(crate) fn at_pitch(self, pitch_mm: f64) -> Self {
-        let area = (pitch_mm / self.pitch_mm).powi(2);
-        let side = (self.array.rows as f64 * self.pitch_mm / pitch_mm).round() as usize;
-        Self {
-            array: Array {
-                rows: side,
-                cols: side,
-            },
-            pitch_mm,
-            active_mm: self.active_mm * pitch_mm / self.pitch_mm,
-            noise_n: self.noise_n * area,
-            threshold_median_n: self.threshold_median_n * area,
-            threshold_bound_n: self.threshold_bound_n * area,
-            count_n: self.count_n * area as f32,
-            ..self
-        }
-    }
-
     /// Draws the design of a sensor under a cover of this thickness. The ranges of forces are those of a
     /// taxel 3.5 mm wide; wider taxels have more, by area. `results/simulator.md` gives the sources.
     pub(crate) fn broad(cover_mm: f64, stream: &mut Stream) -> Self {

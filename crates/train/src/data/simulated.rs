@@ -9,9 +9,7 @@ use anyhow::Context as _;
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
-use hardnessd_simulator::{
-    self, Borders, CourseSettings, DatasetSettings, Family, LEVELS, LevelRange, Materials,
-};
+use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Family, LEVELS, Materials};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
@@ -57,10 +55,12 @@ pub fn simulate(settings: &CourseSettings, layout: Layout) -> Presses {
 
 /// The levels with their intervals of Shore. Those of the named materials are the paper's.
 fn levels(settings: &DatasetSettings) -> Vec<Level> {
-    let touching = |range: &LevelRange| source::level(range, range.touching);
-    match (settings.materials, settings.borders) {
-        (Materials::Broad, Borders::Touching) => LEVELS.iter().map(touching).collect(),
-        (Materials::Named, _) | (_, Borders::Gaps) => source::papers_levels(),
+    match settings.materials {
+        Materials::Broad => LEVELS
+            .iter()
+            .map(|range| source::level(range, range.touching))
+            .collect(),
+        Materials::Named => source::papers_levels(),
     }
 }
 
