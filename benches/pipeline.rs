@@ -1,11 +1,8 @@
 //! The cost of one press from bytes to verdict, and of its parts: `cargo bench --bench pipeline`.
 //!
-//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. A bench called
-//! `..._floor` is the least that the machine needs for the same work: a copy of the same bytes, or as
-//! many multiply-adds. `docs/performance.md` has the ratios. Only compare lines of one run with each
-//! other, not with those of another day.
+//! The bytes are a recording of two presses on foam at 5 frames/s, 41 frames. Only compare lines of one
+//! run with each other, not with those of another day.
 
-use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -17,7 +14,6 @@ use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
 use hardnessd_core::wire::{self, Decoder, Layout};
-use tract_onnx::prelude::tract_ndarray::Array2;
 
 /// The approximate size of one read of a serial port at 115,200 baud.
 const CHUNK_BYTES: usize = 64;
@@ -44,19 +40,6 @@ fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
     Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate)
 }
 
-/// Copies bytes as [`Decoder::push`] gets them.
-fn copy_chunks(bytes: &[u8], chunk_bytes: usize, copy: &mut Vec<u8>) {
-    for chunk in bytes.chunks(chunk_bytes) {
-        copy.extend_from_slice(black_box(chunk));
-    }
-}
-
-/// Two matrices whose product takes as many multiply-adds as `verdicts` of the built-in model: 1.01
-/// million each.
-fn factors(verdicts: usize) -> [Array2<f32>; 2] {
-    [[101 * verdicts, 100], [100, 100]].map(|dims| Array2::from_elem(dims, 0.5))
-}
-
 /// Measures bytes to frames.
 #[divan::bench(args = [1, CHUNK_BYTES, 4096])]
 fn decode(bencher: Bencher, chunk_bytes: usize) {
@@ -74,16 +57,6 @@ fn decode(bencher: Bencher, chunk_bytes: usize) {
             }
             frames
         });
-}
-
-/// Measures a copy of the bytes that [`decode`] decodes.
-#[divan::bench(args = [1, CHUNK_BYTES, 4096])]
-fn decode_floor(bencher: Bencher, chunk_bytes: usize) {
-    let bytes = recording();
-    bencher
-        .counter(BytesCount::new(bytes.len()))
-        .with_inputs(|| Vec::with_capacity(bytes.len()))
-        .bench_local_refs(|copy| copy_chunks(&bytes, chunk_bytes, copy));
 }
 
 /// Measures bytes to events, with an early and a final verdict for each press. An item is a press.
@@ -121,33 +94,11 @@ fn bytes_to_events(bencher: Bencher) {
         });
 }
 
-/// Measures a copy of the bytes that [`bytes_to_events`] reads, and as many multiply-adds as its
-/// verdicts make: early and final of two presses. An item is a press.
-#[divan::bench]
-fn bytes_to_events_floor(bencher: Bencher) {
-    let bytes = recording();
-    let [left, right] = factors(4);
-    bencher
-        .counter(ItemsCount::new(2_usize))
-        .with_inputs(|| Vec::with_capacity(bytes.len()))
-        .bench_local_refs(|copy| {
-            copy_chunks(&bytes, CHUNK_BYTES, copy);
-            black_box(&left).dot(black_box(&right))
-        });
-}
-
 /// Measures a frame to a verdict.
 #[divan::bench]
 fn judge(bencher: Bencher) {
     let hrn = hrn();
     bencher.bench_local(|| hrn.judge_check(2));
-}
-
-/// Measures as many multiply-adds as [`judge`] makes, as a matrix product.
-#[divan::bench]
-fn judge_floor(bencher: Bencher) {
-    let [left, right] = factors(1);
-    bencher.bench_local(|| black_box(&left).dot(black_box(&right)));
 }
 
 /// Measures loading a model file, including its check frames. Start and reload do this.
