@@ -10,10 +10,10 @@ use std::io::{self, ErrorKind};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Args as ClapArgs;
-#[cfg(feature = "watch")]
-use futures_util::FutureExt as _;
+use serde_json::Value;
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream};
 
@@ -22,11 +22,12 @@ use super::{demo, doctor};
 use crate::daemon::config::Unix;
 use crate::daemon::lines::{LineRead, Lines};
 use crate::thread::spawn_thread;
+use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::exit::UNAVAILABLE;
 
-/// The reason why there is no daemon where a line begins with `HTTP/`.
-pub(super) const WEB_SERVER: &str = "a web server answers there, such as the live page's: name the address \
-                                     of [publish.tcp]";
+/// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes
+/// at most, because a service manager may have to start it first.
+const HELLO: Duration = Duration::from_secs(5);
 
 /// Options that name a daemon.
 #[derive(Debug, Clone, Default, ClapArgs)]
@@ -69,7 +70,7 @@ impl fmt::Display for Address {
 
 /// The longest line that a daemon may send: a `hello` that describes thousands of sensors. A frame
 /// takes about 6 kB.
-pub(super) const LONGEST_LINE_BYTES: usize = 1 << 20;
+const LONGEST_LINE_BYTES: usize = 1 << 20;
 
 /// A connection to a daemon.
 pub(super) struct Connection {
@@ -181,6 +182,39 @@ impl Connection {
         &self.address
     }
 
+    /// The first line of a daemon, its `hello`. A web server answers only if something was sent before.
+    ///
+    /// # Errors
+    ///
+    /// Fails if what answers is no daemon of this protocol, or has too many subscribers.
+    pub(super) async fn meet(&mut self) -> Result<Value, Failure> {
+        let Ok(first) = tokio::time::timeout(HELLO, self.next()).await else {
+            return Err(self.failed(format_args!(
+                "no answer for {} s: what listens there is no hardnessd, or it hangs",
+                HELLO.as_secs()
+            )));
+        };
+        let first = first?;
+        let hello: Value = serde_json::from_str(&first).unwrap_or_default();
+        let found = match (hello["type"].as_str(), &hello["protocol"]) {
+            (Some("hello"), protocol) if *protocol == PROTOCOL => return Ok(hello),
+            (Some("hello"), protocol) => format!("protocol {protocol}"),
+            (Some("error"), _) => {
+                let message = hello["message"].as_str().unwrap_or_default();
+                return Err(self.failed(format_args!("the daemon says: {message}")));
+            }
+            (Some(kind), _) => format!("{kind:?}"),
+            (None, _) if first.starts_with("HTTP/") => {
+                let server = "a web server answers there, such as the live page's: name the address of [publish.tcp]";
+                return Err(self.failed(server));
+            }
+            (None, _) => "a line that is no JSON".to_owned(),
+        };
+        Err(self.failed(format_args!(
+            "found {found}, expected the hello of a daemon of protocol {PROTOCOL}"
+        )))
+    }
+
     /// The next line, without its newline. Cancelling the call loses nothing.
     ///
     /// # Errors
@@ -198,7 +232,7 @@ impl Connection {
     }
 
     /// The failure of this connection.
-    pub(super) fn failed(&self, why: impl fmt::Display) -> Failure {
+    fn failed(&self, why: impl fmt::Display) -> Failure {
         Failure::new(UNAVAILABLE, format!("{}: {why}", self.address))
     }
 
@@ -216,14 +250,6 @@ impl Connection {
         let line = format!("{request}\n");
         let sent = self.output.write_all(line.as_bytes()).await;
         sent.map_err(|error| self.broke(error))
-    }
-
-    /// Sends a request if there is room for it now.
-    #[cfg(feature = "watch")]
-    pub(super) fn try_send(&mut self, request: &str) {
-        let line = format!("{request}\n");
-        // If the daemon does not receive the request, its missing answer shows that later.
-        let _ = self.output.write(line.as_bytes()).now_or_never();
     }
 }
 

@@ -78,7 +78,7 @@ pub async fn run(command: Command) -> Result<(), Failure> {
         }
         Command::Context(Context { target, pairs }) => {
             let mut daemon = connect::control(target.socket).await?;
-            let hello: Value = serde_json::from_str(&daemon.next().await?).unwrap_or_default();
+            let hello = daemon.meet().await?;
             let mut context: Map<String, Value> = pairs.into_iter().collect();
             context.insert("sensor".to_owned(), target.sensor.into());
             if let Some(level) = context.get_mut("level") {

@@ -10,18 +10,15 @@ use super::answer::named;
 /// What is being pressed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Truth {
-    level: Option<usize>,
+    level: Option<u64>,
     object: Option<String>,
 }
 
 impl Truth {
     /// The truth of a context. Nothing is known without one.
     fn of(context: &Value) -> Self {
-        let level = context["level"]
-            .as_u64()
-            .and_then(|level| usize::try_from(level).ok());
         Self {
-            level: level.filter(|&level| level > 0),
+            level: context["level"].as_u64().filter(|&level| level > 0),
             object: context["object"].as_str().map(str::to_owned),
         }
     }
@@ -29,15 +26,9 @@ impl Truth {
     /// Reads what a person typed: a level by number or label, a name, or a name and then a level.
     pub(super) fn read(text: &str, labels: &[String]) -> Self {
         let level = |word: &str| {
-            let by_label = labels
-                .iter()
-                .position(|label| label == word)
-                .map(|at| at + 1);
-            let by_number = word
-                .parse()
-                .ok()
-                .filter(|level| (1..=labels.len()).contains(level));
-            by_label.or(by_number)
+            let mut levels = (1_u64..).zip(labels);
+            let known = levels.find(|(level, label)| *label == word || level.to_string() == word);
+            known.map(|(level, _)| level)
         };
         let text = text.trim();
         let (before, last) = text.rsplit_once(' ').unwrap_or(("", text));
@@ -71,8 +62,8 @@ impl Truth {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Score {
     truth: Truth,
-    /// The verdicts of each level.
-    levels: Vec<u32>,
+    verdicts: u32,
+    right: u32,
     /// The verdicts without a level.
     without: u32,
 }
@@ -94,44 +85,40 @@ impl Score {
             return;
         }
         self.begin(Truth::of(&event["context"]));
-        let level = event["level"]
-            .as_u64()
-            .and_then(|level| usize::try_from(level).ok());
-        match level.and_then(|level| level.checked_sub(1)) {
-            Some(place) => {
-                self.levels.resize(self.levels.len().max(place + 1), 0);
-                self.levels[place] += 1;
-            }
+        self.verdicts += 1;
+        match event["level"].as_u64() {
+            Some(level) => self.right += u32::from(self.truth.level == Some(level)),
             None => self.without += 1,
         }
     }
 
     /// What is pressed and the counts, in words. Nothing where nobody says what is pressed.
     pub(super) fn line(&self, labels: &[String]) -> Option<String> {
-        let label = |level: usize| named(level as u64, labels);
-        let pressed = match (self.truth.level.map(label), self.truth.object.as_deref()) {
+        let label = self.truth.level.map(|level| named(level, labels));
+        let pressed = match (label, self.truth.object.as_deref()) {
             (None, None) => return None,
             (Some(level), None) => level,
             (Some(level), Some(object)) => format!("{object} ({level})"),
             (None, Some(object)) => object.to_owned(),
         };
-        let with: u32 = self.levels.iter().sum();
-        let all = with + self.without;
-        let mut parts = Vec::new();
-        if all == 0 {
-            parts.push("no verdict yet".to_owned());
-        } else if let Some(level) = self.truth.level {
-            let right = self.levels.get(level - 1).copied().unwrap_or_default();
-            parts.push(format!("{right} of {all} right"));
-            parts.push(format!("{} wrong", with - right));
-        } else {
-            let counted = (1..).zip(&self.levels).filter(|(_, count)| **count > 0);
-            parts.extend(counted.map(|(level, count)| format!("{count} {}", label(level))));
+        let Self {
+            verdicts,
+            right,
+            without,
+            ..
+        } = *self;
+        let mut line = match (verdicts, self.truth.level) {
+            (0, _) => format!("{pressed}: no verdict yet"),
+            (_, None) => format!("{pressed}: {verdicts} judged"),
+            (_, Some(_)) => {
+                let wrong = verdicts - right - without;
+                format!("{pressed}: {right} of {verdicts} right, {wrong} wrong")
+            }
+        };
+        if without > 0 {
+            line += &format!(", {without} without a level");
         }
-        if self.without > 0 {
-            parts.push(format!("{} without a level", self.without));
-        }
-        Some(format!("{pressed}: {}", parts.join(", ")))
+        Some(line)
     }
 }
 
@@ -186,7 +173,7 @@ mod tests {
         let expected = "cup (firm): 1 of 3 right, 1 wrong, 1 without a level";
         assert_eq!(said.as_deref(), Some(expected));
         let said = take("final", json!(3), json!({"object": "cup"}));
-        assert_eq!(said.as_deref(), Some("cup: 1 soft"));
+        assert_eq!(said.as_deref(), Some("cup: 1 judged"));
         score.begin(Truth::read("hard", &labels()));
         assert_eq!(
             score.line(&labels()).as_deref(),

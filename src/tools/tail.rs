@@ -5,18 +5,17 @@
 //! `hello` is not printed.
 
 use std::future::Future;
-use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
-use super::connect::{Connection, Source, WEB_SERVER};
+use super::connect::Source;
 use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
 use super::{Stdout, answer};
 use crate::maybe;
-use hardnessd_core::event::{Kind, PROTOCOL};
+use hardnessd_core::event::Kind;
 use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording;
@@ -53,10 +52,6 @@ pub struct Args {
     types: Vec<Kind>,
 }
 
-/// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes
-/// at most, because a service manager may have to start it first.
-const HELLO: Duration = Duration::from_secs(5);
-
 fn events(found: u64, count: Option<u64>) -> String {
     let of = count.map_or_else(String::new, |count| format!(" of {count}"));
     let plural = if count.unwrap_or(found) == 1 { "" } else { "s" };
@@ -91,19 +86,7 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
     let mut daemon = args.source.connect().await?;
     let request = json!({"subscribe": args.types}).to_string();
     daemon.send(&request).await?;
-    let labels = match tokio::time::timeout(HELLO, next(&mut daemon)).await {
-        Ok(hello) => {
-            let (_, hello) = hello?;
-            meet(&hello).map_err(|why| daemon.failed(why))?;
-            answer::labels(&hello)
-        }
-        Err(_) => {
-            return Err(daemon.failed(format_args!(
-                "no answer for {} s: what listens there is no hardnessd, or it hangs",
-                HELLO.as_secs()
-            )));
-        }
-    };
+    let labels = answer::labels(&daemon.meet().await?);
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
@@ -115,7 +98,8 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
     let printer = Printer::new(args.json, labels);
     let mut stdout = Stdout::open()?;
     loop {
-        let (line, event) = next(&mut daemon).await?;
+        let line = daemon.next().await?;
+        let event: Value = serde_json::from_str(&line).unwrap_or_default();
         let kind = event["type"].as_str().unwrap_or_default();
         // Events that were queued before the subscription took effect are left out.
         let counts = wording::named::<Kind>(kind).is_ok_and(|kind| args.types.contains(&kind));
@@ -130,37 +114,5 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
         if args.count == Some(*found) {
             return stdout.finish().await.map(drop);
         }
-    }
-}
-
-/// Fails unless this is a daemon's first line.
-fn meet(hello: &Value) -> Result<(), String> {
-    let found = match (
-        hello["type"].as_str().unwrap_or_default(),
-        &hello["protocol"],
-    ) {
-        ("hello", protocol) if *protocol == PROTOCOL => return Ok(()),
-        ("hello", protocol) => format!("protocol {protocol}"),
-        // It has too many subscribers.
-        ("error", _) => {
-            let message = hello["message"].as_str().unwrap_or_default();
-            return Err(format!("the daemon says: {message}"));
-        }
-        (kind, _) => format!("{kind:?}"),
-    };
-    Err(foreign(&found))
-}
-
-fn foreign(found: &str) -> String {
-    format!("found {found}, expected the hello of a daemon of protocol {PROTOCOL}")
-}
-
-/// The daemon's next line, as text and as JSON.
-async fn next(daemon: &mut Connection) -> Result<(String, Value), Failure> {
-    let line = daemon.next().await?;
-    match serde_json::from_str(&line) {
-        Ok(event) => Ok((line, event)),
-        Err(_) if line.starts_with("HTTP/") => Err(daemon.failed(WEB_SERVER)),
-        Err(_) => Err(daemon.failed(foreign("a line that is no JSON"))),
     }
 }

@@ -1,11 +1,10 @@
 //! `hardnessd watch`: the sensors of a running daemon, on a terminal.
 //!
-//! It is a subscriber like any other. It asks for the totals once a second, and connects again when
-//! the daemon goes away. `view` keeps what is known, and `draw` draws it. This file connects both
-//! with the socket, the keys and the clock.
+//! It is a subscriber like any other. `follow` connects, asks for the totals once a second, and connects
+//! again when the daemon goes away. `view` keeps what is known, and `draw` draws it. This file connects
+//! them with the keys and the clock.
 
 mod draw;
-mod look;
 mod screen;
 #[cfg(test)]
 mod tests;
@@ -13,7 +12,6 @@ mod view;
 
 use std::future::Future;
 use std::io::{self, IsTerminal};
-use std::pin::Pin;
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
@@ -21,10 +19,9 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
-use self::draw::draw;
-use self::look::Look;
+use self::draw::{Look, draw};
 use self::screen::{Screen, keys};
-use self::view::{Clock, Loss, Order, QUESTION, View};
+use self::view::{Order, View};
 use super::connect::{Address, Connection, Source};
 use super::control;
 use super::exit::{Fail, Failure};
@@ -50,8 +47,22 @@ pub struct Args {
 /// Time between two pictures: as fast as eyes can follow.
 const PICTURE: Duration = Duration::from_millis(100);
 
+/// The request for the totals, and the time between two of them. Without a request, the daemon sends them
+/// only when the state changes.
+const QUESTION: &str = r#"{"get":"status"}"#;
+const QUESTIONS: Duration = Duration::from_secs(1);
+
 /// Time between two tries to connect.
 const PAUSE: Duration = Duration::from_millis(500);
+
+/// What comes from a daemon.
+enum News {
+    /// Its first line, and where it is.
+    Hello(Address, Value),
+    Event(Value),
+    /// Why there is none.
+    Absence(String),
+}
 
 /// Shows the sensors until a key or `shutdown` ends it, or the terminal goes away.
 ///
@@ -63,23 +74,23 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         let needs = "`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead";
         return Err(Failure::new(USAGE, needs));
     }
-    let look = look();
-    let mut view = View::new();
-    let mut daemon = Daemon::new(args.source.clone());
     if args.source.given().is_none()
         && let Ok(connection) = args.source.connect().await
     {
         let address = connection.address().to_string();
         stderr_line!("hardnessd: watching {}", escaped(&address));
     }
+    let variable = |name| std::env::var(name).unwrap_or_default();
+    let look = Look::new(&variable("TERM"), &variable("NO_COLOR"));
+    let mut view = View::new();
     let mut screen = Screen::open().of("terminal", IO)?;
     let mut keys = keys().of("terminal", IO)?;
     let mut pictures = tokio::time::interval(PICTURE);
     pictures.set_missed_tick_behavior(MissedTickBehavior::Skip);
-    let mut questions = tokio::time::interval(QUESTION);
-    questions.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    let (sender, mut news) = mpsc::channel(16);
+    tokio::spawn(follow(args.source, sender));
     let mut shutdown = std::pin::pin!(shutdown);
-    // The address of the last connection.
+    // The address of the last daemon.
     let mut daemon_at = None;
     let (told, mut outcomes) = mpsc::channel(4);
     loop {
@@ -101,22 +112,59 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
                 let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
                 drawn.of("terminal", IO)?;
             }
-            _ = questions.tick() => daemon.send(r#"{"get":"status"}"#),
-            received = daemon.next() => match received {
-                Ok(FromDaemon::Connection(address)) => {
-                    let clock = Clock::of(&address);
-                    view.wait(address.to_string(), clock, now().mono);
+            Some(news) = news.recv() => match news {
+                News::Hello(address, hello) => {
+                    let is_remote = matches!(address, Address::Tcp(_));
+                    view.meet(hello, is_remote, now().mono);
                     daemon_at = Some(address);
                 }
-                Ok(FromDaemon::Line(line)) => {
-                    if let Some(request) = view.take_line(&line, now()) {
-                        daemon.send(&request);
-                    }
-                }
-                Err(loss) => view.lose(loss),
+                News::Event(event) => view.take(event, now()),
+                News::Absence(reason) => view.lose(reason),
             },
         }
     }
+}
+
+/// Reads the lines of one daemon after the other, for as long as somebody takes them.
+async fn follow(source: Source, news: mpsc::Sender<News>) {
+    while !news.is_closed() {
+        let absence = match source.connect().await {
+            Ok(daemon) => read(daemon, &news).await,
+            Err(failure) => failure,
+        };
+        // If `watch` has ended, nobody takes it.
+        let _ = news.send(News::Absence(absence.line())).await;
+        tokio::time::sleep(PAUSE).await;
+    }
+}
+
+/// Reads the lines of a daemon until it is gone, and returns why. Asks for all events of this run that the
+/// daemon still holds, and those that come.
+async fn read(mut daemon: Connection, news: &mpsc::Sender<News>) -> Failure {
+    let read = async {
+        daemon.send(QUESTION).await?;
+        let hello = daemon.meet().await?;
+        let types = ["hardness", "press", "status", "frame"];
+        let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
+        let request = json!({"subscribe": types, "since": since});
+        let address = daemon.address().clone();
+        let _ = news.send(News::Hello(address, hello)).await;
+        daemon.send(&request.to_string()).await?;
+        let mut questions = tokio::time::interval(QUESTIONS);
+        questions.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                line = daemon.next() => {
+                    let event = serde_json::from_str(&line?).unwrap_or_default();
+                    let _ = news.send(News::Event(event)).await;
+                }
+                _ = questions.tick() => daemon.send(QUESTION).await?,
+            }
+        }
+    };
+    let gone: Result<std::convert::Infallible, Failure> = read.await;
+    let Err(failure) = gone;
+    failure
 }
 
 /// Sets a context at the control socket beside the daemon's other one, and sends the outcome in words.
@@ -134,74 +182,4 @@ async fn tell(daemon_at: Option<Address>, context: Value, told: mpsc::Sender<Str
     };
     // If `watch` has ended, nobody reads it.
     let _ = told.send(outcome).await;
-}
-
-fn look() -> Look {
-    let variable = |name| std::env::var(name).unwrap_or_default();
-    Look::new(&variable("TERM"), &variable("NO_COLOR"))
-}
-
-/// A connection to the daemon, or a line from it.
-enum FromDaemon {
-    /// The daemon accepted the connection at this address.
-    Connection(Address),
-    Line(String),
-}
-
-/// The connection to the daemon. When it breaks, it is made again.
-struct Daemon {
-    source: Source,
-    connection: Option<Connection>,
-    /// The next try to connect.
-    connecting: Pin<Box<dyn Future<Output = Result<Connection, Failure>>>>,
-}
-
-impl Daemon {
-    fn new(source: Source) -> Self {
-        Self {
-            connecting: Box::pin(connect(source.clone(), Duration::ZERO)),
-            connection: None,
-            source,
-        }
-    }
-
-    /// The next connection or line, or the reason why there is no daemon. Cancelling the call loses
-    /// nothing.
-    async fn next(&mut self) -> Result<FromDaemon, Loss> {
-        if let Some(connection) = &mut self.connection {
-            let line = connection.next().await;
-            return line.map(FromDaemon::Line).map_err(|error| {
-                self.connection = None;
-                Loss::Broken(error.line())
-            });
-        }
-        let made = self.connecting.as_mut().await;
-        self.connecting = Box::pin(connect(self.source.clone(), PAUSE));
-        let connection = made.map_err(|error| Loss::Unreachable(error.line()))?;
-        let address = connection.address().clone();
-        self.connection = Some(connection);
-        Ok(FromDaemon::Connection(address))
-    }
-
-    /// Sends a request, if there is a daemon.
-    fn send(&mut self, request: &str) {
-        if let Some(connection) = &mut self.connection {
-            connection.try_send(request);
-        }
-    }
-}
-
-async fn connect(source: Source, pause: Duration) -> Result<Connection, Failure> {
-    tokio::time::sleep(pause).await;
-    source.connect().await
-}
-
-impl Clock {
-    /// The clock of a daemon at this address.
-    fn of(address: &Address) -> Self {
-        match address {
-            Address::Unix(_) => Self::Ours,
-            Address::Tcp(_) => Self::Theirs,
-        }
-    }
 }

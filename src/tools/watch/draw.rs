@@ -1,358 +1,48 @@
 //! Draws as much of a view as fits.
 //!
 //! The state of a sensor's link and the age of its frame come above all else. If the link is not
-//! live, the last frame is shown without its colours and under the state of the link, the curves
-//! end, and no value is shown as present.
-
-mod curve;
-mod map;
+//! live, the last frame is shown without its colours and under the state of the link, the curve
+//! ends, and no value is shown as present.
 
 use std::time::Duration;
 
 use ratatui_core::buffer::Buffer;
-use ratatui_core::layout::Rect;
+use ratatui_core::layout::{Constraint, Layout, Rect};
 use ratatui_core::style::{Color, Modifier, Style};
 use ratatui_core::terminal::Frame;
+use ratatui_core::text::{Line, Span, Text};
 use serde_json::Value;
 
-use self::map::MapSize;
-use super::look::Look;
-use super::view::{Link, Sensor, View, age};
+use super::view::{Link, Sensor, View, WINDOW, age};
 use crate::tools::answer::{Answer, items, with_shore};
 use crate::tools::readable::number;
+use hardnessd_core::colour::viridis;
+use hardnessd_core::frame::Array;
 use hardnessd_core::wording;
 
 /// Pictures up to this width have no map.
 const NARROW: u16 = 64;
 
-/// The blank columns between the left and the right part of a picture.
+/// The least width of the left part of a picture, and the blank columns after it.
+const LEFT: u16 = 30;
 const GAP: u16 = 2;
 
-/// Draws as much as there is room for.
-pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
-    let area = frame.area();
-    let page = &mut Page {
-        buffer: frame.buffer_mut(),
-        look,
-        now,
-    };
-    let mut rows = Rows(area);
-    let foot = rows.take_last();
-    if let Some(row) = rows.take(1) {
-        page.title(row, view);
-    }
-    let keys = items(&view.hello["model"], "without_effect").filter_map(Value::as_str);
-    let keys: Vec<&str> = keys.collect();
-    if !keys.is_empty() {
-        let line = format!("{}: changes no verdict of this model", keys.join(", "));
-        page.wrapped(&mut rows, &line, look.aside());
-    }
-    let Some(sensor) = view.sensor() else {
-        if let Some((link, reason)) = view.trouble(now) {
-            let line = format!("{}  {reason}", link.name());
-            page.wrapped(&mut rows, &line, look.link(link));
-        }
-        page.keys(foot, view);
-        return;
-    };
-    let (link, reason) = view.link(sensor, now);
-    if view.sensors.len() > 1
-        && let Some(row) = rows.take(1)
-    {
-        page.tabs(row, view);
-    }
-    page.link(&mut rows, sensor, link, reason.as_deref());
-    let mut body = rows.0;
-    if body.width > NARROW && body.height > 10 {
-        let map = page.map_size(sensor, body.width / 2, body.height.saturating_sub(4));
-        let width = map.cols.max(30);
-        page.map_and_counters(Rect { width, ..body }, map, sensor, link);
-        body.x += width + GAP;
-        body.width -= width + GAP;
-    }
-    page.curves_and_verdicts(body, view, sensor, link);
-    page.keys(foot, view);
-}
+/// The least full scale of the map, in newtons a taxel: noise must not look like a touch.
+const LEAST_SCALE_N: f32 = 1.0;
 
-/// A picture that is being drawn.
-struct Page<'a> {
-    buffer: &'a mut Buffer,
-    look: Look,
-    now: Duration,
-}
+/// Greys from no pressure to the greatest, for a map that is no longer current.
+const GREY: [u8; 13] = [
+    234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
+];
 
-/// Rows of an area, taken from the top.
-struct Rows(Rect);
+/// Characters from no pressure to the greatest, for a terminal without colours.
+const CHARACTERS: &[u8; 10] = b" .:-=+*#%@";
 
-impl Rows {
-    /// The next `height` rows, if there are that many.
-    fn take(&mut self, height: u16) -> Option<Rect> {
-        if height == 0 || self.0.height < height {
-            return None;
-        }
-        let taken = Rect { height, ..self.0 };
-        self.0.y += height;
-        self.0.height -= height;
-        Some(taken)
-    }
-
-    /// The last row, if there is more than one.
-    fn take_last(&mut self) -> Option<Rect> {
-        if self.0.height < 2 {
-            return None;
-        }
-        self.0.height -= 1;
-        Some(Rect {
-            y: self.0.y + self.0.height,
-            height: 1,
-            ..self.0
-        })
-    }
-}
-
-impl Page<'_> {
-    /// Writes a text without hidden characters: a reason comes from the system and a label from a model
-    /// file, and neither may move the cursor. Returns the rest of the row.
-    fn text(&mut self, area: Rect, text: &str, style: Style) -> Rect {
-        let plain: String = text.chars().filter(|&c| !wording::is_hidden(c)).collect();
-        let width = usize::from(area.width);
-        let (end, _) = self.buffer.set_stringn(area.x, area.y, plain, width, style);
-        Rect {
-            x: end,
-            width: area.right() - end,
-            ..area
-        }
-    }
-
-    /// Writes a text into as many rows as it needs, and gives these rows its style.
-    fn wrapped(&mut self, rows: &mut Rows, text: &str, style: Style) {
-        // A blank column on each side.
-        for line in lines(text, usize::from(rows.0.width).saturating_sub(2)) {
-            let Some(row) = rows.take(1) else { return };
-            self.buffer.set_style(row, style);
-            self.text(row, &format!(" {line}"), style);
-        }
-    }
-
-    fn title(&mut self, row: Rect, view: &View) {
-        let (hello, model) = (&view.hello, &view.hello["model"]);
-        if hello.is_null() {
-            self.text(row, "hardnessd", self.look.strong());
-            return;
-        }
-        let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
-        let rest = self.text(row, &text(hello, "robot"), self.look.strong());
-        // Several sensors have tabs.
-        let sensor = match &view.sensors[..] {
-            [only] => format!(" · {}", only.name),
-            _ => String::new(),
-        };
-        let line = format!(
-            "{sensor} · hardnessd {} · model {} ({}): {}",
-            text(hello, "version"),
-            text(model, "name"),
-            text(model, "validation"),
-            text(model, "needs")
-        );
-        self.text(rest, &line, self.look.aside());
-    }
-
-    fn tabs(&mut self, row: Rect, view: &View) {
-        let tab = |(index, sensor): (usize, &Sensor)| {
-            let (link, _) = view.link(sensor, self.now);
-            let mark = if index == view.chosen { '>' } else { ' ' };
-            (
-                format!("{mark}{} {} {}", index + 1, sensor.name, link.name()),
-                link,
-            )
-        };
-        let tabs: Vec<(String, Link)> = view.sensors.iter().enumerate().map(tab).collect();
-        // The chosen sensor must be visible.
-        let mut first = 0;
-        let width = |tabs: &[(String, Link)]| tabs.iter().map(|tab| tab.0.len() + 2).sum::<usize>();
-        while first < view.chosen && width(&tabs[first..=view.chosen]) > usize::from(row.width) {
-            first += 1;
-        }
-        let mut rest = row;
-        for (index, (text, link)) in tabs.iter().enumerate().skip(first) {
-            let style = match (index == view.chosen, link) {
-                (true, _) => self.look.strong(),
-                (false, Link::Live) => self.look.aside(),
-                (false, _) => self.look.link(*link),
-            };
-            rest = self.text(rest, text, style);
-            rest = self.text(rest, "  ", Style::new());
-        }
-    }
-
-    /// The state of the link, the age of the last frame, and the frame rate.
-    fn link(&mut self, rows: &mut Rows, sensor: &Sensor, link: Link, reason: Option<&str>) {
-        let mut line = format!("{} ", link.name());
-        if let Some(frame) = &sensor.frame {
-            let old = age(self.now.saturating_sub(frame.at));
-            line += &match link {
-                Link::Live | Link::NoZero => format!(" frame {old} old"),
-                _ => format!(" last frame {old} ago"),
-            };
-        }
-        if link == Link::Lost && reason.is_some_and(is_unplugged) {
-            line.insert_str("LOST ".len(), &format!(" {UNPLUGGED_WORDS};"));
-        }
-        let rate_hz = sensor.status["frame_rate_hz"].as_f64();
-        if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
-            line += &format!(" · {rate_hz:.1} frames/s");
-        }
-        if let Some(reason) = reason {
-            line += &format!("  ({reason})");
-        }
-        self.wrapped(rows, &line, self.look.link(link));
-    }
-
-    fn map_and_counters(&mut self, area: Rect, map: MapSize, sensor: &Sensor, link: Link) {
-        let mut rows = Rows(area);
-        if map.rows > 0
-            && let Some(area) = rows.take(map.rows + 1)
-        {
-            self.map(area, map, sensor, link);
-        }
-        if sensor.status.is_null() {
-            return;
-        }
-        for (name, key) in [
-            ("frames", "frames"),
-            ("damaged", "frames_damaged"),
-            ("dropped", "frames_dropped"),
-            ("bytes skipped", "bytes_skipped"),
-        ] {
-            let count = number(&sensor.status, key);
-            // A count of damage stands out if it is not 0.
-            let style = if name == "frames" || count == 0 {
-                self.look.aside()
-            } else {
-                let orange = Style::new().fg(Color::Indexed(214));
-                self.look.style(orange, Modifier::BOLD)
-            };
-            if let Some(row) = rows.take(1) {
-                self.text(row, &format!("{name:<14} {count:>14}"), style);
-            }
-        }
-    }
-
-    fn curves_and_verdicts(&mut self, area: Rect, view: &View, sensor: &Sensor, link: Link) {
-        let mut rows = Rows(area);
-        if let Some(row) = rows.take(1) {
-            self.press(row, sensor, link);
-        }
-        if let Some(line) = sensor.score.line(&view.labels) {
-            self.wrapped(&mut rows, &format!("pressing {line}"), Style::new());
-        }
-        // Verdicts get the rest, but at least 6 rows.
-        let curve = (rows.0.height.saturating_sub(6) / 3).clamp(2, 12);
-        if let Some(area) = rows.take(curve) {
-            self.force(area, sensor, link);
-        }
-        if let Some(area) = rows.take(curve) {
-            self.contact(area, sensor, link);
-        }
-        self.verdicts(rows.0, view, sensor, link);
-    }
-
-    fn press(&mut self, row: Rect, sensor: &Sensor, link: Link) {
-        let rest = self.text(row, "press ", self.look.heading());
-        let Some((at, press)) = &sensor.press else {
-            self.text(rest, "none yet", self.look.aside());
-            return;
-        };
-        let (old, number) = (age(self.now.saturating_sub(*at)), number(press, "press"));
-        let (mut line, style) = match (press["state"].as_str(), link) {
-            (Some("begin"), Link::Live) => {
-                (format!("{number} in contact for {old}"), self.look.strong())
-            }
-            (Some("begin"), _) => {
-                let unknown = format!("{number} began {old} ago, its end is not known");
-                (unknown, Style::new())
-            }
-            (state, _) => {
-                let state = state.unwrap_or_default();
-                (format!("{number} {state} {old} ago"), Style::new())
-            }
-        };
-        if let Some(reason) = press["reason"].as_str() {
-            line += &format!(" ({reason})");
-        }
-        self.text(rest, &line, style);
-    }
-
-    fn verdicts(&mut self, area: Rect, view: &View, sensor: &Sensor, link: Link) {
-        let mut rows = Rows(area);
-        let Some(row) = rows.take(1) else { return };
-        let rest = self.text(row, "verdicts ", self.look.heading());
-        let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
-        self.text(rest, &of, self.look.aside());
-        if sensor.verdicts.is_empty()
-            && let Some(row) = rows.take(1)
-        {
-            self.text(row, "none yet", self.look.aside());
-        }
-        for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
-            let Some(row) = rows.take(1) else { return };
-            let answer = Answer::of(verdict, &view.labels);
-            let style = if answer.is_weak {
-                self.look.aside()
-            } else if index == 0 && link == Link::Live {
-                self.look.strong()
-            } else {
-                Style::new()
-            };
-            let old = age(self.now.saturating_sub(*at));
-            let line = verdict_line(verdict, &answer.text, &old, usize::from(row.width));
-            self.text(row, &line, style);
-        }
-    }
-
-    fn keys(&mut self, row: Option<Rect>, view: &View) {
-        let Some(row) = row else { return };
-        if let Some(text) = &view.entry {
-            let ask = "pressing (a level, a name, or both; Enter): ";
-            let rest = self.text(row, ask, self.look.heading());
-            self.text(rest, &format!("{text}_"), self.look.strong());
-            return;
-        }
-        if let Some(said) = &view.said {
-            self.text(row, said, self.look.strong());
-            return;
-        }
-        let line = if view.sensors.len() > 1 {
-            "q quit   p what you press   Tab or 1-9 another sensor   Ctrl-L draw again"
-        } else {
-            "q quit   p what you press   Ctrl-L draw again"
-        };
-        let rest = self.text(row, line, self.look.aside());
-        // Show the daemon's address if there is room for it.
-        let columns = view.address.chars().count();
-        if let Some(indent) = usize::from(rest.width).checked_sub(columns + 3) {
-            let address = format!("{:indent$}   {}", "", view.address);
-            self.text(rest, &address, self.look.aside());
-        }
-    }
-}
-
-/// A text as lines of at most `width` columns, where its words allow it.
-fn lines(text: &str, width: usize) -> Vec<String> {
-    let mut lines = vec![String::new()];
-    let columns = |text: &str| text.chars().count();
-    for word in text.split(' ') {
-        let line = lines.last_mut().expect("there is a first line");
-        if line.is_empty() {
-            *line = word.to_owned();
-        } else if columns(line) + 1 + columns(word) <= width {
-            *line += &format!(" {word}");
-        } else {
-            lines.push(word.to_owned());
-        }
-    }
-    lines
-}
+/// The symbols of a cell that is filled by 0 to 8 eighths.
+const BLOCKS: [char; 9] = [
+    ' ', '\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}',
+    '\u{2588}',
+];
 
 /// The reasons that mean that the device was unplugged. `page.html` repeats them and the words for
 /// them, and a test compares the two.
@@ -364,9 +54,398 @@ pub(super) const UNPLUGGED: [&str; 4] = [
 ];
 pub(super) const UNPLUGGED_WORDS: &str = "unplugged: plug it in again";
 
-/// Whether this reason means that the device was unplugged.
-fn is_unplugged(reason: &str) -> bool {
-    UNPLUGGED.iter().any(|gone| reason.contains(gone))
+/// The abilities of the terminal, and the styles that follow from them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Look {
+    /// Whether the terminal has 256 colours.
+    pub(super) colours: bool,
+}
+
+impl Look {
+    /// Derives the abilities from the values of `TERM` and `NO_COLOR` (<https://no-color.org>).
+    pub(super) fn new(term: &str, no_color: &str) -> Self {
+        let is_plain = ["", "dumb", "unknown"].contains(&term);
+        let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
+        Self {
+            colours: !is_plain && !is_old && no_color.is_empty(),
+        }
+    }
+
+    fn colour(self, colour: u8, without: Modifier) -> Style {
+        match self.colours {
+            true => Style::new().fg(Color::Indexed(colour)),
+            false => Style::new().add_modifier(without),
+        }
+    }
+
+    fn heading(self) -> Style {
+        self.colour(75, Modifier::BOLD)
+    }
+
+    fn aside(self) -> Style {
+        self.colour(245, Modifier::empty())
+    }
+
+    fn strong(self) -> Style {
+        Style::new().add_modifier(Modifier::BOLD)
+    }
+
+    /// The style of the word for a link. Other states must not look like live.
+    fn link(self, link: Link) -> Style {
+        let (fg, bg) = match link {
+            Link::Live => (16, 40),
+            Link::Connecting => (16, 75),
+            Link::NoZero | Link::Stale | Link::Silent => (16, 214),
+            Link::Lost | Link::NoDaemon => (231, 160),
+        };
+        match (self.colours, link) {
+            (true, _) => self.strong().fg(Color::Indexed(fg)).bg(Color::Indexed(bg)),
+            (false, Link::Live) => self.strong(),
+            (false, _) => self.strong().add_modifier(Modifier::REVERSED),
+        }
+    }
+}
+
+/// Draws as much as there is room for.
+pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
+    let area = frame.area();
+    let width = usize::from(area.width);
+    let sensor = view.sensor();
+    let (link, reason) = view.link(sensor, now);
+    let mut head = vec![title(view, look)];
+    if view.sensors.len() > 1 {
+        head.push(tabs(view, now, width, look));
+    }
+    let line = link_line(sensor, link, reason.as_deref(), now);
+    head.extend(wrapped(&line, width, look.link(link)));
+    // The keys have the last row.
+    head.truncate(usize::from(area.height).saturating_sub(1).max(1));
+    let [top, body, foot] = Layout::vertical([
+        Constraint::Length(head.len() as u16),
+        Constraint::Fill(1),
+        Constraint::Length(1),
+    ])
+    .areas(area);
+    frame.render_widget(Text::from(head), top);
+    frame.render_widget(keys(view, look), foot);
+    let Some(sensor) = sensor else { return };
+    let mut right = body;
+    if body.width > NARROW && body.height > 10 {
+        let (cols, rows) = map_size(sensor, body.width / 2, body.height - 5);
+        let wide = Constraint::Length(cols.max(LEFT) + GAP);
+        let [left, rest] = Layout::horizontal([wide, Constraint::Fill(1)]).areas(body);
+        right = rest;
+        let [scale, map, counts] = Layout::vertical([
+            Constraint::Length(1),
+            Constraint::Length(rows),
+            Constraint::Fill(1),
+        ])
+        .areas(left);
+        let top_n = highest_n(sensor).max(LEAST_SCALE_N);
+        let scale_line = format!("0 to {top_n:.2} N a taxel");
+        let heading = [
+            span("pressure ", look.heading()),
+            span(&scale_line, look.aside()),
+        ];
+        frame.render_widget(Line::from_iter(heading), scale);
+        let map = Rect { width: cols, ..map };
+        draw_map(frame.buffer_mut(), map, sensor, top_n, link, look);
+        if link != Link::Live {
+            let word = span(&format!(" {} ", link.name()), look.link(link));
+            frame.render_widget(Line::from(word).centered(), map);
+        }
+        frame.render_widget(counters(sensor, look), counts);
+    }
+    let width = usize::from(right.width);
+    let mut lines = vec![press_line(sensor, link, now, look)];
+    if let Some(line) = sensor.score.line(&view.labels) {
+        lines.extend(wrapped(&format!("pressing {line}"), width, Style::new()));
+    }
+    lines.push(force_line(sensor, link, look));
+    let height = (right.height / 4).clamp(1, 10);
+    lines.extend(curve(sensor, now, width, usize::from(height), look));
+    lines.extend(verdicts(view, sensor, link, now, width, look));
+    frame.render_widget(Text::from(lines), right);
+}
+
+/// A text without hidden characters: a reason comes from the system and a label from a model file, and
+/// neither may move the cursor.
+fn span(text: &str, style: Style) -> Span<'static> {
+    let plain: String = text.chars().filter(|&c| !wording::is_hidden(c)).collect();
+    Span::styled(plain, style)
+}
+
+/// A text as lines of at most `width` columns, where its words allow it, with a blank column on each side.
+fn wrapped(text: &str, width: usize, style: Style) -> Vec<Line<'static>> {
+    let mut lines = vec![String::new()];
+    let columns = |text: &str| text.chars().count();
+    for word in text.split(' ') {
+        let line = lines.last_mut().expect("there is a first line");
+        if columns(line) + 1 + columns(word) < width || line.is_empty() {
+            *line += &format!(" {word}");
+        } else {
+            lines.push(format!(" {word}"));
+        }
+    }
+    let line = |line: String| Line::from(span(&line, style)).style(style);
+    lines.into_iter().map(line).collect()
+}
+
+fn title(view: &View, look: Look) -> Line<'static> {
+    let (hello, model) = (&view.hello, &view.hello["model"]);
+    if hello.is_null() {
+        return span("hardnessd", look.strong()).into();
+    }
+    let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
+    // Several sensors have tabs.
+    let sensor = match &view.sensors[..] {
+        [only] => format!(" · {}", only.name),
+        _ => String::new(),
+    };
+    let line = format!(
+        "{sensor} · hardnessd {} · model {} ({}): {}",
+        text(hello, "version"),
+        text(model, "name"),
+        text(model, "validation"),
+        text(model, "needs")
+    );
+    let robot = span(&text(hello, "robot"), look.strong());
+    Line::from_iter([robot, span(&line, look.aside())])
+}
+
+/// All sensors with their links. The chosen one is visible.
+fn tabs(view: &View, now: Duration, width: usize, look: Look) -> Line<'static> {
+    let tab = |(index, sensor): (usize, &Sensor)| {
+        let (link, _) = view.link(Some(sensor), now);
+        let is_chosen = index == view.chosen;
+        let style = match (is_chosen, link) {
+            (true, _) => look.strong(),
+            (false, Link::Live) => look.aside(),
+            (false, _) => look.link(link),
+        };
+        let mark = if is_chosen { '>' } else { ' ' };
+        let text = format!("{mark}{} {} {}  ", index + 1, sensor.name, link.name());
+        span(&text, style)
+    };
+    let mut tabs: Vec<Span> = view.sensors.iter().enumerate().map(tab).collect();
+    let columns = |tabs: &[Span]| tabs.iter().map(Span::width).sum::<usize>();
+    let mut first = 0;
+    while first < view.chosen && columns(&tabs[first..=view.chosen]) > width {
+        first += 1;
+    }
+    tabs.split_off(first).into()
+}
+
+/// The state of the link, the age of the last frame, and the frame rate.
+fn link_line(sensor: Option<&Sensor>, link: Link, reason: Option<&str>, now: Duration) -> String {
+    let mut line = format!("{} ", link.name());
+    let is_unplugged = |reason: &str| UNPLUGGED.iter().any(|gone| reason.contains(gone));
+    if link == Link::Lost && reason.is_some_and(is_unplugged) {
+        line += &format!(" {UNPLUGGED_WORDS};");
+    }
+    if let Some(frame) = sensor.and_then(|sensor| sensor.frame.as_ref()) {
+        let old = age(now.saturating_sub(frame.at));
+        line += &match link {
+            Link::Live | Link::NoZero => format!(" frame {old} old"),
+            _ => format!(" last frame {old} ago"),
+        };
+    }
+    let rate_hz = sensor.and_then(|sensor| sensor.status["frame_rate_hz"].as_f64());
+    if let (Link::Live, Some(rate_hz)) = (link, rate_hz) {
+        line += &format!(" · {rate_hz:.1} frames/s");
+    }
+    if let Some(reason) = reason {
+        line += &format!("  ({reason})");
+    }
+    line
+}
+
+/// The columns and rows of the largest pressure map that fits. A taxel takes half as many rows as columns,
+/// because a cell is twice as high as it is wide.
+fn map_size(sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
+    let places = (usize::from(width), 2 * usize::from(height));
+    let scale = (places.0 / sensor.cols).min(places.1 / sensor.rows);
+    let (cols, halves) = match scale {
+        // Several taxels share a place.
+        0 => {
+            let taxels = sensor
+                .cols
+                .div_ceil(places.0)
+                .max(sensor.rows.div_ceil(places.1));
+            (sensor.cols.div_ceil(taxels), sensor.rows.div_ceil(taxels))
+        }
+        _ => (scale * sensor.cols, scale * sensor.rows),
+    };
+    (cols as u16, halves.div_ceil(2) as u16)
+}
+
+/// The greatest force on a taxel in the last frame, in newtons.
+fn highest_n(sensor: &Sensor) -> f32 {
+    let newtons = sensor.frame.iter().flat_map(|frame| &frame.newtons);
+    newtons.copied().fold(0.0, f32::max)
+}
+
+/// The pressure map: in colours, in greys if it is no longer current, or in characters.
+fn draw_map(buffer: &mut Buffer, area: Rect, sensor: &Sensor, top_n: f32, link: Link, look: Look) {
+    let Some(frame) = &sensor.frame else { return };
+    let (rows, cols) = (sensor.rows, sensor.cols);
+    let array = Array { rows, cols };
+    let (wide, high) = (usize::from(area.width), 2 * usize::from(area.height));
+    // The taxels of a place: a part of one, or several.
+    let taxels = |place: usize, places: usize, taxels: usize| {
+        place * taxels / places..((place + 1) * taxels).div_ceil(places)
+    };
+    // The greatest of the taxels that share a place, so that no touch vanishes. The square root
+    // keeps a soft touch visible beside a hard one.
+    let shade = |x: usize, y: usize| {
+        let row_newtons = |row: usize| {
+            let of_row = taxels(x, wide, cols).map(move |col| array.place(row, col));
+            of_row.map(|place| frame.newtons[place])
+        };
+        let most = taxels(y, high, rows)
+            .flat_map(row_newtons)
+            .fold(0.0, f32::max);
+        (most / top_n).min(1.0).sqrt()
+    };
+    let step = |share: f32, steps: usize| ((share * steps as f32) as usize).min(steps - 1);
+    let colour = |share: f32| match link {
+        Link::Live => indexed(viridis(share)),
+        _ => Color::Indexed(GREY[step(share, GREY.len())]),
+    };
+    for (x, y) in (0..area.height).flat_map(|y| (0..area.width).map(move |x| (x, y))) {
+        let half = |half: usize| shade(usize::from(x), 2 * usize::from(y) + half);
+        let (upper, lower) = (half(0), half(1));
+        let cell = &mut buffer[(area.x + x, area.y + y)];
+        if look.colours {
+            cell.set_char('\u{2580}').set_fg(colour(upper));
+            cell.set_bg(colour(lower));
+        } else {
+            let step = step(upper.max(lower), CHARACTERS.len());
+            cell.set_char(char::from(CHARACTERS[step]));
+        }
+    }
+}
+
+/// The nearest of xterm's 256 colours. 216 of them are a cube with the levels 0, 95, 135, 175, 215
+/// and 255 of red, green and blue.
+fn indexed(colour: [u8; 3]) -> Color {
+    let level = |value: u8| match value {
+        0..48 => 0,
+        48..115 => 1,
+        _ => (value - 35) / 40,
+    };
+    let [red, green, blue] = colour.map(level);
+    Color::Indexed(16 + 36 * red + 6 * green + blue)
+}
+
+fn counters(sensor: &Sensor, look: Look) -> Text<'static> {
+    let keys = [
+        "frames",
+        "frames_damaged",
+        "frames_dropped",
+        "bytes_skipped",
+    ];
+    let line = |key: &str| {
+        let count = number(&sensor.status, key);
+        // A count of damage stands out if it is not 0.
+        let style = match key == "frames" || count == 0 {
+            true => look.aside(),
+            false => look.colour(214, Modifier::BOLD),
+        };
+        let name = key.replace('_', " ");
+        Line::from(span(&format!("{name:<14} {count:>14}"), style))
+    };
+    let counts = keys.into_iter().filter(|_| !sensor.status.is_null());
+    counts.map(line).collect()
+}
+
+fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'static> {
+    let heading = span("press ", look.heading());
+    let Some((at, press)) = &sensor.press else {
+        return Line::from_iter([heading, span("none yet", look.aside())]);
+    };
+    let (old, number) = (age(now.saturating_sub(*at)), number(press, "press"));
+    let (mut line, style) = match (press["state"].as_str().unwrap_or_default(), link) {
+        ("begin", Link::Live) => (format!("{number} in contact for {old}"), look.strong()),
+        ("begin", _) => {
+            let unknown = format!("{number} began {old} ago, its end is not known");
+            (unknown, Style::new())
+        }
+        (state, _) => (format!("{number} {state} {old} ago"), Style::new()),
+    };
+    if let Some(reason) = press["reason"].as_str() {
+        line += &format!(" ({reason})");
+    }
+    Line::from_iter([heading, span(&line, style)])
+}
+
+/// The present force and contact area.
+fn force_line(sensor: &Sensor, link: Link, look: Look) -> Line<'static> {
+    let value = match (&sensor.frame, link) {
+        (Some(frame), Link::Live) => {
+            // A small negative sum is noise.
+            let force_n = frame.force_n.unwrap_or(0.0).max(0.0);
+            let taxels = frame.contact_area_taxels;
+            let present = format!("{force_n:.2} N on {taxels} taxels");
+            span(&present, look.strong())
+        }
+        _ => span("not known", look.aside()),
+    };
+    Line::from_iter([span("force ", look.heading()), value])
+}
+
+/// The force of the last 30 s, as bars, and its scale.
+fn curve(
+    sensor: &Sensor,
+    now: Duration,
+    width: usize,
+    height: usize,
+    look: Look,
+) -> Vec<Line<'static>> {
+    let curve = sensor.curve(now, width);
+    let most = curve.iter().flatten().copied().fold(0.0, f32::max);
+    let symbol = |force_n: &Option<f32>, below: usize| match force_n {
+        // If nothing was ever pressed, the share is NaN, and the cast makes it 0.
+        Some(force_n) => {
+            let eighths = (force_n / most * 8.0 * height as f32) as usize;
+            BLOCKS[eighths.saturating_sub(8 * below).min(8)]
+        }
+        None => '\u{b7}',
+    };
+    let row = |below: usize| -> String { curve.iter().map(|one| symbol(one, below)).collect() };
+    let rows = (0..height).rev().map(row);
+    let mut lines: Vec<Line> = rows.map(|row| span(&row, look.heading()).into()).collect();
+    let scale = format!("{} s, to {most:.0} N", WINDOW.as_secs());
+    lines.push(span(&scale, look.aside()).into());
+    lines
+}
+
+fn verdicts(
+    view: &View,
+    sensor: &Sensor,
+    link: Link,
+    now: Duration,
+    width: usize,
+    look: Look,
+) -> Vec<Line<'static>> {
+    let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
+    let heading = [span("verdicts ", look.heading()), span(&of, look.aside())];
+    let mut lines = vec![Line::from_iter(heading)];
+    if sensor.verdicts.is_empty() {
+        lines.push(span("none yet", look.aside()).into());
+    }
+    for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
+        let answer = Answer::of(verdict, &view.labels);
+        let style = match answer.is_weak {
+            true => look.aside(),
+            false if index == 0 && link == Link::Live => look.strong(),
+            false => Style::new(),
+        };
+        let old = age(now.saturating_sub(*at));
+        let line = verdict_line(verdict, &answer.text, &old, width);
+        lines.push(span(&line, style).into());
+    }
+    lines
 }
 
 /// Press, answer with its Shore hardness, and age. What else is known follows as far as there is room.
@@ -391,4 +470,22 @@ fn verdict_line(verdict: &Value, answer: &str, old: &str, width: usize) -> Strin
         line += &more;
     }
     line
+}
+
+/// The keys, what a person types, or the outcome of the last command.
+fn keys(view: &View, look: Look) -> Line<'static> {
+    if let Some(text) = &view.entry {
+        let ask = "pressing (a level, a name, or both; Enter): ";
+        let typed = span(&format!("{text}_"), look.strong());
+        return Line::from_iter([span(ask, look.heading()), typed]);
+    }
+    if let Some(said) = &view.said {
+        return span(said, look.strong()).into();
+    }
+    let more = match view.sensors.len() {
+        0 | 1 => "",
+        _ => "Tab or 1-9 another sensor   ",
+    };
+    let line = format!("q quit   p what you press   {more}Ctrl-L draw again");
+    span(&line, look.aside()).into()
 }

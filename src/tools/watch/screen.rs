@@ -18,7 +18,7 @@ use ratatui_core::layout::Rect;
 use ratatui_core::terminal::{Frame, Terminal, TerminalOptions, Viewport};
 use ratatui_crossterm::CrosstermBackend;
 use ratatui_crossterm::crossterm::cursor::{Hide, MoveTo, Show};
-use ratatui_crossterm::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyModifiers};
+use ratatui_crossterm::crossterm::event::{self, Event, KeyEvent};
 use ratatui_crossterm::crossterm::execute;
 use ratatui_crossterm::crossterm::style::{Attribute, SetAttribute};
 use ratatui_crossterm::crossterm::terminal::{
@@ -26,7 +26,6 @@ use ratatui_crossterm::crossterm::terminal::{
 };
 use tokio::sync::mpsc;
 
-use super::view::Key;
 use crate::maybe;
 
 /// How long the terminal may take for the last bytes.
@@ -150,13 +149,13 @@ fn area() -> Rect {
 }
 
 /// Sends keys as they are pressed, until the input ends.
-pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
+pub(super) fn keys() -> io::Result<mpsc::Receiver<KeyEvent>> {
     let (sender, keys) = mpsc::channel(16);
     std::thread::Builder::new()
         .name("keys".to_owned())
         .spawn(move || {
             while let Ok(event) = event::read() {
-                if let Some(key) = key(&event)
+                if let Event::Key(key) = event
                     && sender.blocking_send(key).is_err()
                 {
                     return;
@@ -164,28 +163,4 @@ pub(super) fn keys() -> io::Result<mpsc::Receiver<Key>> {
             }
         })?;
     Ok(keys)
-}
-
-/// The key of an event, if `watch` knows it.
-fn key(event: &Event) -> Option<Key> {
-    let &Event::Key(KeyEvent {
-        code, modifiers, ..
-    }) = event
-    else {
-        return None;
-    };
-    let is_control = modifiers == KeyModifiers::CONTROL;
-    match code {
-        // In raw mode Ctrl-C sends no signal.
-        KeyCode::Char('c') if is_control => Some(Key::Quit),
-        KeyCode::Char('l') if is_control => Some(Key::Redraw),
-        _ if modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) => None,
-        KeyCode::Char(char) => Some(Key::Char(char)),
-        KeyCode::Enter => Some(Key::Enter),
-        KeyCode::Backspace => Some(Key::Backspace),
-        KeyCode::Esc => Some(Key::Escape),
-        KeyCode::Tab | KeyCode::Right | KeyCode::Down => Some(Key::Next),
-        KeyCode::BackTab | KeyCode::Left | KeyCode::Up => Some(Key::Previous),
-        _ => None,
-    }
 }

@@ -1,28 +1,31 @@
-//! The state of each sensor and its age. In: lines of the daemon. Out: answers for a moment.
+//! The state of each sensor and its age. In: events of the daemon, and keys. Out: answers for a moment.
 //!
 //! A moment is a [`Duration`] on CLOCK_MONOTONIC. The moment of an event is when it happened, not
 //! when it was read, so time in a queue counts as age. Nothing here has a clock or does I/O.
 
-mod sensor;
-
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use jiff::SignedDuration;
-use serde_json::{Value, json};
+use ratatui_crossterm::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use serde_json::Value;
 
-pub(super) use self::sensor::{Frame, Load, Sensor, WINDOW};
 use crate::tools::answer::{items, labels};
-use crate::tools::connect::WEB_SERVER;
-use crate::tools::score::Truth;
-use hardnessd_core::event::PROTOCOL;
-use hardnessd_core::frame::Stamp;
-
-/// The time between two requests for the totals. Without a request, the daemon sends them only when
-/// the state changes.
-pub(super) const QUESTION: Duration = Duration::from_secs(1);
+use crate::tools::readable::number;
+use crate::tools::score::{Score, Truth};
+use hardnessd_core::frame::{MOST_SIDE, Stamp};
 
 /// After three questions without an answer, the daemon counts as dead.
 const SILENCE: Duration = Duration::from_secs(3);
+
+/// How far back the curve of the force goes.
+pub(super) const WINDOW: Duration = Duration::from_secs(30);
+
+/// The number of verdicts kept for a sensor: more than a tall terminal shows.
+const VERDICTS: usize = 100;
+
+/// The longest text that a person may type.
+const ENTRY_CHARS: usize = 60;
 
 /// Everything that `watch` shows.
 #[derive(Debug)]
@@ -34,39 +37,19 @@ pub(super) struct View {
     pub(super) sensors: Vec<Sensor>,
     /// Index of the sensor that is shown.
     pub(super) chosen: usize,
-    /// Address of the last connection.
-    pub(super) address: String,
     /// What a person types, while they do.
     pub(super) entry: Option<String>,
     /// The outcome of the last command, until the next key.
     pub(super) said: Option<String>,
-    daemon: Daemon,
-    /// The moment of the daemon's last line, or of the connection.
+    /// Why there is no daemon. `None` while there is one.
+    absence: Option<String>,
+    /// The moment of the daemon's last line.
     last_line: Duration,
-    clock: Clock,
+    /// Whether the daemon is on another machine, whose clock may be wrong.
+    is_remote: bool,
     /// How far the daemon's clock is behind this machine's. Frames show it, because they are sent
     /// at once.
     behind: Option<SignedDuration>,
-}
-
-/// The clock that the daemon's times come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Clock {
-    /// The clock of this machine.
-    Ours,
-    /// The clock of another machine, which may be wrong.
-    Theirs,
-}
-
-/// Whether there is a daemon.
-#[derive(Debug, PartialEq, Eq)]
-enum Daemon {
-    /// There is no daemon, for this reason.
-    Absent(String),
-    /// Something has accepted the connection, but has not sent `hello` yet. The field is the reason
-    /// why there was no daemon before.
-    Unknown(String),
-    Met,
 }
 
 /// The state of a link. The values of a sensor are current only if it is `Live`.
@@ -97,20 +80,6 @@ impl Link {
     }
 }
 
-/// A key.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Key {
-    /// Ctrl-C, also while a person types.
-    Quit,
-    Redraw,
-    Next,
-    Previous,
-    Enter,
-    Backspace,
-    Escape,
-    Char(char),
-}
-
 /// What a key asks for that the view cannot do.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Order {
@@ -120,16 +89,36 @@ pub(super) enum Order {
     Context(Value),
 }
 
-/// The longest text that a person may type.
-const ENTRY_CHARS: usize = 60;
+/// One sensor.
+#[derive(Debug, Default)]
+pub(super) struct Sensor {
+    pub(super) name: String,
+    pub(super) rows: usize,
+    pub(super) cols: usize,
+    /// The last status. Null before the first one.
+    pub(super) status: Value,
+    pub(super) frame: Option<Frame>,
+    /// The forces of the last frames and their moments, in newtons.
+    forces: VecDeque<(Duration, f32)>,
+    /// The last event of a press, and its moment.
+    pub(super) press: Option<(Duration, Value)>,
+    /// The verdicts and their moments, the newest first.
+    pub(super) verdicts: VecDeque<(Duration, Value)>,
+    /// What is being pressed, and how many verdicts are right.
+    pub(super) score: Score,
+    /// The context of the last press.
+    context: Value,
+}
 
-/// The way in which a daemon was lost.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Loss {
-    /// The connection broke, for this reason.
-    Broken(String),
-    /// The daemon cannot be reached, for this reason.
-    Unreachable(String),
+/// The last frame.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Frame {
+    pub(super) at: Duration,
+    /// `[rows, cols]`, newtons a taxel.
+    pub(super) newtons: Vec<f32>,
+    /// `None` until the sensor has a zero.
+    pub(super) force_n: Option<f32>,
+    pub(super) contact_area_taxels: u64,
 }
 
 impl View {
@@ -140,52 +129,46 @@ impl View {
             labels: Vec::new(),
             sensors: Vec::new(),
             chosen: 0,
-            address: String::new(),
             entry: None,
             said: None,
-            daemon: Daemon::Absent("connecting".to_owned()),
+            absence: Some("connecting".to_owned()),
             last_line: Duration::ZERO,
-            clock: Clock::Ours,
+            is_remote: false,
             behind: None,
         }
     }
 
-    /// Takes in a line of the daemon, read at `now`. Ignores an unknown line. The caller must send
-    /// the returned request to the daemon.
-    pub(super) fn take_line(&mut self, line: &str, now: Stamp) -> Option<String> {
-        if line.starts_with("HTTP/") {
-            self.daemon = Daemon::Absent(WEB_SERVER.to_owned());
-            return None;
-        }
-        let event = serde_json::from_str::<Value>(line).ok()?;
+    /// Takes in a `hello`, read at `now`, and begins anew.
+    pub(super) fn meet(&mut self, hello: Value, is_remote: bool, now: Duration) {
+        let chosen = self.sensor().map(|one| one.name.clone());
+        self.sensors = items(&hello, "sensors").map(Sensor::new).collect();
+        let is_chosen = |one: &Sensor| Some(&one.name) == chosen.as_ref();
+        self.chosen = self.sensors.iter().position(is_chosen).unwrap_or(0);
+        self.labels = labels(&hello);
+        self.hello = hello;
+        self.absence = None;
+        self.last_line = now;
+        (self.is_remote, self.behind) = (is_remote, None);
+    }
+
+    /// Takes in an event of the daemon, read at `now`.
+    pub(super) fn take(&mut self, event: Value, now: Stamp) {
         self.last_line = now.mono;
-        let kind = event["type"].as_str().unwrap_or_default();
-        match kind {
-            "hello" => return self.meet(event),
-            // Before a `hello`, an error means that the daemon has no room.
-            "error" if self.daemon != Daemon::Met => {
-                let reason = event["message"].as_str().unwrap_or_default();
-                self.daemon = Daemon::Absent(reason.to_owned());
-            }
-            _ => {
-                let at = self.moment(&event, kind, now);
-                let mut sensors = self.sensors.iter_mut();
-                if let Some(sensor) = sensors.find(|one| event["sensor"] == *one.name) {
-                    sensor.take_event(event, at);
-                }
-            }
+        let at = self.moment(&event, now);
+        let mut sensors = self.sensors.iter_mut();
+        if let Some(sensor) = sensors.find(|one| event["sensor"] == *one.name) {
+            sensor.take(event, at);
         }
-        None
     }
 
     /// The moment of an event. A daemon on another machine has another clock. The frame with the
     /// shortest delay shows how far that clock is behind.
-    fn moment(&mut self, event: &Value, kind: &str, now: Stamp) -> Duration {
+    fn moment(&mut self, event: &Value, now: Stamp) -> Duration {
         let time = event["time"].as_str().and_then(|time| time.parse().ok());
         let Some(past) = time.map(|time: jiff::Timestamp| now.wall.duration_since(time)) else {
             return now.mono;
         };
-        if self.clock == Clock::Theirs && kind == "frame" {
+        if self.is_remote && event["type"] == "frame" {
             self.behind = Some(self.behind.map_or(past, |behind| behind.min(past)));
         }
         let past = past - self.behind.unwrap_or_default();
@@ -193,73 +176,57 @@ impl View {
             .saturating_sub(Duration::try_from(past).unwrap_or_default())
     }
 
-    /// Takes in that something at `address` has accepted the connection at `now`. It has as long to
-    /// send `hello` as a daemon has to answer.
-    pub(super) fn wait(&mut self, address: String, clock: Clock, now: Duration) {
-        self.last_line = now;
-        self.address = address;
-        (self.clock, self.behind) = (clock, None);
-        self.daemon = Daemon::Unknown(self.absence().to_owned());
-    }
-
-    /// Takes in a `hello`, and begins anew. Returns the request for all events of this run that the
-    /// daemon still holds, and those that come.
-    fn meet(&mut self, hello: Value) -> Option<String> {
-        let protocol = &hello["protocol"];
-        if *protocol != PROTOCOL {
-            let reason = format!("found protocol {protocol}, expected {PROTOCOL}");
-            self.daemon = Daemon::Absent(reason);
-            return None;
-        }
-        let chosen = self.sensor().map(|one| one.name.clone());
-        self.sensors = items(&hello, "sensors").map(Sensor::new).collect();
-        let is_chosen = |one: &Sensor| Some(&one.name) == chosen.as_ref();
-        self.chosen = self.sensors.iter().position(is_chosen).unwrap_or(0);
-        self.labels = labels(&hello);
-        self.daemon = Daemon::Met;
-        let types = ["hardness", "press", "status", "frame"];
-        let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
-        self.hello = hello;
-        Some(json!({"subscribe": types, "since": since}).to_string())
-    }
-
-    /// Takes in that the daemon has gone or cannot be reached.
-    pub(super) fn lose(&mut self, loss: Loss) {
-        match loss {
-            Loss::Unreachable(reason) => self.daemon = Daemon::Absent(reason),
-            // The daemon's `error` or its protocol gave the reason already.
-            Loss::Broken(_) if matches!(self.daemon, Daemon::Absent(_)) => {}
-            Loss::Broken(reason) => self.daemon = Daemon::Absent(reason),
-        }
+    /// Takes in why there is no daemon.
+    pub(super) fn lose(&mut self, reason: String) {
+        self.absence = Some(reason);
     }
 
     /// Takes in a key. The caller must carry out the order.
-    pub(super) fn press(&mut self, key: Key) -> Option<Order> {
+    pub(super) fn press(&mut self, key: KeyEvent) -> Option<Order> {
+        // In raw mode Ctrl-C sends no signal.
+        if key.modifiers == KeyModifiers::CONTROL {
+            return match key.code {
+                KeyCode::Char('c') => Some(Order::Quit),
+                KeyCode::Char('l') => Some(Order::Redraw),
+                _ => None,
+            };
+        }
         self.said = None;
-        let count = self.sensors.len().max(1);
-        match (&mut self.entry, key) {
-            (_, Key::Quit) | (None, Key::Char('q' | 'Q')) => return Some(Order::Quit),
-            (_, Key::Redraw) => return Some(Order::Redraw),
-            (Some(text), Key::Char(char)) if text.chars().count() < ENTRY_CHARS => text.push(char),
-            (Some(text), Key::Backspace) => drop(text.pop()),
-            (Some(_), Key::Escape) => self.entry = None,
-            (Some(_), Key::Enter) => {
+        let Some(text) = &mut self.entry else {
+            return self.choose(key.code);
+        };
+        match key.code {
+            KeyCode::Char(char) if text.chars().count() < ENTRY_CHARS => text.push(char),
+            KeyCode::Backspace => drop(text.pop()),
+            KeyCode::Esc => self.entry = None,
+            KeyCode::Enter => {
                 let text = self.entry.take().unwrap_or_default();
                 return self.pressing(&text);
             }
-            (Some(_), _) => {}
-            (None, Key::Char('p' | 'P')) => {
-                self.entry = Some(String::new());
-            }
-            (None, Key::Char(digit @ '1'..='9')) => {
+            _ => {}
+        }
+        None
+    }
+
+    /// Takes in a key while nobody types a text.
+    fn choose(&mut self, key: KeyCode) -> Option<Order> {
+        let count = self.sensors.len().max(1);
+        match key {
+            KeyCode::Char('q' | 'Q') => return Some(Order::Quit),
+            KeyCode::Char('p' | 'P') => self.entry = Some(String::new()),
+            KeyCode::Char(digit @ '1'..='9') => {
                 let index = digit as usize - '1' as usize;
                 if index < count {
                     self.chosen = index;
                 }
             }
-            (None, Key::Next) => self.chosen = (self.chosen + 1) % count,
-            (None, Key::Previous) => self.chosen = (self.chosen + count - 1) % count,
-            (None, _) => {}
+            KeyCode::Tab | KeyCode::Right | KeyCode::Down => {
+                self.chosen = (self.chosen + 1) % count
+            }
+            KeyCode::BackTab | KeyCode::Left | KeyCode::Up => {
+                self.chosen = (self.chosen + count - 1) % count;
+            }
+            _ => {}
         }
         None
     }
@@ -269,9 +236,8 @@ impl View {
         let truth = Truth::read(text, &self.labels);
         let sensor = self.sensors.get_mut(self.chosen)?;
         sensor.score.begin(truth.clone());
-        let context = truth.within(&sensor.context, &sensor.name);
-        sensor.context = context.clone();
-        Some(Order::Context(context))
+        sensor.context = truth.within(&sensor.context, &sensor.name);
+        Some(Order::Context(sensor.context.clone()))
     }
 
     /// The sensor that is shown.
@@ -279,11 +245,21 @@ impl View {
         self.sensors.get(self.chosen)
     }
 
-    /// The state of a sensor, with its reason.
-    pub(super) fn link(&self, sensor: &Sensor, now: Duration) -> (Link, Option<String>) {
-        if let Some((link, reason)) = self.trouble(now) {
-            return (link, Some(reason));
+    /// The state of a sensor, with its reason. That of the daemon comes first.
+    pub(super) fn link(&self, sensor: Option<&Sensor>, now: Duration) -> (Link, Option<String>) {
+        if let Some(reason) = &self.absence {
+            return (Link::NoDaemon, Some(reason.clone()));
         }
+        let silence = now.saturating_sub(self.last_line);
+        if silence > SILENCE {
+            return (
+                Link::Silent,
+                Some(format!("no answer for {}", age(silence))),
+            );
+        }
+        let Some(sensor) = sensor else {
+            return (Link::Connecting, None);
+        };
         let has_zero = |frame: &Frame| frame.force_n.is_some();
         let text = |key: &str| sensor.status[key].as_str();
         let link = match text("state").unwrap_or_default() {
@@ -293,33 +269,73 @@ impl View {
             "lost" => Link::Lost,
             _ => Link::Connecting,
         };
-        let detail = text("detail").map(|detail| format!(": {detail}"));
-        let detail = detail.unwrap_or_default();
-        (
-            link,
-            text("reason").map(|reason| reason.to_owned() + &detail),
-        )
+        let reason = text("reason").map(|reason| match text("detail") {
+            Some(detail) => format!("{reason}: {detail}"),
+            None => reason.to_owned(),
+        });
+        (link, reason)
+    }
+}
+
+impl Sensor {
+    fn new(card: &Value) -> Self {
+        let size = |key| (number(card, key) as usize).clamp(1, MOST_SIDE);
+        Self {
+            name: card["name"].as_str().unwrap_or_default().to_owned(),
+            rows: size("rows"),
+            cols: size("cols"),
+            ..Self::default()
+        }
     }
 
-    /// The state that holds for all sensors because of the daemon, with its reason.
-    pub(super) fn trouble(&self, now: Duration) -> Option<(Link, String)> {
-        let silence = now.saturating_sub(self.last_line);
-        match &self.daemon {
-            Daemon::Absent(reason) => Some((Link::NoDaemon, reason.clone())),
-            Daemon::Unknown(_) | Daemon::Met if silence > SILENCE => {
-                Some((Link::Silent, format!("no answer for {}", age(silence))))
+    /// Takes in an event.
+    fn take(&mut self, event: Value, at: Duration) {
+        match event["type"].as_str() {
+            Some("status") => self.status = event,
+            Some("press") => {
+                self.context = event["context"].clone();
+                self.press = Some((at, event));
             }
-            Daemon::Unknown(reason) => Some((Link::NoDaemon, reason.clone())),
-            Daemon::Met => None,
+            Some("hardness") => {
+                self.score.take(&event);
+                self.verdicts.push_front((at, event));
+                self.verdicts.truncate(VERDICTS);
+            }
+            Some("frame") => self.show(&event, at),
+            _ => {}
         }
     }
 
-    /// The reason why there is no daemon.
-    fn absence(&self) -> &str {
-        match &self.daemon {
-            Daemon::Absent(reason) | Daemon::Unknown(reason) => reason,
-            Daemon::Met => "",
+    fn show(&mut self, event: &Value, at: Duration) {
+        let newtons = items(event, "newtons").filter_map(Value::as_f64);
+        let newtons: Vec<f32> = newtons.map(|newtons| newtons as f32).collect();
+        if newtons.len() != self.rows * self.cols {
+            return;
         }
+        let force_n = event["force_n"].as_f64().map(|force_n| force_n as f32);
+        self.frame = Some(Frame {
+            at,
+            newtons,
+            force_n,
+            contact_area_taxels: number(event, "contact_area_taxels"),
+        });
+        self.forces
+            .retain(|(moment, _)| moment.saturating_add(WINDOW) >= at);
+        self.forces.extend(force_n.map(|force_n| (at, force_n)));
+    }
+
+    /// The greatest force in each of `spans` equal spans up to `now`. `None` where no frame came.
+    pub(super) fn curve(&self, now: Duration, spans: usize) -> Vec<Option<f32>> {
+        let span_s = WINDOW.as_secs_f64() / spans.max(1) as f64;
+        let mut curve: Vec<Option<f32>> = vec![None; spans];
+        for &(at, force_n) in &self.forces {
+            let before = (now.saturating_sub(at).as_secs_f64() / span_s) as usize;
+            if let Some(place) = spans.checked_sub(1 + before) {
+                let most = curve[place].map_or(force_n, |most| most.max(force_n));
+                curve[place] = Some(most);
+            }
+        }
+        curve
     }
 }
 
