@@ -15,6 +15,7 @@ pub mod exit;
 mod faults;
 pub mod identify;
 pub mod live;
+mod played;
 mod player;
 pub(crate) mod pty;
 pub mod record;

@@ -22,12 +22,10 @@ use super::live;
 use super::simulate::within;
 use crate::daemon::config::Setup;
 use hardnessd_core::exit::{FAILED, IO, USAGE};
-use hardnessd_core::frame::Array;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
-use hardnessd_core::tare::Gains;
 
 /// What `--help` says below the options.
 const MORE: &str = "\
@@ -41,8 +39,8 @@ const MORE: &str = "\
 #[command(after_long_help = MORE)]
 pub struct Args {
     /// arm: press something rigid a few times, while the robot sends the positions of its arm. force: put
-    /// known weights on the sensor, on a foot of at least three taxels. taxels: press something wide and soft at
-    /// many places, or the whole array evenly
+    /// known weights on the sensor, on a foot of at least three taxels. taxels: press a bag of air or water on the
+    /// whole array a few times
     what: What,
     #[expect(missing_docs, reason = "a comment would be taken for help")]
     #[command(flatten)]
@@ -53,7 +51,7 @@ pub struct Args {
     /// force: the weights, in newtons, in the order in which they are put on (1 kg is 9.81 N)
     #[arg(long, value_name = "N", num_args = 1.., required_if_eq("what", "force"), value_parser = newtons)]
     newtons: Vec<f64>,
-    /// arm, taxels: presses to make, 2 to 1000 [default: arm 5, taxels 200]
+    /// arm, taxels: presses to make, 2 to 1000 [default: arm 5, taxels 10]
     #[arg(long, value_name = "N", conflicts_with = "from", value_parser = clap::value_parser!(u64).range(2..=1000))]
     presses: Option<u64>,
     /// Take the presses from these recordings, and leave the sensor alone
@@ -84,7 +82,7 @@ const GAINS: &str = "gains.npy";
 
 /// The number of presses if `--presses` does not give it.
 const ARM_PRESSES: u64 = 5;
-const TAXEL_PRESSES: u64 = 200;
+const TAXEL_PRESSES: u64 = 10;
 
 impl Args {
     /// The number of presses to make.
@@ -119,7 +117,7 @@ pub async fn run(
         return Err(Failure::new(USAGE, unasked));
     }
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
-    // Test the output file now, before anybody presses two hundred times.
+    // Test the output file now, before anybody presses.
     let path = args.out.clone();
     let path = path.unwrap_or_else(|| config.with_file_name(GAINS));
     let out = match args.what {
@@ -128,32 +126,13 @@ pub async fn run(
     };
     let read = {
         let (sensor, hrn) = (sensor.clone(), setup.hrn.clone());
-        let with_track = matches!(args.what, What::Arm);
-        move |file, path: &Path| gather::presses(file, path, &sensor, hrn.clone(), with_track)
+        move |file, path: &Path| gather::presses(file, path, &sensor, &hrn)
     };
-    let presses: Vec<Press> = if args.from.is_empty() {
-        let print_next = |seen| print_next(&args, seen);
-        let wanted = args.wanted();
-        let made = live::record(setup, sensor.name(), wanted, print_next, shutdown).await?;
-        let Some(file) = made else {
-            return Ok(());
-        };
-        // Something else may have been pressed before the recording ended.
-        let presses = read(file, Path::new(live::RECORDED))?.into_iter();
-        presses.take(wanted as usize).collect()
-    } else {
-        let files = args.from.clone();
-        let work = move || {
-            let mut all = Vec::new();
-            for path in &files {
-                all.extend(read(super::open(path)?, path)?);
-            }
-            Ok(all)
-        };
-        match live::unless(shutdown, "calibrate", work).await? {
-            Some(presses) => presses,
-            None => return Ok(()),
-        }
+    let (name, wanted) = (sensor.name(), args.wanted());
+    let print_next = |seen| print_next(&args, seen);
+    let presses = live::gather(setup, name, wanted, &args.from, print_next, shutdown, read);
+    let Some(presses) = presses.await? else {
+        return Ok(());
     };
     let text = match out {
         None if matches!(args.what, What::Arm) => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
@@ -162,38 +141,6 @@ pub async fn run(
     };
     super::print_apart(text.into_bytes()).await?;
     Ok(())
-}
-
-/// The dead taxels of the sensor, and those that were dead in a recording: what these show is no
-/// measurement.
-fn dead_taxels(sensor: &Sensor, presses: &[Press]) -> Vec<[usize; 2]> {
-    let mut dead = sensor.calibration().dead_taxels.clone();
-    let described = presses.iter().filter_map(|press| press.described.as_ref());
-    for taxel in described.flat_map(|described| &described.sensor.calibration.dead_taxels) {
-        if !dead.contains(taxel) {
-            dead.push(*taxel);
-        }
-    }
-    dead
-}
-
-/// A press without the gains that were in force when it was recorded.
-fn plain(press: &Press) -> taxels::Plain {
-    let mut frames = press.frames.clone();
-    if let Some(described) = &press.described
-        && let Some(Gains::Taxels(rows)) = &described.sensor.calibration.gains
-    {
-        let array = Array {
-            rows: rows.len(),
-            cols: rows.first().map_or(0, Vec::len),
-        };
-        for frame in &mut frames {
-            for (place, gain) in (0..array.taxels()).zip(rows.iter().flatten()) {
-                frame[place] /= gain;
-            }
-        }
-    }
-    taxels::Plain { frames }
 }
 
 /// Says on stderr what to do next, after `seen` presses.
@@ -210,8 +157,7 @@ fn print_next(args: &Args, seen: u64) {
             "press something rigid {wanted} times, while the robot tells where its arm is"
         ),
         (What::Taxels, 0) => stderr_line!(
-            "press something wide and soft {wanted} times, each time at another place, up to the edges; or press \
-             the whole array evenly"
+            "lay a bag of air or water on the whole array, and press it through a plate {wanted} times"
         ),
         _ => stderr_line!("press {seen} of {wanted}"),
     }
@@ -312,39 +258,45 @@ fn of_taxels(
             found - presses.len()
         );
     }
-    let plain: Vec<taxels::Plain> = presses.iter().map(plain).collect();
-    let dead = dead_taxels(sensor, &presses);
     let array = sensor.layout().array();
-    let fit = taxels::Fit::of(&plain, array, &dead).exit(FAILED)?;
-    let bytes = npy::to_bytes(&fit.gains, array.rows, array.cols);
+    // Those of the sensor, and those that were dead in a recording.
+    let mut dead = sensor.calibration().dead_taxels.clone();
+    for press in &presses {
+        dead.extend(&press.calibration.dead_taxels);
+    }
+    dead.sort_unstable();
+    dead.dedup();
+    let mut is_dead = vec![false; array.taxels()];
+    for &[row, col] in &dead {
+        is_dead[array.place(row, col)] = true;
+    }
+    let plain = presses.iter().map(|press| press.without_gains());
+    let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead).exit(FAILED)?;
+    let gains: Vec<f32> = fit.gains.iter().map(|gain| gain.unwrap_or(1.0)).collect();
+    let bytes = npy::to_bytes(&gains, array.rows, array.cols);
     part.write(&bytes).of_file(path, IO)?;
 
-    let mut text = String::from("gains, in percent; . where fewer than two presses tell of it:\n");
-    let (mut least, mut most, mut counts) = (f32::INFINITY, 0.0_f32, Vec::new());
-    for (place, (&gain, &presses)) in fit.gains.iter().zip(&fit.presses).enumerate() {
-        if presses > 1 {
-            text += &format!(" {:3.0}", 100.0 * gain);
-            (least, most) = (gain.min(least), gain.max(most));
-            counts.push(presses);
-        } else {
-            text += "   .";
-        }
-        if (place + 1).is_multiple_of(array.cols) {
-            text.push('\n');
-        }
+    let mut text = String::from("gains, in percent; . where no press tells of it:\n");
+    for row in fit.gains.chunks(array.cols) {
+        let shown = |gain: &Option<f32>| match gain {
+            Some(gain) => format!(" {:3.0}", 100.0 * gain),
+            None => "   .".to_owned(),
+        };
+        text += &(row.iter().map(shown).collect::<String>() + "\n");
     }
-    counts.sort_unstable();
-    let median = counts.get(counts.len() / 2).copied().unwrap_or(0);
+    let known: Vec<f32> = fit.gains.iter().flatten().copied().collect();
     text += &format!(
-        "\ntaxels  {} of {} measured, each in {median} presses (median); {} presses loaded the whole array\n\
-         gains   {least:.2} to {most:.2}, spread {:.1} %\n\
+        "\ntaxels  {} of {} measured in {} presses\n\
+         gains   {:.2} to {:.2}, spread {:.1} %\n\
          error   {:.1} % of a gain\n\
          \n\
          [sensor.calibration]\n\
          gains = {}\n",
-        counts.len(),
-        fit.gains.len(),
-        fit.even,
+        known.len(),
+        gains.len(),
+        fit.presses,
+        known.iter().copied().fold(f32::INFINITY, f32::min),
+        known.iter().copied().fold(0.0, f32::max),
         100.0 * fit.spread,
         100.0 * fit.error,
         toml::Value::from(super::as_in(config, path))

@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{BufReader, ErrorKind, Read};
+use std::io::{ErrorKind, Read as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -15,13 +15,12 @@ use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
 use super::exit::{Fail, Failure};
-use super::replay::{self, feed, motion, no_frame};
-use super::{cannot_read, live, open, print_apart, unplayable};
+use super::played::Played;
+use super::{cannot_read, live, print_apart};
 use crate::daemon::config::{self, Config, Setup};
 use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::part::Part;
-use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{FileKind, Labels, Playback, Reader};
+use hardnessd_core::recording::Labels;
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
@@ -121,39 +120,36 @@ pub async fn run(
 ) -> Result<(), Failure> {
     let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
     // A file that cannot be made or added to shows before anything is pressed.
-    begin(&args)?;
-    let levels = setup.hrn.card().levels.clone();
+    let (mut all, part) = begin(&args)?;
     let hrn = setup.hrn.clone();
-    let made = if args.files.is_empty() {
-        let Some(what) = args.what else {
-            return Err(Failure::new(
-                USAGE,
-                "--as: found nothing, expected what will be pressed, such as flat:20 or ball:10",
-            ));
-        };
-        let wanted = args.presses;
-        let print_next = |seen: u64| match seen {
-            0 => stderr_line!("press it {wanted} times, harder each time"),
-            _ => stderr_line!("press {seen} of {wanted}"),
-        };
-        let made = live::record(setup, sensor.name(), wanted, print_next, shutdown).await?;
-        let Some(file) = made else {
-            return Ok(());
-        };
-        let path = Path::new(live::RECORDED);
-        let (mut courses, _) = of_recording(file, path, sensor.name(), hrn.clone())?;
-        // Something else may have been pressed before the recording ended.
-        courses.truncate(wanted as usize);
-        made_of(courses, piece(what, &levels)?, path, &sensor)?
-    } else {
-        let (args, hrn) = (args.clone(), hrn.clone());
-        let work = move || of_files(&args, &sensor, &hrn, &levels);
-        match live::unless(shutdown, "identify", work).await? {
-            Some(made) => made,
-            None => return Ok(()),
-        }
+    if args.files.is_empty() && args.what.is_none() {
+        let unknown =
+            "--as: found nothing, expected what will be pressed, such as flat:20 or ball:10";
+        return Err(Failure::new(USAGE, unknown));
+    }
+    let read = {
+        let (args, sensor, hrn) = (args.clone(), sensor.clone(), hrn.clone());
+        move |file, path: &Path| of_file(&args, file, path, &sensor, &hrn)
     };
-    let all = write(&args, made)?;
+    let (name, wanted) = (sensor.name(), args.presses);
+    let print_next = |seen: u64| match seen {
+        0 => stderr_line!("press it {wanted} times, harder each time"),
+        _ => stderr_line!("press {seen} of {wanted}"),
+    };
+    let made = live::gather(setup, name, wanted, &args.files, print_next, shutdown, read);
+    let Some(made) = made.await? else {
+        return Ok(());
+    };
+    all.extend(made);
+    if all.len() > MOST_REFERENCES {
+        let found = all.len();
+        let many = format!(
+            "found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out"
+        );
+        return Err(Failure::new(FAILED, many));
+    }
+    let bytes = references::write(&all).of_file(&args.out, IO)?;
+    part.write(&bytes).of_file(&args.out, IO)?;
     let tried = if all.len() <= hrn.most_references() {
         let identified = hrn.identified_by(&all);
         identified.of_file(&args.out, FAILED)?.1
@@ -208,43 +204,33 @@ fn piece(what: What, levels: &[Level]) -> Result<Piece, Failure> {
     Ok(Piece::Shore { range })
 }
 
-/// The references of all files of the command line.
-fn of_files(
+/// The references of a file: of those of the command line, some presses, and of presses of now, all.
+fn of_file(
     args: &Args,
+    file: File,
+    path: &Path,
     sensor: &Sensor,
     hrn: &Arc<Hrn>,
-    levels: &[Level],
 ) -> Result<Vec<ReferencePress>, Failure> {
-    let motion = args.motion.as_deref().map(motion::load).transpose()?;
-    let mut all = Vec::new();
-    for path in &args.files {
-        let (kind, file) = FileKind::read(open(path)?).map_err(cannot_read(path))?;
-        let (courses, labels) = match kind {
-            FileKind::Recording if motion.is_some() => {
-                return Err(replay::own_motion(path));
-            }
-            FileKind::Recording => {
-                of_recording(BufReader::new(file), path, sensor.name(), hrn.clone())?
-            }
-            FileKind::Raw => {
-                let mut pipeline = Pipeline::new(sensor.clone(), hrn.clone(), Clock::FrameRate);
-                pipeline.keep_courses();
-                let motion = motion.clone();
-                let end = feed(path, file, motion, false, &mut pipeline, |_, _| Ok(true))?;
-                if let Some(error) = end.and_then(|end| no_frame(path, &end)) {
-                    return Err(error);
-                }
-                (pipeline.courses(), Labels::new())
-            }
-        };
-        let what = match args.what {
-            Some(what) => what,
-            None => labelled(&labels, path)?,
-        };
-        let courses = spread(courses, args.presses as usize);
-        all.extend(made_of(courses, piece(what, levels)?, path, sensor)?);
+    let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
+    played.keep_courses();
+    let mut courses = Vec::new();
+    played.play(|played, _, _| courses.extend(played.courses(sensor.name())))?;
+    let what = match args.what {
+        Some(what) => what,
+        None => labelled(&played.labels(), path)?,
+    };
+    let piece = piece(what, &hrn.card().levels)?;
+    if courses.is_empty() {
+        let (path, sensor) = (path.display(), sensor.name());
+        let none = format!("{path}: found no press of sensor {sensor:?}, expected at least one");
+        return Err(Failure::new(FAILED, none));
     }
-    Ok(all)
+    if !args.files.is_empty() {
+        courses = spread(courses, args.presses as usize);
+    }
+    let press = |course| ReferencePress { course, piece };
+    Ok(courses.into_iter().map(press).collect())
 }
 
 /// The greatest force of a press, in newtons.
@@ -275,63 +261,6 @@ fn labelled(labels: &Labels, path: &Path) -> Result<What, Failure> {
     let unlabelled =
         "found no label `reference`, `shore` or `level`: say what was pressed with --as";
     Err(failed(unlabelled.to_owned()))
-}
-
-fn made_of(
-    courses: Vec<TimeSeries>,
-    piece: Piece,
-    path: &Path,
-    sensor: &Sensor,
-) -> Result<Vec<ReferencePress>, Failure> {
-    if courses.is_empty() {
-        let (path, sensor) = (path.display(), sensor.name());
-        let none = format!("{path}: found no press of sensor {sensor:?}, expected at least one");
-        return Err(Failure::new(FAILED, none));
-    }
-    let press = |course| ReferencePress { course, piece };
-    Ok(courses.into_iter().map(press).collect())
-}
-
-/// The courses of the presses in a recording, and its labels.
-fn of_recording(
-    file: impl Read,
-    path: &Path,
-    sensor: &str,
-    hrn: Arc<Hrn>,
-) -> Result<(Vec<TimeSeries>, Labels), Failure> {
-    let read = || -> anyhow::Result<_> {
-        let (mut playback, mut courses) = (Playback::new(hrn), Vec::new());
-        playback.keep_courses();
-        for found in Reader::new(file) {
-            playback.feed(found?)?;
-            courses.extend(playback.courses(sensor));
-        }
-        playback.end();
-        courses.extend(playback.courses(sensor));
-        for note in playback.left_out() {
-            stderr_line!("warning: {}: {note}", path.display());
-        }
-        Ok((courses, playback.labels()))
-    };
-    read().map_err(unplayable(path))
-}
-
-/// Writes the file, and returns all its presses.
-fn write(args: &Args, made: Vec<ReferencePress>) -> Result<Vec<ReferencePress>, Failure> {
-    let out = &args.out;
-    // Another call may have added to the file meanwhile.
-    let (mut all, part) = begin(args)?;
-    all.extend(made);
-    if all.len() > MOST_REFERENCES {
-        let found = all.len();
-        let many = format!(
-            "found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out"
-        );
-        return Err(Failure::new(FAILED, many));
-    }
-    let bytes = references::write(&all).of_file(out, IO)?;
-    part.write(&bytes).of_file(out, IO)?;
-    Ok(all)
 }
 
 /// What the file holds, what is missing, and the lines of the configuration. `out` is the file's path as

@@ -6,6 +6,7 @@
 use std::fs::File;
 use std::future::Future;
 use std::io::{Seek, SeekFrom};
+use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::time::Duration;
 
@@ -21,17 +22,46 @@ use hardnessd_core::exit::IO;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::stderr_line;
 
-/// What an error calls the recording in place of its path.
-pub(super) const RECORDED: &str = "what was recorded";
-
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
-/// Records `wanted` presses of `sensor`; `None` if `shutdown` comes first. `say_next` is called with
+/// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now; `None` if `shutdown`
+/// comes first. `print_next` is that of [`record`].
+pub(super) async fn gather<T: Send + 'static>(
+    setup: Setup,
+    sensor: &str,
+    wanted: u64,
+    files: &[PathBuf],
+    print_next: impl Fn(u64),
+    shutdown: impl Future<Output = ()>,
+    read: impl Fn(File, &Path) -> Result<Vec<T>, Failure> + Send + 'static,
+) -> Result<Option<Vec<T>>, Failure> {
+    if files.is_empty() {
+        let made = record(setup, sensor, wanted, print_next, shutdown).await?;
+        let Some(file) = made else {
+            return Ok(None);
+        };
+        let mut all = read(file, Path::new("what was recorded"))?;
+        // Something else may have been pressed before the recording ended.
+        all.truncate(wanted as usize);
+        return Ok(Some(all));
+    }
+    let files = files.to_vec();
+    let work = move || {
+        let mut all = Vec::new();
+        for path in &files {
+            all.extend(read(super::open(path)?, path)?);
+        }
+        Ok(all)
+    };
+    unless(shutdown, "presses", work).await
+}
+
+/// Records `wanted` presses of `sensor`; `None` if `shutdown` comes first. `print_next` is called with
 /// the number of presses so far, when the zero is taken and after each press. The other sensors of
 /// the configuration stay closed: their presses would count, and a missing one would end the
 /// command.
-pub(super) async fn record(
+async fn record(
     mut setup: Setup,
     sensor: &str,
     wanted: u64,

@@ -1,8 +1,8 @@
 //! Computes the arm's stiffness and the delay of its stamps from presses on something rigid.
 //!
-//! The way of the arm is a curve over force. It is mostly a line, whose slope comes from what gives
-//! way behind the sensor's face. It is a little bent, because the sensor's cover stiffens. With the
-//! right delay, the arm returns on the same curve. With another delay, there is a loop.
+//! The way of the arm over force is nearly a line, whose slope comes from what gives way behind the
+//! sensor's face. With the right delay, the arm returns on the same line. With another delay, there is
+//! a loop.
 
 use anyhow::{Context as _, Result, bail};
 
@@ -26,21 +26,21 @@ pub(super) struct Fit {
     pub(super) force_n: [f64; 2],
     pub(super) n_per_mm: Spread,
     pub(super) delay_ms: Spread,
-    /// Root mean square of the distance from the curve.
+    /// Root mean square of the distance from the line.
     pub(super) residual_mm: f64,
 }
 
 /// The least and the greatest delay that are tried.
 const DELAYS_MS: (f64, f64) = (-300.0, 600.0);
-/// The step between delays in the first and in the second search.
-const STEPS_MS: [f64; 2] = [10.0, 0.5];
+/// The step between delays.
+const STEP_MS: f64 = 2.0;
 /// Frames with a smaller share of a press's peak force depend on the cover alone.
 const FAIR_SHARE: f64 = 0.2;
 /// The slope comes from frames with at least this share of a press's peak force.
 const STEEP_SHARE: f64 = 0.5;
 /// Fewer frames than this cannot determine four numbers and a spread.
 const LEAST_FRAMES: usize = 8;
-/// If a delay is wrong by `WRONG_MS`, the distance from the curve must be more than `GROWN` times
+/// If a delay is wrong by `WRONG_MS`, the distance from the line must be more than `GROWN` times
 /// as large as at the best delay. Otherwise, the delay is unknown.
 const WRONG_MS: f64 = 150.0;
 const GROWN: f64 = 1.3;
@@ -109,46 +109,29 @@ impl Fit {
                  Press deeper, and keep the arm moving"
             );
         }
-        // The second search goes a step beyond the ends of the first, so a delay just inside is
-        // found.
-        for end_ms in [DELAYS_MS.0, DELAYS_MS.1] {
-            if (delay_ms - end_ms) * end_ms.signum() >= 0.0 {
-                let (least, most) = DELAYS_MS;
-                bail!(
-                    "no delay from {least} to {most} ms fits: the best is {end_ms:.0} ms or beyond. Do the \
-                     stamps of the positions come from a clock that agrees with the clock of this machine?"
-                );
-            }
+        let (least, most) = DELAYS_MS;
+        if [least, most].contains(&delay_ms) {
+            bail!(
+                "no delay from {least} to {most} ms fits: the best is {delay_ms:.0} ms or beyond. Do the \
+                 stamps of the positions come from a clock that agrees with the clock of this machine?"
+            );
         }
         let n_per_mm = slope(&known, delay_ms).context(
             "the force does not grow with the way of the arm: do positions grow towards the object?",
         )?;
         let one = |press: &&Press| {
             let alone = [*press];
-            let is_enough = fair(press) >= LEAST_FRAMES;
-            let delay_ms = if is_enough {
-                best_delay(&alone).0
-            } else {
-                delay_ms
+            let delay_ms = match fair(press) >= LEAST_FRAMES {
+                true => best_delay(&alone).0,
+                false => delay_ms,
             };
             (delay_ms, slope(&alone, delay_ms).unwrap_or(n_per_mm))
         };
         let alone: Vec<(f64, f64)> = known.iter().map(one).collect();
-        let spread = |value: f64, of: fn(&(f64, f64)) -> f64| {
-            let mut alone: Vec<f64> = alone.iter().map(of).collect();
-            alone.sort_by(f64::total_cmp);
-            let (least, most) = (alone[0], alone[alone.len() - 1]);
-            // All presses together may give a value that none of them gives.
-            let is_inside = (least..=most).contains(&value);
-            Spread {
-                value: if is_inside {
-                    value
-                } else {
-                    alone[alone.len() / 2]
-                },
-                least,
-                most,
-            }
+        let spread = |value: f64, of: fn(&(f64, f64)) -> f64| Spread {
+            value,
+            least: alone.iter().map(of).fold(value, f64::min),
+            most: alone.iter().map(of).fold(value, f64::max),
         };
         let forces = known.iter().map(|press| press.force_n());
         Ok(Self {
@@ -164,71 +147,43 @@ impl Fit {
     }
 }
 
-/// The delay with which the presses are nearest to one curve, and their distance from it in mm.
+/// The delay with which the presses are nearest to one line, and their distance from it in mm.
 fn best_delay(presses: &[&Press]) -> (f64, f64) {
-    let mut best = (0.0, f64::INFINITY);
-    let (mut from, mut to) = DELAYS_MS;
-    for step in STEPS_MS {
-        for count in 0..=((to - from) / step).round() as u32 {
-            let delay_ms = from + f64::from(count) * step;
-            if let Some(residual) = residual_mm_at(presses, delay_ms)
-                && residual < best.1
-            {
-                best = (delay_ms, residual);
-            }
-        }
-        (from, to) = (best.0 - step, best.0 + step);
-    }
-    best
+    let (least, most) = DELAYS_MS;
+    let delays = (0..=((most - least) / STEP_MS) as u32).map(|n| least + f64::from(n) * STEP_MS);
+    let tried = delays.filter_map(|ms| Some((ms, residual_mm_at(presses, ms)?)));
+    let best = tried.min_by(|one, other| one.1.total_cmp(&other.1));
+    best.unwrap_or((0.0, f64::INFINITY))
 }
 
-/// Root mean square distance of the way from a + b force + c force^2. Each press has its own a.
+/// Root mean square distance of the way from a line over force. Each press has its own zero.
 fn residual_mm_at(presses: &[&Press], delay_ms: f64) -> Option<f64> {
-    // Sums over all frames, of differences from the press's means.
-    let [mut ff, mut fq, mut qq, mut fx, mut qx, mut xx] = [0.0; 6];
-    let mut count = 0.0;
-    for press in presses {
-        let points = press.points(delay_ms, FAIR_SHARE)?;
-        let own = points.len() as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / own;
-        let (x, f, q) = (mean(|p| p.0), mean(|p| p.1), mean(|p| p.1 * p.1));
-        for (way, force) in &points {
-            let (x, f, q) = (way - x, force - f, force * force - q);
-            ff += f * f;
-            fq += f * q;
-            qq += q * q;
-            fx += f * x;
-            qx += q * x;
-            xx += x * x;
-        }
-        count += own;
-    }
-    let determinant = ff * qq - fq * fq;
-    // If there are only one or two different forces, fit a line.
-    let explained = if determinant > 1e-9 * ff * qq {
-        let (b, c) = (
-            (fx * qq - qx * fq) / determinant,
-            (qx * ff - fx * fq) / determinant,
-        );
-        b * fx + c * qx
-    } else if ff > 0.0 {
-        fx * fx / ff
+    let sums = sums(presses, delay_ms, FAIR_SHARE)?;
+    let explained = if sums.yy > 0.0 {
+        sums.xy * sums.xy / sums.yy
     } else {
         0.0
     };
-    Some(((xx - explained).max(0.0) / count).sqrt())
+    Some(((sums.xx - explained).max(0.0) / sums.count).sqrt())
 }
 
 /// The slope of force over way, in N/mm. Each press has its own zero.
 fn slope(presses: &[&Press], delay_ms: f64) -> Option<f64> {
-    let (mut ff, mut fx) = (0.0, 0.0);
+    let sums = sums(presses, delay_ms, STEEP_SHARE)?;
+    (sums.xy > 0.0 && sums.yy > 0.0).then(|| sums.yy / sums.xy)
+}
+
+/// The sums of way and force over the frames of all presses.
+fn sums(presses: &[&Press], delay_ms: f64, share: f64) -> Option<Sums> {
+    let mut all = Sums::default();
     for press in presses {
-        let points = press.points(delay_ms, STEEP_SHARE)?;
-        let own = Sums::of(&points);
-        ff += own.yy;
-        fx += own.xy;
+        let own = Sums::of(&press.points(delay_ms, share)?);
+        all.count += own.count;
+        all.xx += own.xx;
+        all.xy += own.xy;
+        all.yy += own.yy;
     }
-    (fx > 0.0 && ff > 0.0).then(|| ff / fx)
+    Some(all)
 }
 
 #[cfg(test)]
@@ -246,19 +201,10 @@ mod tests {
             let gone = 5.0 * (time_s - load_s - 0.4);
             (5.0 * time_s).min(depth_mm).min(depth_mm - gone)
         };
-        // The cover gives way by 0.1 mm at 4 N, and by twice as much at 16 N.
+        // The cover gives way by 0.05 mm times the root of the force: by 0.1 mm at 4 N.
         let force = |mm: f64| {
-            let (mut low, mut high) = (0.0, 100.0);
-            for _ in 0..60 {
-                let middle: f64 = 0.5 * (low + high);
-                let needs = middle / n_per_mm + 0.05 * middle.sqrt();
-                if needs < mm {
-                    low = middle;
-                } else {
-                    high = middle;
-                }
-            }
-            low
+            let root = (0.05_f64.powi(2) + 4.0 * mm / n_per_mm).sqrt() - 0.05;
+            (0.5 * n_per_mm * root).powi(2)
         };
         let start_s = 10.0;
         let mut track = Track::default();
@@ -329,8 +275,8 @@ mod tests {
             press.forces_n.truncate(3);
         }
         check(&short, "frames with a fair force in 2 presses");
-        // The delay is far beyond those that are tried, or just at their end.
-        for (delay_ms, tried_ms) in [(650.0, 600), (600.0, 600), (-340.0, -300)] {
+        // The delay is far beyond those that are tried.
+        for (delay_ms, tried_ms) in [(650.0, 600), (-340.0, -300)] {
             let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
             check(&late, &format!("the best is {tried_ms} ms or beyond"));
         }

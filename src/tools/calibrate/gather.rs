@@ -1,23 +1,20 @@
 //! The presses of a recording, each with the positions of the arm.
 
-use std::io::{BufReader, Read};
+use std::io::Read;
 use std::mem;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
-
 use crate::tools::exit::Failure;
-use crate::tools::replay::feed;
-use crate::tools::unplayable;
+use crate::tools::played::Played;
 use hardnessd_core::event::{Event, FrameEvent, Note, Phase, PressState};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
-use hardnessd_core::pipeline::{Clock, Pipeline};
-use hardnessd_core::recording::{Entry, FileKind, Playback, Reader};
-use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::stderr_line;
+use hardnessd_core::pipeline::Pipeline;
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::tare::{self, Gains};
 use hardnessd_core::verdict::Hrn;
 
 /// One press.
@@ -31,64 +28,63 @@ pub(super) struct Press {
     pub(super) forces_n: Vec<f64>,
     /// The positions of the arm.
     pub(super) track: Track,
-    /// The description of the sensor when the press ended. `None` if the file has none.
-    pub(super) described: Option<Arc<Description>>,
+    /// The settings that turned counts into newtons.
+    pub(super) calibration: tare::Settings,
     /// Whether a taxel of the press's best frame read full scale.
     pub(super) saturated: bool,
     /// When it ended.
     pub(super) end: Duration,
 }
 
+impl Press {
+    /// The newtons of its frames with gains of 1.
+    pub(super) fn without_gains(&self) -> Vec<Vec<f32>> {
+        let mut frames = self.frames.clone();
+        if let Some(Gains::Taxels(rows)) = &self.calibration.gains {
+            for frame in &mut frames {
+                for (newtons, gain) in frame.iter_mut().zip(rows.iter().flatten()) {
+                    *newtons /= gain;
+                }
+            }
+        }
+        frames
+    }
+}
+
 /// This long after a press, all its positions have come.
 const AFTER: Duration = Duration::from_millis(800);
 
 /// The presses of `sensor` in the file at `path`. A recording tells sensors apart by name. In a file of raw
-/// bytes, all bytes are those of `sensor`. The presses have the positions of the arm `with_track`.
+/// bytes, all bytes are those of `sensor`.
 pub(super) fn presses(
     file: impl Read,
     path: &Path,
     sensor: &Sensor,
-    hrn: Arc<Hrn>,
-    with_track: bool,
+    hrn: &Arc<Hrn>,
 ) -> Result<Vec<Press>, Failure> {
-    let (kind, file) = FileKind::read(file).map_err(unplayable(path))?;
-    let mut gathered = Gathered {
-        with_track,
-        ..Gathered::default()
-    };
-    match kind {
-        FileKind::Recording => {
-            let taken = gathered.take_recording(BufReader::new(file), sensor.name(), hrn);
-            taken.map_err(unplayable(path))?;
+    let mut gathered = Gathered::default();
+    Played::open(path, file, sensor, hrn, None)?.play(|played, mut events, at| {
+        events.retain(|event| event.sensor() == sensor.name());
+        if let Some(pipeline) = played.pipeline(sensor.name()) {
+            gathered.take(events, at, pipeline);
         }
-        FileKind::Raw => {
-            // The frames of raw bytes get their times from the frame rate, counted from here.
-            let start = Stamp {
-                mono: Duration::ZERO,
-                wall: Timestamp::UNIX_EPOCH,
-            };
-            let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
-            gathered.describe(sensor.description());
-            let each = |events, _| {
-                gathered.take(events, start);
-                Ok(true)
-            };
-            let end = feed(path, file, None, false, &mut pipeline, each)?;
-            gathered.take(end.unwrap_or_default(), start);
+    })?;
+    let taxels = sensor.layout().array().taxels();
+    let frames = gathered.presses.iter().flat_map(|press| &press.frames);
+    match frames.map(Vec::len).find(|&found| found != taxels) {
+        Some(found) => {
+            let path = path.display();
+            let other = format!("{path}: found frames of {found} taxels, expected {taxels}");
+            Err(Failure::new(FAILED, other))
         }
+        None => Ok(gathered.presses),
     }
-    Ok(gathered.presses)
 }
 
 /// The presses and the state of reading so far.
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
-    /// Whether a press takes a copy of the arm's positions.
-    with_track: bool,
-    /// The number of presses that have their positions.
-    settled: usize,
-    described: Option<Arc<Description>>,
     /// The frames of the press under way, and the newest frame.
     frames: Vec<(FrameEvent, Duration)>,
     /// The number of the first frame of the press under way.
@@ -96,39 +92,7 @@ struct Gathered {
 }
 
 impl Gathered {
-    fn take_recording(
-        &mut self,
-        file: impl Read,
-        sensor: &str,
-        hrn: Arc<Hrn>,
-    ) -> anyhow::Result<()> {
-        let (mut playback, none) = (Playback::new(hrn), Track::default());
-        for found in Reader::new(file) {
-            let found = found?;
-            if found.sensor != sensor {
-                continue;
-            }
-            let at = found.at;
-            if let Entry::State(state) = &found.entry {
-                self.describe(&state.sensor.description);
-            }
-            self.settle(at.mono, playback.track(sensor).unwrap_or(&none));
-            self.take(playback.feed(found)?, at);
-        }
-        for note in playback.left_out() {
-            stderr_line!("warning: {note}");
-        }
-        self.settle(Duration::MAX, playback.track(sensor).unwrap_or(&none));
-        Ok(())
-    }
-
-    fn describe(&mut self, description: &Description) {
-        if self.described.as_deref() != Some(description) {
-            self.described = Some(Arc::new(description.clone()));
-        }
-    }
-
-    fn take(&mut self, events: Vec<Event>, at: Stamp) {
+    fn take(&mut self, events: Vec<Event>, at: Stamp, pipeline: &Pipeline) {
         for event in events {
             match event {
                 Event::Frame(frame) if frame.force_n.is_some() => {
@@ -140,7 +104,10 @@ impl Gathered {
                 }
                 Event::Press(press) => match press.state {
                     PressState::Begin => self.began = Some(press.frame),
-                    PressState::End => self.end(press.frame, at.mono_of(press.time)),
+                    PressState::End => {
+                        let calibration = pipeline.sensor().calibration().clone();
+                        self.end(press.frame, at.mono_of(press.time), calibration);
+                    }
                     PressState::Aborted => self.began = None,
                 },
                 // The final verdict follows the end of its press.
@@ -152,13 +119,18 @@ impl Gathered {
                 _ => {}
             }
         }
+        if let Some(press) = self.presses.last_mut()
+            && at.mono < press.end.saturating_add(AFTER)
+        {
+            press.track = pipeline.track().clone();
+        }
     }
 
     /// Makes a press of the frames up to the `last` one.
-    fn end(&mut self, last: u64, end: Duration) {
+    fn end(&mut self, last: u64, end: Duration, calibration: tare::Settings) {
         let own = self.began.take().unwrap_or(last)..=last;
         let mut press = Press {
-            described: self.described.clone(),
+            calibration,
             end,
             ..Press::default()
         };
@@ -171,17 +143,6 @@ impl Gathered {
         }
         self.presses.push(press);
     }
-
-    /// Gives the presses whose positions have come by `now` a copy of `track`, which has them.
-    fn settle(&mut self, now: Duration, track: &Track) {
-        while self.with_track
-            && let Some(press) = self.presses.get_mut(self.settled)
-            && now >= press.end.saturating_add(AFTER)
-        {
-            press.track = track.clone();
-            self.settled += 1;
-        }
-    }
 }
 
 #[cfg(test)]
@@ -192,7 +153,7 @@ mod tests {
     #[test]
     fn a_press_has_the_positions_from_before_its_recording() {
         let (recording, sensor) = of_a_press(|_| {}, None, true);
-        let presses = presses(recording.as_slice(), Path::new("x"), &sensor, hrn(), true).unwrap();
+        let presses = presses(recording.as_slice(), Path::new("x"), &sensor, &hrn()).unwrap();
         let [press] = &presses[..] else {
             panic!("one press");
         };

@@ -205,11 +205,15 @@ impl Playback {
             .collect()
     }
 
+    /// The pipeline of a sensor.
+    pub fn pipeline(&self, sensor: &str) -> Option<&Pipeline> {
+        let mut pipelines = self.players.iter().map(|player| &player.pipeline);
+        pipelines.find(|pipeline| pipeline.sensor().name() == sensor)
+    }
+
     /// The positions of a sensor's arm, as its pipeline knows them.
     pub fn track(&self, sensor: &str) -> Option<&Track> {
-        let mut players = self.players.iter();
-        let player = players.find(|player| player.pipeline.sensor().name() == sensor)?;
-        Some(player.pipeline.track())
+        self.pipeline(sensor).map(Pipeline::track)
     }
 
     /// What cannot be played, in words: a clip of a recording may begin inside a press. It is played
