@@ -1,7 +1,7 @@
 //! The daemon's binary: arguments, log, runtime, signals, exit codes.
 
 use std::future::Future;
-use std::io::{self, IsTerminal, Write as _};
+use std::io::{self, Write as _};
 use std::panic;
 use std::path::PathBuf;
 use std::pin::{Pin, pin};
@@ -99,12 +99,9 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             let Some(setup) = load(args.config.path()?, None, end.as_mut()).await? else {
                 return Ok(());
             };
-            // On a terminal the progress line replaces the log.
-            let is_shown = io::stderr().is_terminal();
-            let log = Log::start(setup.config.log, if is_shown { "warn" } else { "info" })?;
-            if is_shown {
-                log.clear_progress();
-            }
+            // Lines of the log would come between the questions of a session.
+            let level = if args.is_session() { "warn" } else { "info" };
+            let log = Log::start(setup.config.log, level)?;
             record::run(args, setup, &log, end).await
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,

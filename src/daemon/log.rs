@@ -92,12 +92,6 @@ impl Log {
         Ok(Self { output, lines })
     }
 
-    /// From now on, each line on stderr first clears the line that the cursor is in. Call this if
-    /// stderr is a terminal on which the process shows a line of progress.
-    pub fn clear_progress(&self) {
-        self.lines.clear_progress();
-    }
-
     /// Waits until all lines so far are written, but not longer than `LAST_LINES`.
     pub fn flush(&self) {
         self.lines.flush(LAST_LINES);

@@ -1,22 +1,18 @@
 //! `hardnessd record`: a daemon that records its sensors to a file. It opens sockets only if asked
 //! to.
 //!
-//! On a terminal, a line on stderr says how many presses the file holds so far. At the end, a
-//! warning says if there were none. A session records one file after another.
+//! At the end, a warning says if there was no press. A session records one file after another.
 
 mod session;
 
-use std::cell::Cell;
 use std::fs::File;
 use std::future::Future;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
-use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use tokio::sync::watch;
-use tokio::time::Instant;
 
 use super::configuration::Configuration;
 use super::doctor;
@@ -36,9 +32,9 @@ use hardnessd_core::wording::escaped;
 /// What `--help` says below the options.
 const MORE: &str = "\
     --session asks for the name of each object, and for the reading of a durometer or its level, \
-    then counts its presses. Meanwhile Enter starts the next object, r and Enter records this one \
-    again, q and Enter or Ctrl-C ends. Each object becomes a file NUMBER-NAME.mcap. A second session in the \
-    same directory continues the numbers.";
+    then shows the verdict on each press. Meanwhile Enter starts the next object, q and Enter or Ctrl-C \
+    ends. Each object becomes a file NUMBER-NAME.mcap. A second session in the same directory continues the \
+    numbers.";
 
 /// Arguments of `record`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -65,16 +61,10 @@ pub struct Args {
     seconds: Option<f64>,
 }
 
-/// A recording that could not begin, or ended by an error.
-pub(super) struct Failed {
-    failure: Failure,
-    /// Whether a sensor was missing at the start, so that there is nothing worth keeping.
-    is_unavailable: bool,
-}
-
-impl From<Failed> for Failure {
-    fn from(failed: Failed) -> Self {
-        failed.failure
+impl Args {
+    /// Whether it asks the user on the terminal.
+    pub fn is_session(&self) -> bool {
+        self.session.is_some()
     }
 }
 
@@ -119,37 +109,23 @@ pub async fn run(
         .expect("clap asks for it where there is no session");
     let (file, own) = create(&path)?;
     let (progress, counted) = watch::channel(Progress::default());
-    // The time begins with the first wait.
-    let over = async { maybe::until(maybe::after(args.seconds)).await };
-    let is_ending = Cell::new(false);
     let end = async {
         tokio::select! {
             () = shutdown => {}
-            () = over => {}
-        }
-        is_ending.set(true);
-        clear();
-    };
-    let recorded = tokio::select! {
-        recorded = record(setup, sockets, &path, file, labels, progress, end) => recorded,
-        () = show(&path, &counted, &is_ending) => {
-            unreachable!("it goes on as long as it is waited for")
+            () = maybe::until(maybe::after(args.seconds)) => {}
         }
     };
-    // The recording may have ended by itself.
-    clear();
+    let recorded = record(setup, sockets, &path, file, labels, progress, end).await;
     let Progress {
         frames,
         tared,
         presses,
         ..
     } = *counted.borrow();
-    if let Err(failed) = &recorded
-        && (failed.is_unavailable || frames == 0)
-    {
+    if recorded.is_err() && frames == 0 {
         // The path must be free for the next try.
         part::remove(&path, &own);
-        return Ok(recorded?);
+        return recorded;
     }
     let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
     if io::stderr().is_terminal() {
@@ -164,7 +140,7 @@ pub async fn run(
         };
         stderr_line!("warning: {shown}: no press in {seen}{why}");
     }
-    Ok(recorded?)
+    recorded
 }
 
 /// Makes the file of a recording, twice open: to record into, and to know it again. A file that exists is
@@ -186,7 +162,7 @@ pub(super) async fn record(
     labels: Labels,
     progress: watch::Sender<Progress>,
     end: impl Future<Output = ()>,
-) -> Result<(), Failed> {
+) -> Result<(), Failure> {
     let sensors = setup.config.sensors.clone();
     let recorded = async {
         let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
@@ -201,15 +177,9 @@ pub(super) async fn record(
             let port = port.expect("a missing sensor is one of the configuration");
             let obstacle = doctor::obstacle(port).unwrap_or(reason);
             let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
-            Failed {
-                failure: Failure::new(UNAVAILABLE, problem),
-                is_unavailable: true,
-            }
+            Failure::new(UNAVAILABLE, problem)
         }
-        error => Failed {
-            failure: error.into(),
-            is_unavailable: false,
-        },
+        error => error.into(),
     })
 }
 
@@ -222,74 +192,20 @@ fn counted_in_words(count: u64, what: &str, plural: &str) -> String {
     format!("{count} {what}{plural}")
 }
 
-/// Clears the line of progress. On a terminal only, because only a terminal has one.
-fn clear() {
-    let mut stderr = io::stderr();
-    if stderr.is_terminal() {
-        let _ = stderr.write_all(b"\r\x1b[K");
-    }
-}
-
-/// The time between two lines of progress.
-const PROGRESS: Duration = Duration::from_millis(500);
-
-/// Shows the progress on a terminal, always in the same line, until the recording is ending.
-async fn show(path: &Path, counted: &watch::Receiver<Progress>, is_ending: &Cell<bool>) {
-    let mut stderr = io::stderr();
-    if !stderr.is_terminal() {
-        return std::future::pending().await;
-    }
-    let start = Instant::now();
-    while !is_ending.get() {
-        let Progress {
-            frames, presses, ..
-        } = *counted.borrow();
-        let frames = counted_in_words(frames, "frame", "s");
-        let presses = counted_in_words(presses, "press", "es");
-        let (seconds, path) = (start.elapsed().as_secs(), shown(path));
-        // If the terminal has gone, its signal ends the recording.
-        let _ = write!(
-            stderr,
-            "\r\x1b[Krecording {path}: {seconds} s, {frames}, {presses} (Ctrl-C ends it)"
-        );
-        let _ = stderr.flush();
-        tokio::time::sleep(PROGRESS).await;
-    }
-    std::future::pending::<()>().await;
-}
-
-/// Checks the label `level`, which a data set is made from. A wrong level must be found before
-/// anything is pressed. A name that the model does not have may be that of a level of the user's own, of which
-/// `hrn-train fit` makes a model.
+/// Checks the label `level`, which a data set is made from. A wrong number must be found before
+/// anything is pressed. A name may be that of a level of the user's own, of which `hrn-train fit` makes a model.
 fn check_level(labels: &Labels, setup: &Setup) -> Result<(), Failure> {
-    let Some(found) = labels.get("level") else {
-        return Ok(());
-    };
+    let found = labels.get("level").and_then(|level| level.parse().ok());
     let levels = &setup.hrn.card().levels;
-    let (is_known, may_be_own) = match found.parse::<usize>() {
-        Ok(number) => (number <= levels.len(), false),
-        Err(_) => (
-            levels
-                .iter()
-                .any(|level| level.label.eq_ignore_ascii_case(found)),
-            setup.config.levels.is_empty() && found.starts_with(char::is_alphabetic),
-        ),
-    };
-    if is_known {
+    if found.is_none_or(|level| (0..=levels.len() as i64).contains(&level)) {
         return Ok(());
     }
-    let shown = levels
+    let named = levels
         .iter()
         .map(|level| format!("{} ({})", level.level, level.label));
-    let shown: Vec<String> = shown.collect();
-    let problem = format!(
-        "--label level: found {found:?}, expected 0 (unlabelled), {}",
-        shown.join(", ")
-    );
-    if may_be_own {
-        stderr_line!("warning: {problem}, or the name of a level of your own");
-        return Ok(());
-    }
+    let named = named.collect::<Vec<_>>().join(", ");
+    let found = &labels["level"];
+    let problem = format!("--label level: found {found:?}, expected 0 (unlabelled), {named}");
     Err(Failure::new(USAGE, problem))
 }
 

@@ -19,8 +19,6 @@ const WAITING: usize = 1024;
 
 enum Message {
     Line(Vec<u8>),
-    /// From now on, clear the terminal's line before each line.
-    ClearProgress,
     /// A request for an answer as soon as all earlier lines are written.
     Flush(SyncSender<()>),
 }
@@ -51,11 +49,6 @@ impl Lines {
         Ok(lines)
     }
 
-    /// Clears the terminal's line before each line from now on.
-    pub(super) fn clear_progress(&self) {
-        let _ = self.thread.try_send(Message::ClearProgress);
-    }
-
     /// Waits until all lines are written, but not longer than `patience`.
     pub(super) fn flush(&self, patience: Duration) {
         let (written, answer) = mpsc::sync_channel(1);
@@ -67,18 +60,16 @@ impl Lines {
 }
 
 fn write(messages: &Receiver<Message>, lost: &AtomicU64) {
-    let mut before: &[u8] = b"";
     while let Ok(message) = messages.recv() {
         // A write that fails cannot be logged: stderr is closed.
         match message {
             Message::Line(line) => {
-                let _ = io::stderr().write_all(&[before, &line].concat());
+                let _ = io::stderr().write_all(&line);
                 let lines = lost.swap(0, Ordering::Relaxed);
                 if lines > 0 {
                     let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
                 }
             }
-            Message::ClearProgress => before = b"\r\x1b[K",
             Message::Flush(written) => {
                 let _ = written.try_send(());
             }

@@ -6,14 +6,13 @@
 
 use std::fs::{self, File};
 use std::future::Future;
-use std::io::{self, IsTerminal, Seek, Write};
+use std::io::{self, IsTerminal, Write};
 use std::path::Path;
 use std::pin::Pin;
-use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{clear, counted_in_words, record, shown};
+use super::{counted_in_words, record, shown};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
@@ -24,14 +23,10 @@ use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label};
 use hardnessd_core::verdict::{Borders, Level};
 
-/// The time between two updates of the progress.
-const SHOWN_EVERY: Duration = Duration::from_millis(200);
-
 /// The user at the terminal.
 struct User<'a> {
     lines: mpsc::Receiver<String>,
     shutdown: Pin<&'a mut dyn Future<Output = ()>>,
-    has_gone: bool,
 }
 
 impl User<'_> {
@@ -48,24 +43,15 @@ impl User<'_> {
             }
         });
         started.map_err(NoThread)?;
-        Ok(User {
-            lines,
-            shutdown,
-            has_gone: false,
-        })
+        Ok(User { lines, shutdown })
     }
 
-    /// The next line. `None` if no more lines come.
+    /// The next line. `None` if no more lines come: do not ask again then.
     async fn line(&mut self) -> Option<String> {
-        if self.has_gone {
-            return None;
-        }
-        let line = tokio::select! {
+        tokio::select! {
             line = self.lines.recv() => line,
             () = &mut self.shutdown => None,
-        };
-        self.has_gone = line.is_none();
-        line
+        }
     }
 
     /// Asks until the answer is usable. Returns `None` if the answer is `q` or no more answers
@@ -104,13 +90,6 @@ struct Score {
     right: u64,
 }
 
-/// What to do with a recording that the user has ended.
-enum Next {
-    Keep,
-    Redo,
-    KeepAndQuit,
-}
-
 /// Records object after object into `directory`, until the user quits or `shutdown` comes.
 ///
 /// # Errors
@@ -142,20 +121,16 @@ pub(super) async fn run(
             ("name".to_owned(), object.name.clone()),
             ("level".to_owned(), object.level.to_string()),
         ]);
-        labels.extend(
-            object
-                .shore
-                .clone()
-                .map(|shore| ("shore".to_owned(), shore)),
-        );
-        let next = record_object(
-            &mut user, &object, &path, &labels, &setup, sockets, &mut score,
+        let shore = object.shore.clone();
+        labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
+        let goes_on = record_object(
+            &mut user, &object, &path, labels, &setup, sockets, &mut score,
         )
         .await?;
         number += u32::from(path.exists());
         // A late line would cut through the next question.
         log.flush();
-        if !next {
+        if !goes_on {
             break;
         }
     }
@@ -225,111 +200,78 @@ fn hardness<'a>(
     }
 }
 
-/// Records presses of one object, and again if the user asks for it. A recording without a press is removed.
-/// Returns `false` if the user quits.
+/// Records presses of one object. A recording without a press is removed. Returns `false` if the user quits.
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
     path: &Path,
-    labels: &Labels,
+    labels: Labels,
     setup: &Setup,
     sockets: Sockets,
     score: &mut Score,
 ) -> Result<bool, Failure> {
     let failed = failed_at(path);
-    let file = File::create_new(path).map_err(&failed)?;
-    loop {
-        print("do not touch the sensor until the zero is taken\n");
-        let mut next = Next::KeepAndQuit;
-        let (progress, mut counted) = watch::channel(Progress::default());
-        let recorded = {
-            let end = async {
-                let levels = &setup.hrn.card().levels;
-                next = wait_for_user(user, &mut counted, object, levels).await;
-            };
-            let (setup, file) = (setup.clone(), file.try_clone().map_err(&failed)?);
-            record(setup, sockets, path, file, labels.clone(), progress, end).await
-        };
-        clear();
-        let Progress {
-            presses,
-            verdicts,
-            right,
-            ..
-        } = *counted.borrow();
-        if presses > 0 && !matches!(next, Next::Redo) {
-            if object.level > 0 {
-                score.verdicts += verdicts;
-                score.right += right;
-            }
-            recorded?;
-            return Ok(matches!(next, Next::Keep));
-        }
-        if recorded.is_err() || matches!(next, Next::KeepAndQuit) {
-            // A recording without a press would stop `hrn-train collect`.
-            part::remove(path, &file);
-        }
-        recorded?;
-        match next {
-            Next::KeepAndQuit => return Ok(false),
-            Next::Redo => print(&format!("again: {}\n", shown(Path::new(&object.name)))),
-            Next::Keep => print("no press was recorded: again\n"),
-        }
-        let emptied = file.set_len(0).and_then(|()| (&file).rewind());
-        emptied.map_err(&failed)?;
+    let own = File::create_new(path).map_err(&failed)?;
+    let file = own.try_clone().map_err(&failed)?;
+    print("do not touch the sensor until the zero is taken\n");
+    let mut goes_on = false;
+    let (progress, mut counted) = watch::channel(Progress::default());
+    let levels = &setup.hrn.card().levels;
+    let end = async { goes_on = wait_for_user(user, &mut counted, object, levels).await };
+    let setup = setup.clone();
+    let recorded = record(setup, sockets, path, file, labels, progress, end).await;
+    let Progress {
+        presses,
+        verdicts,
+        right,
+        ..
+    } = *counted.borrow();
+    if presses == 0 {
+        // It would stop `hrn-train collect`.
+        part::remove(path, &own);
+        print("no press was recorded\n");
+    } else if object.level > 0 {
+        score.verdicts += verdicts;
+        score.right += right;
     }
+    recorded?;
+    Ok(goes_on)
 }
 
-/// Counts presses in one line, with a line above it for each verdict, until the user says what to do next.
+/// Shows the verdict on each press, until the user says what to do next. Returns `false` if the user quits.
 async fn wait_for_user(
     user: &mut User<'_>,
     counted: &mut watch::Receiver<Progress>,
     object: &Object,
     levels: &[Level],
-) -> Next {
+) -> bool {
     let label = |level: u8| {
         let known = levels.iter().find(|known| known.level == level);
         known.map_or("no level", |known| known.label.as_str())
     };
     let (mut shown, mut is_tared) = (0, false);
     loop {
-        let Progress {
-            frames,
-            tared,
-            presses,
-            verdicts,
-            right,
-            said,
-        } = *counted.borrow_and_update();
-        if verdicts > shown {
-            shown = verdicts;
-            let said = label(said.unwrap_or(0));
-            let beside = match object.level {
-                0 => String::new(),
-                level => format!(", you said {}; {right} of {verdicts} right", label(level)),
-            };
-            print(&format!("\r\x1b[Kverdict: {said}{beside}\n"));
-        }
-        if tared > 0 && !is_tared {
-            is_tared = true;
-            print("\r\x1b[Kthe zero is taken: press now\n");
-        }
-        let line = if frames == 0 {
-            "waiting for the sensor".to_owned()
-        } else if tared == 0 {
-            "taking the zero".to_owned()
-        } else {
-            format!("presses: {presses}; Enter: next object, r: redo this one, q: quit")
-        };
-        print(&format!("\r\x1b[K{line} "));
         tokio::select! {
             answer = user.line() => match answer.as_deref() {
-                Some("") => return Next::Keep,
-                Some("r") => return Next::Redo,
-                Some("q") | None => return Next::KeepAndQuit,
+                Some("") => return true,
+                Some("q") | None => return false,
                 Some(_) => {}
             },
-            () = tokio::time::sleep(SHOWN_EVERY) => {}
+            Ok(()) = counted.changed() => {
+                let Progress { tared, verdicts, right, said, .. } = *counted.borrow_and_update();
+                if tared > 0 && !is_tared {
+                    is_tared = true;
+                    print("the zero is taken: press now (Enter: next object, q: quit)\n");
+                }
+                if verdicts > shown {
+                    shown = verdicts;
+                    let beside = match object.level {
+                        0 => String::new(),
+                        level => format!(", you said {}; {right} of {verdicts} right", label(level)),
+                    };
+                    print(&format!("verdict {verdicts}: {}{beside}\n", label(said.unwrap_or(0))));
+                }
+            }
         }
     }
 }
