@@ -124,7 +124,7 @@ impl Player {
                 }));
             let time_s = since.as_secs_f64() * self.pace.speed;
             let layout = &self.layout;
-            let line = self.faults.encode(time_s, frame.raw, layout, &mut bytes);
+            let line = self.faults.encode(time_s, &frame.raw, layout, &mut bytes);
             match line {
                 Line::Up => {
                     if self.pty.is_none() {

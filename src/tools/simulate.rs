@@ -5,8 +5,6 @@ use std::future::Future;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
-use std::sync::mpsc::{self, TryRecvError};
-use std::time::Duration;
 
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
@@ -20,13 +18,12 @@ use super::robot::Robot;
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::Unix;
 use crate::maybe;
-use crate::thread::spawn_thread;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::wire::{Layout, Preset, Settings as Frame};
 use hardnessd_core::wording::named;
-use hardnessd_simulator::{Material, REST_S, Reference, SensorProfile, Sequence, SequenceSettings};
+use hardnessd_simulator::{Material, Reference, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -56,18 +53,12 @@ pub struct Args {
     /// random, 5 to 25]
     #[arg(long = "force", value_name = "N", value_parser = force_n)]
     forces: Vec<f64>,
-    /// How alike the taxels are: clean, as after a calibration, or raw, with a gain of their own each
-    #[arg(long, value_name = "PROFILE", default_value = "clean", value_parser = named::<SensorProfile>)]
-    sensor_profile: SensorProfile,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
     /// End after N presses [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     presses: Option<u32>,
-    /// Least rest before the first press (at least 2) and after each, in seconds, 1 to 3600
-    #[arg(long, value_name = "S", default_value_t = REST_S, value_parser = rest_s)]
-    rest: f64,
     /// Play X times as fast, 0.000001 to 1000000000
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = positive)]
     speed: f64,
@@ -79,7 +70,7 @@ pub struct Args {
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<Option<PathBuf>>,
     /// Play no presses: move the arm as a controller says on this new Unix socket
-    #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces", "rest"])]
+    #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces"])]
     arm: Option<PathBuf>,
     /// Script of faults; `--help` shows its format
     #[arg(long, value_name = "FILE")]
@@ -112,21 +103,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     };
     if let Some(path) = args.to.clone() {
         let settings = sequence(&args);
-        // This runs on another thread, so that a signal need not wait for the physics or a slow
-        // disk.
-        let to = path.clone();
-        let (stop, stopped) = mpsc::channel();
-        let work = move || record(&to, &layout, settings, faults, &stopped);
-        let mut recorded = spawn_thread("record", work)?;
-        let finished = tokio::select! {
-            finished = &mut recorded => Some(finished),
-            () = shutdown => {
-                drop(stop);
-                tokio::time::timeout(LAST_FRAME, recorded).await.ok()
-            }
-        };
-        let written = finished.map(|finished| finished.expect("the simulation does not panic"));
-        return written.unwrap_or(Ok(())).of_file(&path, IO);
+        let work = move || record(&path, &layout, settings, faults).of_file(&path, IO);
+        return live::unless(shutdown, "record", work).await.map(drop);
     }
     let baud = baud(&args, &layout)?;
     let link = args.link.as_ref();
@@ -174,8 +152,6 @@ fn sequence(args: &Args) -> SequenceSettings {
         },
         forces_n: args.forces.iter().map(|&force| force as f32).collect(),
         presses: args.presses,
-        rest_s: args.rest,
-        profile: args.sensor_profile,
         piece: args.piece,
         ..SequenceSettings::default()
     }
@@ -194,54 +170,33 @@ fn piece(text: &str) -> Result<Reference, String> {
     }
 }
 
-/// How long a signal waits for the frame that is being written.
-const LAST_FRAME: Duration = Duration::from_millis(500);
-
-/// Writes the bytes that a sensor sends, back to back, until the presses are over or the other end
-/// of `stopped` is dropped. A file that exists is left alone, but a device or a pipe is written to.
-/// If a write fails, the file is removed.
+/// Writes the bytes that a sensor sends, back to back and frame by frame, until the presses are over. While the
+/// sensor is silent or unplugged it sends nothing. A file that exists is left alone, but a device or a pipe
+/// is written to. If a write fails, the file is removed.
 fn record(
     path: &Path,
     layout: &Layout,
     settings: SequenceSettings,
-    faults: Faults,
-    stopped: &mpsc::Receiver<()>,
-) -> std::io::Result<()> {
-    if path.metadata().is_ok_and(|file| !file.is_file()) {
-        let device = File::options().write(true).open(path)?;
-        return write(&device, layout, settings, faults, stopped);
-    }
-    let file = File::create_new(path)?;
-    let written = write(&file, layout, settings, faults, stopped);
-    if written.is_err() {
-        part::remove(path, &file);
-    }
-    written
-}
-
-/// Writes frame by frame, so that the file holds what was played whenever the simulation is
-/// stopped. While the sensor is silent or unplugged it sends nothing.
-fn write(
-    mut file: &File,
-    layout: &Layout,
-    settings: SequenceSettings,
     mut faults: Faults,
-    stopped: &mpsc::Receiver<()>,
 ) -> std::io::Result<()> {
+    let is_device = path.metadata().is_ok_and(|file| !file.is_file());
+    let mut options = File::options();
+    let mut file = options.write(true).create_new(!is_device).open(path)?;
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
         let time_s = f64::from(index) / frame_rate_hz;
-        match faults.encode(time_s, frame.raw, layout, &mut bytes) {
-            Line::Up => file.write_all(&bytes)?,
-            Line::Silent | Line::Unplugged => {}
-        }
-        // A process that ends during a write may leave a part of a frame.
-        if stopped.try_recv() == Err(TryRecvError::Disconnected) {
-            return Ok(());
+        let line = faults.encode(time_s, &frame.raw, layout, &mut bytes);
+        if line == Line::Up
+            && let Err(error) = file.write_all(&bytes)
+        {
+            if !is_device {
+                part::remove(path, &file);
+            }
+            return Err(error);
         }
     }
-    file.sync_all()
+    Ok(())
 }
 
 /// The baud rate of the line: the given one, or the first usual one from 115,200 on that carries the
@@ -274,11 +229,6 @@ fn frame_rate_hz(text: &str) -> Result<f64, String> {
 /// material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N a taxel.
 fn force_n(text: &str) -> Result<f64, String> {
     within(text, 0.01, 200.0)
-}
-
-/// Parses `--rest`.
-fn rest_s(text: &str) -> Result<f64, String> {
-    within(text, REST_S, 3600.0)
 }
 
 pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {

@@ -77,32 +77,6 @@ fn a_tail_that_nobody_reads_is_over_in_its_time() {
 }
 
 #[test]
-fn one_thread_writes_all_lines_of_tail() {
-    let bench = Bench::new();
-    let _daemon = bench.daemon();
-    let _sensor = bench.sensor(&[]);
-    let mut command = Command::new(BINARY);
-    command.args(["tail", "--types", "frame", "--socket"]);
-    let child = command
-        .arg(bench.path("events.sock"))
-        .stdout(Stdio::piped())
-        .spawn();
-    let mut tail = Process(child.unwrap());
-    let mut lines = BufReader::new(tail.0.stdout.take().unwrap()).lines();
-    let tasks = format!("/proc/{}/task", tail.0.id());
-    let threads = || -> Vec<_> {
-        let tasks = std::fs::read_dir(&tasks).unwrap();
-        tasks.map(|task| task.unwrap().file_name()).collect()
-    };
-    lines.next().unwrap().unwrap();
-    let first = threads();
-    for line in lines.by_ref().take(5) {
-        line.unwrap();
-        assert_eq!(threads(), first);
-    }
-}
-
-#[test]
 fn a_demonstration_that_nobody_reads_goes_on_and_ends_at_a_signal() {
     let (mut command, _reader) = unread(&["demo"]);
     let mut demo = Process(command.stderr(Stdio::piped()).spawn().unwrap());

@@ -183,7 +183,7 @@ fn levels_of_ones_own_replace_those_of_the_model() {
 fn a_recording_keeps_the_references_that_presses_of_now_gave() {
     let bench = bench();
     // It ends after the second press, and so does the recording.
-    let _sensor = bench.sensor(&["--seed", "5", "--presses", "2", "--rest", "3"]);
+    let _sensor = bench.sensor(&["--seed", "5", "--presses", "2", "--speed", "0.5"]);
     let mut identify = by_terminal();
     identify
         .args(["identify", "--config", "plain.toml", "--out", "r.npz"])

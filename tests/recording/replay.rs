@@ -32,11 +32,6 @@ fn replay(recording: &Path, more: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-fn simulate(to: &Path, more: &[&str]) {
-    let output = hardnessd(&[&["simulate", "--to", to.to_str().unwrap()], more].concat());
-    assert!(output.status.success(), "{to:?}: {output:?}");
-}
-
 /// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
 /// machines.
 fn assert_same(found: &str, golden: &str, recording: &Path) {
@@ -119,69 +114,4 @@ fn the_pace_of_a_replay_does_not_show() {
         replay(&recording, &[]),
         replay(&recording, &["--speed", "50"])
     );
-}
-
-/// What came of the presses of a recording.
-#[derive(Debug, Default, PartialEq)]
-struct Outcome {
-    /// The level of each press that ended by its release.
-    released: Vec<u64>,
-    /// The number of presses that ended by `max_seconds`.
-    timed_out: usize,
-}
-
-/// Replays a recording with or without `auto_tare`.
-fn outcome(recording: &Path, auto_tare: bool) -> Outcome {
-    let config = recording.with_extension("toml");
-    let text = format!(
-        "[[sensor]]\nname = \"forearm\"\nport = \"none\"\n\
-         [sensor.calibration]\nauto_tare = {auto_tare}\n[model]\nbuilt_in = \"hrn\"\n"
-    );
-    std::fs::write(&config, text).unwrap();
-    let replayed = replay(recording, &["--config", config.to_str().unwrap()]);
-    let mut outcome = Outcome::default();
-    let mut is_released = false;
-    for event in events(&replayed) {
-        if event["state"] == "end" {
-            is_released = event["reason"].is_null();
-            outcome.timed_out += usize::from(event["reason"] == "timeout");
-        }
-        if event["phase"] == "final" && is_released {
-            outcome.released.push(event["level"].as_u64().unwrap());
-        }
-    }
-    outcome
-}
-
-/// The figures are in `docs/operator.md`, "Slow drift".
-#[test]
-fn with_auto_tare_an_hour_of_drift_costs_no_press() {
-    let directory = tempfile::tempdir().unwrap();
-    let script = directory.path().join("drift.toml");
-    let drift = "[[fault]]\nat_s = 0.0\nkind = \"drift\"\nnewtons_per_hour = 0.5\n";
-    std::fs::write(&script, drift).unwrap();
-    let simulated = |name: &str, more: &[&str]| {
-        let path = directory.path().join(name);
-        let presses = ["--presses", "60", "--rest", "60"];
-        simulate(&path, &[&presses, more].concat());
-        path
-    };
-    let steady = simulated("steady.bin", &[]);
-    let drifting = simulated("drift.bin", &["--faults", script.to_str().unwrap()]);
-    let frames = std::fs::metadata(&drifting).unwrap().len() / 790;
-    assert!(frames > 5 * 3600, "more than an hour: {frames} frames");
-
-    let presses = |outcome: &Outcome| (outcome.released.len(), outcome.timed_out);
-    let without_drift = outcome(&steady, false);
-    assert_eq!(presses(&without_drift), (60, 0));
-    assert_eq!(outcome(&steady, true), without_drift);
-    // Once the drift is above the contact threshold, it is a press that never ends.
-    let fixed = outcome(&drifting, false);
-    assert_eq!(presses(&fixed), (6, 1), "{fixed:?}");
-    let following = outcome(&drifting, true);
-    assert_eq!(presses(&following), (60, 0), "{following:?}");
-    let levels = following.released.iter().zip(&without_drift.released);
-    let same = levels.filter(|(with, without)| with == without).count();
-    println!("{same} of 60 levels are those without drift");
-    assert!(same >= 56, "{following:?} {without_drift:?}");
 }

@@ -38,7 +38,7 @@ impl Account {
                 self.labels = answer::labels(event);
                 None
             }
-            ("hardness", "final", _) => Some(self.verdict(event)),
+            ("hardness", "final", _) => self.verdict(event),
             ("press", _, "aborted") => {
                 let begin = begin(event, &self.pressed(event)?);
                 self.presses += 1;
@@ -55,10 +55,8 @@ impl Account {
         }
     }
 
-    fn verdict(&mut self, event: &Value) -> String {
-        let Some(pressed) = self.pressed(event) else {
-            return String::new();
-        };
+    fn verdict(&mut self, event: &Value) -> Option<String> {
+        let pressed = self.pressed(event)?;
         self.presses += 1;
         let mark = match event["level"].as_u64() {
             None => "-",
@@ -76,7 +74,7 @@ impl Account {
         let force_n = event["force_n"].as_f64().unwrap_or_default();
         let line = format!("{begin}{shown:<columns$}  {mark:<5} {force_n:4.1} N");
         let notes = answer::items(event, "notes").filter_map(Value::as_str);
-        notes.fold(line, |line, note| line + "  " + &note.replace('_', " "))
+        Some(notes.fold(line, |line, note| line + "  " + &note.replace('_', " ")))
     }
 
     /// The columns of the longest answer of one or two neighbouring levels.

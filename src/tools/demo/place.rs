@@ -2,7 +2,7 @@
 
 use std::env;
 use std::fs::{self, Permissions};
-use std::io::{self, ErrorKind};
+use std::io;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::PathBuf;
 
@@ -15,21 +15,13 @@ const PREFIX: &str = "hardnessd-demo-";
 pub(super) struct Place(TempDir);
 
 impl Place {
-    /// Makes a directory in the user's runtime directory, else in the directory for temporary
-    /// files.
+    /// Makes a directory. A killed demonstration may have left one, so a part of the name is random.
     pub(super) fn new() -> io::Result<Self> {
-        let mut outcome = Err(ErrorKind::NotFound.into());
-        for directory in directories().filter(|one| one.as_os_str().len() <= LONGEST_BYTES) {
-            // A killed demonstration may have left one, so a part of the name is random.
-            outcome = tempfile::Builder::new()
-                .prefix(PREFIX)
-                .permissions(Permissions::from_mode(0o700))
-                .tempdir_in(directory);
-            if outcome.is_ok() {
-                break;
-            }
-        }
-        outcome.map(Self)
+        let mut named = tempfile::Builder::new();
+        let named = named
+            .prefix(PREFIX)
+            .permissions(Permissions::from_mode(0o700));
+        Ok(Self(named.tempdir_in(directory())?))
     }
 
     /// The link to the pty.
@@ -45,16 +37,11 @@ impl Place {
 
 const SOCKET: &str = "events.sock";
 
-/// The longest path of a directory in which to make the demonstration's own. The path of a socket
-/// has at most 107 bytes.
-const LONGEST_BYTES: usize = 60;
-
-fn directories() -> impl Iterator<Item = PathBuf> {
-    let runtime = env::var_os("XDG_RUNTIME_DIR").filter(|directory| !directory.is_empty());
-    runtime
-        .map(PathBuf::from)
-        .into_iter()
-        .chain([env::temp_dir()])
+/// Where demonstrations have their directories: the user's runtime directory, else that for temporary files.
+fn directory() -> PathBuf {
+    let runtime = env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
+    let there = runtime.filter(|directory| directory.is_dir());
+    there.unwrap_or_else(env::temp_dir)
 }
 
 /// Sockets of this user's demonstrations, the newest first. A killed demonstration may have left
@@ -62,11 +49,7 @@ fn directories() -> impl Iterator<Item = PathBuf> {
 pub(in crate::tools) fn sockets() -> Vec<PathBuf> {
     let uid = rustix::process::geteuid().as_raw();
     let mut found = Vec::new();
-    for entry in directories()
-        .filter_map(|directory| fs::read_dir(directory).ok())
-        .flatten()
-    {
-        let Ok(entry) = entry else { continue };
+    for entry in fs::read_dir(directory()).into_iter().flatten().flatten() {
         let name = entry.file_name();
         // Anyone may put a directory among the temporary files: only the user's own are trusted.
         let ours = name.to_string_lossy().starts_with(PREFIX)

@@ -9,10 +9,8 @@ use toml::Spanned;
 use crate::tools::exit::Failure;
 use crate::tools::{cannot_read, open};
 use hardnessd_core::exit::FAILED;
-use hardnessd_core::frame::Array;
 use hardnessd_core::range::{self, OutOfRange};
 use hardnessd_core::wording;
-use hardnessd_simulator::FULL_SCALE_COUNTS;
 
 /// The file format, for `--help`.
 pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; times in the sensor's seconds from the start:
@@ -30,19 +28,11 @@ Bytes, of the first frame unless `frames` says of how many:
   kind = "drop-bytes"    # `bytes` of each are not sent
   kind = "flip"          # `bits` of each are inverted
 
-Taxels, those in `rows = [first, last]` and `cols = [first, last]`, counted from 0:
-  kind = "stuck"         # they read `counts`
-  kind = "drift"         # each reads `newtons_per_hour` more every hour. After `for_s` it stays so
-
-`bytes` and `bits` are 1 unless given, and at most 1000000. `counts` is 255 unless given. Without
-`rows` or `cols`, all are meant. A drift may be negative, but no taxel reads below 0 or above 255."#;
+`bytes` and `bits` are 1 unless given, and at most 1000000."#;
 
 /// The most bytes or bits of a frame that a fault may strike. It is far more than a frame has: a
 /// line at 115,200 baud needs a minute and a half for this many bytes.
 const MOST_STRUCK: usize = 1_000_000;
-
-/// The most newtons an hour that a taxel can read more: far more than its full scale.
-const MOST_NEWTONS: f64 = 1e6;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -61,11 +51,6 @@ pub(super) struct Fault {
     pub(super) for_s: f64,
     /// The most frames that it strikes.
     frames: Option<usize>,
-    /// The first and the last row, and column, that it strikes.
-    #[serde(default = "all")]
-    pub(super) rows: [usize; 2],
-    #[serde(default = "all")]
-    pub(super) cols: [usize; 2],
     #[serde(flatten)]
     pub(super) kind: Kind,
     /// The number of frames that it has struck.
@@ -92,13 +77,6 @@ pub(super) enum Kind {
         #[serde(default = "one")]
         bits: usize,
     },
-    Stuck {
-        #[serde(default = "full_scale")]
-        counts: u16,
-    },
-    Drift {
-        newtons_per_hour: f64,
-    },
 }
 
 fn no_end() -> f64 {
@@ -107,17 +85,6 @@ fn no_end() -> f64 {
 
 fn one() -> usize {
     1
-}
-
-/// The first and the last row, or column, of the simulated array.
-fn all() -> [usize; 2] {
-    let Array { rows, cols } = Array::JX255N;
-    assert_eq!(rows, cols, "the array is a square");
-    [0, rows - 1]
-}
-
-fn full_scale() -> u16 {
-    FULL_SCALE_COUNTS
 }
 
 impl Fault {
@@ -129,9 +96,8 @@ impl Fault {
             }
             _ => self.frames.unwrap_or(usize::MAX),
         };
-        // What has drifted stays so.
-        let is_over = time_s >= self.at_s + self.for_s && !matches!(self.kind, Kind::Drift { .. });
-        let strikes = time_s >= self.at_s && !is_over && self.struck < frames;
+        let is_now = (self.at_s..self.at_s + self.for_s).contains(&time_s);
+        let strikes = is_now && self.struck < frames;
         self.struck += usize::from(strikes);
         strikes
     }
@@ -141,20 +107,11 @@ impl Fault {
         let from_0 = at_s.is_finite() && at_s >= 0.0;
         range::check("at_s", at_s, from_0, "seconds from 0")?;
         range::check("for_s", for_s, for_s > 0.0, "seconds above 0")?;
-        for (key, [first, last]) in [("rows", self.rows), ("cols", self.cols)] {
-            let [_, end] = all();
-            let expected = format_args!("[first, last] of 0 to {end}");
-            range::check(key, [first, last], first <= last && last <= end, expected)?;
-        }
         let struck = |key, found| range::within(key, found, (0, MOST_STRUCK), "");
-        let newtons = (-MOST_NEWTONS, MOST_NEWTONS);
         match self.kind {
-            Kind::Unplug {} | Kind::Silence {} | Kind::Stuck { .. } => Ok(()),
+            Kind::Unplug {} | Kind::Silence {} => Ok(()),
             Kind::Noise { bytes } | Kind::DropBytes { bytes } => struck("bytes", bytes),
             Kind::Flip { bits } => struck("bits", bits),
-            Kind::Drift { newtons_per_hour } => {
-                range::within("newtons_per_hour", newtons_per_hour, newtons, "")
-            }
         }
     }
 }
@@ -217,18 +174,6 @@ mod tests {
             (
                 "at_s = 1.0\nkind = \"flip\"\nbits = 1000001",
                 "bits: found 1000001, expected 0 to 1000000",
-            ),
-            (
-                "at_s = 1.0\nkind = \"stuck\"\nrows = [13, 28]",
-                "rows: found [13, 28], expected [first, last] of 0 to 27",
-            ),
-            (
-                "at_s = 1.0\nkind = \"stuck\"\ncols = [14, 13]",
-                "cols: found [14, 13]",
-            ),
-            (
-                "at_s = 1.0\nkind = \"drift\"\nnewtons_per_hour = nan",
-                "newtons_per_hour: found NaN",
             ),
             (
                 "at_s = 1.0\nkind = \"silence\"\nfor_s = 0",
