@@ -1,15 +1,11 @@
 //! `hardnessd check`: prints what the daemon would run, without opening a device.
 
-use std::net::SocketAddr;
-use std::path::Path;
-
 use clap::Args as ClapArgs;
-use rustix::fs::Access;
 
 use super::configuration::Configuration;
 use super::exit::{Coded, Failure};
 use crate::daemon::baud::{Load, Pace};
-use crate::daemon::config::{Setup, Zenoh};
+use crate::daemon::config::Setup;
 use crate::daemon::{publish, record};
 use hardnessd_core::frame::Array;
 use hardnessd_core::sensor::Settings;
@@ -65,11 +61,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let idle = setup.without_effect().into_iter();
     warnings
         .extend(idle.map(|key| format!("{key}: changes no verdict, because the model {needs}")));
-    let unix = &setup.config.publish.unix;
-    if unix.enabled {
-        warnings.extend(permission_warning("path", &unix.path()));
-        warnings.extend(permission_warning("control_path", &unix.control_path()));
-    }
     if let Some(record) = &setup.config.record {
         warnings.extend(record::check(record).err().map(|error| error.to_string()));
     }
@@ -80,19 +71,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     lines += &format!("\n{}", setup.in_force());
     super::print(lines.as_bytes())?;
     Ok(())
-}
-
-/// Warns if you may not make a socket at `socket`. It is no error, because the daemon may run as another
-/// user.
-fn permission_warning(key: &str, socket: &Path) -> Option<String> {
-    let socket = super::absolute(socket);
-    let mut above = socket.ancestors().skip(1);
-    let directory = above.find(|one| one.is_dir())?;
-    rustix::fs::access(directory, Access::WRITE_OK).err()?;
-    let directory = directory.display();
-    Some(format!(
-        "publish.unix.{key}: you may not write to {directory}, but the user who runs the daemon must"
-    ))
 }
 
 /// Warns if the taxels have another pitch than the model's.
@@ -139,35 +117,27 @@ fn scale_warning(sensor: &Settings, layout: &Layout) -> Option<String> {
 }
 
 /// Warns of each address that others can reach.
-fn stranger_warnings(setup: &Setup) -> Vec<String> {
+fn stranger_warnings(setup: &Setup) -> impl Iterator<Item = String> {
     let publish = &setup.config.publish;
-    let mut addresses = Vec::new();
-    let mut add = |key, listen: SocketAddr| addresses.push((key, listen.to_string()));
-    if let Some(tcp) = &publish.tcp {
-        add("publish.tcp.listen", tcp.listen);
-    }
-    if let Some(foxglove) = &publish.foxglove {
-        add("publish.foxglove.listen", foxglove.listen);
-    }
-    if let Some(http) = &setup.config.http {
-        add("http.listen", http.listen);
-    }
-    let zenoh = publish.zenoh.iter().flat_map(|zenoh| &zenoh.listen);
-    let zenoh = zenoh.filter_map(|endpoint| Zenoh::address(endpoint));
-    let zenoh = zenoh.map(|address| ("publish.zenoh.listen", address.to_owned()));
-    addresses.extend(zenoh);
-    let is_open = |address: &str| {
-        let parsed = address.parse::<SocketAddr>();
-        parsed.map_or(true, |address| !address.ip().is_loopback())
-    };
-    addresses.retain(|(_, address)| is_open(address));
-    let warning = |(key, address)| {
-        format!(
+    let (tcp, foxglove) = (publish.tcp.as_ref(), publish.foxglove.as_ref());
+    let addresses = [
+        ("publish.tcp.listen", tcp.map(|tcp| tcp.listen)),
+        (
+            "publish.foxglove.listen",
+            foxglove.map(|foxglove| foxglove.listen),
+        ),
+        (
+            "http.listen",
+            setup.config.http.as_ref().map(|http| http.listen),
+        ),
+    ];
+    addresses.into_iter().filter_map(|(key, address)| {
+        let address = address.filter(|address| !address.ip().is_loopback())?;
+        Some(format!(
             "{key}: {address} is open to anyone who can reach this machine; a loopback address, such as 127.0.0.1, \
              is not"
-        )
-    };
-    addresses.into_iter().map(warning).collect()
+        ))
+    })
 }
 
 /// Pitches closer than this count as equal, because datasheets give two digits.

@@ -21,7 +21,7 @@ use hardnessd_core::wording::escaped;
 /// What `--help` says below the options.
 const MORE: &str = "\
     It opens no device. It looks for a missing port, missing rights of this user, other processes \
-    that have the port open (all of them only as root), addresses that do not answer, brltty, \
+    that have the port open (all of them only as root), addresses that do not answer, \
     ModemManager and a slow FTDI timer. Exit code 1: it found a fault.";
 
 /// Arguments of `doctor`.
@@ -39,8 +39,7 @@ pub(super) fn obstacle(port: &Port) -> Option<String> {
     let root = Path::new("/");
     let port = absolute(port.device()?);
     let user = User::of_this_process(root);
-    let fault = refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next());
-    fault.map(|fault| fault.to_string())
+    refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next())
 }
 
 /// The name of a group.

@@ -1,7 +1,6 @@
 //! The checks of a port. They read the file trees under a root, which is `/` except in tests.
 
 use std::ffi::OsStr;
-use std::fmt;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::os::unix::ffi::OsStrExt;
@@ -13,19 +12,6 @@ use rustix::fs::{Access, AtFlags, CWD, accessat};
 use crate::daemon::serial;
 use crate::holders::{holders, processes, under};
 use hardnessd_core::port::Port;
-
-/// A fault and its remedy.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Fault {
-    what: String,
-    cure: String,
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.what, self.cure)
-    }
-}
 
 /// The user who wants to use the port.
 #[derive(Debug, Clone)]
@@ -66,16 +52,13 @@ pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
 }
 
 /// The fault if `port` exists but cannot be a serial port. Then no other check makes sense.
-pub(super) fn refused(root: &Path, port: &Path) -> Option<Fault> {
+pub(super) fn refused(root: &Path, port: &Path) -> Option<String> {
     let file = fs::metadata(port).ok()?;
     let is_other = match file.file_type().is_char_device() {
         true => is_no_tty(root, file.rdev()),
         false => true,
     };
-    is_other.then(|| Fault {
-        what: "this is not a serial port".to_owned(),
-        cure: others(&ports(root)),
-    })
+    is_other.then(|| format!("this is not a serial port: {}", others(&ports(root))))
 }
 
 /// Whether the kernel says that the character device `number` is no tty. It does not say it of a pty,
@@ -87,7 +70,7 @@ fn is_no_tty(root: &Path, number: u64) -> bool {
 }
 
 /// All faults of `port`, an absolute path under `root`.
-pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
+pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<String> {
     let mut faults = in_the_way(root, port, user);
     if let Some(device) = device(root, port) {
         faults.extend(modem_manager(root, &device));
@@ -97,17 +80,14 @@ pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
 }
 
 /// The fault of a port that is no device. It connects, or binds the address, for a moment.
-pub(super) fn unreachable(port: &Port) -> Option<Fault> {
+pub(super) fn unreachable(port: &Port) -> Option<String> {
     let error = match serial::probe(port) {
         Err(error) => error,
         Ok(false) => return None,
         Ok(true) => {
-            return Some(Fault {
-                what: "the other end is a telnet server (RFC 2217), which doubles each FF"
-                    .to_owned(),
-                cure: "set it to raw mode, as in `connection: raw` of ser2net or its menu"
-                    .to_owned(),
-            });
+            let telnet = "the other end is a telnet server (RFC 2217), which doubles each FF: set it to raw mode, \
+                          as in `connection: raw` of ser2net or its menu";
+            return Some(telnet.to_owned());
         }
     };
     let cure = match (port, error.kind()) {
@@ -119,20 +99,13 @@ pub(super) fn unreachable(port: &Port) -> Option<Fault> {
         }
         _ => "correct the address, or look for the way there with `ping`",
     };
-    Some(Fault {
-        what: serial::reason(port, &error),
-        cure: cure.to_owned(),
-    })
+    Some(format!("{}: {cure}", serial::reason(port, &error)))
 }
 
 /// The faults that keep `user` from opening `port`.
-pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<Fault> {
+pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<String> {
     let Some(device) = device(root, port) else {
-        let missing = Fault {
-            what: "no such device".to_owned(),
-            cure: others(&ports(root)),
-        };
-        return [missing].into_iter().chain(braille(root)).collect();
+        return vec![format!("no such device: {}", others(&ports(root)))];
     };
     let denied = denied(root, &device, user).into_iter();
     denied
@@ -147,26 +120,6 @@ fn device(root: &Path, port: &Path) -> Option<PathBuf> {
     Some(Path::new("/").join(device))
 }
 
-/// brltty takes adapters with the chips CH340 and CP210x for braille displays. Their port goes away at
-/// once then.
-fn braille(root: &Path) -> Option<Fault> {
-    let rules = [
-        "etc/udev/rules.d",
-        "usr/lib/udev/rules.d",
-        "lib/udev/rules.d",
-    ];
-    let mut rules = rules.iter().flat_map(|folder| names(root, folder));
-    let is_installed = rules.any(|name| name.ends_with("-brltty.rules"));
-    let runs = processes(root).any(|pid| command(root, pid) == "brltty");
-    (is_installed || runs).then(|| Fault {
-        what: "brltty is installed, which takes adapters with the chips CH340 and CP210x"
-            .to_owned(),
-        cure:
-            "if nobody here reads braille: `sudo apt remove brltty`, then plug the adapter in again"
-                .to_owned(),
-    })
-}
-
 /// Other ports that the user could mean.
 fn others(ports: &[PathBuf]) -> String {
     if ports.is_empty() {
@@ -177,7 +130,7 @@ fn others(ports: &[PathBuf]) -> String {
     format!("these are there: {}", keys.collect::<Vec<_>>().join(", "))
 }
 
-fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
+fn denied(root: &Path, device: &Path, user: &User) -> Option<String> {
     let path = under(root, device);
     (user.access)(&path).err()?;
     let file = fs::metadata(path).ok()?;
@@ -194,13 +147,10 @@ fn denied(root: &Path, device: &Path, user: &User) -> Option<Fault> {
     } else {
         format!("sudo usermod -aG {group} {name}, then log in again")
     };
-    Some(Fault {
-        what: format!(
-            "permission denied to {name} (group {group}, mode {:03o})",
-            mode & 0o777
-        ),
-        cure,
-    })
+    let mode = mode & 0o777;
+    Some(format!(
+        "permission denied to {name} (group {group}, mode {mode:03o}): {cure}"
+    ))
 }
 
 fn allows(mode: u32, shift: u32) -> bool {
@@ -210,20 +160,19 @@ fn allows(mode: u32, shift: u32) -> bool {
 
 /// A fault for each process other than `own` that has the device open. Only root can see this of
 /// other users' processes.
-fn held(root: &Path, device: &Path, own: u32) -> Vec<Fault> {
+fn held(root: &Path, device: &Path, own: u32) -> Vec<String> {
     let others = holders(root, device).filter(|&pid| pid != own);
-    let fault = |pid| {
-        let (what, cure) = match subcommand(root, pid).as_deref() {
-            // A simulator made the port and does not keep others from opening it.
-            Some(b"simulate" | b"demo") => return None,
-            Some(b"run") => (
-                ", the daemon (hardnessd run)".to_owned(),
-                format!("sudo systemctl stop hardnessd; where it is no service, kill {pid}"),
-            ),
-            _ => (format!(" ({})", command(root, pid)), format!("kill {pid}")),
-        };
-        let what = format!("held by process {pid}{what}");
-        Some(Fault { what, cure })
+    let fault = |pid| match subcommand(root, pid).as_deref() {
+        // A simulator made the port and does not keep others from opening it.
+        Some(b"simulate" | b"demo") => None,
+        Some(b"run") => Some(format!(
+            "held by process {pid}, the daemon (hardnessd run): sudo systemctl stop hardnessd; where it is no \
+             service, kill {pid}"
+        )),
+        _ => Some(format!(
+            "held by process {pid} ({}): kill {pid}",
+            command(root, pid)
+        )),
     };
     others.filter_map(fault).collect()
 }
@@ -239,19 +188,19 @@ fn subcommand(root: &Path, pid: u32) -> Option<Vec<u8>> {
 
 /// ModemManager writes to every new USB serial port, unless udev's database says of this one that it
 /// must not.
-fn modem_manager(root: &Path, device: &Path) -> Option<Fault> {
+fn modem_manager(root: &Path, device: &Path) -> Option<String> {
     if !is_usb(device) || property(root, device, "ID_MM_DEVICE_IGNORE").as_deref() == Some("1") {
         return None;
     }
     let pid = processes(root).find(|&pid| command(root, pid) == "ModemManager")?;
-    Some(Fault {
-        what: format!("ModemManager (process {pid}) writes to it, and no udev rule forbids that"),
-        cure: udev_rule(root, device),
-    })
+    let cure = udev_rule(root, device);
+    Some(format!(
+        "ModemManager (process {pid}) writes to it, and no udev rule forbids that: {cure}"
+    ))
 }
 
 /// An FTDI adapter holds bytes back until its latency timer expires.
-fn latency(root: &Path, device: &Path) -> Option<Fault> {
+fn latency(root: &Path, device: &Path) -> Option<String> {
     let timer = Path::new("sys/class/tty")
         .join(device.file_name()?)
         .join("device/latency_timer");
@@ -260,13 +209,11 @@ fn latency(root: &Path, device: &Path) -> Option<Fault> {
         .trim()
         .parse()
         .ok()?;
-    (ms > 1).then(|| Fault {
-        what: format!("its latency timer holds bytes back for {ms} ms"),
-        cure: format!(
-            "echo 1 | sudo tee /{}; to last: {}",
-            timer.display(),
-            udev_rule(root, device)
-        ),
+    (ms > 1).then(|| {
+        let (timer, rule) = (timer.display(), udev_rule(root, device));
+        format!(
+            "its latency timer holds bytes back for {ms} ms: echo 1 | sudo tee /{timer}; to last: {rule}"
+        )
     })
 }
 
