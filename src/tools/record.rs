@@ -25,7 +25,7 @@ use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
-use hardnessd_core::recording::{LabelError, Labels, check_label, misspelt};
+use hardnessd_core::recording::{Labels, check_label, misspelt};
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
 
@@ -210,7 +210,7 @@ fn check_level(labels: &Labels, setup: &Setup) -> Result<(), Failure> {
 }
 
 /// Parses a label, `KEY=VALUE`.
-fn label(text: &str) -> Result<(String, String), LabelError> {
+fn label(text: &str) -> Result<(String, String), String> {
     let (key, value) = text.split_once('=').unwrap_or(("", text));
     check_label(key, value)?;
     Ok((key.to_owned(), value.to_owned()))

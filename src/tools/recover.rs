@@ -43,17 +43,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         RecoverError::Write(error) => unwritten(error),
     })?;
     let path = args.broken.display();
-    let problem = match (recovered.messages, recovered.messages_foreign) {
-        (0, _) => Some(format!(
+    if recovered.messages == 0 {
+        let problem = format!(
             "{path}: not a recording, or no chunk of messages in it is whole ({bytes} bytes read); \
              `mcap recover` rewrites chunks of over 64 MiB"
-        )),
-        (messages, foreign) if messages == foreign => Some(format!(
-            "{path}: nothing to save: all {messages} messages are of other programs"
-        )),
-        _ => None,
-    };
-    if let Some(problem) = problem {
+        );
         return Err(Failure::new(FAILED, problem));
     }
     part.finish().map_err(|error| unwritten(error.into()))?;
@@ -75,10 +69,8 @@ fn account(recovered: &Recovered) -> String {
         chunks,
         span_ns,
         lost,
-        messages_unknown,
-        messages_damaged,
+        messages_lost,
         complete,
-        messages_foreign: _,
         states,
     } = recovered;
     let time = |ns: u64| {
@@ -91,11 +83,10 @@ fn account(recovered: &Recovered) -> String {
         text +=
             &format!("\nlost {bytes} bytes at byte {place}: damaged, or a chunk of over 64 MiB");
     }
-    if *messages_unknown > 0 {
-        text += &format!("\nlost {messages_unknown} messages of channels that nothing describes");
-    }
-    if *messages_damaged > 0 {
-        text += &format!("\nlost {messages_damaged} messages that cannot be read");
+    if *messages_lost > 0 {
+        text += &format!(
+            "\nlost {messages_lost} messages that cannot be read, or that nothing describes"
+        );
     }
     if !complete {
         text += "\nthe end was missing: the recording was cut off, or it is still being written";

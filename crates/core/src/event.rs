@@ -4,7 +4,6 @@
 //! ever changes its meaning. The order of fields is part of the golden bytes. Nothing here decides
 //! anything: the pipeline fills events in, and the hub numbers and publishes them.
 
-mod number;
 mod reply;
 
 use std::fmt::Display;
@@ -16,6 +15,7 @@ use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
 use crate::verdict::{ReferenceKinds, Shore};
+pub use crate::wording::name;
 
 /// The version of the format, as announced in `hello`.
 pub const PROTOCOL: u32 = 1;
@@ -491,18 +491,8 @@ pub struct FrameEvent {
 }
 
 fn line<T: Serialize>(value: &T) -> String {
-    let mut text = number::json(value);
-    text.push('\n');
-    text
-}
-
-/// The name under which a kind, state, phase or note is published. The log, the metrics and
-/// recordings use it too. [`crate::wording::named`] reads it.
-pub fn name(state: &impl Serialize) -> String {
-    match serde_json::to_value(state) {
-        Ok(serde_json::Value::String(name)) => name,
-        other => unreachable!("a state without data is published as its name, not {other:?}"),
-    }
+    let text = serde_json::to_string(value);
+    text.expect("plain structs of numbers and strings always serialise") + "\n"
 }
 
 /// RFC 3339 in UTC with microseconds, so that every time has the same width.

@@ -76,15 +76,6 @@ pub fn within<T: PartialOrd + Debug + Display>(
     check(key, found, fits, expected.trim_end())
 }
 
-/// Checks that a number is above 0 and at most `most`.
-///
-/// # Errors
-///
-/// Returns [`OutOfRange`] if the number is less or more, or no number.
-pub fn positive(key: &str, found: f64, most: f64) -> Result<(), OutOfRange> {
-    above_0(most).check(key, &found)
-}
-
 /// The range of a number in a table of settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
@@ -121,7 +112,7 @@ impl Range {
     /// # Errors
     ///
     /// Returns [`OutOfRange`] if one of its numbers is outside the range.
-    pub fn check(self, key: &str, value: &impl Ranged) -> Result<(), OutOfRange> {
+    pub fn check<T: Ranged>(self, key: &str, value: &T) -> Result<(), OutOfRange> {
         let Self {
             least,
             most,
@@ -136,65 +127,60 @@ impl Range {
             true => format!("a number above {least} and at most {most}"),
             false => format!("{least} to {most} {unit}"),
         };
+        let found = match T::IS_WHOLE {
+            true => found.to_string(),
+            false => format!("{found:?}"),
+        };
+        let expected = expected.trim_end();
         Err(OutOfRange::because(
             key,
-            format_args!(
-                "found {}, expected {}",
-                value.shown(found),
-                expected.trim_end()
-            ),
+            format_args!("found {found}, expected {expected}"),
         ))
     }
 }
 
 /// A value whose numbers have a range.
 pub trait Ranged {
+    /// Whether the numbers are whole ones.
+    const IS_WHOLE: bool;
     /// The numbers of the value. Without a value, there are none.
     fn numbers(&self) -> Vec<f64>;
-    /// One of these numbers, as a message shows it.
-    fn shown(&self, number: f64) -> String;
 }
 
 macro_rules! ranged {
-    ($($kind:ty, $number:expr, $shown:literal;)*) => {
+    ($($kind:ty, $number:expr, $is_whole:literal;)*) => {
         $(impl Ranged for $kind {
+            const IS_WHOLE: bool = $is_whole;
+
             fn numbers(&self) -> Vec<f64> {
                 vec![$number(*self)]
-            }
-
-            fn shown(&self, number: f64) -> String {
-                format!($shown, number)
             }
         })*
     };
 }
 
 ranged! {
-    f64, f64::from, "{:?}";
-    f32, as_written, "{:?}";
-    u16, f64::from, "{}";
-    u32, f64::from, "{}";
-    u64, |number| number as f64, "{}";
-    usize, |number| number as f64, "{}";
+    f64, f64::from, false;
+    f32, as_written, false;
+    u16, f64::from, true;
+    u32, f64::from, true;
+    u64, |number| number as f64, true;
+    usize, |number| number as f64, true;
 }
 
 impl Ranged for Pitch {
+    const IS_WHOLE: bool = false;
+
     fn numbers(&self) -> Vec<f64> {
         vec![self.rows_mm, self.cols_mm]
     }
-
-    fn shown(&self, number: f64) -> String {
-        number.shown(number)
-    }
 }
 
-impl<T: Ranged + Default> Ranged for Option<T> {
+impl<T: Ranged> Ranged for Option<T> {
+    const IS_WHOLE: bool = T::IS_WHOLE;
+
     fn numbers(&self) -> Vec<f64> {
         self.as_ref().map_or_else(Vec::new, T::numbers)
-    }
-
-    fn shown(&self, number: f64) -> String {
-        T::default().shown(number)
     }
 }
 

@@ -127,7 +127,7 @@ impl Arrays<'_> {
         let failed = |error: std::io::Error| Error(format!("{array}: found {error}"));
         let header = Header::read(&mut entry).map_err(failed)?;
         let found = match header.shape.split_first() {
-            Some((&found, rest)) if !header.fortran_order && rest == row => found,
+            Some((&found, rest)) if rest == row => found,
             _ => return Err(failed(header.unexpected_shape())),
         };
         if !rows.contains(&found) {

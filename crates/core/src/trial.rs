@@ -8,7 +8,6 @@
 
 use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::panic;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode, ExitStatus, Stdio};
 use std::sync::OnceLock;
@@ -18,7 +17,6 @@ use rustix::process::{Resource, Rlimit, Signal};
 use rustix::time::ClockId;
 
 use crate::verdict::{self, Hrn, ModelError};
-use crate::wording;
 
 /// The name (argv 0) by which a process of the program knows that it is a trial.
 const NAME: &str = "hardnessd-trial";
@@ -110,15 +108,13 @@ fn tried(command: &mut Command, bytes: &[u8]) -> Result<Duration, ModelError> {
     let output = child.wait_with_output();
     let output =
         output.map_err(|error| refused(format!("the process that tried it is lost: {error}")))?;
-    // After a panic, a second answer may follow. Only the first answer counts.
-    let mut answers = serde_json::Deserializer::from_slice(&output.stdout).into_iter();
-    match answers.next().and_then(serde_json::Result::<Answer>::ok) {
-        Some(Ok(verdict_us)) => {
+    match serde_json::from_slice::<Answer>(&output.stdout) {
+        Ok(Ok(verdict_us)) => {
             let verdict = Duration::try_from_secs_f64(verdict_us / 1e6);
             Ok(verdict.unwrap_or(Duration::MAX))
         }
-        Some(Err(problem)) => Err(ModelError::new(problem)),
-        None => Err(refused(why_silent(output.status))),
+        Ok(Err(problem)) => Err(ModelError::new(problem)),
+        Err(_) => Err(refused(why_silent(output.status))),
     }
 }
 
@@ -140,25 +136,18 @@ fn why_silent(status: ExitStatus) -> String {
 /// Runs in the child: tries the file on stdin and answers on stdout.
 fn trial() -> ExitCode {
     limit();
-    panic::set_hook(Box::new(|info| {
-        let text = info.payload_as_str().unwrap_or("a panic");
-        let text = text.chars().take(200).collect::<String>();
-        let text = wording::escaped(&text);
-        write_answer(&Err(format!(
-            "model: the inference library failed on it: {text}"
-        )));
-    }));
     let mut bytes = Vec::new();
     let read = std::io::stdin()
         .take(verdict::MAX_FILE_BYTES as u64 + 1)
         .read_to_end(&mut bytes);
-    let judged = match read {
+    let judged: Answer = match read {
         Err(error) => Err(error.to_string()),
         Ok(_) => Hrn::load(&bytes)
             .and_then(|hrn| median_us(&hrn))
             .map_err(|error| error.to_string()),
     };
-    write_answer(&judged);
+    // If writing fails, nobody is left to tell.
+    let _ = serde_json::to_writer(std::io::stdout(), &judged);
     ExitCode::SUCCESS
 }
 
@@ -204,11 +193,6 @@ fn median_us(hrn: &Hrn) -> Result<f64, ModelError> {
     Ok(times[times.len() / 2].as_secs_f64() * 1e6)
 }
 
-fn write_answer(answer: &Answer) {
-    // If writing fails, nobody is left to tell.
-    let _ = serde_json::to_writer(std::io::stdout(), answer);
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -243,10 +227,7 @@ mod tests {
             ),
             ("kill -XCPU $$", "more than 10 s of processor time"),
             ("echo nonsense", "the inference library failed on it"),
-            (
-                r#"echo '{"Err":"model of clay"}{"Err":"so"}'"#,
-                "model of clay",
-            ),
+            (r#"echo '{"Err":"model of clay"}'"#, "model of clay"),
         ] {
             let line = tried(script).unwrap_err().to_string();
             assert!(line.contains(expected), "{script}: {line}");

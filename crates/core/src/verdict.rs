@@ -29,8 +29,8 @@ pub use self::card::{
 };
 pub use self::course::{COURSE_FRAMES, Extents, Sample, TimeSeries, extents};
 pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
-use self::file::{File, Outputs};
-pub use self::file::{check_levels, check_line};
+use self::file::File;
+pub use self::file::{are_levels, check_line};
 pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
 use self::inputs::{Input, Query};
 pub use self::probabilities::argmax;
@@ -145,15 +145,9 @@ impl Hrn {
         let mut inference = inference.map_err(ModelError::of_graph)?;
         // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
-        let shapes = match file.format {
-            Format::Frame | Format::Parts => vec![file.format.shape(file.card.grid)],
-            Format::Course { .. } => {
-                let inputs = file.inputs.iter();
-                inputs.map(|input| input.shape(file.lengths)).collect()
-            }
-        };
-        for (at, shape) in shapes.iter().enumerate() {
-            let fixed = inference.with_input_fact(at, f32::fact(shape).into());
+        for (at, input) in file.inputs.iter().enumerate() {
+            let shape = input.shape(file.lengths);
+            let fixed = inference.with_input_fact(at, f32::fact(&shape).into());
             inference = fixed.map_err(ModelError::of_graph)?;
         }
         let typed = inference.into_typed();
@@ -161,15 +155,17 @@ impl Hrn {
         let mut optimized = typed.map_err(ModelError::of_graph)?;
         guard::check_values(&optimized)?;
         optimized.optimize().map_err(ModelError::of_graph)?;
-        for (name, output, lengths) in file.outputs() {
-            let fact = optimized
-                .output_fact(output)
-                .map_err(ModelError::of_graph)?;
+        for (place, output) in file.outputs.iter().enumerate() {
+            let Some(lengths) = file.lengths_of(output) else {
+                continue;
+            };
+            let fact = optimized.output_fact(place).map_err(ModelError::of_graph)?;
             let is_float = fact.datum_type == f32::datum_type();
             let shape = fact.shape.as_concrete();
             if !(is_float && matches!(shape, Some([1, length]) if lengths.contains(length))) {
                 let expected = format!("f32 [1, {} to {}]", lengths.start(), lengths.end());
-                let problem = format!("model output `{name}`: found {fact:?}, expected {expected}");
+                let problem =
+                    format!("model output `{output}`: found {fact:?}, expected {expected}");
                 return Err(ModelError::new(problem));
             }
         }
@@ -200,12 +196,12 @@ impl Hrn {
     /// Returns an error if the model gives no distribution over the scale, or the levels are no parts
     /// of it.
     pub fn with_levels(mut self, levels: Vec<Level>) -> Result<Self, ModelError> {
-        let Outputs::Bins { .. } = self.file.outputs else {
+        if self.file.place_of("bins").is_none() {
             return Err(ModelError::new(
                 "found levels, expected none: the model has levels of its own, and only a model of format 3 \
                  takes others",
             ));
-        };
+        }
         Borders::of(&levels)?;
         self.file.card.levels = levels;
         Ok(self)
@@ -213,7 +209,13 @@ impl Hrn {
 
     /// The input that the model judges.
     pub fn format(&self) -> Format {
-        self.file.format
+        match self.file.inputs[0] {
+            Input::Frame => Format::Frame,
+            Input::Parts => Format::Parts,
+            _ => Format::Course {
+                most_frames: self.file.lengths.frames,
+            },
+        }
     }
 
     /// The checks in the file.
@@ -228,17 +230,13 @@ impl Hrn {
     ///
     /// Returns the errors of [`Self::judge`]. One of them is that the model takes another number of taxels.
     pub fn judge_taxels(&self, newtons: &[f32]) -> Result<Verdict, ModelError> {
-        let shape = self.file.format.shape(self.file.card.grid);
-        let input = match self.file.format {
-            // As [`ModelFrame::pressed`].
-            Format::Frame => {
-                let pressed: Vec<f32> = newtons.iter().map(|newtons| newtons.max(0.0)).collect();
-                Tensor::from_shape(&shape, &pressed)
-            }
-            _ => Tensor::from_shape(&shape, newtons),
-        };
-        let input = input.map_err(ModelError::of_judgement)?;
-        self.verdict(&self.run(tvec!(input.into()))?, Knowledge::None)
+        let input = self.file.inputs[0];
+        // As [`ModelFrame::pressed`].
+        let least = if input == Input::Frame { 0.0 } else { f32::MIN };
+        let newtons: Vec<f32> = newtons.iter().map(|newtons| newtons.max(least)).collect();
+        let tensor = Tensor::from_shape(&input.shape(self.file.lengths), &newtons);
+        let tensor = tensor.map_err(ModelError::of_judgement)?;
+        self.verdict(&self.run(tvec!(tensor.into()))?, Knowledge::None)
     }
 
     /// Judges one frame on the model's grid, as a press with one frame and an unknown approach.
@@ -274,13 +272,9 @@ impl Hrn {
     ///
     /// Panics if a press has no frame.
     pub fn references(&self, presses: &[ReferencePress]) -> Result<References, ModelError> {
-        let Outputs::Bins {
-            reference: Some(reference),
-            ..
-        } = self.file.outputs
-        else {
+        if self.most_references() == 0 {
             return Ok(References::NONE);
-        };
+        }
         at_most(presses.len(), self.most_references(), "references")?;
         let mut features = Vec::new();
         for press in presses {
@@ -289,7 +283,7 @@ impl Hrn {
                 piece: Some(press.piece),
                 references: &References::NONE,
             })?;
-            features.extend(read(&outputs, reference, "reference")?);
+            features.extend(self.numbers(&outputs, "reference")?.unwrap_or_default());
         }
         Ok(References::new(presses, features))
     }
@@ -366,23 +360,13 @@ impl Hrn {
         course: &TimeSeries,
         references: &References,
     ) -> Result<Verdict, ModelError> {
-        let moments = &course.moments;
-        let last = moments.last().expect("a press has a frame");
-        if let Format::Course { .. } = self.file.format {
-            let outputs = self.run_course(&Query {
-                course,
-                piece: None,
-                references,
-            })?;
-            return self.verdict(&outputs, references.kinds().knowledge());
-        }
         self.file.card.check_array(Array::JX255N)?;
-        if self.file.format == Format::Frame {
-            return self.judge_taxels(&last.frame.newtons);
-        }
-        let moments = moments.iter();
-        let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
-        self.judge_taxels(&parts::parts(&moments.collect::<Vec<_>>()))
+        let outputs = self.run_course(&Query {
+            course,
+            piece: None,
+            references,
+        })?;
+        self.verdict(&outputs, references.kinds().knowledge())
     }
 
     /// Judges one of [`Self::checks`].
@@ -419,6 +403,22 @@ impl Hrn {
         self.plan.run(inputs).map_err(ModelError::of_judgement)
     }
 
+    /// The numbers of an output, if the model has it.
+    fn numbers(&self, outputs: &[TValue], output: &str) -> Result<Option<Vec<f32>>, ModelError> {
+        let Some(place) = self.file.place_of(output) else {
+            return Ok(None);
+        };
+        let view = outputs[place].try_as_plain_ram();
+        let view = view.map_err(ModelError::of_judgement)?;
+        let values = view.as_slice::<f32>().map_err(ModelError::of_judgement)?;
+        match values.iter().all(|value| value.is_finite()) {
+            true => Ok(Some(values.to_vec())),
+            false => Err(ModelError::new(format!(
+                "model gave a number that is not finite in `{output}`"
+            ))),
+        }
+    }
+
     /// What the outputs say.
     fn verdict(&self, outputs: &[TValue], knowledge: Knowledge) -> Result<Verdict, ModelError> {
         let card = &self.file.card;
@@ -426,39 +426,26 @@ impl Hrn {
             .conformal
             .as_ref()
             .map(|promised| promised.limits(knowledge));
-        let (logits, probabilities, shore) = match self.file.outputs {
-            Outputs::Levels {
-                logits,
-                probabilities,
-                shore,
-            } => {
-                let shore = shore
-                    .map(|place| read(outputs, place, "shore"))
-                    .transpose()?;
-                // An interval has to contain its value, so widen it if it does not.
-                let shore = shore.map(|found| Shore {
-                    value: found[0],
-                    low: found[1].min(found[0]),
-                    high: found[2].max(found[0]),
-                });
-                let logits = read(outputs, logits, "logits")?;
-                (
-                    logits,
-                    read(outputs, probabilities, "probabilities")?,
-                    shore,
-                )
-            }
-            Outputs::Bins { bins, .. } => {
-                let distribution = Distribution::of(&read(outputs, bins, "bins")?);
-                let borders = Borders::of(&card.levels);
-                let borders = &borders.expect("the levels were checked when they came");
-                let probabilities = distribution.levels(borders);
-                let logits = probabilities.iter();
-                let logits = logits.map(|p| p.max(f32::MIN_POSITIVE).ln()).collect();
-                let tail = limits.map_or(TAIL, |limits| limits.tail);
-                let shore = distribution.shore(borders, tail);
-                (logits, probabilities, Some(shore))
-            }
+        let given = |output| self.numbers(outputs, output);
+        let (logits, probabilities, shore) = if let Some(bins) = given("bins")? {
+            let distribution = Distribution::of(&bins);
+            let borders = Borders::of(&card.levels);
+            let borders = &borders.expect("the levels were checked when they came");
+            let probabilities = distribution.levels(borders);
+            let logits = probabilities.iter();
+            let logits = logits.map(|p| p.max(f32::MIN_POSITIVE).ln()).collect();
+            let tail = limits.map_or(TAIL, |limits| limits.tail);
+            let shore = distribution.shore(borders, tail);
+            (logits, probabilities, Some(shore))
+        } else {
+            // An interval has to contain its value, so widen it if it does not.
+            let shore = given("shore")?.map(|found| Shore {
+                value: found[0],
+                low: found[1].min(found[0]),
+                high: found[2].max(found[0]),
+            });
+            let logits = given("logits")?.unwrap_or_default();
+            (logits, given("probabilities")?.unwrap_or_default(), shore)
         };
         let (best, confidence) = argmax(&probabilities);
         Ok(Verdict {
@@ -517,19 +504,6 @@ fn at_most(found: usize, most: usize, what: &str) -> Result<(), ModelError> {
         true => Ok(()),
         false => Err(ModelError::new(format!(
             "found {found} {what}, expected at most {most}"
-        ))),
-    }
-}
-
-/// An output's numbers.
-fn read(outputs: &[TValue], place: usize, output: &'static str) -> Result<Vec<f32>, ModelError> {
-    let view = outputs[place].try_as_plain_ram();
-    let view = view.map_err(ModelError::of_judgement)?;
-    let values = view.as_slice::<f32>().map_err(ModelError::of_judgement)?;
-    match values.iter().all(|value| value.is_finite()) {
-        true => Ok(values.to_vec()),
-        false => Err(ModelError::new(format!(
-            "model gave a number that is not finite in `{output}`"
         ))),
     }
 }

@@ -21,7 +21,6 @@ use crate::run::progress::ensure_finite;
 use crate::run::{Description, Run};
 use crate::settings::{self, Profile};
 use hardnessd_core::exit::{UNAVAILABLE, USAGE};
-use hardnessd_core::wording;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
@@ -121,7 +120,9 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     check(recipe, &presses, &parts)?;
     let findings = Findings::of(&presses, Some(labels));
     let findings = findings.usable()?;
-    hardnessd_core::stderr_part!("{}", wording::lines(&findings.to_string()));
+    if !findings.warnings.is_empty() {
+        hardnessd_core::stderr_line!("{}", findings.to_string().trim_end());
+    }
     export::check_sources(&presses.sources)?;
 
     let description = Description {
@@ -137,7 +138,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         run.write("findings.txt", findings.to_string().as_bytes())?;
     }
     presses.warn_of_other_levels();
-    hardnessd_core::stderr_part!("{}", counts(&presses));
+    hardnessd_core::stderr_line!("{}", counts(&presses).trim_end());
     if profile == Profile::Smoke {
         hardnessd_core::stderr_line!(
             "--profile smoke: tries the commands in seconds; too short to learn anything"

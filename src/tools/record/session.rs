@@ -154,8 +154,7 @@ async fn ask_for_object(user: &mut User<'_>, number: u32, levels: &[Level]) -> O
         if name.is_empty() {
             return Err("the name is empty: write what you will press".to_owned());
         }
-        let checked = check_label("name", name).map_err(|error| error.to_string());
-        checked.map(|()| name.to_owned())
+        check_label("name", name).map(|()| name.to_owned())
     };
     let question = format!("\nobject {number}: its name");
     let name = user.ask(&question, named).await?;

@@ -61,13 +61,6 @@ struct InputMessage {
     data: Blob,
 }
 
-/// The part of a state that says whether the rest can be read.
-#[derive(Deserialize)]
-struct Version {
-    #[serde(default)]
-    format: u32,
-}
-
 fn from_cdr<M: DeserializeOwned>(bytes: &[u8]) -> Result<M, Error> {
     let foreign =
         |found: &str| Error::Content(format!("found {found}, expected a message of ours"));
@@ -83,10 +76,12 @@ fn json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(value).expect("plain structs of numbers and strings always serialise")
 }
 
+fn mono_ns(at: Stamp) -> u64 {
+    u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX)
+}
+
 /// The message of an entry of `sensor` at `at`.
 pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
-    let header = Header::new(at.wall, sensor);
-    let mono_ns = u64::try_from(at.mono.as_nanos()).unwrap_or(u64::MAX);
     let text = |text: &str| text.as_bytes().to_vec();
     let (kind, data) = match entry {
         Entry::Input(Input::Bytes(bytes)) => (0, bytes.to_vec()),
@@ -99,31 +94,28 @@ pub(super) fn encode_entry(sensor: &str, at: Stamp, entry: &Entry) -> Vec<u8> {
         Entry::Input(Input::Shutdown) => (7, Vec::new()),
         Entry::Input(Input::Motion(points)) => {
             return ros::to_cdr(&MotionMessage {
-                header,
-                mono_ns,
+                header: Header::new(at.wall, sensor),
+                mono_ns: mono_ns(at),
                 at_ns: points.iter().map(|point| point.at_ns).collect(),
                 approach_mm: points.iter().map(|point| point.mm).collect(),
             });
         }
-        Entry::State(state) => (9, json(state)),
+        Entry::State(state) => (STATE, json(state)),
         Entry::Input(Input::Skipped(bytes)) => (11, json(bytes)),
     };
-    ros::to_cdr(&InputMessage {
-        header,
-        mono_ns,
-        kind,
-        data: Blob::from(data),
-    })
+    encode(sensor, at, kind, data)
 }
 
-/// The message of a state that may be anything.
-#[cfg(test)]
-pub(super) fn encode_state(sensor: &str, at: Stamp, state: &Value) -> Vec<u8> {
+/// The kind of a state.
+pub(super) const STATE: u8 = 9;
+
+/// A message on [`INPUT`].
+pub(super) fn encode(sensor: &str, at: Stamp, kind: u8, data: Vec<u8>) -> Vec<u8> {
     ros::to_cdr(&InputMessage {
         header: Header::new(at.wall, sensor),
-        mono_ns: at.mono.as_nanos() as u64,
-        kind: 9,
-        data: Blob::from(json(state)),
+        mono_ns: mono_ns(at),
+        kind,
+        data: Blob::from(data),
     })
 }
 
@@ -190,15 +182,16 @@ pub(super) fn decode_entry(
             Entry::Input(Input::Context(context))
         }
         7 => Entry::Input(Input::Shutdown),
-        9 => {
-            let Version { format } = serde_json::from_slice(&data).map_err(unreadable)?;
-            if format != FORMAT {
+        STATE => {
+            let state: Value = serde_json::from_slice(&data).map_err(unreadable)?;
+            let format = &state["format"];
+            if *format != FORMAT {
                 return Err(Error::Content(format!(
                     "found a recording of format {format}, expected format {FORMAT}: play it with the version \
                      that wrote it"
                 )));
             }
-            let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
+            let state: State = serde_json::from_value(state).map_err(unreadable)?;
             check_context(state.at_rest.context())?;
             Entry::State(Box::new(state))
         }

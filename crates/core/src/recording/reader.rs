@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::{Cursor, ErrorKind, Read};
 
-use mcap::MAGIC;
-use mcap::records::{ChunkHeader, Record, op};
+use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use super::message::{self, INPUT, MOTION};
@@ -33,26 +32,60 @@ pub(super) fn too_long(bytes: u64) -> String {
 
 /// The bytes of a chunk's record before its data, without the name of the compression: two times, the
 /// unpacked length, the checksum, the name's length, and the data's length.
-const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
+const CHUNK_HEADER_BYTES: usize = 8 + 8 + 8 + 4 + 4 + 8;
 
-/// The schemas, channels and messages of a chunk, one after another. The chunk is held unpacked, and never
-/// all its records: a chunk may have millions.
-pub(super) struct ChunkRecords {
-    reader: LinearReader,
-    /// The rest of the chunk's record.
-    rest: Cursor<Vec<u8>>,
+/// The records of a file or of a chunk, one after another: the opcode and the bytes of each.
+pub(super) struct Records<R> {
+    source: R,
+    linear: LinearReader,
 }
 
-impl ChunkRecords {
-    /// The records of a chunk whose record has the bytes `body`. The unpacked length is checked before the
-    /// chunk is unpacked, and the checksum before any record is used. The chunk is read apart from the
-    /// file and without what may follow its data, because the crate reads past the data of a chunk without
-    /// compression.
+impl<R: Read> Records<R> {
+    /// The records of a file. Chunks are records here.
+    fn of_file(source: R) -> Self {
+        let options = LinearReaderOptions::default()
+            .with_emit_chunks(true)
+            .with_record_length_limit(LONGEST_CHUNK_BYTES);
+        Self {
+            source,
+            linear: LinearReader::new_with_options(options),
+        }
+    }
+
+    fn read(&mut self) -> Result<Option<(u8, Vec<u8>)>, Error> {
+        while let Some(event) = self.linear.next_event() {
+            match event? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let read = loop {
+                        match self.source.read(self.linear.insert(wanted)) {
+                            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                            read => break read?,
+                        }
+                    };
+                    self.linear.notify_read(read);
+                }
+                LinearReadEvent::Record { opcode, data } => {
+                    return Ok(Some((opcode, data.to_vec())));
+                }
+            }
+        }
+        Ok(None)
+    }
+}
+
+impl Records<Cursor<Vec<u8>>> {
+    /// The records of a chunk whose record has the bytes `body`. The chunk is held unpacked, and never all
+    /// its records: a chunk may have millions. The unpacked length is checked before the chunk is unpacked,
+    /// and the checksum before any record is used. The chunk is read apart from the file and without what
+    /// may follow its data, because the crate reads past the data of a chunk without compression.
     ///
     /// # Errors
     ///
     /// Fails if the chunk is cut off or too long.
-    pub(super) fn new(header: &ChunkHeader, body: &[u8]) -> Result<Self, Error> {
+    pub(super) fn of_chunk(mut body: Vec<u8>) -> Result<Self, Error> {
+        let Record::Chunk { header, data } = parse(op::CHUNK, &body)? else {
+            return Err(mcap::McapError::UnexpectedEoc.into());
+        };
         let length = header.uncompressed_size;
         if length > LONGEST_CHUNK_BYTES as u64 {
             return Err(mcap::McapError::ChunkTooLarge(length).into());
@@ -63,42 +96,19 @@ impl ChunkRecords {
             .with_prevalidate_chunk_crcs(true)
             // The crate holds the chunk itself to the limit of its records too.
             .with_record_length_limit(LONGEST_CHUNK_BYTES);
-        let data_at = CHUNK_HEADER_BYTES + header.compression.len() as u64;
-        let end = usize::try_from(data_at.saturating_add(header.compressed_size)).ok();
-        let Some(body) = end.and_then(|end| body.get(..end)) else {
-            return Err(mcap::McapError::UnexpectedEoc.into());
-        };
-        let length = (body.len() as u64).to_le_bytes();
+        let length = CHUNK_HEADER_BYTES + header.compression.len() + data.len();
+        body.truncate(length);
+        let length = (length as u64).to_le_bytes();
+        body.splice(..0, [op::CHUNK].into_iter().chain(length));
         Ok(Self {
-            reader: LinearReader::new_with_options(options),
-            rest: Cursor::new([&[op::CHUNK], &length[..], body].concat()),
+            source: Cursor::new(body),
+            linear: LinearReader::new_with_options(options),
         })
-    }
-
-    fn read(&mut self) -> Result<Option<(Record<'static>, usize)>, Error> {
-        while let Some(event) = self.reader.next_event() {
-            match event? {
-                LinearReadEvent::ReadRequest(wanted) => {
-                    let read = self.rest.read(self.reader.insert(wanted))?;
-                    self.reader.notify_read(read);
-                }
-                LinearReadEvent::Record { opcode, data } => {
-                    let record = parse(opcode, data)?;
-                    if let Record::Schema { .. } | Record::Channel(_) | Record::Message { .. } =
-                        record
-                    {
-                        return Ok(Some((record.into_owned(), data.len())));
-                    }
-                }
-            }
-        }
-        Ok(None)
     }
 }
 
-impl Iterator for ChunkRecords {
-    /// A record, and the number of its bytes.
-    type Item = Result<(Record<'static>, usize), Error>;
+impl<R: Read> Iterator for Records<R> {
+    type Item = Result<(u8, Vec<u8>), Error>;
 
     fn next(&mut self) -> Option<Self::Item> {
         self.read().transpose()
@@ -146,15 +156,13 @@ pub(super) type Decode = fn(&[u8], u64) -> Result<(String, Stamp, Entry), Error>
 /// assert!(reader.next().is_none());
 /// ```
 pub struct Reader<R> {
-    source: R,
-    linear: LinearReader,
+    records: Records<R>,
     /// The decoders of the messages that are read, by schema number. `channels` has them by channel
     /// number.
     schemas: BTreeMap<u16, Decode>,
     channels: BTreeMap<u16, Decode>,
-    bytes: u64,
     /// The current chunk.
-    chunk: Option<ChunkRecords>,
+    chunk: Option<Records<Cursor<Vec<u8>>>>,
     /// Whether the summary, an error or the end was reached.
     done: bool,
 }
@@ -162,15 +170,10 @@ pub struct Reader<R> {
 impl<R: Read> Reader<R> {
     /// A reader of `source`.
     pub fn new(source: R) -> Self {
-        let options = LinearReaderOptions::default()
-            .with_emit_chunks(true)
-            .with_record_length_limit(LONGEST_CHUNK_BYTES);
         Self {
-            source,
-            linear: LinearReader::new_with_options(options),
+            records: Records::of_file(source),
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
-            bytes: 0,
             chunk: None,
             done: false,
         }
@@ -178,55 +181,28 @@ impl<R: Read> Reader<R> {
 
     fn read(&mut self) -> Result<Option<Found>, Error> {
         loop {
-            match self.chunk.as_mut().and_then(Iterator::next) {
-                Some(record) => {
-                    if let Some(found) = self.take(record?.0)? {
-                        return Ok(Some(found));
-                    }
-                    continue;
-                }
-                None => self.chunk = None,
+            let of_chunk = self.chunk.as_mut().and_then(Iterator::next);
+            if of_chunk.is_none() {
+                self.chunk = None;
             }
-            let Some(event) = self.linear.next_event() else {
+            let Some((opcode, body)) = of_chunk.or_else(|| self.records.next()).transpose()? else {
                 return Ok(None);
             };
-            let record = match event? {
-                LinearReadEvent::ReadRequest(wanted) => {
-                    let read = loop {
-                        match self.source.read(self.linear.insert(wanted)) {
-                            Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                            read => break read?,
-                        }
-                    };
-                    self.bytes += read as u64;
-                    if read == 0 && self.bytes < MAGIC.len() as u64 {
-                        // Such a short file holds nothing that could be saved.
-                        let found = format!("found {} bytes, expected a recording", self.bytes);
-                        return Err(Error::Content(found));
+            match opcode {
+                // The summary only repeats what was read.
+                op::DATA_END => return Ok(None),
+                op::CHUNK => self.chunk = Some(Records::of_chunk(body)?),
+                _ => {
+                    if let Some(found) = self.take(parse(opcode, &body)?)? {
+                        return Ok(Some(found));
                     }
-                    self.linear.notify_read(read);
-                    continue;
                 }
-                LinearReadEvent::Record { opcode, .. } if opcode == op::DATA_END => {
-                    // The summary only repeats what was read.
-                    return Ok(None);
-                }
-                LinearReadEvent::Record { opcode, data } => match parse(opcode, data)? {
-                    Record::Chunk { header, .. } => {
-                        self.chunk = Some(ChunkRecords::new(&header, data)?);
-                        continue;
-                    }
-                    record => record.into_owned(),
-                },
-            };
-            if let Some(found) = self.take(record)? {
-                return Ok(Some(found));
             }
         }
     }
 
     /// Learns from a schema or a channel. Returns the entry of a message that is read.
-    fn take(&mut self, record: Record<'static>) -> Result<Option<Found>, Error> {
+    fn take(&mut self, record: Record<'_>) -> Result<Option<Found>, Error> {
         match record {
             Record::Schema { header, .. } => {
                 if let Some(decode) = decoder(&header.name) {

@@ -223,32 +223,6 @@ fn a_press_that_lost_its_end_with_missing_entries_is_aborted() {
 }
 
 #[test]
-fn a_sensor_that_cannot_be_is_refused_wherever_it_is_described() {
-    let hrn = hrn();
-    let good = RecordedSensor::new(&sensor(), &hrn);
-    let pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
-    let state = |sensor: RecordedSensor| {
-        let state = State::of(&pipeline, &labels()).unwrap();
-        Entry::State(Box::new(State { sensor, ..state }))
-    };
-    let mut nameless = good.clone();
-    nameless.description.sensor.name = "\u{1b}[2J\n".to_owned();
-    let mut playback = Playback::new(hrn);
-    let mut feed = |entry| {
-        playback.feed(Found {
-            sensor: "forearm".to_owned(),
-            at: at(0),
-            entry,
-        })
-    };
-    feed(state(good)).unwrap();
-    let error = feed(state(nameless)).unwrap_err().to_string();
-    let expected =
-        "sensor \"forearm\": sensor.name: found \"\\u{1b}[2J\\n\", expected a letter a to z";
-    assert!(error.starts_with(expected), "{error}");
-}
-
-#[test]
 fn a_state_that_no_pipeline_came_to_is_refused() {
     let hrn = hrn();
     let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
@@ -262,7 +236,8 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
     let fed = |place: &str, value: Value| {
         let mut state = state.clone();
         *state.pointer_mut(place).unwrap() = value;
-        let message = message::encode_state("forearm", at(0), &state);
+        let data = state.to_string().into_bytes();
+        let message = message::encode("forearm", at(0), message::STATE, data);
         let (sensor, at, entry) =
             message::decode_entry(&message, 1).map_err(|error| error.to_string())?;
         let found = Found { sensor, at, entry };
@@ -277,10 +252,15 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
             json!(1),
             "found a recording of format 1, expected",
         ),
+        (
+            "/sensor/name",
+            json!("\u{1b}[2J\n"),
+            "sensor \"forearm\": sensor.name: found \"\\u{1b}[2J\\n\", expected a letter a to z",
+        ),
         ("/at_rest/context", json!("picking"), "context: found"),
         ("/at_rest/decoder/decoded", json!(u64::MAX), no_state),
         ("/at_rest/decoder/skipped", json!(1_u64 << 40), no_state),
-        ("/at_rest/tare/baseline/7", json!(1e39), "found other JSON"),
+        ("/at_rest/tare/baseline/7", json!(1e39), no_state),
         ("/at_rest/tare/baseline", json!([0.0]), no_state),
         ("/at_rest/motion/points/0", json!([0, 1e9]), no_state),
         ("/at_rest/frames", json!(u64::MAX), no_state),
@@ -340,37 +320,14 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
 }
 
 #[test]
-fn what_is_saved_without_a_state_is_told() {
-    let (mut file, _) = recorded(1000, 7);
-    // Before the sensor begins anew, the only state is in the first chunk.
-    file.truncate(file.len() / 3);
-    let mut unplayable = 0;
-    for place in (0..file.len()).step_by(97) {
-        let mut file = file.clone();
-        file[place] ^= 1;
-        let (found, good) = recover(Cursor::new(&file), Vec::new()).unwrap();
-        let mut playback = Playback::new(hrn());
-        for found in Reader::new(&good[..]) {
-            playback.feed(found.unwrap()).unwrap();
-        }
-        assert_eq!(found.states, playback.sensors() as u64, "byte {place}");
-        unplayable += usize::from(found.messages > 0 && found.states == 0);
-    }
-    assert!(unplayable > 0, "no byte lies within the first chunk");
-}
-
-#[test]
 fn what_is_no_recording_is_refused_in_words() {
     let error = |file: &[u8]| {
         let mut errors = Reader::new(file).filter_map(Result::err);
         errors.next().map(|error| error.to_string())
     };
     assert!(error(b"no recording at all").unwrap().contains("no MCAP"));
-    for (file, found) in [(&b""[..], "found 0 bytes"), (b"\x89MCAP", "found 5 bytes")] {
-        assert_eq!(
-            error(file).unwrap(),
-            format!("{found}, expected a recording")
-        );
+    for file in [&b""[..], b"\x89MCAP"] {
+        assert!(error(file).unwrap().contains("damaged"));
     }
     let (file, _) = recorded(10, 7);
     assert_eq!(error(&file), None);

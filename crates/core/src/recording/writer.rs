@@ -7,7 +7,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Compression, WriteOptions};
 
-use super::message::{self, INPUT, TOPICS};
+use super::message::{self, TOPICS};
 use super::{Entry, Error, Labels, RecordedSensor};
 use crate::event::Event;
 use crate::frame::Stamp;
@@ -98,19 +98,6 @@ pub(super) fn topic_of(channel_id: u16) -> Topic {
 pub(super) fn schema_id(topic: Topic) -> u16 {
     let place = TOPICS.iter().position(|known| *known == topic);
     place.expect("every topic of a sensor is in TOPICS") as u16 + 1
-}
-
-/// Whether this program may have written a channel of this name.
-pub(super) fn is_topic_of_ours(name: &str) -> bool {
-    let parts = name
-        .strip_prefix("/tactile/")
-        .and_then(|rest| rest.split_once('/'));
-    parts.is_some_and(|(_, name)| TOPICS.iter().any(|topic| topic.name == name))
-}
-
-/// Whether a channel of this name holds a sensor's entries.
-pub(super) fn is_input(name: &str) -> bool {
-    is_topic_of_ours(name) && name.rsplit('/').next() == Some(INPUT.name)
 }
 
 impl<W: Write> Writer<W> {

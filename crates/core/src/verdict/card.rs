@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use super::course::{Extents, TimeSeries};
 use super::error::ModelError;
-use super::parts::PARTS;
 use super::probabilities::argmax;
 use super::references::{Knowledge, ReferencePress};
 use super::shore::{Level, Shore};
@@ -291,16 +290,4 @@ pub enum Format {
         /// The largest number of frames in a course.
         most_frames: usize,
     },
-}
-
-impl Format {
-    /// The shape of the one input of format 1, in a model with this grid.
-    pub(super) fn shape(self, grid: Option<Array>) -> Vec<usize> {
-        let Array { rows, cols } = grid.unwrap_or(Array::JX255N);
-        let frames = match self {
-            Self::Parts => PARTS,
-            Self::Frame | Self::Course { .. } => 1,
-        };
-        vec![1, frames, rows, cols]
-    }
 }

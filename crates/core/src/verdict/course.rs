@@ -66,12 +66,7 @@ const SPEED_SHARE: f32 = 0.9;
 pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
     let exactly = |value: f32| [value, value];
     let last = moments.last().map(|&(time_s, _)| exactly(time_s));
-    let mut periods: Vec<f32> = moments
-        .windows(2)
-        .map(|pair| pair[1].0 - pair[0].0)
-        .collect();
-    periods.sort_unstable_by(f32::total_cmp);
-    let period = periods.get(periods.len() / 2).copied().map(exactly);
+    let period = period_s(moments.iter().map(|moment| moment.0)).map(exactly);
     let known = moments.iter().enumerate();
     let known = known.filter_map(|(place, &(time_s, mm))| Some((place, time_s, mm?)));
     let furthest = known.clone().map(|(.., mm)| mm).reduce(f32::max);
@@ -83,17 +78,19 @@ pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
         });
     let speed = reached.map(|(place, time_s, mm)| {
         // The arm may have stopped anywhere before the second frame, so it may have been faster.
-        [
-            mm / time_s,
-            if place > 1 {
-                mm / time_s
-            } else {
-                f32::INFINITY
-            },
-        ]
+        let least = mm / time_s;
+        [least, if place > 1 { least } else { f32::INFINITY }]
     });
     let arm = (arm_n_per_mm > 0.0).then(|| exactly(arm_n_per_mm));
     [last, period, speed, furthest.map(exactly), arm]
+}
+
+/// The median of the times between two frames.
+pub(super) fn period_s(times: impl Iterator<Item = f32> + Clone) -> Option<f32> {
+    let next = times.clone().skip(1);
+    let mut periods: Vec<f32> = times.zip(next).map(|(time, next)| next - time).collect();
+    periods.sort_unstable_by(f32::total_cmp);
+    periods.get(periods.len() / 2).copied()
 }
 
 impl TimeSeries {

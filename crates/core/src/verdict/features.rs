@@ -7,7 +7,7 @@
 
 use std::ops::Range;
 
-use super::course::{Sample, TimeSeries};
+use super::course::{Sample, TimeSeries, period_s};
 use super::grid::{COLS, ModelFrame, ROWS};
 use crate::line;
 use crate::press::Phases;
@@ -61,46 +61,48 @@ pub type FrameFeatures = [f32; FRAME];
 
 /// The features of a frame on the model's grid.
 pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
-    let Bounds { rows, cols, peak } = Bounds::of(frame);
+    // A press has 0 beyond the margin of its contact, so most frames have few other taxels.
+    let taxels = frame.newtons.iter().enumerate();
+    let felt = taxels.filter(|&(_, &newtons)| newtons != 0.0);
+    let felt = felt.map(|(place, &newtons)| (place / COLS, place % COLS, newtons));
+    let felt: Vec<(usize, usize, f32)> = felt.collect();
+    let peak = felt.iter().map(|taxel| taxel.2).fold(0.0, f32::max);
     let mut sums = Sums::default();
     let mut counts = [0.0_f32; 5];
     let mut shares = [0.0_f32; 3];
     let (mut roughness, mut border) = (0.0, 0.0);
-    let taxel = |row: usize, col: usize| {
-        let newtons = frame.newtons[row * COLS + col];
-        if newtons >= CONTACT_N { newtons } else { 0.0 }
-    };
-    // A taxel before the contact still borders on it.
-    for row in rows.start.saturating_sub(1)..rows.end {
-        for col in cols.start.saturating_sub(1)..cols.end {
-            let newtons = taxel(row, col);
-            let below = (row + 1 < ROWS).then(|| taxel(row + 1, col));
-            let right = (col + 1 < COLS).then(|| taxel(row, col + 1));
-            for beside in [below, right].into_iter().flatten() {
-                roughness += (newtons - beside).abs();
-                border += f32::from(u8::from((newtons > 0.0) != (beside > 0.0)));
-            }
-            let felt_n = frame.newtons[row * COLS + col];
-            if felt_n != 0.0 {
-                sums.of_force.add(row, col, felt_n);
-            }
-            if newtons == 0.0 {
+    for &(row, col, newtons) in &felt {
+        sums.of_force.add(row, col, newtons);
+        if newtons < CONTACT_N {
+            continue;
+        }
+        sums.of_contact.add(row, col, 1.0);
+        sums.squares += newtons * newtons;
+        for (count, threshold_n) in counts.iter_mut().zip(COUNTED_N) {
+            *count += f32::from(u8::from(newtons >= threshold_n));
+        }
+        for (count, share) in shares.iter_mut().zip(COUNTED_SHARES) {
+            *count += f32::from(u8::from(newtons >= share * peak));
+        }
+        let (above, left) = (row.wrapping_sub(1), col.wrapping_sub(1));
+        for (row, col) in [(above, col), (row, left), (row, col + 1), (row + 1, col)] {
+            if row >= ROWS || col >= COLS {
                 continue;
             }
-            sums.of_contact.add(row, col, 1.0);
-            sums.squares += newtons * newtons;
-            for (count, threshold_n) in counts.iter_mut().zip(COUNTED_N) {
-                *count += f32::from(u8::from(newtons >= threshold_n));
-            }
-            for (count, share) in shares.iter_mut().zip(COUNTED_SHARES) {
-                *count += f32::from(u8::from(newtons >= share * peak));
+            match frame.newtons[row * COLS + col] {
+                // Two taxels in contact meet twice.
+                beside if beside >= CONTACT_N => roughness += 0.5 * (newtons - beside).abs(),
+                _ => {
+                    roughness += newtons;
+                    border += 1.0;
+                }
             }
         }
     }
     let (spread, elongation) = sums.of_force.moments();
     let (width, oblong) = sums.of_contact.moments();
     let (force, area) = (sums.of_force.total.max(0.0), sums.of_contact.total);
-    let fourth = sums.fourth(frame, rows, cols);
+    let fourth = sums.fourth(&felt);
     let effective = force * force / (sums.squares + TINY);
     let [c02, c05, c1, c2, c4] = counts.map(f32::ln_1p);
     let [half, quarter, most] = shares.map(|count| (count + 0.5).ln());
@@ -147,39 +149,6 @@ pub fn force_n(frame: &FrameFeatures) -> f32 {
     (frame[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
-/// The rows and columns of the taxels that are not 0, and the greatest force of a taxel. A press has
-/// 0 beyond the margin of its contact, so most frames have few such taxels.
-struct Bounds {
-    rows: Range<usize>,
-    cols: Range<usize>,
-    peak: f32,
-}
-
-impl Bounds {
-    fn of(frame: &ModelFrame) -> Self {
-        let mut is_felt = [false; COLS];
-        let mut peak = 0.0_f32;
-        let mut rows = 0..0;
-        for (row, newtons) in frame.newtons.chunks_exact(COLS).enumerate() {
-            for (col, &newtons) in newtons.iter().enumerate() {
-                is_felt[col] |= newtons != 0.0;
-                peak = peak.max(newtons);
-            }
-            if newtons.iter().any(|&newtons| newtons != 0.0) {
-                let first = if rows.is_empty() { row } else { rows.start };
-                rows = first..row + 1;
-            }
-        }
-        let first = is_felt.iter().position(|&felt| felt).unwrap_or(0);
-        let last = is_felt.iter().rposition(|&felt| felt);
-        Self {
-            rows,
-            cols: first..last.map_or(0, |last| last + 1),
-            peak,
-        }
-    }
-}
-
 /// Sums of the force over all taxels, with its sign, so that noise cancels; and over the taxels in
 /// contact, all alike.
 #[derive(Default)]
@@ -190,18 +159,15 @@ struct Sums {
 }
 
 impl Sums {
-    /// The fourth moment of the force about its centre, of the taxels in these rows and columns.
-    fn fourth(&self, frame: &ModelFrame, rows: Range<usize>, cols: Range<usize>) -> f32 {
+    /// The fourth moment of the force of these taxels about its centre.
+    fn fourth(&self, felt: &[(usize, usize, f32)]) -> f32 {
         let [centre_row, centre_col] = self.of_force.centre();
-        let mut sum = 0.0;
-        for (row, col) in rows.flat_map(|row| cols.clone().map(move |col| (row, col))) {
-            let newtons = frame.newtons[row * COLS + col];
-            if newtons != 0.0 {
-                let (row, col) = centred(row, col);
-                let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
-                sum += newtons * square * square;
-            }
-        }
+        let moment = |&(row, col, newtons): &(usize, usize, f32)| {
+            let (row, col) = centred(row, col);
+            let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
+            newtons * square * square
+        };
+        let sum: f32 = felt.iter().map(moment).sum();
         (sum / self.of_force.weight()).clamp(0.0, MOST_MOMENT * MOST_MOMENT)
     }
 }
@@ -367,13 +333,7 @@ impl<'a> Press<'a> {
 
     fn times(&self, row: &mut Vec<f32>) {
         let time_s = |place: usize| self.moments[place].time_s;
-        let mut periods: Vec<f32> = self
-            .moments
-            .windows(2)
-            .map(|pair| pair[1].time_s - pair[0].time_s)
-            .collect();
-        periods.sort_unstable_by(f32::total_cmp);
-        let period = periods.get(periods.len() / 2);
+        let period = period_s(self.moments.iter().map(|moment| moment.time_s));
         row.extend([
             period.map_or(0.0, |period_s| (period_s.max(0.0) + 0.005).ln()),
             (self.moments.len() as f32).ln(),
@@ -402,26 +362,36 @@ impl<'a> Press<'a> {
         ]);
     }
 
-    /// The value when the rising force passed `force_n`, interpolated between two frames.
-    fn while_loading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
-        let after = (0..=self.top).find(|&place| self.forces_n[place] >= force_n)?;
-        let Some(before) = after.checked_sub(1) else {
-            return value(after);
-        };
-        let (low, high) = (self.forces_n[before], self.forces_n[after]);
-        let part = (force_n - low) / (high - low + TINY);
+    /// The value where `by` passed `level` among these frames, interpolated between two of them.
+    fn passed(
+        &self,
+        places: Range<usize>,
+        by: impl Fn(usize) -> Option<f32>,
+        level: f32,
+        value: &dyn Fn(usize) -> Option<f32>,
+    ) -> Option<f32> {
+        let mut places = places.into_iter();
+        let after = places.find(|&place| by(place).is_some_and(|own| own >= level))?;
+        let before = after.checked_sub(1)?;
+        let (low, high) = (by(before)?, by(after)?);
+        let part = (level - low) / (high - low + TINY);
         let (low, high) = (value(before)?, value(after)?);
         Some(low + part * (high - low))
     }
 
-    /// The value when the rising approach passed `mm`.
-    fn at_approach(&self, mm: f32, value: &dyn Fn(usize) -> f32) -> Option<f32> {
-        let at = |place: usize| self.approach_mm(place);
-        let after = (0..=self.top).find(|&place| at(place).is_some_and(|own| own >= mm))?;
-        let before = after.checked_sub(1)?;
-        let (low, high) = (at(before)?, at(after)?);
-        let part = (mm - low) / (high - low + TINY);
-        Some(value(before) + part * (value(after) - value(before)))
+    /// The value when the rising force passed `force_n`. The first frame may have more force already.
+    fn while_loading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
+        if self.forces_n[0] >= force_n {
+            return value(0);
+        }
+        let force = |place: usize| Some(self.forces_n[place]);
+        self.passed(0..self.top + 1, force, force_n, value)
+    }
+
+    /// The value when the falling force passed `force_n`.
+    fn while_unloading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
+        let force = |place: usize| Some(-self.forces_n[place]);
+        self.passed(self.held..self.moments.len(), force, -force_n, value)
     }
 
     fn loading(&self, row: &mut Vec<f32>) {
@@ -435,8 +405,11 @@ impl<'a> Press<'a> {
             }
         }
         for mm in APPROACHES_MM {
-            let force = self.at_approach(mm, &|place| self.forces_n[place]);
-            let area = self.at_approach(mm, &|place| self.moments[place].frame[AREA]);
+            let at = |value: &dyn Fn(usize) -> Option<f32>| {
+                self.passed(0..self.top + 1, |place| self.approach_mm(place), mm, value)
+            };
+            let force = at(&|place| Some(self.forces_n[place]));
+            let area = at(&self.of_frame(AREA));
             row.push(force.map_or(0.0, |force_n| (force_n + LITTLE_N).ln()));
             row.push(area.unwrap_or(0.0));
             row.push(f32::from(u8::from(force.is_some())));
@@ -520,19 +493,6 @@ impl<'a> Press<'a> {
             row.extend([FORCE, AREA, PEAK].map(|number| after(seconds, number)));
         }
         row.extend([FORCE, SPREAD, EFFECTIVE].map(|number| after(f32::INFINITY, number)));
-    }
-
-    /// The value when the falling force passed `force_n`.
-    fn while_unloading(&self, force_n: f32, value: &dyn Fn(usize) -> Option<f32>) -> Option<f32> {
-        let places = self.held..self.moments.len();
-        let after = places
-            .into_iter()
-            .find(|&place| self.forces_n[place] <= force_n)?;
-        let before = after.checked_sub(1)?;
-        let (high, low) = (self.forces_n[before], self.forces_n[after]);
-        let part = (high - force_n) / (high - low + TINY);
-        let (high, low) = (value(before)?, value(after)?);
-        Some(high + part * (low - high))
     }
 
     /// How the unloading differs from the loading.

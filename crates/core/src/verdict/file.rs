@@ -3,7 +3,7 @@
 //! In: the file as ONNX's own messages. Out: the model's description, or all that breaks the format.
 //! Nothing here runs the model.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -11,27 +11,29 @@ use serde::de::DeserializeOwned;
 use tract_onnx::pb;
 use tract_onnx::pb::tensor_shape_proto::dimension::Value as Dimension;
 
-use super::card::{Card, Checks, Conformal, Format, Limits, Range};
+use super::card::{Card, Checks, Conformal, Limits, Range};
 use super::course::COURSE_FRAMES;
 use super::error::{MIN_OPSET, ModelError};
 use super::inputs::{Input, Lengths};
 use super::references::{Knowledge, MOST_REFERENCES};
 use super::shore::{Borders, Level};
 use crate::frame::{Array, MOST_SIDE};
-use crate::wording::is_plain;
+use crate::wording::{is_plain, named};
 
 /// The longest `label` and `shore` of a level: every event carries a label.
 const LONGEST_LABEL_BYTES: usize = 255;
 /// The longest part of a name or a text in a message.
 const NAME_CHARS: usize = 60;
-/// The longest text of another key.
+/// The longest text that people read.
 const LONGEST_LINE_BYTES: usize = 16_384;
-/// The longest `hrn.metrics`. As a value, it takes some ten times the memory.
-const LONGEST_METRICS_BYTES: usize = 1 << 20;
+/// The longest JSON but that of `hrn.check`. As a value, it takes some ten times the memory.
+const LONGEST_JSON_BYTES: usize = 1 << 20;
 /// The numbers of bins that a model of format 3 may divide the scale into.
 const BINS: RangeInclusive<usize> = 10..=400;
 /// The numbers that such a model may take of a reference.
 const NUMBERS: RangeInclusive<usize> = 1..=1024;
+/// The key of the checks.
+const CHECK: &str = "hrn.check";
 
 /// What breaks the format, so that all of it is said at once.
 #[derive(Default)]
@@ -41,10 +43,6 @@ impl Problems {
     fn keep<T>(&mut self, read: Result<T, ModelError>) -> Option<T> {
         read.map_err(|error| self.0.push(error.to_string())).ok()
     }
-
-    fn error(&self) -> ModelError {
-        ModelError::new(self.0.join("; "))
-    }
 }
 
 /// What a model file says.
@@ -52,29 +50,11 @@ impl Problems {
 pub(super) struct File {
     pub(super) card: Card,
     pub(super) checks: Arc<Checks>,
-    pub(super) format: Format,
-    /// The inputs of a model of courses, in their order.
+    /// The inputs of the model, in their order.
     pub(super) inputs: Vec<Input>,
     pub(super) lengths: Lengths,
-    pub(super) outputs: Outputs,
-}
-
-/// The places of a model's outputs.
-#[derive(Debug, Clone)]
-pub(super) enum Outputs {
-    /// Format 1, and a model of format 3 that names the levels itself.
-    Levels {
-        logits: usize,
-        probabilities: usize,
-        /// Such a model may have this output.
-        shore: Option<usize>,
-    },
-    /// Format 3.
-    Bins {
-        bins: usize,
-        /// A model that takes no references has none.
-        reference: Option<usize>,
-    },
+    /// The names of the outputs, in their order.
+    pub(super) outputs: Vec<String>,
 }
 
 impl File {
@@ -89,94 +69,64 @@ impl File {
         let mut problems = Problems::default();
         problems.keep(check_opset(proto));
         problems.keep(check_tensors_inside(graph));
-        let metadata = Metadata(&proto.metadata_props);
+        let metadata = Metadata::of(proto, &mut problems);
         let card = card(&metadata, &mut problems);
+        let format = metadata.0.get("hrn.format").copied().unwrap_or("1");
         let given = given(graph);
-        let inputs = problems.keep(match metadata.find("hrn.format") {
-            Some("3") => course_inputs(&given),
-            _ => frame_input(&given, card.as_ref().and_then(|card| card.grid))
-                .map(|format| (format, Vec::new(), Lengths::default())),
+        let inputs = problems.keep(match format {
+            "3" => course_inputs(&given),
+            _ => frame_input(&given, card.as_ref().and_then(|card| card.grid)),
         });
-        // Which outputs a model of courses has depends on its inputs.
-        let taken = inputs
-            .as_ref()
-            .map(|(format, _, lengths)| (*format, *lengths));
-        let frame = (Format::Frame, Lengths::default());
-        let taken = taken.or((metadata.find("hrn.format") == Some("1")).then_some(frame));
-        let outputs = taken.and_then(|(format, lengths)| {
-            let outputs = outputs(graph, format, lengths);
-            problems.keep(outputs)
-        });
-        let (Some(card), Some((format, inputs, lengths)), Some(outputs), true) =
+        let takes_references = given.iter().any(|(name, _)| *name == "references");
+        let outputs = problems.keep(outputs(graph, format, takes_references));
+        let (Some(card), Some((inputs, lengths)), Some(outputs), true) =
             (card, inputs, outputs, problems.0.is_empty())
         else {
-            return Err(problems.error());
+            return Err(ModelError::new(problems.0.join("; ")));
         };
-        if let Outputs::Bins { .. } = outputs {
-            let borders = Borders::of(&card.levels);
-            borders.map_err(|error| {
+        if outputs.iter().any(|output| output == "bins") {
+            Borders::of(&card.levels).map_err(|error| {
                 ModelError::new(format!("model metadata `hrn.levels`: {error}"))
             })?;
         }
-        let key = "hrn.check";
         let checks = match format {
-            Format::Course { .. } => {
-                Checks::Courses(metadata.json(key, "presses with what the trainer says")?)
-            }
-            _ => Checks::Frames(metadata.json(key, "frames and probabilities")?),
+            "3" => Checks::Courses(metadata.json(CHECK, "presses", |_| true)?),
+            _ => Checks::Frames(metadata.json(CHECK, "frames and probabilities", |_| true)?),
         };
-        let file = Self {
+        // There are 8, or two a level: only a model of four levels has both.
+        let (levels, count) = (card.levels.len(), checks.count());
+        let rows = checks.expected();
+        let mut lengths_of_rows = rows.iter().map(|(probabilities, _)| probabilities.len());
+        let is_number = [8, 2 * levels].contains(&count) && rows.len() == count;
+        if !is_number || !lengths_of_rows.all(|length| length == levels) {
+            let found = format!("{count} of other lengths or number");
+            let expected = format!("8, or two a level, each with {levels} probabilities");
+            return Err(ModelError::of_key(CHECK, found, expected));
+        }
+        Ok(Self {
             card,
             checks: Arc::new(checks),
-            format,
             inputs,
             lengths,
             outputs,
-        };
-        file.check_checks()?;
-        Ok(file)
+        })
     }
 
-    /// The name, the place and the length of each output.
-    pub(super) fn outputs(&self) -> Vec<(&'static str, usize, RangeInclusive<usize>)> {
-        let levels = self.card.levels.len();
-        match self.outputs {
-            Outputs::Levels {
-                logits,
-                probabilities,
-                shore,
-            } => {
-                let of_levels = [
-                    ("logits", logits, levels..=levels),
-                    ("probabilities", probabilities, levels..=levels),
-                ];
-                let shore = shore.map(|place| ("shore", place, 3..=3));
-                of_levels.into_iter().chain(shore).collect()
-            }
-            Outputs::Bins { bins, reference } => {
-                let features = self.lengths.features;
-                let reference = reference.map(|at| ("reference", at, features..=features));
-                [("bins", bins, BINS)]
-                    .into_iter()
-                    .chain(reference)
-                    .collect()
-            }
-        }
+    /// The place of an output. `None` if the model has none of this name.
+    pub(super) fn place_of(&self, output: &str) -> Option<usize> {
+        self.outputs.iter().position(|name| name == output)
     }
 
-    /// Refuses checks of another number. There are 8, or two a level: only a model of four levels has
-    /// both.
-    fn check_checks(&self) -> Result<(), ModelError> {
-        let (levels, count) = (self.card.levels.len(), self.checks.count());
-        let rows = self.checks.expected();
-        let mut lengths = rows.iter().map(|(probabilities, _)| probabilities.len());
-        let fits = [8, 2 * levels].contains(&count) && rows.len() == count;
-        if fits && lengths.all(|length| length == levels) {
-            return Ok(());
+    /// The lengths that an output may have, if it is used.
+    pub(super) fn lengths_of(&self, output: &str) -> Option<RangeInclusive<usize>> {
+        let (levels, features) = (self.card.levels.len(), self.lengths.features);
+        match output {
+            "logits" | "probabilities" => Some(levels..=levels),
+            "shore" => Some(3..=3),
+            "bins" => Some(BINS),
+            "reference" => Some(features..=features),
+            _ => None,
         }
-        let found = format!("{count} of other lengths or number");
-        let expected = format!("8, or two a level, each with {levels} probabilities");
-        Err(ModelError::of_key("hrn.check", found, expected))
     }
 }
 
@@ -256,42 +206,56 @@ fn unexpected(given: &[Given<'_>], expected: &str) -> ModelError {
     ModelError::new(format!("model inputs: found {found}, expected {expected}"))
 }
 
-/// The format of a model with this one input.
-fn frame_input(given: &[Given<'_>], grid: Option<Array>) -> Result<Format, ModelError> {
-    let parts = grid.map(|_| ("parts", Format::Parts));
-    let formats = [Some(("frame", Format::Frame)), parts];
-    for (name, format) in formats.into_iter().flatten() {
-        if given == [(name, Some(format.shape(grid)))] {
-            return Ok(format);
+/// The input of a model of format 1, and its lengths.
+fn frame_input(
+    given: &[Given<'_>],
+    grid: Option<Array>,
+) -> Result<(Vec<Input>, Lengths), ModelError> {
+    let lengths = Lengths {
+        array: grid.unwrap_or(Array::JX255N),
+        frames: usize::MAX,
+        references: 0,
+        features: 0,
+    };
+    let mut expected = vec![Input::Frame];
+    expected.extend(grid.map(|_| Input::Parts));
+    let found = expected
+        .iter()
+        .find(|input| *given == [(&*input.name(), Some(input.shape(lengths)))]);
+    match found {
+        Some(&input) => Ok((vec![input], lengths)),
+        None => {
+            let expected = expected.iter();
+            let expected = expected.map(|input| described(&input.name(), &input.shape(lengths)));
+            let expected: Vec<String> = expected.collect();
+            Err(unexpected(given, &expected.join(" or ")))
         }
     }
-    let expected = formats.into_iter().flatten();
-    let expected = expected.map(|(name, format)| described(name, &format.shape(grid)));
-    let expected: Vec<String> = expected.collect();
-    Err(unexpected(given, &expected.join(" or ")))
 }
 
 /// The inputs of a model of courses in their order, and their lengths. A model takes those that it needs,
 /// and of those for references all or none.
-fn course_inputs(given: &[Given<'_>]) -> Result<(Format, Vec<Input>, Lengths), ModelError> {
-    let named = |input: &Input| given.iter().find(|(name, _)| *name == input.name());
-    let along = |input: &Input, axis: usize| named(input)?.1.as_ref()?.get(axis).copied();
-    let mut of_frames = Input::OF_FRAMES.iter();
+fn course_inputs(given: &[Given<'_>]) -> Result<(Vec<Input>, Lengths), ModelError> {
+    let inputs = given.iter().map(|(name, _)| named::<Input>(name).ok());
+    let inputs: Vec<Input> = inputs.flatten().collect();
+    let along = |wanted: Input, axis: usize| {
+        let at = inputs.iter().position(|input| *input == wanted)?;
+        given.get(at)?.1.as_ref()?.get(axis).copied()
+    };
     let lengths = Lengths {
+        array: Array::JX255N,
         // A model that takes no frame takes the features of any number of them.
-        frames: of_frames
+        frames: Input::OF_FRAMES
+            .into_iter()
             .find_map(|input| along(input, 1))
             .unwrap_or(COURSE_FRAMES.1),
-        references: along(&Input::References, 1).unwrap_or(0),
-        features: along(&Input::References, 2).unwrap_or(0),
+        references: along(Input::References, 1).unwrap_or(0),
+        features: along(Input::References, 2).unwrap_or(0),
     };
-    let input_of = |(name, shape): &Given<'_>| {
-        let input = Input::ALL.into_iter().find(|input| input.name() == *name)?;
-        (*shape == Some(input.shape(lengths))).then_some(input)
-    };
-    let inputs: Option<Vec<Input>> = given.iter().map(input_of).collect();
-    let of_references = Input::OF_REFERENCES.iter().filter_map(named).count();
-    let fits = match of_references {
+    let shapes = given.iter().map(|(_, shape)| shape.clone());
+    let is_of_course = |input: &Input| !matches!(input, Input::Frame | Input::Parts);
+    let of_references = Input::OF_REFERENCES.iter();
+    let fits = match of_references.filter(|one| inputs.contains(one)).count() {
         0 => true,
         3 => {
             (1..=MOST_REFERENCES).contains(&lengths.references)
@@ -299,82 +263,64 @@ fn course_inputs(given: &[Given<'_>]) -> Result<(Format, Vec<Input>, Lengths), M
         }
         _ => false,
     };
-    let fits = fits && (COURSE_FRAMES.0..=COURSE_FRAMES.1).contains(&lengths.frames);
-    match inputs.filter(|inputs| fits && !inputs.is_empty()) {
-        Some(inputs) => {
-            let most_frames = lengths.frames;
-            Ok((Format::Course { most_frames }, inputs, lengths))
-        }
-        None => {
-            let names = Input::ALL.map(Input::name).join(", ");
-            let expected = format!("some of {names}, of the shapes in results/course-format.md");
-            Err(unexpected(given, &expected))
-        }
+    if fits
+        && !inputs.is_empty()
+        && inputs.iter().all(is_of_course)
+        && (COURSE_FRAMES.0..=COURSE_FRAMES.1).contains(&lengths.frames)
+        && shapes.eq(inputs.iter().map(|input| Some(input.shape(lengths))))
+    {
+        return Ok((inputs, lengths));
     }
+    let expected = "some of frames, time_s, approach_mm, known, mask, arm_n_per_mm, piece, references, given, \
+                    features, of the shapes in results/course-format.md";
+    Err(unexpected(given, expected))
 }
 
-/// The outputs. What the graph computes for them shows their lengths.
+/// The names of the outputs. What the graph computes for them shows their lengths.
 fn outputs(
     graph: &pb::GraphProto,
-    format: Format,
-    lengths: Lengths,
-) -> Result<Outputs, ModelError> {
-    let place = |name: &str| graph.output.iter().position(|output| output.name == name);
-    let of_levels = || {
-        Some(Outputs::Levels {
-            logits: place("logits")?,
-            probabilities: place("probabilities")?,
-            shore: place("shore"),
-        })
+    format: &str,
+    takes_references: bool,
+) -> Result<Vec<String>, ModelError> {
+    let names: Vec<String> = graph
+        .output
+        .iter()
+        .map(|output| output.name.clone())
+        .collect();
+    let has = |wanted: &str| names.iter().any(|name| name == wanted);
+    let has_levels = has("logits") && has("probabilities");
+    let (fits, expected) = match format {
+        "3" if takes_references => (has("bins") && has("reference"), "bins, reference"),
+        "3" => (has("bins") || has_levels, "bins; or logits, probabilities"),
+        _ => (has_levels, "logits, probabilities"),
     };
-    let of_bins = || {
-        let reference = place("reference");
-        (reference.is_some() == (lengths.references > 0)).then_some(())?;
-        let bins = place("bins")?;
-        Some(Outputs::Bins { bins, reference })
-    };
-    let (found, expected) = match format {
-        Format::Course { .. } if lengths.references > 0 => (of_bins(), "bins, reference"),
-        Format::Course { .. } => (
-            of_bins().or_else(of_levels),
-            "bins; or logits, probabilities",
-        ),
-        _ => (of_levels(), "logits, probabilities"),
-    };
-    found.ok_or_else(|| {
-        let names: Vec<&str> = graph.output.iter().map(|output| &*output.name).collect();
+    if !fits {
         let found = shown(&names.join(", "));
-        ModelError::new(format!("model outputs: found {found}, expected {expected}"))
-    })
+        let problem = format!("model outputs: found {found}, expected {expected}");
+        return Err(ModelError::new(problem));
+    }
+    Ok(names)
 }
 
 /// The metadata of a file.
-struct Metadata<'a>(&'a [pb::StringStringEntryProto]);
+struct Metadata<'a>(BTreeMap<&'a str, &'a str>);
 
 impl<'a> Metadata<'a> {
-    fn find(&self, key: &str) -> Option<&'a str> {
-        let mut entries = self.0.iter();
-        let entry = entries.find(|entry| entry.key == key)?;
-        Some(entry.value.as_str())
-    }
-
-    fn check_once(&self) -> Result<(), ModelError> {
-        let mut seen = BTreeSet::new();
-        let twice = self.0.iter().find(|entry| !seen.insert(&entry.key));
-        match twice {
-            Some(entry) => {
+    fn of(proto: &'a pb::ModelProto, problems: &mut Problems) -> Self {
+        let mut found = BTreeMap::new();
+        for entry in &proto.metadata_props {
+            if found.insert(&*entry.key, &*entry.value).is_some() {
                 let key = shown(&entry.key);
-                Err(ModelError::new(format!(
-                    "model metadata: found {key} twice, expected it once"
-                )))
+                let problem = format!("model metadata: found {key} twice, expected it once");
+                problems.0.push(problem);
             }
-            None => Ok(()),
         }
+        Self(found)
     }
 
     fn text(&self, key: &str) -> Result<&'a str, ModelError> {
         let missing = || ModelError::new(format!("model metadata `{key}` is missing"));
-        self.find(key).ok_or_else(missing)
+        self.0.get(key).copied().ok_or_else(missing)
     }
 
     fn line(&self, key: &'static str) -> Result<String, ModelError> {
@@ -383,18 +329,35 @@ impl<'a> Metadata<'a> {
         Ok(value.to_owned())
     }
 
-    fn json<T: DeserializeOwned>(&self, key: &str, expected: &str) -> Result<T, ModelError> {
-        let read = serde_json::from_str(self.text(key)?);
-        read.map_err(|error| ModelError::of_key(key, error, expected))
+    /// The value of a key, if it `fits`.
+    fn json<T: DeserializeOwned>(
+        &self,
+        key: &str,
+        expected: &str,
+        fits: impl Fn(&T) -> bool,
+    ) -> Result<T, ModelError> {
+        let text = self.text(key)?;
+        if key != CHECK && text.len() > LONGEST_JSON_BYTES {
+            let found = format!("{} bytes", text.len());
+            let expected = format!("at most {LONGEST_JSON_BYTES}");
+            return Err(ModelError::of_key(key, found, expected));
+        }
+        let value = serde_json::from_str(text);
+        let value = value.map_err(|error| ModelError::of_key(key, error, expected))?;
+        match fits(&value) {
+            true => Ok(value),
+            false => Err(ModelError::of_key(key, shown(text), expected)),
+        }
     }
 
-    /// The value of a key that a file need not have.
+    /// The value of a key that a file need not have, if it `fits`.
     fn json_if_any<T: DeserializeOwned>(
         &self,
         key: &str,
         expected: &str,
+        fits: impl Fn(&T) -> bool,
     ) -> Result<Option<T>, ModelError> {
-        let found = self.find(key).map(|_| self.json(key, expected));
+        let found = self.0.get(key).map(|_| self.json(key, expected, fits));
         found.transpose()
     }
 }
@@ -417,18 +380,35 @@ pub fn check_line(key: &'static str, value: &str) -> Result<(), ModelError> {
 /// Reads what a file says of itself.
 fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
     let format = problems.keep(format(metadata));
-    let levels = problems.keep(levels(metadata));
-    let pitch_mm = problems.keep(pitch_mm(metadata));
+    let levels = "levels 1, 2, ... in order, at least two, each with `label` and `shore` of 1 to 255 bytes without \
+                  control or bidirectional characters";
+    let levels =
+        problems.keep(metadata.json("hrn.levels", levels, |of: &Vec<Level>| are_levels(of)));
+    let is_length = |mm: &f32| mm.is_finite() && *mm > 0.0;
+    let pitch_mm = problems.keep(metadata.json("hrn.pitch_mm", "millimetres above 0", is_length));
     let lines = ["hrn.method", "hrn.data", "hrn.validation"];
     let [method, data, validation] = lines.map(|key| problems.keep(metadata.line(key)));
-    let metrics = problems.keep(metrics(metadata));
-    problems.keep(metadata.check_once());
+    let metrics = problems.keep(metadata.json("hrn.metrics", "JSON", |_| true));
     let format = format?;
-    let range = problems.keep(range(metadata, &format));
-    let grid = problems.keep(grid(metadata, &format));
-    let conformal = problems.keep(match &*format {
-        "1" => Ok(None),
-        _ => conformal(metadata),
+    let is_of_frames = format == "1";
+    let range = "[least, greatest] of finite numbers, in format 1 those of `force_n` and `contact_area_taxels`, and \
+                 perhaps `pitch_mm`";
+    let range = problems.keep(metadata.json("hrn.range", range, |range: &Range| {
+        let of_presses = range.of_presses().into_iter().flatten();
+        let is_of_format = !is_of_frames || of_presses.clone().next().is_none();
+        is_of_format && is_range(range, of_presses)
+    }));
+    let grid = format!("[rows, columns], each 1 to {MOST_SIDE}, in a file of format 1");
+    let grid = problems.keep(
+        metadata.json_if_any("hrn.grid", &grid, |sides: &[usize; 2]| {
+            is_of_frames && sides.iter().all(|side| (1..=MOST_SIDE).contains(side))
+        }),
+    );
+    let conformal = "`alpha` between 0 and 1, `threshold`, 0 to 1, and perhaps `contexts`, each with `threshold` and \
+                     `tail`, 0 to 0.5";
+    let conformal = problems.keep(match is_of_frames {
+        true => Ok(None),
+        false => metadata.json_if_any("hrn.conformal", conformal, is_promise),
     });
     Some(Card {
         format,
@@ -439,7 +419,7 @@ fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
         metrics: metrics?,
         validation: validation?,
         range: range?,
-        grid: grid?,
+        grid: grid?.map(|[rows, cols]| Array { rows, cols }),
         conformal: conformal?,
     })
 }
@@ -453,66 +433,13 @@ fn format(metadata: &Metadata<'_>) -> Result<String, ModelError> {
     }
 }
 
-fn levels(metadata: &Metadata<'_>) -> Result<Vec<Level>, ModelError> {
-    let levels: Vec<Level> = metadata.json("hrn.levels", "the levels as in hello")?;
-    check_levels(&levels)?;
-    Ok(levels)
+fn is_range(range: &Range, of_presses: impl Iterator<Item = [f32; 2]>) -> bool {
+    let mut pairs = of_presses.chain([range.force_n]).chain(range.pitch_mm);
+    let [least, most] = range.contact_area_taxels;
+    least <= most && pairs.all(|[low, high]| low.is_finite() && high.is_finite() && low <= high)
 }
 
-fn pitch_mm(metadata: &Metadata<'_>) -> Result<f32, ModelError> {
-    let (key, expected) = ("hrn.pitch_mm", "millimetres above 0");
-    let pitch_mm: f32 = metadata.json(key, expected)?;
-    match pitch_mm.is_finite() && pitch_mm > 0.0 {
-        true => Ok(pitch_mm),
-        false => Err(ModelError::of_key(key, pitch_mm, expected)),
-    }
-}
-
-fn metrics(metadata: &Metadata<'_>) -> Result<serde_json::Value, ModelError> {
-    let key = "hrn.metrics";
-    let bytes = metadata.text(key)?.len();
-    if bytes > LONGEST_METRICS_BYTES {
-        let expected = format!("at most {LONGEST_METRICS_BYTES}");
-        return Err(ModelError::of_key(key, format!("{bytes} bytes"), expected));
-    }
-    metadata.json(key, "JSON")
-}
-
-fn range(metadata: &Metadata<'_>, format: &str) -> Result<Range, ModelError> {
-    let key = "hrn.range";
-    let range: Range = metadata.json(key, "trained force and area")?;
-    if format == "1" && range.of_presses().iter().any(Option::is_some) {
-        let expected = "`force_n` and `contact_area_taxels` alone: the others are of format 3";
-        return Err(ModelError::of_key(key, format!("{range:?}"), expected));
-    }
-    check_range(&range)?;
-    Ok(range)
-}
-
-fn grid(metadata: &Metadata<'_>, format: &str) -> Result<Option<Array>, ModelError> {
-    let key = "hrn.grid";
-    let expected = format!("[rows, columns], each 1 to {MOST_SIDE}, in a file of format 1");
-    let Some([rows, cols]) = metadata.json_if_any::<[usize; 2]>(key, &expected)? else {
-        return Ok(None);
-    };
-    let is_side = |side| (1..=MOST_SIDE).contains(&side);
-    match is_side(rows) && is_side(cols) && format == "1" {
-        true => Ok(Some(Array { rows, cols })),
-        false => Err(ModelError::of_key(
-            key,
-            format!("[{rows}, {cols}]"),
-            expected,
-        )),
-    }
-}
-
-fn conformal(metadata: &Metadata<'_>) -> Result<Option<Conformal>, ModelError> {
-    let key = "hrn.conformal";
-    let expected = "`alpha` between 0 and 1, `threshold`, 0 to 1, and perhaps `contexts`, each with \
-                    `threshold` and `tail`, 0 to 0.5";
-    let Some(conformal) = metadata.json_if_any::<Conformal>(key, expected)? else {
-        return Ok(None);
-    };
+fn is_promise(conformal: &Conformal) -> bool {
     let fits = |Limits { threshold, tail }: Limits| {
         (0.0..=1.0).contains(&threshold) && (0.0..0.5).contains(&tail)
     };
@@ -520,35 +447,16 @@ fn conformal(metadata: &Metadata<'_>) -> Result<Option<Conformal>, ModelError> {
         .into_iter()
         .map(|known| conformal.limits(known));
     let is_share = conformal.alpha > 0.0 && conformal.alpha < 1.0;
-    match is_share && limits.all(fits) && (0.0..=1.0).contains(&conformal.threshold) {
-        true => Ok(Some(conformal)),
-        false => Err(ModelError::of_key(key, format!("{conformal:?}"), expected)),
-    }
+    is_share && limits.all(fits) && (0.0..=1.0).contains(&conformal.threshold)
 }
 
-/// Checks the levels that a model states: numbers from 1, and labels that can be shown.
-///
-/// # Errors
-///
-/// Returns an error for the first level that breaks the format.
-pub fn check_levels(levels: &[Level]) -> Result<(), ModelError> {
-    let key = "hrn.levels";
-    let numbers: Vec<u8> = levels.iter().map(|level| level.level).collect();
-    let consecutive = numbers.iter().copied().eq((1..=u8::MAX).take(levels.len()));
-    if levels.len() < 2 || !consecutive {
-        let expected = "levels 1, 2, ... in order, at least two";
-        return Err(ModelError::of_key(key, format!("{numbers:?}"), expected));
-    }
-    for text in levels.iter().flat_map(|level| [&level.label, &level.shore]) {
-        if text.is_empty() || !is_plain(text) || text.len() > LONGEST_LABEL_BYTES {
-            let expected = format!(
-                "`label` and `shore` of 1 to {LONGEST_LABEL_BYTES} bytes, without control or bidirectional \
-                 characters"
-            );
-            return Err(ModelError::of_key(key, shown(text), expected));
-        }
-    }
-    Ok(())
+/// Whether a model may have these levels: numbers from 1, and labels that can be shown.
+pub fn are_levels(levels: &[Level]) -> bool {
+    let numbers = levels.iter().map(|level| level.level);
+    let mut texts = levels.iter().flat_map(|level| [&level.label, &level.shore]);
+    levels.len() >= 2
+        && numbers.eq((1..=u8::MAX).take(levels.len()))
+        && texts.all(|text| (1..=LONGEST_LABEL_BYTES).contains(&text.len()) && is_plain(text))
 }
 
 /// The beginning of a text, quoted.
@@ -557,23 +465,5 @@ pub(super) fn shown(text: &str) -> String {
     match begin.len() < text.len() {
         true => format!("{begin:?}... of {} bytes", text.len()),
         false => format!("{text:?}"),
-    }
-}
-
-fn check_range(range: &Range) -> Result<(), ModelError> {
-    let of_presses = range.of_presses().into_iter().flatten();
-    let mut pairs = of_presses.chain([range.force_n]).chain(range.pitch_mm);
-    let is_ordered = |[low, high]: [f32; 2]| low.is_finite() && high.is_finite() && low <= high;
-    let [least, most] = range.contact_area_taxels;
-    match least <= most && pairs.all(is_ordered) {
-        true => Ok(()),
-        false => {
-            let expected = "[least, greatest] of finite numbers";
-            Err(ModelError::of_key(
-                "hrn.range",
-                format!("{range:?}"),
-                expected,
-            ))
-        }
     }
 }

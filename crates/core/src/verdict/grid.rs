@@ -95,8 +95,9 @@ impl ModelFrame {
 /// ```
 #[derive(Debug, Clone)]
 pub struct Resampling {
-    rows: Side,
-    cols: Side,
+    /// For each row of the array, the model's rows that it covers, and the share on each; likewise the columns.
+    rows: Vec<Vec<(usize, f32)>>,
+    cols: Vec<Vec<(usize, f32)>>,
     is_resampled: bool,
 }
 
@@ -108,8 +109,8 @@ impl Resampling {
         let (row, col) = best.centre();
         let is_same = |mm: f64| (mm / model_mm - 1.0).abs() <= SAME_PITCH;
         Self {
-            rows: Side::new(rows, pitch.rows_mm / model_mm, ROWS, row),
-            cols: Side::new(cols, pitch.cols_mm / model_mm, COLS, col),
+            rows: shares(rows, pitch.rows_mm / model_mm, ROWS, row),
+            cols: shares(cols, pitch.cols_mm / model_mm, COLS, col),
             is_resampled: !(is_same(pitch.rows_mm) && is_same(pitch.cols_mm)),
         }
     }
@@ -123,12 +124,12 @@ impl Resampling {
     pub fn apply(&self, frame: &Frame) -> ModelFrame {
         let mut resampled = ModelFrame::default();
         for (row, newtons) in frame.newtons.chunks_exact(frame.array.cols).enumerate() {
-            for &(model_row, row_share) in self.rows.shares(row) {
+            for &(model_row, row_share) in &self.rows[row] {
                 for (col, &newtons) in newtons.iter().enumerate() {
                     if newtons == 0.0 {
                         continue;
                     }
-                    for &(model_col, col_share) in self.cols.shares(col) {
+                    for &(model_col, col_share) in &self.cols[col] {
                         resampled.newtons[model_row * COLS + model_col] +=
                             newtons * row_share * col_share;
                     }
@@ -139,53 +140,38 @@ impl Resampling {
     }
 }
 
-/// How the taxels along one side of an array lie on the model's.
-#[derive(Debug, Clone)]
-struct Side {
-    /// For each row or column of the array, the model's that it covers, and the share on each.
-    shares: Vec<Vec<(usize, f32)>>,
-}
-
-impl Side {
-    /// A side of `count` taxels, each as long as `length` model taxels, on a side of `grid` model
-    /// taxels. The contact's centre is at taxel `centre`.
-    fn new(count: usize, length: f64, grid: usize, centre: f64) -> Self {
-        // Taxels of the same pitch move as they are.
-        let length = if (length - 1.0).abs() <= SAME_PITCH {
-            1.0
-        } else {
-            length
+/// How a side of `count` taxels, each as long as `length` model taxels, lies on a side of `grid` model
+/// taxels. The contact's centre is at taxel `centre`.
+fn shares(count: usize, length: f64, grid: usize, centre: f64) -> Vec<Vec<(usize, f32)>> {
+    // Taxels of the same pitch move as they are.
+    let length = if (length - 1.0).abs() <= SAME_PITCH {
+        1.0
+    } else {
+        length
+    };
+    let whole = count as f64 * length;
+    // The place of the array's border on the grid, negative if the array begins before it. It
+    // is a whole number, so that taxels half or a third as long share no border.
+    let free = grid as f64 - whole;
+    let first = if free >= 0.0 {
+        (free / 2.0).floor()
+    } else {
+        let around = (grid as f64 / 2.0 - (centre + 0.5) * length).round();
+        around.clamp(free.floor(), 0.0)
+    };
+    let shares = |taxel: usize| {
+        let from = first + taxel as f64 * length;
+        let to = from + length;
+        let first_cell = from.floor().max(0.0) as usize;
+        let cells = first_cell..(to.ceil().max(0.0) as usize).min(grid);
+        let share = |cell: usize| {
+            let covered = to.min(cell as f64 + 1.0) - from.max(cell as f64);
+            (cell, (covered / length) as f32)
         };
-        let whole = count as f64 * length;
-        // The place of the array's border on the grid, negative if the array begins before it. It
-        // is a whole number, so that taxels half or a third as long share no border.
-        let free = grid as f64 - whole;
-        let first = if free >= 0.0 {
-            (free / 2.0).floor()
-        } else {
-            let around = (grid as f64 / 2.0 - (centre + 0.5) * length).round();
-            around.clamp(free.floor(), 0.0)
-        };
-        let shares = |taxel: usize| {
-            let from = first + taxel as f64 * length;
-            let to = from + length;
-            let first_cell = from.floor().max(0.0) as usize;
-            let cells = first_cell..(to.ceil().max(0.0) as usize).min(grid);
-            let share = |cell: usize| {
-                let covered = to.min(cell as f64 + 1.0) - from.max(cell as f64);
-                (cell, (covered / length) as f32)
-            };
-            // What is left of a border after rounding is no share.
-            cells.map(share).filter(|&(_, s)| s > 1e-6).collect()
-        };
-        Self {
-            shares: (0..count).map(shares).collect(),
-        }
-    }
-
-    fn shares(&self, taxel: usize) -> &[(usize, f32)] {
-        &self.shares[taxel]
-    }
+        // What is left of a border after rounding is no share.
+        cells.map(share).filter(|&(_, s)| s > 1e-6).collect()
+    };
+    (0..count).map(shares).collect()
 }
 
 #[cfg(test)]

@@ -1,18 +1,25 @@
-//! The inputs of a model of format 3.
+//! The inputs of a model.
 //!
 //! In: the course of a press, the pressed piece, the sensor's references. Out: the model's inputs as
 //! tensors.
 
+use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
 
 use super::course::{Sample, TimeSeries};
 use super::features::FEATURES;
-use super::grid::{COLS, ROWS, TAXELS};
+use super::grid::{COLS, ROWS};
+use super::parts::{self, PARTS};
 use super::references::{PIECE, Piece, References};
+use crate::frame::Array;
+use crate::wording;
 
-/// An input of a model of courses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// An input of a model, by its name in the file. The first two are those of format 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(super) enum Input {
+    Frame,
+    Parts,
     Frames,
     TimeS,
     ApproachMm,
@@ -26,8 +33,10 @@ pub(super) enum Input {
 }
 
 /// The lengths of the inputs of a model.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Lengths {
+    /// The array of a model of format 1.
+    pub(super) array: Array,
     /// The frames of a press.
     pub(super) frames: usize,
     /// The references, and the numbers of each. Both are 0 in a model that takes none.
@@ -35,7 +44,7 @@ pub(super) struct Lengths {
     pub(super) features: usize,
 }
 
-/// What a model of courses judges.
+/// What a model judges. One of format 1 takes the course alone.
 pub(super) struct Query<'a> {
     pub(super) course: &'a TimeSeries,
     /// The pressed piece, if the press is to become a reference.
@@ -44,19 +53,6 @@ pub(super) struct Query<'a> {
 }
 
 impl Input {
-    /// Every input.
-    pub(super) const ALL: [Self; 10] = [
-        Self::Frames,
-        Self::TimeS,
-        Self::ApproachMm,
-        Self::Known,
-        Self::Mask,
-        Self::ArmNPerMm,
-        Self::Piece,
-        Self::References,
-        Self::Given,
-        Self::Features,
-    ];
     /// The inputs that have a place for each frame.
     pub(super) const OF_FRAMES: [Self; 5] = [
         Self::Frames,
@@ -68,24 +64,16 @@ impl Input {
     /// The inputs of a model that takes references.
     pub(super) const OF_REFERENCES: [Self; 3] = [Self::Piece, Self::References, Self::Given];
 
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Self::Frames => "frames",
-            Self::TimeS => "time_s",
-            Self::ApproachMm => "approach_mm",
-            Self::Known => "known",
-            Self::Mask => "mask",
-            Self::ArmNPerMm => "arm_n_per_mm",
-            Self::Piece => "piece",
-            Self::References => "references",
-            Self::Given => "given",
-            Self::Features => "features",
-        }
+    pub(super) fn name(self) -> String {
+        wording::name(&self)
     }
 
     /// The shape of the input in a model of these lengths.
     pub(super) fn shape(self, lengths: Lengths) -> Vec<usize> {
+        let Array { rows, cols } = lengths.array;
         match self {
+            Self::Frame => vec![1, 1, rows, cols],
+            Self::Parts => vec![1, PARTS, rows, cols],
             Self::Frames => vec![1, lengths.frames, ROWS, COLS],
             Self::ArmNPerMm => vec![1, 1],
             Self::TimeS | Self::ApproachMm | Self::Known | Self::Mask => vec![1, lengths.frames],
@@ -99,18 +87,17 @@ impl Input {
     /// The tensor of this input for `query`. Places after the last frame or reference are 0.
     pub(super) fn tensor(self, query: &Query, lengths: Lengths) -> TractResult<Tensor> {
         let course = query.course;
-        let each = |value: fn(&Sample) -> f32| {
-            let values = course.moments.iter().map(value);
-            values.collect::<Vec<f32>>()
-        };
+        let pressed = |moment: &Sample| -> Vec<f32> { moment.frame.pressed().collect() };
+        let each =
+            |value: fn(&Sample) -> f32| -> Vec<f32> { course.moments.iter().map(value).collect() };
+        let moments = course.moments.iter();
         let mut values = match self {
-            Self::Frames => {
-                let mut values = Vec::with_capacity(lengths.frames * TAXELS);
-                for moment in &course.moments {
-                    values.extend(moment.frame.pressed());
-                }
-                values
+            Self::Frame => moments.last().map_or_else(Vec::new, pressed),
+            Self::Parts => {
+                let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
+                parts::parts(&moments.collect::<Vec<_>>())
             }
+            Self::Frames => moments.flat_map(pressed).collect(),
             Self::TimeS => each(|moment| moment.time_s),
             Self::ApproachMm => each(|moment| moment.approach_mm.unwrap_or(0.0)),
             Self::Known => each(|moment| f32::from(u8::from(moment.approach_mm.is_some()))),

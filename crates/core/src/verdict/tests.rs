@@ -1,13 +1,10 @@
-use pb::tensor_shape_proto::dimension::Value as Dimension;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
 use crate::tests::course_model::{course_model, encoded, given, judged};
-use crate::tests::graph::{int, node};
-
-mod own_grid;
+use crate::tests::graph::{int, node, value};
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
     proto.graph.as_mut().unwrap()
@@ -37,10 +34,6 @@ fn tensor_type(value: &mut pb::ValueInfoProto) -> &mut pb::type_proto::Tensor {
     let value = value.r#type.as_mut().unwrap().value.as_mut().unwrap();
     let pb::type_proto::Value::TensorType(tensor) = value;
     tensor
-}
-
-fn set_length(value: &mut pb::ValueInfoProto, axis: usize, length: Dimension) {
-    tensor_type(value).shape.as_mut().unwrap().dim[axis].value = Some(length);
 }
 
 /// A change of a model file.
@@ -108,13 +101,6 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             "model inputs: found image f32 [1,1,28,28], expected frame f32 [1,1,28,28]",
             |p| graph(p).input[0].name = "image".into(),
         ),
-        (
-            "found frame of another type or no fixed shape, expected frame",
-            |p| {
-                let batch = Dimension::DimParam("batch".into());
-                set_length(&mut graph(p).input[0], 0, batch);
-            },
-        ),
         ("found frame of another type", |p| {
             let double = pb::tensor_proto::DataType::Double;
             tensor_type(&mut graph(p).input[0]).elem_type = double as i32;
@@ -141,24 +127,20 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             let entry = entry.unwrap().clone();
             p.metadata_props.push(entry);
         }),
-        ("`hrn.range`: found Range", |p| {
+        ("in format 1 those of `force_n` and `contact_area", |p| {
             let add = |range: &mut Value| range["duration_s"] = serde_json::json!([0.5, 2.0]);
             edit(p, "hrn.range", add);
         }),
-        ("`hrn.pitch_mm`: found -1, expected", |p| {
+        ("`hrn.pitch_mm`: found \"-1\", expected", |p| {
             set(p, "hrn.pitch_mm", "-1");
         }),
-        (
-            "`hrn.levels`: found [1, 2, 4, 3], expected levels 1, 2",
-            |p| {
-                let swap = |levels: &mut Value| levels.as_array_mut().unwrap().swap(2, 3);
-                edit(p, "hrn.levels", swap);
-            },
-        ),
-        (
-            "`hrn.levels`: found \"ha\\u{1b}rd\", expected `label` and `shore` of 1 to 255 bytes",
-            |p| edit(p, "hrn.levels", |l| l[0]["label"] = "ha\u{1b}rd".into()),
-        ),
+        ("expected levels 1, 2, ... in order", |p| {
+            let swap = |levels: &mut Value| levels.as_array_mut().unwrap().swap(2, 3);
+            edit(p, "hrn.levels", swap);
+        }),
+        ("each with `label` and `shore` of 1 to 255 bytes", |p| {
+            edit(p, "hrn.levels", |l| l[0]["label"] = "ha\u{1b}rd".into());
+        }),
         ("`hrn.validation`: found \"aaaa", |p| {
             set(p, "hrn.validation", &"a".repeat(20_000));
         }),
@@ -207,6 +189,31 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
     }
 }
 
+/// The paper's network, as one of the frames of this array.
+fn of_grid(grid: &str) -> Vec<u8> {
+    changed(BUILT_IN_HRN, |proto| {
+        proto.metadata_props.push(pb::StringStringEntryProto {
+            key: "hrn.grid".to_owned(),
+            value: grid.to_owned(),
+        });
+    })
+}
+
+#[test]
+fn a_model_of_frames_as_they_are_has_one_array() {
+    let card = Hrn::load(&of_grid("[28, 28]")).unwrap().card().clone();
+    assert!(card.check_array(Array::JX255N).is_ok());
+    let refused = card.check_array(Array { rows: 2, cols: 3 }).unwrap_err();
+    let expected = "the model takes frames of 28x28 taxels as they are, and the sensor has 2x3: use the model of \
+                    this sensor, or none";
+    assert_eq!(refused.to_string(), expected);
+    let other = "expected frame f32 [1,1,2,3] or parts f32 [1,8,2,3]";
+    refused_by(&of_grid("[2, 3]"), other);
+    for grid in ["[0, 3]", "[2, 65]", "\"2x3\""] {
+        refused_by(&of_grid(grid), "expected [rows, columns], each 1 to 64");
+    }
+}
+
 fn rename_logits(proto: &mut pb::ModelProto) {
     for node in &mut graph(proto).node {
         for name in node.output.iter_mut().chain(&mut node.input) {
@@ -227,7 +234,7 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
             },
         ),
         ("time_s f32 [1,9], expected some of", |p| {
-            set_length(&mut graph(p).input[5], 1, Dimension::DimValue(9));
+            graph(p).input[5] = value("time_s", &[1, 9]);
         }),
         ("expected bins; or logits, probabilities", |p| {
             drop(graph(p).output.remove(0));

@@ -155,8 +155,8 @@ impl Checkpoint {
                 let mut packed = packed.with_context(|| format!("array `{array}`"))?;
                 let header = Header::read(&mut packed)?;
                 ensure!(
-                    header.shape == *dims && !header.fortran_order,
-                    "array `{array}`: found shape {:?}, expected {dims:?} in C order",
+                    header.shape == *dims,
+                    "array `{array}`: found shape {:?}, expected {dims:?}",
                     header.shape
                 );
                 let values = header.elements(&mut packed, f32::of)?;

@@ -17,7 +17,7 @@ use crate::exit::unreadable;
 use hardnessd_core::frame::Array;
 use hardnessd_core::npy::Header;
 use hardnessd_core::npz::{Element, Writer};
-use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Level, ROWS, TAXELS, check_levels, sha256_hex};
+use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Level, ROWS, TAXELS, are_levels, sha256_hex};
 use hardnessd_simulator::{BroadSensors, Family, Reference, Split};
 
 /// Forces beyond any sensor's, and low enough that sums of squares stay finite.
@@ -221,7 +221,7 @@ fn source(bytes: &[u8], file: &File, meta: &Value) -> anyhow::Result<Source> {
         return Err(refused("seed", "a number up to 9223372036854775807"));
     }
     let stated: Option<Vec<Level>> = serde_json::from_value(meta["levels"].clone()).ok();
-    let stated = stated.filter(|of| check_levels(of).is_ok() && of.len() <= MOST_LEVELS);
+    let stated = stated.filter(|of| are_levels(of) && of.len() <= MOST_LEVELS);
     if !meta["levels"].is_null() && stated.is_none() {
         return Err(refused(
             "levels",
@@ -465,23 +465,7 @@ impl<'a> File<'a> {
         };
         let bytes = count.saturating_mul(size_of::<T>());
         ensure!(bytes <= self.most, "{bytes} bytes of a small file");
-        let values = header.elements(&mut reader, T::of)?;
-        if !header.fortran_order {
-            return Ok(values);
-        }
-        // In Fortran order the first axis changes fastest; in our order the last one does.
-        let place = |mut index: usize| {
-            let mut steps = count;
-            let (mut place, mut stride) = (0, 1);
-            for &length in &header.shape {
-                steps /= length;
-                place += index / steps * stride;
-                index %= steps;
-                stride *= length;
-            }
-            place
-        };
-        Ok((0..count).map(|index| values[place(index)]).collect())
+        Ok(header.elements(&mut reader, T::of)?)
     }
 
     /// The array `meta` as JSON. Null if it is missing.
