@@ -5,7 +5,8 @@
 
 A generator that shares no code with the product: arrays, cells, marks, counters, lengths, checksums, SLIP, COBS and
 text by chance, with rests and noise, pressed at a few places. Claims: the share that is right, and that hardly any is
-sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames.
+sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames, tares at once and has
+presses.
 """
 
 import argparse
@@ -136,7 +137,7 @@ def stream(seed):
 
 
 def judged(binary, directory, sent, data):
-    """`right`, `wrong` or `not sure`, and what was said."""
+    """`right`, `wrong`, `not sure` or `no tare or no press`, and what was said."""
     capture, config = directory / "capture.bin", directory / "found.toml"
     capture.write_bytes(data)
     config.unlink(missing_ok=True)
@@ -149,10 +150,15 @@ def judged(binary, directory, sent, data):
     # A signed cell that is never below 0 is read without its sign.
     is_cell = cell == wanted or cell.replace("u", "i", 1) == wanted.replace("u", "i", 1)
     played = subprocess.run([binary, "replay", capture, "--config", config, "--json"], capture_output=True, text=True)
-    frames = json.loads(played.stdout.splitlines()[-1])["frames"] if played.stdout else 0
+    events = [json.loads(line) for line in played.stdout.splitlines()]
+    frames = events[-1]["frames"] if events else 0
     is_array = (found["rows"], found["cols"]) == (sent["rows"], sent["cols"])
-    is_right = is_array and is_cell and frames >= 0.95 * sent["frames"] - 2
-    return "right" if is_right else "wrong", json.dumps(found)
+    if not (is_array and is_cell and frames >= 0.95 * sent["frames"] - 2):
+        return "wrong", json.dumps(found)
+    untared = [event["reason"] for event in events if (event.get("reason") or "").startswith("tare")]
+    if untared or not any(event["type"] == "press" for event in events):
+        return "no tare or no press", json.dumps(untared[:1])
+    return "right", ""
 
 
 def main():
