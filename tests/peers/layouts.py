@@ -118,7 +118,7 @@ def stream(seed):
         value = rest + load[frame] + rng.normal(0, noise, (rows, cols))
         if framing == "text":
             separator = " ,"[seed % 2]
-            counts = np.clip(np.round(value * (10 if full < 50 else 1)), 0, 4095).astype(int)
+            counts = np.clip(np.round(value * min(10, 4095 / full)), 0, 4095).astype(int)
             out += ("\n".join(separator.join(map(str, row)) for row in counts) + "\n\n").encode()
             continue
         if not cell.startswith("f"):

@@ -14,11 +14,10 @@ const MANY: usize = 10;
 const LITTLE: usize = 4;
 /// One of so many numbers that wraps is no damage.
 const WRAPS: usize = 1000;
-/// From so many jumps in so many pairs of frames on, and jumps of so much of the range, a number wraps. A press
-/// that saturates at once makes fewer.
-const OFTEN: usize = 12;
+/// A number that jumps so often in so many pairs of frames is not damaged, nor are all of them together.
+const OFTEN: usize = 4;
+const OFTEN_IN_ALL: usize = 20;
 const PAIRS: usize = 200;
-const NEARLY_WHOLE: f32 = 0.9;
 /// The fewest bytes that show whether bytes are parts of longer numbers.
 const FEWEST_PARTS: usize = 64;
 /// The high half of a number of 24 bits is smaller.
@@ -95,20 +94,26 @@ impl<'a> Cells<'a> {
             let is_jump = |&(a, b): &(&f32, &f32)| (a - b).abs() > half;
             jumps += a.iter().zip(&b).filter(is_jump).count();
         }
-        jumps * WRAPS > all || self.jumps_often(cell)
+        jumps * WRAPS > all || self.jumps_alone(cell)
     }
 
-    /// Whether one number often jumps by nearly its whole range, as one that is about 0 and has a sign does.
-    fn jumps_often(&self, cell: Cell) -> bool {
+    /// Whether numbers are often large for a moment, alone among small ones: they are about 0 and have a sign. A
+    /// press is large in several taxels, and damage is rare and at another place each time.
+    fn jumps_alone(&self, cell: Cell) -> bool {
         let range = 2.0_f32.powi(8 * cell.bytes() as i32);
+        let is_small = |number: f32| number < 0.1 * range;
         let mut jumps = vec![0; self.bytes / cell.bytes()];
-        for (a, b) in self.frames.pairs().take(PAIRS) {
-            let [a, b] = [a, b].map(|index| numbers::numbers(cell, self.of_frame(index)));
-            for ((a, b), jumps) in a.iter().zip(&b).zip(&mut jumps) {
-                *jumps += usize::from((a - b).abs() > NEARLY_WHOLE * range);
+        for (before, now) in self.frames.pairs().take(PAIRS) {
+            let [before, now] =
+                [before, now].map(|index| numbers::numbers(cell, self.of_frame(index)));
+            for at in 1..now.len().saturating_sub(1) {
+                let is_alone = [before[at], now[at - 1], now[at + 1]]
+                    .into_iter()
+                    .all(is_small);
+                jumps[at] += usize::from(now[at] > 0.9 * range && is_alone);
             }
         }
-        jumps.into_iter().any(|jumps| jumps >= OFTEN)
+        jumps.iter().sum::<usize>() >= OFTEN_IN_ALL || jumps.into_iter().any(|jumps| jumps >= OFTEN)
     }
 
     /// Whether numbers are parts of longer ones: of four bytes in a row one is nearly always the same, or of

@@ -25,6 +25,8 @@ pub struct Scale {
 
 /// One in so many frames is quiet, that with the smallest change.
 const QUIET: usize = 4;
+/// A tare at rest has at most so many times the noise of a usual quiet one.
+const CALM: f32 = 2.5;
 /// As many taxels in contact begin a press, and as many may be touched in a tare.
 const TAXELS: usize = 3;
 /// As many frames make a tare.
@@ -102,9 +104,14 @@ impl Scale {
             };
             third((0..taxels).map(of_taxel).collect())
         };
-        let mut noises: Vec<f32> = quiet.chunks(TARE_FRAMES).map(varies).collect();
-        noises.sort_by(f32::total_cmp);
-        let noise = noises[noises.len() / 2];
+        let mut quiet_noises: Vec<f32> = quiet.chunks(TARE_FRAMES).map(varies).collect();
+        quiet_noises.sort_by(f32::total_cmp);
+        let usual = quiet_noises[quiet_noises.len() / 2];
+        // The largest, so that every tare at rest passes. In a press it is larger still.
+        let tares = all.chunks(TARE_FRAMES).map(varies);
+        let noise = tares
+            .filter(|noise| *noise <= CALM * usual)
+            .fold(usual, f32::max);
         let mut sorted = rest.clone();
         sorted.sort_by(f32::total_cmp);
         let median = sorted[taxels / 2];
