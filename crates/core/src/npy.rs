@@ -316,7 +316,6 @@ mod tests {
             &" ".repeat(LONGEST_HEADER + 1),
             "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (1,)}",
             "{'descr': '<f4', 'fortran_order': False, 'shape': (2, -1)}",
-            "{'descr': '<f4', 'fortran_order': False, 'shape': (99999999999999999999,)}",
             "{'descr': '<f4', 'fortran_order': False, 'shape': (1,), 'more': 1}",
             "{'descr': '<f4'}",
             "{'descr': '<f4",
@@ -354,7 +353,6 @@ mod tests {
             ("|i1", &[1, 255], [1.0, -1.0]),
             ("<u2", &[1, 0, 0, 1], [1.0, 256.0]),
             (">i2", &[0, 1, 255, 255], [1.0, -1.0]),
-            ("<i4", &[1, 0, 0, 0, 255, 255, 255, 255], [1.0, -1.0]),
             ("<i8", &long, [7.0, -7.0]),
             ("<f4", &half, [0.5, -2.0]),
             (">f4", &[0x3F, 0x80, 0, 0, 0xC0, 0, 0, 0], [1.0, -2.0]),
@@ -387,10 +385,6 @@ mod tests {
         assert_eq!(read(of("<f8", false, &[1, 3])).unwrap()[0].len(), 3);
         for (header, expected) in [
             (of("<f4", false, &[6]), "an array of shape [6]"),
-            (
-                of("<f4", false, &[9_000_000_000, 0]),
-                "of shape [9000000000, 0]",
-            ),
             (of("<f4", false, &[2, 2]), "more than 4 elements"),
             (of("<f4", false, &[2, 4]), "6 elements of 8"),
             (

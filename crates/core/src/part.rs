@@ -102,25 +102,24 @@ impl Part {
     /// renamed.
     pub fn finish(self) -> io::Result<()> {
         self.file.sync_all()?;
-        let named = match (self.named, self.replaces) {
-            (Some(part), true) => part.persist(&self.path).map_err(|failed| failed.error),
-            (Some(part), false) => {
-                let named = part.persist_noclobber(&self.path);
-                named.map_err(|failed| failed.error)
-            }
-            (None, false) => link(&self.file, &self.path),
-            // A link replaces nothing, but a renamed one does.
-            (None, true) => name(&prefix(&self.path))
-                .make_in(directory_of(&self.path), |part| link(&self.file, part))
-                .and_then(|part| part.persist(&self.path).map_err(|failed| failed.error))
-                .map(drop),
+        let directory = directory_of(&self.path);
+        // A link replaces nothing, but a renamed one does.
+        let part = match self.named {
+            Some(part) => part,
+            None => name(&prefix(&self.path))
+                .make_in(directory, |part| link(&self.file, part))?
+                .into_temp_path(),
         };
-        named.map_err(|error| match error.kind() {
+        let named = match self.replaces {
+            true => part.persist(&self.path),
+            false => part.persist_noclobber(&self.path),
+        };
+        named.map_err(|failed| match failed.error.kind() {
             ErrorKind::AlreadyExists => taken(),
-            _ => error,
+            _ => failed.error,
         })?;
         // The name is on the disk only after the directory is flushed.
-        File::open(directory_of(&self.path))?.sync_all()
+        File::open(directory)?.sync_all()
     }
 }
 

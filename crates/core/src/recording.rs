@@ -218,11 +218,6 @@ pub enum Error {
 
 impl From<mcap::McapError> for Error {
     fn from(error: mcap::McapError) -> Self {
-        let unread = |found: String| {
-            Error::Content(format!(
-                "{found}: `mcap recover` rewrites the recording with chunks that are read"
-            ))
-        };
         match error {
             mcap::McapError::Io(error) => Error::Io(error),
             mcap::McapError::BadMagic => {
@@ -232,9 +227,10 @@ impl From<mcap::McapError> for Error {
             | mcap::McapError::RecordTooLarge {
                 opcode: mcap::records::op::CHUNK,
                 len: bytes,
-            } => unread(reader::too_long(bytes)),
-            mcap::McapError::UnsupportedCompression(name) => unread(format!(
-                "found a chunk packed with {name:?}, expected zstd, lz4 or none"
+            } => Error::Content(format!(
+                "found a chunk of {bytes} bytes, expected at most {}: `mcap recover` rewrites the recording with \
+                 chunks that are read",
+                reader::LONGEST_CHUNK_BYTES
             )),
             other => Error::Content(format!(
                 "the recording is damaged ({other}): `hardnessd recover` saves what is whole"

@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Entry, Error, FORMAT, State};
+use super::{Entry, Error, FORMAT, Found, State};
 use crate::event;
 use crate::frame::Stamp;
 use crate::motion::Point;
@@ -142,10 +142,7 @@ fn stamp(header: &Header, mono_ns: u64, log_time_ns: u64) -> Result<Stamp, Error
 }
 
 /// Reads the sensor, the moment and the positions of the arm from a message on [`MOTION`].
-pub(super) fn decode_motion(
-    bytes: &[u8],
-    log_time_ns: u64,
-) -> Result<(String, Stamp, Entry), Error> {
+pub(super) fn decode_motion(bytes: &[u8], log_time_ns: u64) -> Result<Found, Error> {
     let message: MotionMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
     let (moments, positions) = (message.at_ns, message.approach_mm);
@@ -155,15 +152,15 @@ pub(super) fn decode_motion(
     if !same || !points.iter().all(Point::is_usable) {
         return Err(foreign("invalid positions"));
     }
-    let motion = Input::Motion(points);
-    Ok((message.header.frame_id, at, Entry::Input(motion)))
+    Ok(Found {
+        sensor: message.header.frame_id,
+        at,
+        entry: Entry::Input(Input::Motion(points)),
+    })
 }
 
 /// Reads the sensor, the moment and the entry from a message on [`INPUT`].
-pub(super) fn decode_entry(
-    bytes: &[u8],
-    log_time_ns: u64,
-) -> Result<(String, Stamp, Entry), Error> {
+pub(super) fn decode_entry(bytes: &[u8], log_time_ns: u64) -> Result<Found, Error> {
     let message: InputMessage = from_cdr(bytes)?;
     let at = stamp(&message.header, message.mono_ns, log_time_ns)?;
     let data = message.data.into_vec();
@@ -205,7 +202,8 @@ pub(super) fn decode_entry(
         }
         other => return Err(foreign(&format!("an input of kind {other}"))),
     };
-    Ok((message.header.frame_id, at, entry))
+    let sensor = message.header.frame_id;
+    Ok(Found { sensor, at, entry })
 }
 
 /// The sensor's name in any message that this program writes.

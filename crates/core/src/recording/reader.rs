@@ -25,11 +25,6 @@ pub struct Found {
 /// after 1 MiB. Those of other programs may be longer.
 pub(super) const LONGEST_CHUNK_BYTES: usize = 64 << 20;
 
-/// The reason why a chunk of `bytes` bytes is not read.
-pub(super) fn too_long(bytes: u64) -> String {
-    format!("found a chunk of {bytes} bytes, expected at most {LONGEST_CHUNK_BYTES}")
-}
-
 /// The bytes of a chunk's record before its data, without the name of the compression: two times, the
 /// unpacked length, the checksum, the name's length, and the data's length.
 const CHUNK_HEADER_BYTES: usize = 8 + 8 + 8 + 4 + 4 + 8;
@@ -137,7 +132,7 @@ pub(super) fn decoder(schema: &str) -> Option<Decode> {
 }
 
 /// A function that reads a message and the time at which it was logged, in nanoseconds since 1970.
-pub(super) type Decode = fn(&[u8], u64) -> Result<(String, Stamp, Entry), Error>;
+pub(super) type Decode = fn(&[u8], u64) -> Result<Found, Error>;
 
 /// Reads a recording from its beginning. It yields the entries in order, and ends after the first
 /// error.
@@ -216,8 +211,7 @@ impl<R: Read> Reader<R> {
             }
             Record::Message { header, data } => {
                 if let Some(decode) = self.channels.get(&header.channel_id) {
-                    let (sensor, at, entry) = decode(&data, header.log_time)?;
-                    return Ok(Some(Found { sensor, at, entry }));
+                    return decode(&data, header.log_time).map(Some);
                 }
             }
             _ => {}

@@ -175,6 +175,9 @@ impl<R: Read + Seek> Broken<R> {
 /// Whether these bytes, [`HEAD_BYTES`] or more, begin a chunk that ends within `left` bytes. The check
 /// compares its lengths with each other, so the rest of the chunk need not be read.
 fn is_chunk_head(head: &[u8], left: u64) -> bool {
+    if head.first() != Some(&op::CHUNK) {
+        return false;
+    }
     let length = number(head, LENGTH_AT);
     let is_of = |compression: &&[u8]| {
         let packed_at = COMPRESSION_AT + compression.len();
@@ -182,9 +185,7 @@ fn is_chunk_head(head: &[u8], left: u64) -> bool {
         let named = head.get(COMPRESSION_AT..packed_at) == Some(*compression);
         named && length.checked_sub(number(head, packed_at)) == Some(data_at - RECORD_HEAD_BYTES)
     };
-    head.first() == Some(&op::CHUNK)
-        && length <= left.saturating_sub(RECORD_HEAD_BYTES)
-        && COMPRESSIONS.iter().any(is_of)
+    length <= left.saturating_sub(RECORD_HEAD_BYTES) && COMPRESSIONS.iter().any(is_of)
 }
 
 /// The number of eight bytes at `at`.
@@ -292,7 +293,9 @@ impl<W: Write> Copy<W> {
                         self.done.messages_lost += 1;
                         return Ok(());
                     }
-                    Some(Ok((_, _, Entry::State(_)))) => self.done.states += 1,
+                    Some(Ok(found)) if matches!(found.entry, Entry::State(_)) => {
+                        self.done.states += 1;
+                    }
                     _ => {}
                 }
                 self.out.write_to_known_channel(&header, &data)?;

@@ -238,9 +238,7 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
         *state.pointer_mut(place).unwrap() = value;
         let data = state.to_string().into_bytes();
         let message = message::encode("forearm", at(0), message::STATE, data);
-        let (sensor, at, entry) =
-            message::decode_entry(&message, 1).map_err(|error| error.to_string())?;
-        let found = Found { sensor, at, entry };
+        let found = message::decode_entry(&message, 1).map_err(|error| error.to_string())?;
         let played = Playback::new(hrn.clone()).feed(found);
         played.map(drop).map_err(|error| error.to_string())
     };
@@ -436,9 +434,9 @@ fn a_replay_knows_the_time_after_2038() {
     let late = Stamp { wall, ..at(0) };
     let message = message::encode_entry("forearm", late, &Entry::Input(Input::Tick));
     let log_time_ns = u64::try_from(wall.as_nanosecond()).unwrap();
-    let (_, read, _) = message::decode_entry(&message, log_time_ns).unwrap();
-    assert_eq!(read, late);
+    let read = message::decode_entry(&message, log_time_ns).unwrap();
+    assert_eq!(read.at, late);
     // The header of the message, which other programs read, ends in 2038.
-    let (_, by_header, _) = message::decode_entry(&message, 0).unwrap();
-    assert_eq!(by_header.wall.to_string(), "2038-01-19T03:14:07.25Z");
+    let by_header = message::decode_entry(&message, 0).unwrap();
+    assert_eq!(by_header.at.wall.to_string(), "2038-01-19T03:14:07.25Z");
 }

@@ -150,48 +150,43 @@ fn range(text: &str) -> Option<[f32; 2]> {
 /// A distribution over the scale: a probability for each of a number of equal bins from 0 to 100.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Distribution {
-    /// The probability below the end of each bin.
+    /// The probability below the beginning of each bin, and below the end of the last one.
     below: Vec<f32>,
 }
 
 impl Distribution {
     /// The softmax of `logits`, one for each bin.
     pub fn of(logits: &[f32]) -> Self {
+        let mut below = vec![0.0];
         let mut sum = 0.0;
-        let mut below = softmax(logits);
-        for share in &mut below {
-            sum += *share;
-            *share = sum;
+        for share in softmax(logits) {
+            sum += share;
+            below.push(sum);
         }
-        for share in &mut below {
-            *share /= sum;
-        }
+        below.iter_mut().for_each(|below| *below /= sum);
         Self { below }
     }
 
-    fn width(&self) -> f32 {
-        MOST / self.below.len() as f32
-    }
-
-    fn below_bin(&self, bin: usize) -> f32 {
-        if bin == 0 { 0.0 } else { self.below[bin - 1] }
+    fn bins(&self) -> usize {
+        self.below.len() - 1
     }
 
     /// The probability below `shore`. It is even within a bin.
     pub fn below(&self, shore: f32) -> f32 {
-        let place = (shore / self.width()).clamp(0.0, self.below.len() as f32);
-        let bin = (place as usize).min(self.below.len() - 1);
-        let before = self.below_bin(bin);
-        before + (place - bin as f32) * (self.below[bin] - before)
+        let place = shore / MOST * self.bins() as f32;
+        let place = place.clamp(0.0, self.bins() as f32);
+        let bin = (place as usize).min(self.bins() - 1);
+        self.below[bin] + (place - bin as f32) * (self.below[bin + 1] - self.below[bin])
     }
 
     /// The Shore hardness that has this share below it.
     fn quantile(&self, share: f32) -> f32 {
-        let bin = self.below.partition_point(|&below| below < share);
-        let bin = bin.min(self.below.len() - 1);
-        let before = self.below_bin(bin);
-        let within = (share - before) / (self.below[bin] - before).max(f32::MIN_POSITIVE);
-        (bin as f32 + within.clamp(0.0, 1.0)) * self.width()
+        let ends = &self.below[1..];
+        let bin = ends.partition_point(|&below| below < share);
+        let bin = bin.min(self.bins() - 1);
+        let before = self.below[bin];
+        let within = (share - before) / (self.below[bin + 1] - before).max(f32::MIN_POSITIVE);
+        (bin as f32 + within.clamp(0.0, 1.0)) * MOST / self.bins() as f32
     }
 
     /// The probability of each level.
