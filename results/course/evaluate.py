@@ -126,7 +126,8 @@ def figures(evaluated, verdicts, data):
     for sensor, (_, level, named, _, _) in zip(sensors, rows):
         counts[covers.index(sensor // ELECTRONICS), level - 1] += [named == level, 1]
     share = counts.sum(axis=1)
-    is_layered = data["layered"][places] == 1
+    materials = json.loads(data["meta"].tobytes())["materials"]
+    is_layered = data["material"][places] == materials.index("broad-layered")
     pairs = [(level, named) for _, level, named, _, _ in rows]
     sure = [level == named for _, level, named, shares, _ in rows if max(shares) > SURE]
     return {

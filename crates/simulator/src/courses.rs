@@ -12,16 +12,15 @@ use serde::{Deserialize, Serialize};
 
 pub use self::world::{BroadSensors, SensorDesigns};
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
-use super::material::{Body, Split};
+use super::material::Split;
 use super::motion::Arm;
-use super::object::{Family, POSTURES, Pose, Shapes};
+use super::object::{POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen, draw_patch};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
 use super::solved::SolvedPress;
 use super::subject::{Subject, shared_out, units};
-use super::substance::Law;
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
@@ -108,11 +107,6 @@ pub struct LabelledCourse {
     pub sensor: u32,
     /// The rigid piece that was pressed. Its level is 0 and its Shore hardness NaN.
     pub reference: Option<Reference>,
-    /// The family of the object's shape.
-    pub family: Family,
-    /// Whether the object is a soft layer on a stiff core: the durometer reads the layer, a press feels
-    /// the core.
-    pub layered: bool,
 }
 
 /// One frame of a press.
@@ -232,7 +226,7 @@ pub fn courses(
             let subject = Subject::draw(of, unit, settings.flat_share());
             let mut made = Vec::with_capacity(of.presses as usize);
             for press in 0..u64::from(of.presses) {
-                let mut paired = subject.draws.geometry.child(3).child(press);
+                let mut paired = subject.geometry.child(3).child(press);
                 let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
                 let read = subject.pressed(bench, &plan, press, |solved, force_n, noise| {
                     let press = plan.read(&subject.sensor, solved, force_n, plan.reading, noise)?;
@@ -256,17 +250,13 @@ impl Subject {
         press: u64,
         read: impl Fn(&SolvedPress, f64, &mut Stream) -> Option<T>,
     ) -> Option<T> {
-        let Body {
-            substance,
-            young_mpa,
-            ..
-        } = self.body;
-        let face = self.object.faces[plan.posture];
-        let mut roughness = self.draws.body.child(1).child(plan.posture as u64);
-        let patch = draw_patch(&substance.texture, face.roughness, &mut roughness);
+        let body = &self.body;
+        let face = self.object[plan.posture];
+        let mut roughness = self.draws.child(1).child(plan.posture as u64);
+        let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
         let pose = Pose::draw(&face, &mut plan.pose.clone());
-        let specimen = Specimen::new(substance, young_mpa, &face, &pose, &patch);
-        let noise = self.draws.body.child(4).child(press);
+        let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+        let noise = self.draws.child(4).child(press);
         let mut force_n = plan.travel_mm.map_or(plan.force_n, |travel_mm| {
             bench.force_at(&specimen, plan.arm, travel_mm, plan.highest_force_n)
         });
@@ -311,8 +301,6 @@ impl Subject {
             material: self.body.material,
             split: self.split,
             shore: self.body.shore as f32,
-            family: self.object.family,
-            layered: matches!(self.body.substance.law, Law::Layered { .. }),
             ..press
         }
     }
@@ -374,8 +362,6 @@ impl Plan {
             shore: f32::NAN,
             sensor: 0,
             reference: None,
-            family: Family::Disc,
-            layered: false,
         })
     }
 }

@@ -82,18 +82,18 @@ impl Subject {
         let presses = press_numbers(settings.presses as usize);
         let mut samples = Vec::with_capacity(presses.len());
         for posture in 0..POSTURES {
-            let face = self.object.faces[posture];
-            let mut roughness = self.draws.body.child(1).child(posture as u64);
+            let face = self.object[posture];
+            let mut roughness = self.draws.child(1).child(posture as u64);
             let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
             let of_posture = |press: &usize| press % POSTURES == posture;
             for press in presses.iter().copied().filter(of_posture) {
-                let mut paired = self.draws.geometry.child(1).child(press as u64);
+                let mut paired = self.geometry.child(1).child(press as u64);
                 let pose = Pose::draw(&face, &mut paired);
                 let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
                 let force_n = nominal * (1.0 + FORCE_JITTER * paired.normal()).clamp(0.7, 1.3);
                 let hold_s = paired.range(0.8, 1.5);
                 let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
-                let mut noise = self.draws.body.child(2).child(press as u64);
+                let mut noise = self.draws.child(2).child(press as u64);
                 let (force_n, frame) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
                 samples.push(LabelledSample {
                     frame,
@@ -249,7 +249,7 @@ mod tests {
             let ratio = sample.frame.force_n() / f64::from(sample.force_n);
             assert!(
                 (0.2..1.5).contains(&ratio),
-                "{material}: reads {ratio} of the force"
+                "{material:?}: reads {ratio} of the force"
             );
         }
         let objects: std::collections::BTreeSet<u32> = samples.iter().map(|s| s.object).collect();

@@ -164,7 +164,7 @@ mod tests {
                 let found = Durometer::new(&properties.substance).young_mpa(shore);
                 assert!(
                     (held / found - 1.0).abs() < tolerance,
-                    "{material} at Shore OO {shore}: table {held}, durometer {found}"
+                    "{material:?} at Shore OO {shore}: table {held}, durometer {found}"
                 );
             }
         }

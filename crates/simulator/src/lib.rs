@@ -41,7 +41,7 @@ pub use dataset::{LabelledSample, dataset};
 pub use level::{LEVELS, LevelRange, level_of};
 pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
-pub use object::{Family, Shapes};
+pub use object::Shapes;
 pub use rig::{Rig, Touched};
 pub use rigid::Reference;
 pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};

@@ -102,12 +102,6 @@ impl Material {
     }
 }
 
-impl std::fmt::Display for Material {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 /// The properties of a material: a row of the table.
 #[derive(Debug)]
 pub(super) struct Properties {
@@ -332,7 +326,7 @@ mod tests {
             let (least, most) = bounds[usize::from(material.level()) - 1];
             assert!(
                 least <= low && low < mean && mean < high && high <= most,
-                "{material}"
+                "{material:?}"
             );
         }
     }

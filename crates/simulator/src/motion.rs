@@ -59,8 +59,8 @@ impl Motion {
 pub struct Approach {
     /// The time of the last press's touch, and the arm's motion in that press.
     pub(super) last: Option<(f64, Motion)>,
-    /// The time of the next press's touch, and the arm's speed.
-    pub(super) next: Option<(f64, f64)>,
+    /// The time of the next press's touch.
+    pub(super) next_s: Option<f64>,
 }
 
 impl Approach {
@@ -71,8 +71,8 @@ impl Approach {
         let last = self.last.map_or(-CLEARANCE_MM, |(touch_s, motion)| {
             motion.approach_mm(time_s - touch_s)
         });
-        let next = self.next.map_or(-CLEARANCE_MM, |(touch_s, speed_mm_s)| {
-            (speed_mm_s * (time_s - touch_s)).min(0.0)
+        let next = self.next_s.map_or(-CLEARANCE_MM, |touch_s| {
+            (Arm::default().speed_mm_s * (time_s - touch_s)).min(0.0)
         });
         last.max(next)
     }

@@ -27,52 +27,13 @@ pub enum Shapes {
     Paper,
 }
 
-/// The family of an object's shape.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Family {
-    /// A ball.
-    Ball,
-    /// A cylinder.
-    Cylinder,
-    /// A box with crowned faces.
-    Box,
-    /// A wedge.
-    Wedge,
-    /// A pebble.
-    Pebble,
-    /// A cone, tip up.
-    Point,
-    /// A flat plate.
-    Plate,
-    /// A flat-faced bar.
-    Bar,
-    /// A flat-faced box.
-    FlatBox,
-    /// A flat round face.
-    Disc,
-}
-
-impl Family {
-    /// The names of the families, by their numbers.
-    pub const NAMES: [&str; 10] = [
-        "ball", "cylinder", "box", "wedge", "pebble", "point", "plate", "bar", "flat-box", "disc",
-    ];
-}
-
 /// The number of postures that an object is pressed in (paper: "at least six").
 pub(super) const POSTURES: usize = 6;
 /// The depth beside the object, which no press reaches.
 const NOTHING_MM: f64 = 1e3;
 
-/// An object's outline, the same in every material.
-#[derive(Debug, Clone)]
-pub(super) struct Object {
-    /// The family of its shape.
-    pub(super) family: Family,
-    /// The upper face in each posture.
-    pub(super) faces: [Face; POSTURES],
-}
+/// An object's upper face in each posture, the same in every material.
+pub(super) type Object = [Face; POSTURES];
 
 /// The outline of a flat face.
 #[derive(Debug, Clone, Copy)]
@@ -231,135 +192,112 @@ const SLENDER: f64 = 2.0;
 const EDGE_MM: (f64, f64) = (0.2, 4.0);
 const FLAT_CROWN_MM: f64 = 1e6;
 
-impl Object {
-    /// Draws an object. `level` only matters for the paper's shapes.
-    ///
-    /// Faces are crowned, except those of the paper's rigid objects, which are flat. A single frame
-    /// fixes R / E* and no more, so it carries the hardness only if the range of radii is narrow. A
-    /// flat soft face touches as a whole, whatever its hardness.
-    pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Self {
-        let weights = match shapes {
-            Shapes::Wide => WIDE,
-            Shapes::Flat => return Self::flat(stream),
-            Shapes::Matched => MATCHED,
-            Shapes::Paper if level == 1 => RIGID,
-            Shapes::Paper => SOFT,
-        };
-        let is_wide = shapes == Shapes::Wide;
-        let is_flat = shapes == Shapes::Paper && level == 1;
-        let radius = |matched: (f64, f64), stream: &mut Stream| match is_wide {
-            true => log_even(WIDE_RADIUS_MM, stream),
-            false => stream.range(matched.0, matched.1),
-        };
-        let tip = |stream: &mut Stream| match is_wide {
-            true => log_even(WIDE_TIP_MM, stream),
-            false => stream.range(4.0, 10.0),
-        };
-        let flank_deg = |stream: &mut Stream| stream.range(30.0, 45.0);
-        // The face in a posture, by the radii of the edges and of the three pairs of faces, which are
-        // drawn after the sizes.
-        type Faces = Box<dyn Fn(usize, f64, [f64; 3]) -> Face>;
-        let (family, face): (Family, Faces) = match drawn(&weights, stream) {
-            0 => {
-                let axes = [radius((24.0, 30.0), stream); 3];
-                let face = move |posture, _, _| Face::round(axes, posture, 1.0);
-                (Family::Ball, Box::new(face))
-            }
-            1 => {
-                let radius = radius((16.0, 22.0), stream);
-                let length = stream.range(30.0, 60.0);
-                // Four postures on its side and one on each end.
-                let face = move |posture, edge, crown: [f64; 3]| match posture {
-                    0..4 => Face::ridge(radius, length, edge, 90.0, 2.0 * radius),
-                    _ => {
-                        let end = FlatFace::Round { radius_mm: radius };
-                        Face::crowned(end, edge, crown[posture - 4], length)
-                    }
-                };
-                (Family::Cylinder, Box::new(face))
-            }
-            2 => {
-                let sides = [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)];
-                let sides = sides.map(|(low, high)| stream.range(low, high));
-                let face = move |posture, edge, crown: [f64; 3]| {
-                    let up = (posture + 2) % 3;
-                    let sides_mm = [sides[(up + 1) % 3], sides[(up + 2) % 3]];
-                    let side = FlatFace::Rectangle { sides_mm };
-                    Face::crowned(side, edge, crown[up], sides[up])
-                };
-                (Family::Box, Box::new(face))
-            }
-            3 => {
-                let (length, tip) = (stream.range(25.0, 50.0), tip(stream));
-                let flank_deg = flank_deg(stream);
-                let face =
-                    move |_, edge, _| Face::ridge(tip, length, edge, flank_deg, WEDGE_HEIGHT_MM);
-                (Family::Wedge, Box::new(face))
-            }
-            4 => {
-                let axes = if is_wide {
-                    let radius = log_even(WIDE_RADIUS_MM, stream);
-                    std::array::from_fn(|_| radius * stream.range(0.9, 1.1))
-                } else {
-                    std::array::from_fn(|_| stream.range(23.0, 29.0))
-                };
-                let face = move |posture, _, _| Face::round(axes, posture, 2.0);
-                (Family::Pebble, Box::new(face))
-            }
-            _ => {
-                let (radius, flank_deg) = (tip(stream), flank_deg(stream));
-                let outline = Outline::Tip { radius, flank_deg };
-                let face = move |_, _, _| Face::new(outline, WEDGE_HEIGHT_MM);
-                (Family::Point, Box::new(face))
-            }
-        };
-        let edge_mm = stream.range(1.0, 4.0);
-        let crown_mm = std::array::from_fn(|_| {
-            if !is_flat {
-                return radius((31.0, 42.0), stream);
-            }
-            let radius = stream.range(800.0, 6000.0);
-            if stream.uniform() < 0.3 {
-                -radius
+/// Draws an object. `level` only matters for the paper's shapes.
+///
+/// Faces are crowned, except those of the paper's rigid objects, which are flat. A single frame
+/// fixes R / E* and no more, so it carries the hardness only if the range of radii is narrow. A
+/// flat soft face touches as a whole, whatever its hardness.
+pub(super) fn draw(shapes: Shapes, level: u8, stream: &mut Stream) -> Object {
+    let weights = match shapes {
+        Shapes::Wide => WIDE,
+        Shapes::Flat => return flat(stream),
+        Shapes::Matched => MATCHED,
+        Shapes::Paper if level == 1 => RIGID,
+        Shapes::Paper => SOFT,
+    };
+    let is_wide = shapes == Shapes::Wide;
+    let is_flat = shapes == Shapes::Paper && level == 1;
+    let radius = |matched: (f64, f64), stream: &mut Stream| match is_wide {
+        true => log_even(WIDE_RADIUS_MM, stream),
+        false => stream.range(matched.0, matched.1),
+    };
+    let tip = |stream: &mut Stream| match is_wide {
+        true => log_even(WIDE_TIP_MM, stream),
+        false => stream.range(4.0, 10.0),
+    };
+    let flank_deg = |stream: &mut Stream| stream.range(30.0, 45.0);
+    // The face in a posture, by the radii of the edges and of the three pairs of faces, which are
+    // drawn after the sizes.
+    type Faces = Box<dyn Fn(usize, f64, [f64; 3]) -> Face>;
+    let face: Faces = match drawn(&weights, stream) {
+        0 => {
+            let axes = [radius((24.0, 30.0), stream); 3];
+            Box::new(move |posture, _, _| Face::round(axes, posture, 1.0))
+        }
+        1 => {
+            let radius = radius((16.0, 22.0), stream);
+            let length = stream.range(30.0, 60.0);
+            // Four postures on its side and one on each end.
+            let end = FlatFace::Round { radius_mm: radius };
+            Box::new(move |posture, edge, crown| match posture {
+                0..4 => Face::ridge(radius, length, edge, 90.0, 2.0 * radius),
+                _ => Face::crowned(end, edge, crown[posture - 4], length),
+            })
+        }
+        2 => {
+            let sides = [(25.0, 60.0), (25.0, 60.0), (18.0, 45.0)];
+            let sides = sides.map(|(low, high)| stream.range(low, high));
+            Box::new(move |posture, edge, crown| {
+                let up = (posture + 2) % 3;
+                let sides_mm = [sides[(up + 1) % 3], sides[(up + 2) % 3]];
+                let side = FlatFace::Rectangle { sides_mm };
+                Face::crowned(side, edge, crown[up], sides[up])
+            })
+        }
+        3 => {
+            let (length, tip) = (stream.range(25.0, 50.0), tip(stream));
+            let flank_deg = flank_deg(stream);
+            Box::new(move |_, edge, _| Face::ridge(tip, length, edge, flank_deg, WEDGE_HEIGHT_MM))
+        }
+        4 => {
+            let axes = if is_wide {
+                let radius = log_even(WIDE_RADIUS_MM, stream);
+                std::array::from_fn(|_| radius * stream.range(0.9, 1.1))
             } else {
-                radius
-            }
-        });
-        Self {
-            family,
-            faces: std::array::from_fn(|posture| face(posture, edge_mm, crown_mm)),
+                std::array::from_fn(|_| stream.range(23.0, 29.0))
+            };
+            Box::new(move |posture, _, _| Face::round(axes, posture, 2.0))
         }
-    }
+        _ => {
+            let (radius, flank_deg) = (tip(stream), flank_deg(stream));
+            let outline = Outline::Tip { radius, flank_deg };
+            Box::new(move |_, _, _| Face::new(outline, WEDGE_HEIGHT_MM))
+        }
+    };
+    let edge_mm = stream.range(1.0, 4.0);
+    let crown_mm = std::array::from_fn(|_| {
+        if !is_flat {
+            return radius((31.0, 42.0), stream);
+        }
+        let radius = stream.range(800.0, 6000.0);
+        if stream.uniform() < 0.3 {
+            -radius
+        } else {
+            radius
+        }
+    });
+    std::array::from_fn(|posture| face(posture, edge_mm, crown_mm))
+}
 
-    /// Draws an object with flat faces, which stands or lies on something rigid.
-    pub(super) fn flat(stream: &mut Stream) -> Self {
-        let rectangle = |stream: &mut Stream, one, other| FlatFace::Rectangle {
-            sides_mm: [log_even(one, stream), log_even(other, stream)],
-        };
-        let (family, flat) = match drawn(&FLAT, stream) {
-            0 if stream.uniform() < LARGE_SHARE => {
-                (Family::Plate, rectangle(stream, LARGE_MM, LARGE_MM))
-            }
-            0 => (Family::Plate, rectangle(stream, PLATE_MM, PLATE_MM)),
-            1 => (Family::Bar, rectangle(stream, BAR_MM, LONG_MM)),
-            2 => (Family::FlatBox, rectangle(stream, BOX_MM, BOX_MM)),
-            _ => {
-                let radius_mm = 0.5 * log_even(DISC_MM, stream);
-                (Family::Disc, FlatFace::Round { radius_mm })
-            }
-        };
-        let narrow_mm = flat.narrow_mm();
-        let height = match family {
-            Family::Plate => log_even(THIN_MM, stream),
-            _ => log_even(HIGH_MM, stream),
-        };
-        let edge_mm = log_even(EDGE_MM, stream).min(0.4 * narrow_mm);
-        let face = Face::block(flat, height.min(SLENDER * narrow_mm), edge_mm);
-        Self {
-            family,
-            faces: [face; POSTURES],
-        }
-    }
+/// Draws an object with flat faces, which stands or lies on something rigid.
+pub(super) fn flat(stream: &mut Stream) -> Object {
+    let rectangle = |stream: &mut Stream, one, other| FlatFace::Rectangle {
+        sides_mm: [log_even(one, stream), log_even(other, stream)],
+    };
+    let kind = drawn(&FLAT, stream);
+    let flat = match kind {
+        0 if stream.uniform() < LARGE_SHARE => rectangle(stream, LARGE_MM, LARGE_MM),
+        0 => rectangle(stream, PLATE_MM, PLATE_MM),
+        1 => rectangle(stream, BAR_MM, LONG_MM),
+        2 => rectangle(stream, BOX_MM, BOX_MM),
+        _ => FlatFace::Round {
+            radius_mm: 0.5 * log_even(DISC_MM, stream),
+        },
+    };
+    let narrow_mm = flat.narrow_mm();
+    let height = log_even(if kind == 0 { THIN_MM } else { HIGH_MM }, stream);
+    let edge_mm = log_even(EDGE_MM, stream).min(0.4 * narrow_mm);
+    [Face::block(flat, height.min(SLENDER * narrow_mm), edge_mm); POSTURES]
 }
 
 impl FlatFace {
@@ -562,20 +500,14 @@ mod tests {
     #[test]
     fn flat_objects_have_faces_of_one_to_sixty_mm_and_more() {
         let mut narrow = Vec::new();
-        let mut families = [0; Family::NAMES.len()];
         for k in 0..2000 {
-            let object = Object::flat(&mut Stream::new(3, "flat").child(k));
-            let face = object.faces[0];
+            let [face, ..] = flat(&mut Stream::new(3, "flat").child(k));
             let narrow_mm = face.flat.expect("a flat face").narrow_mm();
             let most_mm = (2.0 * narrow_mm).min(40.0);
-            assert!(face.height_mm <= most_mm, "{object:?}");
-            families[object.family as usize] += 1;
+            assert!(face.height_mm <= most_mm, "{face:?}");
             narrow.push(narrow_mm);
         }
         narrow.sort_by(f64::total_cmp);
         assert!(narrow[0] < 1.1 && narrow[1900] > 30.0 && narrow[1999] > 60.0);
-        let flat = &families[Family::Plate as usize..];
-        assert!(flat.iter().all(|&count| count > 200), "{families:?}");
-        assert_eq!(flat.iter().sum::<i32>(), 2000);
     }
 }

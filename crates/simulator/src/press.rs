@@ -21,9 +21,6 @@ pub(super) const CELLS: usize = 112;
 /// Window widths in cells. FFTs of twice these sizes are fast.
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
-/// The JX255N's cover: E in MPa and thickness in mm (assumed: soft silicone).
-const COVER_YOUNG_MPA: f64 = 3.0;
-const COVER_MM: f64 = 1.0;
 /// Poisson's ratio of every cover.
 const COVER_NU: f64 = 0.45;
 
@@ -35,11 +32,11 @@ pub(super) struct Cover {
 }
 
 impl Default for Cover {
-    /// The cover of the JX255N.
+    /// The cover of the JX255N (assumed: soft silicone).
     fn default() -> Self {
         Self {
-            young_mpa: COVER_YOUNG_MPA,
-            thickness_mm: COVER_MM,
+            young_mpa: 3.0,
+            thickness_mm: 1.0,
         }
     }
 }
@@ -83,7 +80,8 @@ pub(super) struct Window {
     pub(super) width: usize,
 }
 
-/// Plans, kernels and fields, kept between presses.
+/// Plans, kernels and fields, kept between presses. By default it is for the default cover.
+#[derive(Default)]
 pub(super) struct Bench {
     pub(super) cover: Cover,
     widths: BTreeMap<usize, Width>,
@@ -301,21 +299,12 @@ impl Window {
     }
 }
 
-impl Default for Bench {
-    /// A bench for the default cover.
-    fn default() -> Self {
-        Self::under(Cover::default())
-    }
-}
-
 impl Bench {
     /// A bench for a sensor with this cover.
     pub(super) fn under(cover: Cover) -> Self {
         Self {
             cover,
-            widths: BTreeMap::new(),
-            layers: Vec::new(),
-            combined: Vec::new(),
+            ..Self::default()
         }
     }
 
@@ -542,14 +531,17 @@ mod tests {
             for force_n in [2.0, 25.0] {
                 let (window, pressure, contact) =
                     bench.press(&ball(material, 1.0), force_n, 0.5, 1.0);
-                assert!(contact.converged, "{material} at {force_n} N: {contact:?}");
+                assert!(
+                    contact.converged,
+                    "{material:?} at {force_n} N: {contact:?}"
+                );
                 let cells: f64 = pressure
                     .iter()
                     .map(|&p| f64::from(p) * CELL_MM * CELL_MM)
                     .sum();
                 assert!(
                     (cells / force_n - 1.0).abs() < 1e-4,
-                    "{material}: cells carry {cells} N"
+                    "{material:?}: cells carry {cells} N"
                 );
                 let taxels = Grid::jx255n().taxel_forces(&pressure, window);
                 let sum: f64 = taxels.iter().map(|&force| f64::from(force)).sum();
@@ -558,7 +550,7 @@ mod tests {
                 let slack = if material.level() == 1 { 0.25 } else { 0.02 };
                 assert!(
                     (sum / force_n - 1.0).abs() < slack,
-                    "{material}: taxels carry {sum} N"
+                    "{material:?}: taxels carry {sum} N"
                 );
             }
         }

@@ -42,7 +42,8 @@ pub enum SensorProfile {
 pub(super) struct Sensor {
     pub(super) design: Design,
     pub(super) grid: Arc<Grid>,
-    gain: Vec<f32>,
+    /// The gain of each taxel; 0 for a dead one.
+    pub(super) gain: Vec<f32>,
     threshold_n: Vec<f32>,
     /// The counts at which taxels rest, and what a tare took them for. Empty for a film, which rests at 0.
     rest_counts: Vec<f32>,
@@ -125,11 +126,6 @@ impl Sensor {
             }
         }
         self.baseline = sums.iter().map(|sum| sum / frames as f32).collect();
-    }
-
-    /// The gain of each taxel; 0 for a dead one.
-    pub(super) fn gains(&self) -> &[f32] {
-        &self.gain
     }
 
     /// Draws the factor common to all taxels in one press.

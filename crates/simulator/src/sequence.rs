@@ -9,7 +9,7 @@ use super::broad;
 use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
 use super::material::{Body, Material};
 use super::motion::{Approach, Arm, Motion};
-use super::object::{Object, POSTURES, Pose, Shapes};
+use super::object::{self, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen, draw_patch};
 use super::rigid::{self, Reference};
 use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
@@ -186,7 +186,7 @@ impl Sequence {
 
     /// The true gain of each taxel, which a calibration should find; 0 for a dead taxel.
     pub fn gains(&self) -> &[f32] {
-        self.sensor.gains()
+        &self.sensor.gain
     }
 
     /// The touch time of the next press, and the stream that the press is drawn from, after its
@@ -204,10 +204,9 @@ impl Sequence {
 
     /// Makes a frame without load. A rest may be long, so its frames are made one at a time.
     fn rest(&mut self) -> SequenceFrame {
-        let next_s = (!self.is_done()).then(|| self.next_draws().0);
         let approach = Approach {
             last: self.last,
-            next: next_s.map(|touch_s| (touch_s, Arm::default().speed_mm_s)),
+            next_s: (!self.is_done()).then(|| self.next_draws().0),
         };
         self.film.advance(
             &self.sensor.design,
@@ -282,7 +281,7 @@ impl Sequence {
                     loaded: time_s > 0.0,
                     approach: Approach {
                         last: self.last,
-                        next: None,
+                        next_s: None,
                     },
                 }
             });
@@ -293,8 +292,8 @@ impl Sequence {
 /// Draws an object of the material, or of a random one, and one of its faces in a pose.
 pub(super) fn presented(material: Option<Material>, draws: &mut Stream) -> (Body, Specimen) {
     let body = broad::body_of(material, &mut draws.child(3));
-    let object = Object::draw(Shapes::Matched, body.level, &mut draws.child(0));
-    let face = object.faces[draws.below(POSTURES)];
+    let object = object::draw(Shapes::Matched, body.level, &mut draws.child(0));
+    let face = object[draws.below(POSTURES)];
     let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
     let pose = Pose::draw(&face, &mut draws.child(2));
     let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use super::broad;
 use super::level::LEVELS;
 use super::material::{Body, Material, Split};
-use super::object::{Object, Shapes};
+use super::object::{self, Object, Shapes};
 use super::sensor::Sensor;
 use super::settings::{DatasetSettings, Materials};
 use crate::random::Stream;
@@ -90,67 +90,61 @@ pub(super) fn shared_out<U: Sync, B, T: Send>(
     parts.into_iter().flat_map(|(_, made)| made).collect()
 }
 
-/// The streams of one object: one for its geometry, poses and forces, and one for its material.
-pub(super) struct Draws {
-    pub(super) geometry: Stream,
-    pub(super) body: Stream,
+/// The streams of one object: one for its geometry, poses and forces, and one for its material. The first
+/// of test objects of the same number does not depend on the material, except for the paper's shapes.
+/// This pairs the test objects.
+fn streams(settings: &DatasetSettings, unit: &Unit) -> [Stream; 2] {
+    let split = match (unit.material, unit.split) {
+        (Some(_), Split::Train) => "train",
+        (Some(_), Split::Test) => "test",
+        (None, Split::Train) => "broad train",
+        (None, Split::Test) => "broad test",
+    };
+    let is_paired = unit.split == Split::Test && settings.shapes != Shapes::Paper;
+    let geometry = if is_paired {
+        Material::ALL.len() as u64
+    } else {
+        unit.kind.into()
+    };
+    let root = Stream::new(settings.seed, split).child(unit.number.into());
+    [
+        root.child(0).child(geometry),
+        root.child(1).child(unit.kind.into()),
+    ]
 }
 
-impl Draws {
-    /// The streams of a unit. Geometry, poses and forces of test objects of the same number do not
-    /// depend on the material, except for the paper's shapes. This pairs the test objects.
-    fn new(settings: &DatasetSettings, unit: &Unit) -> Self {
-        let split = match (unit.material, unit.split) {
-            (Some(_), Split::Train) => "train",
-            (Some(_), Split::Test) => "test",
-            (None, Split::Train) => "broad train",
-            (None, Split::Test) => "broad test",
-        };
-        let is_paired = unit.split == Split::Test && settings.shapes != Shapes::Paper;
-        let geometry = if is_paired {
-            Material::ALL.len() as u64
-        } else {
-            unit.kind.into()
-        };
-        let root = Stream::new(settings.seed, split).child(u64::from(unit.number));
-        Self {
-            geometry: root.child(0).child(geometry),
-            body: root.child(1).child(unit.kind.into()),
-        }
-    }
-}
-
-/// An object with its material and the sensor it is pressed on.
+/// An object with its material, the sensor it is pressed on, and its streams.
 pub(super) struct Subject {
     pub(super) split: Split,
     pub(super) body: Body,
     pub(super) object: Object,
     pub(super) sensor: Sensor,
-    pub(super) draws: Draws,
+    pub(super) geometry: Stream,
+    pub(super) draws: Stream,
 }
 
 impl Subject {
     /// Draws a subject. A share of the objects has flat faces, whatever the shapes of the others.
     pub(super) fn draw(settings: &DatasetSettings, unit: &Unit, flat_share: f64) -> Self {
-        let draws = Draws::new(settings, unit);
-        let mut hardness = draws.body.child(0);
-        let body = broad::body_of(unit.material, &mut hardness);
+        let [geometry, draws] = streams(settings, unit);
+        let body = broad::body_of(unit.material, &mut draws.child(0));
         // Different stream names keep the splits' sensors apart.
         let sensors = match unit.split {
             Split::Train => "train sensor",
             Split::Test => "test sensor",
         };
         let of_sensor = Stream::new(settings.seed, sensors).child((unit.number % SENSORS).into());
-        let object = if draws.geometry.child(4).uniform() < flat_share {
-            Object::flat(&mut draws.geometry.child(5))
+        let object = if geometry.child(4).uniform() < flat_share {
+            object::flat(&mut geometry.child(5))
         } else {
-            Object::draw(settings.shapes, body.level, &mut draws.geometry.child(0))
+            object::draw(settings.shapes, body.level, &mut geometry.child(0))
         };
         Self {
             split: unit.split,
             object,
             body,
             sensor: Sensor::new(settings.profile, &of_sensor),
+            geometry,
             draws,
         }
     }
@@ -176,8 +170,8 @@ mod tests {
                     split,
                     number,
                 };
-                let stream = &mut Draws::new(&settings, &unit).geometry.child(0);
-                format!("{:?}", Object::draw(shapes, 4, stream))
+                let stream = &mut streams(&settings, &unit)[0].child(0);
+                format!("{:?}", object::draw(shapes, 4, stream))
             };
             for [one, other] in [[foam, mat], [(None, 2), (None, 4)]] {
                 let first = draw(one, Split::Test, 1);

@@ -130,13 +130,13 @@ mod tests {
             let rms_um = 1e3 * (square / (4000.0 * seeds as f64)).sqrt();
             assert!(
                 (rms_um / texture.rms_um - 1.0).abs() < 0.1,
-                "{material}: {rms_um} um"
+                "{material:?}: {rms_um} um"
             );
             // Slopes across the grain are steeper by the anisotropy.
             let grain = (across / along).sqrt();
             assert!(
                 (grain / texture.anisotropy - 1.0).abs() < 0.2,
-                "{material}: grain {grain}"
+                "{material:?}: grain {grain}"
             );
         }
     }

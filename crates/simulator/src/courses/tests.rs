@@ -49,9 +49,6 @@ fn threads_do_not_show_and_courses_are_whole() {
             "{approach:?}"
         );
         assert!((3.0..=30.0).contains(&course.arm_n_per_mm));
-        let names = crate::material_names(Materials::Broad);
-        let is_layered = names[usize::from(course.material)] == "broad-layered";
-        assert_eq!(course.layered, is_layered);
         let ratio = force_read_n(course) / f64::from(course.force_n);
         assert!((0.1..1.6).contains(&ratio), "reads {ratio} of the force");
     }

@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 
 use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading};
 use crate::material::Split;
-use crate::object::Family;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
 use crate::rigid::{self, FLAT_MM, Reference};
@@ -261,11 +260,10 @@ impl<'a> Station<'a> {
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
     fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
-        let flat = (Reference::Flat { width_mm }, Family::Disc);
-        let ball = (Reference::Ball { radius_mm }, Family::Ball);
+        let pieces = [Reference::Flat { width_mm }, Reference::Ball { radius_mm }];
         let material = self.settings.material_names().len() as u8 - 1;
         let mut made = Vec::new();
-        for (piece, (reference, family)) in (0_u32..).zip([flat, ball]) {
+        for (piece, reference) in (0_u32..).zip(pieces) {
             let face = rigid::face(reference);
             for press in 0..REFERENCES {
                 let number = piece * REFERENCES + press;
@@ -287,7 +285,6 @@ impl<'a> Station<'a> {
                         material,
                         split: self.place.split,
                         reference: Some(reference),
-                        family,
                         ..press
                     }));
                 }
@@ -303,7 +300,7 @@ impl<'a> Station<'a> {
         let subject = Subject::draw(&self.settings.objects, unit, flat_share);
         let mut made = Vec::new();
         for press in 0..u64::from(self.settings.objects.presses) {
-            let plan = self.plan(&mut subject.draws.geometry.child(3).child(press));
+            let plan = self.plan(&mut subject.geometry.child(3).child(press));
             let electronics = &self.electronics;
             let read = subject.pressed(&mut self.bench, &plan, press, |solved, force_n, noise| {
                 let of = |electronics: &Electronics| {

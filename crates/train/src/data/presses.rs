@@ -47,10 +47,6 @@ pub struct Press {
     pub sensor: u32,
     /// The rigid piece that was pressed to show what the sensor reads. Such a press has no level.
     pub reference: Option<Reference>,
-    /// The family of the object's shape, an index into [`hardnessd_simulator::Family::NAMES`]. Only simulated presses know it.
-    pub shape: Option<u8>,
-    /// Whether the object is a soft layer on a stiff core. Only simulated presses know it.
-    pub layered: Option<bool>,
     /// The recording and the number of the press in it, to read. Only recordings have it.
     pub name: Option<String>,
     /// The newtons of the array before the touch, without a zero taken: the sensor's own unloaded state. Only
@@ -78,8 +74,6 @@ impl Default for Press {
             arm_n_per_mm: 0.0,
             sensor: 0,
             reference: None,
-            shape: None,
-            layered: None,
             name: None,
             unloaded: None,
             kind: Kind::Unknown,
@@ -180,8 +174,6 @@ impl Presses {
                 arm_n_per_mm: course.arm_n_per_mm,
                 sensor: course.sensor,
                 reference: course.reference,
-                shape: Some(course.family as u8),
-                layered: Some(course.layered),
                 best: course.best,
                 ..Press::default()
             };

@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
-use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Family, LEVELS, Materials};
+use hardnessd_simulator::{self, CourseSettings, DatasetSettings, LEVELS, Materials};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
@@ -88,7 +88,6 @@ pub fn to_bytes(
         Layout::OverTime => {
             meta["materials"] = json!(settings.material_names());
             meta["settings"] = json!(settings);
-            meta["shapes"] = json!(Family::NAMES);
         }
     }
     let written = presses::write(Cursor::new(Vec::new()), presses, layout, &meta);

@@ -18,7 +18,7 @@ use hardnessd_core::frame::Array;
 use hardnessd_core::npy::Header;
 use hardnessd_core::npz::{Element, Writer};
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Level, ROWS, TAXELS, are_levels, sha256_hex};
-use hardnessd_simulator::{BroadSensors, Family, Reference, Split};
+use hardnessd_simulator::{BroadSensors, Reference, Split};
 
 /// Forces beyond any sensor's, and low enough that sums of squares stay finite.
 const FORCES: RangeInclusive<f32> = -1e6..=1e6;
@@ -110,8 +110,6 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
     let material = file.column("material", count, &(0..=u8::MAX))?;
     let sensor = file.column("sensor", count, &(0..=u32::MAX))?;
     let split = file.column("split", count, &(0..=1_u8))?;
-    let shape = file.column("shape", count, &(0..=Family::NAMES.len() as u8 - 1))?;
-    let layered = file.column("layered", count, &(0..=1_u8))?;
     let force_n = file.column("force", count, &FORCES)?;
     let shore = file.column("shore", count, &SHORE)?;
     let arm_n_per_mm = file.column("arm_n_per_mm", count, &(0.0..=1e6))?;
@@ -158,8 +156,6 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
             arm_n_per_mm: arm_n_per_mm[number].unwrap_or(0.0),
             sensor: sensor[number].unwrap_or(0),
             reference: reference[number],
-            shape: shape[number],
-            layered: layered[number].map(|layered| layered == 1),
             unloaded: unloaded.next().map(<[f32]>::to_vec),
             best: best - rows.start,
             ..Press::default()
@@ -303,10 +299,6 @@ pub fn write<W: Write + Seek>(
     add_measured(&mut npz, "force", all, |press| press.force_n)?;
     add(&mut npz, "split", all, |press| Some(press.split as u8))?;
     add_measured(&mut npz, "shore", all, |press| press.shore)?;
-    add(&mut npz, "shape", all, |press| press.shape)?;
-    add(&mut npz, "layered", all, |press| {
-        press.layered.map(u8::from)
-    })?;
     // The whole array of each press, where all have the same one.
     let unloaded = all.iter().map(|press| press.unloaded.as_ref());
     let unloaded: Option<Vec<&Vec<f32>>> = unloaded.collect();
