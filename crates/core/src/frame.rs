@@ -265,7 +265,7 @@ impl Frame {
     }
 
     /// The centre of the force, as a row and a column. The middle of the array if there is no force.
-    pub(crate) fn centre(&self) -> (f64, f64) {
+    pub fn centre(&self) -> (f64, f64) {
         let force_n = self.force_n();
         let Array { rows, cols } = self.array;
         let last = [(rows - 1) as f64, (cols - 1) as f64];

@@ -14,17 +14,15 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use self::approach::PressWithApproach;
-pub use self::approach::{approach_by_speed, approach_speed_mm_s, is_informative};
+pub use self::approach::EndedPress;
+use self::approach::{PressWithApproach, approach_speed_mm_s};
 use self::objects::{Objects, object_of};
 pub use self::own::{OwnPresses, owner};
 use crate::event::{Advice, Hardness, LinkState, Note, Phase, Rejection};
 use crate::motion::Track;
 use crate::press::{ContactFrame, FrameAt, SoFar};
 use crate::sensor::Sensor;
-use crate::verdict::{
-    COURSE_FRAMES, Format, Hrn, ModelError, ReferenceKinds, Resampling, TimeSeries, Verdict,
-};
+use crate::verdict::{COURSE_FRAMES, Format, Hrn, ModelError, ReferenceKinds, Resampling, Verdict};
 
 /// The number of frames in contact that an early verdict on the course needs.
 const FIRST_LOOK: u64 = 3;
@@ -69,8 +67,8 @@ pub struct Judge {
     next_look: Option<u64>,
     /// The missing verdicts that are not fetched yet.
     pub(crate) unjudged: Vec<Unjudged>,
-    /// The courses of presses that ended and are not fetched yet, if they are kept.
-    pub(crate) courses: Option<Vec<TimeSeries>>,
+    /// The presses that ended and are not fetched yet, if they are kept.
+    pub(crate) ended: Option<Vec<EndedPress>>,
 }
 
 /// What a judge keeps from one press to the next. A recording holds it.
@@ -103,7 +101,7 @@ impl Judge {
             speed_mm_s: None,
             next_look: None,
             unjudged: Vec::new(),
-            courses: None,
+            ended: None,
         }
     }
 
@@ -187,9 +185,8 @@ impl Judge {
     /// The press has ended.
     pub(crate) fn end(&mut self, press: &SoFar, now: Moment) -> Option<Hardness> {
         let known = self.known(press, Phase::Final);
-        if let Some(courses) = &mut self.courses {
-            let resampling = resampling(&self.hrn, press.peak(), &self.sensor);
-            courses.push(known.course(&self.sensor, COURSE_FRAMES.1, &resampling));
+        if let Some(ended) = &mut self.ended {
+            ended.push(known.ended(press.press(), COURSE_FRAMES.1, &self.sensor));
         }
         let verdict = self.judge(press, Phase::Final, &known, now);
         let delay_ms = self.sensor.arm().delay_ms;
@@ -246,7 +243,8 @@ impl Judge {
         let mut course = None;
         let verdict = match hrn.format() {
             Format::Course { most_frames } => {
-                let course = course.insert(known.course(&sensor, most_frames, &resampling));
+                let ended = known.ended(press, most_frames, &sensor);
+                let course = course.insert(ended.course(card.pitch_mm.into()));
                 let own = self.kept.own.references(&hrn);
                 let (verdict, used) = hrn.judge_course_with(course, &own)?;
                 references = used;
@@ -255,7 +253,7 @@ impl Judge {
             format => {
                 card.check_array(peak.frame.array)?;
                 hrn.judge_taxels(&match (format, card.grid) {
-                    (Format::Parts, _) => known.parts(),
+                    (Format::Parts, _) => known.ended(press, COURSE_FRAMES.1, &sensor).parts(),
                     (_, Some(_)) => peak.frame.newtons.to_vec(),
                     (_, None) => resampling.apply(&peak.frame).newtons.to_vec(),
                 })?

@@ -22,7 +22,7 @@ use self::link::Link;
 use self::pace::Pace;
 use crate::event::{Event, FrameEvent, Press, PressState, Tared};
 use crate::frame::{Frame, RawFrame, Stamp};
-use crate::judge::{Judge, Moment, OwnPresses, Unjudged};
+use crate::judge::{EndedPress, Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
 use crate::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
 use crate::sensor::Sensor;
@@ -149,16 +149,22 @@ impl Pipeline {
         std::mem::take(&mut self.judge.unjudged)
     }
 
-    /// Keeps the course of each press that ends from now on, as a model of courses takes it, until
-    /// [`Self::courses`] returns it.
+    /// Keeps each press that ends from now on, until [`Self::ended`] or [`Self::courses`] returns it.
     pub fn keep_courses(&mut self) {
-        self.judge.courses.get_or_insert_default();
+        self.judge.ended.get_or_insert_default();
     }
 
-    /// The kept courses that were not returned yet.
-    pub fn courses(&mut self) -> Vec<TimeSeries> {
-        let kept = self.judge.courses.as_mut();
+    /// The kept presses that were not returned yet.
+    pub fn ended(&mut self) -> Vec<EndedPress> {
+        let kept = self.judge.ended.as_mut();
         kept.map(std::mem::take).unwrap_or_default()
+    }
+
+    /// The same as a model of courses takes them.
+    pub fn courses(&mut self) -> Vec<TimeSeries> {
+        let grid_mm = self.hrn().card().pitch_mm.into();
+        let ended = self.ended().into_iter();
+        ended.map(|press| press.course(grid_mm)).collect()
     }
 
     /// The own presses of the sensor.

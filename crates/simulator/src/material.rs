@@ -32,10 +32,12 @@ pub enum Material {
 }
 
 /// The part of a data set that a sample belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Deserialize)]
+#[serde(rename_all = "lowercase")]
 #[repr(u8)]
 pub enum Split {
     /// Training; 0 in the data set's file.
+    #[default]
     Train = 0,
     /// Test; 1 in the data set's file.
     Test = 1,

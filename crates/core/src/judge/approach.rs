@@ -1,14 +1,16 @@
 //! The frames of a press, and how far the arm went at each.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use crate::event::{ApproachSource, Phase};
+use crate::frame::{Frame, Pitch};
 use crate::line::Sums;
 use crate::motion::{self, SPEEDS_MM_S, Track};
 use crate::press::{ContactFrame, Phases, SoFar, thinned};
 use crate::sensor::Sensor;
 use crate::verdict::parts::parts;
-use crate::verdict::{self, COURSE_FRAMES, Resampling};
+use crate::verdict::{Resampling, Sample, TimeSeries};
 
 /// The slope is fitted from this share of loading's last force on, so that it is the slope of the
 /// deepest part.
@@ -18,6 +20,47 @@ const END_FRAMES: usize = 3;
 /// If indentations have a smaller spread (their standard deviation, mm), their slope would be
 /// noise.
 const LEAST_SPREAD_MM: f64 = 0.005;
+
+/// A press that ended, with as many of its frames as a model takes.
+#[derive(Debug)]
+pub struct EndedPress {
+    /// The sensor's name.
+    pub sensor: String,
+    /// The press's number.
+    pub press: u64,
+    /// Seconds since the press began, the approach where it is known, and the frame in the sensor's grid.
+    pub moments: Vec<(f32, Option<f32>, Arc<Frame>)>,
+    /// The place of the best frame among them.
+    pub best: usize,
+    /// Stiffness of the arm. 0 if it or the approach is unknown.
+    pub arm_n_per_mm: f32,
+    /// The distances between the sensor's taxels.
+    pitch: Pitch,
+}
+
+impl EndedPress {
+    /// The press on a model's grid, with taxels `grid_mm` apart.
+    pub fn course(&self, grid_mm: f64) -> TimeSeries {
+        let (.., best) = &self.moments[self.best];
+        let resampling = Resampling::new(best, self.pitch, grid_mm);
+        let sample = |(time_s, approach_mm, frame): &(f32, Option<f32>, Arc<Frame>)| Sample {
+            time_s: *time_s,
+            approach_mm: *approach_mm,
+            frame: resampling.apply(frame),
+        };
+        TimeSeries {
+            moments: self.moments.iter().map(sample).collect(),
+            arm_n_per_mm: self.arm_n_per_mm,
+        }
+    }
+
+    /// The press on the array's own grid, for a model of parts.
+    pub(super) fn parts(&self) -> Vec<f32> {
+        let moments = self.moments.iter();
+        let moments = moments.map(|(time_s, _, frame)| (*time_s, &frame.newtons[..]));
+        parts(&moments.collect::<Vec<_>>())
+    }
+}
 
 /// A press, with the approach at each of its frames.
 pub(super) struct PressWithApproach<'a> {
@@ -83,46 +126,26 @@ impl<'a> PressWithApproach<'a> {
         self.frames[self.best]
     }
 
-    /// The places of at most `most` frames, each with its time since the first one.
-    fn thinned(&self, most: usize) -> impl Iterator<Item = (usize, f32)> {
-        let moment = |place: usize| self.frames[place].moment.stamp.mono;
-        let places = thinned(self.frames.len(), self.best, most).into_iter();
-        places.map(move |place| {
-            let since = moment(place).saturating_sub(moment(0));
-            (place, since.as_secs_f32())
-        })
-    }
-
-    /// The course for a model of `most` frames.
-    pub(super) fn course(
-        &self,
-        sensor: &Sensor,
-        most: usize,
-        resampling: &Resampling,
-    ) -> verdict::TimeSeries {
-        let sample = |(place, time_s): (usize, f32)| verdict::Sample {
-            time_s,
-            approach_mm: self.approach_mm[place].map(|mm| mm as f32),
-            frame: resampling.apply(&self.frames[place].frame),
+    /// The press with at most `most` of its frames.
+    pub(super) fn ended(&self, press: u64, most: usize, sensor: &Sensor) -> EndedPress {
+        let places = thinned(self.frames.len(), self.best, most);
+        let begin = self.frames[0].moment.stamp.mono;
+        let moment = |&place: &usize| {
+            let ContactFrame { moment, frame, .. } = self.frames[place];
+            let since = moment.stamp.mono.saturating_sub(begin);
+            let approach_mm = self.approach_mm[place].map(|mm| mm as f32);
+            (since.as_secs_f32(), approach_mm, Arc::clone(frame))
         };
         let is_known = self.source != ApproachSource::None;
         let arm_n_per_mm = sensor.arm().stiffness_n_per_mm.filter(|_| is_known);
-        verdict::TimeSeries {
-            moments: self.thinned(most).map(sample).collect(),
+        EndedPress {
+            sensor: sensor.name().to_owned(),
+            press,
+            moments: places.iter().map(moment).collect(),
+            best: places.partition_point(|&place| place < self.best),
             arm_n_per_mm: arm_n_per_mm.unwrap_or(0.0) as f32,
+            pitch: sensor.calibration().pitch_mm,
         }
-    }
-
-    /// The press on the array's own grid, for a model of parts: of the frames that a model of courses
-    /// would get.
-    pub(super) fn parts(&self) -> Vec<f32> {
-        let taxels = |place: usize| &self.frames[place].frame.newtons[..];
-        let moments = self.thinned(COURSE_FRAMES.1);
-        parts(
-            &moments
-                .map(|(place, time_s)| (time_s, taxels(place)))
-                .collect::<Vec<_>>(),
-        )
     }
 
     /// The slope of force against indentation at the end of loading, in N/mm, by least squares.
@@ -150,18 +173,14 @@ fn forces_n(frames: &[&ContactFrame]) -> Vec<f64> {
 
 /// Whether an approach is known at two frames up to the best one, or up to the second frame if the
 /// first is the best. It is 0 at the first frame, so it says nothing if it is known there alone.
-pub fn is_informative(approach_mm: &[Option<f64>], best: usize) -> bool {
+fn is_informative(approach_mm: &[Option<f64>], best: usize) -> bool {
     let places = best.max(1) + 1;
     approach_mm.iter().take(places).flatten().count() >= 2
 }
 
 /// The approach at each frame of a press by an arm that moves at a steady speed and then holds its
 /// position. The frames came at `moments` and have these forces; there must be at least one.
-pub fn approach_by_speed(
-    speed_mm_s: f64,
-    moments: &[Duration],
-    forces_n: &[f64],
-) -> Vec<Option<f64>> {
+fn approach_by_speed(speed_mm_s: f64, moments: &[Duration], forces_n: &[f64]) -> Vec<Option<f64>> {
     let Phases { loaded, held, .. } = Phases::of(forces_n);
     let (begin, stop) = (moments[0], moments[loaded]);
     let approach = |(place, moment): (usize, &Duration)| {
@@ -172,7 +191,7 @@ pub fn approach_by_speed(
 }
 
 /// The speed of a steady approach: from the controller's context, or else from the configuration.
-pub fn approach_speed_mm_s(
+pub(super) fn approach_speed_mm_s(
     context: Option<&serde_json::Value>,
     arm: &motion::Settings,
 ) -> Option<f64> {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::{Entry, Found, Labels, RecordedSensor, State};
 use crate::event::Event;
 use crate::frame::Stamp;
-use crate::judge::Unjudged;
+use crate::judge::{EndedPress, Unjudged};
 use crate::motion::Track;
 use crate::pipeline::Pipeline;
 use crate::press::End;
@@ -85,12 +85,18 @@ impl Playback {
         }
     }
 
-    /// Keeps the course of each press that ends, until [`Self::courses`] returns it.
+    /// Keeps each press that ends, until [`Self::ended`] or [`Self::courses`] returns it.
     pub fn keep_courses(&mut self) {
         self.keeps_courses = true;
     }
 
-    /// The kept courses of a sensor that were not returned yet. A state of the sensor forgets them.
+    /// The kept presses that were not returned yet. A state of a sensor forgets its own.
+    pub fn ended(&mut self) -> Vec<EndedPress> {
+        let players = self.players.iter_mut();
+        players.flat_map(|player| player.pipeline.ended()).collect()
+    }
+
+    /// The kept presses of a sensor as a model of courses takes them.
     pub fn courses(&mut self, sensor: &str) -> Vec<TimeSeries> {
         let mut players = self.players.iter_mut();
         let player = players.find(|player| player.pipeline.sensor().name() == sensor);

@@ -1,14 +1,13 @@
 //! What data cannot mean, found before anything is learnt from them.
 //!
-//! In: presses as they were read. Out: [`Findings`], one line each. Presses are compared by their frames and
-//! not by their numbers: a recording that was collected twice has two numbers. An error means that no figure
-//! of a model of these data would say what its reader thinks.
+//! In: presses as they were read. Out: warnings, or an error: no figure of a model of these data would say what its
+//! reader thinks. Presses are compared by their frames and not by their numbers: a recording that was collected twice
+//! has two numbers.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::fmt;
-use std::hash::{DefaultHasher, Hasher as _};
+use std::hash::{BuildHasher as _, RandomState};
 
-use anyhow::bail;
+use anyhow::ensure;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 
@@ -35,135 +34,120 @@ const TWICE: Kind = (true, "twice");
 const DEAD: Kind = (true, "in which no taxel reads anything");
 const REPEATED: Kind = (true, "of one frame, repeated");
 
-/// Everything that is wrong with data. As text, a line each.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Findings {
-    /// Of such data no model should be made.
-    pub errors: Vec<String>,
-    /// What is doubtful.
-    pub warnings: Vec<String>,
-}
-
-impl Findings {
-    /// Looks through `presses`, of which a training uses `labels` labelled ones.
-    pub fn of(presses: &Presses, labels: Option<usize>) -> Self {
-        let mut found = Self::default();
-        found.files(presses);
-        found.contents(presses);
-        found.errors.extend(units(presses));
-        found.levels(presses);
-        let labelled = presses.labelled(Split::Train).count();
-        if let Some(labels) = labels.filter(|&labels| labels < labelled) {
-            found.warnings.push(format!(
-                "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
+/// Looks through `presses`, of which a training uses `labels` labelled ones. Gives what is doubtful.
+///
+/// # Errors
+///
+/// Returns all reasons for which no model should be made of such data, as one error.
+pub fn warnings(presses: &Presses, labels: usize) -> anyhow::Result<Vec<String>> {
+    let (mut errors, mut warnings) = (Vec::new(), Vec::new());
+    let mut first = BTreeMap::new();
+    for source in presses.sources.iter().filter(|one| !one.sha256.is_empty()) {
+        if let Some(before) = first.insert(&source.sha256, &source.name) {
+            let name = &source.name;
+            errors.push(format!(
+                "{name} and {before} are the same file: name it once"
             ));
         }
-        found
     }
-
-    /// The same, if there is no error.
-    ///
-    /// # Errors
-    ///
-    /// Returns all errors as one.
-    pub fn usable(self) -> anyhow::Result<Self> {
-        match self.errors.is_empty() {
-            true => Ok(self),
-            false => bail!(
-                "the data cannot mean what their labels say: {}",
-                self.errors.join("; ")
-            ),
+    for ((is_usable, what), (count, first)) in contents(presses) {
+        let presses_are = if count == 1 { "press" } else { "presses" };
+        let text = format!("{count} {presses_are} {what}, such as {first}");
+        match is_usable && count < presses.all.len() {
+            true => warnings.push(text),
+            false => errors.push(text),
         }
     }
-
-    /// Levels with few labelled training presses, or none.
-    fn levels(&mut self, presses: &Presses) {
-        for Level { level, .. } in presses.levels() {
-            let places = presses.labelled(Split::Train);
-            let own = places.filter(|&place| presses.all[place].level == level);
-            let objects: BTreeSet<_> = own.map(|place| presses.all[place].object).collect();
-            let warning = match (objects.len(), objects.contains(&None)) {
-                (0, _) => "no labelled training press: the model never learns to say it",
-                (1, false) => {
-                    "all training presses are of one object: the model may learn the object and not the hardness"
-                }
-                _ => continue,
-            };
-            self.warnings.push(format!("level {level}: {warning}"));
+    errors.extend(units(presses));
+    ensure!(
+        errors.is_empty(),
+        "the data cannot mean what their labels say: {}",
+        errors.join("; ")
+    );
+    warnings.extend(presses.object_in_both_splits().map(|object| {
+        format!(
+            "object {object} is in both splits: its presses are near-copies, so a test on some of them overrates a \
+             model that learnt from the others"
+        )
+    }));
+    let ours = presses.levels();
+    for source in &presses.sources {
+        if source.levels.as_ref().is_some_and(|own| *own != ours) {
+            warnings.push(format!(
+                "{}: states other levels than the first file, whose levels the model will state",
+                source.name
+            ));
         }
     }
-
-    fn files(&mut self, presses: &Presses) {
-        let mut first = BTreeMap::new();
-        for source in presses.sources.iter().filter(|one| !one.sha256.is_empty()) {
-            if let Some(before) = first.insert(&source.sha256, &source.name) {
-                let text = format!(
-                    "{} and {before} are the same file: name it once",
-                    source.name
-                );
-                self.errors.push(text);
-            }
-        }
+    warnings.extend(levels(presses));
+    let labelled = presses.labelled(Split::Train).count();
+    if labels < labelled {
+        warnings.push(format!(
+            "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
+        ));
     }
-
-    /// What the frames say: copies of presses, and presses without a contact.
-    fn contents(&mut self, presses: &Presses) {
-        let mut first = HashMap::<u64, usize>::new();
-        // Of each kind the number of presses, and the first of them.
-        let mut counts = BTreeMap::<Kind, (usize, String)>::new();
-        let mut count = |kind: Kind, place: usize, other: Option<usize>| {
-            let (count, _) = counts.entry(kind).or_insert_with(|| {
-                let with = other.map(|other| format!(" and {}", named(presses, other)));
-                (0, named(presses, place) + &with.unwrap_or_default())
-            });
-            *count += 1;
-        };
-        for (place, press) in presses.all.iter().enumerate() {
-            let content = Content::of(presses, place);
-            if content.taxels == 0 {
-                count(DEAD, place, None);
-            } else if content.is_one_frame {
-                count(REPEATED, place, None);
-            }
-            if content.taxels < LEAST_TAXELS {
-                continue;
-            }
-            let other = *first.entry(content.hash).or_insert(place);
-            if other == place {
-                continue;
-            }
-            let before = &presses.all[other];
-            let kind = if press.split != before.split {
-                IN_BOTH_SPLITS
-            } else if press.level != before.level && press.level > 0 && before.level > 0 {
-                TWO_LEVELS
-            } else if press.object != before.object {
-                TWO_OBJECTS
-            } else {
-                TWICE
-            };
-            count(kind, place, Some(other));
-        }
-        for ((is_usable, what), (count, first)) in counts {
-            let presses_are = if count == 1 { "press" } else { "presses" };
-            let text = format!("{count} {presses_are} {what}, such as {first}");
-            match is_usable && count < presses.all.len() {
-                true => self.warnings.push(text),
-                false => self.errors.push(text),
-            }
-        }
-    }
+    Ok(warnings)
 }
 
-impl fmt::Display for Findings {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (word, texts) in [("error", &self.errors), ("warning", &self.warnings)] {
-            for text in texts {
-                writeln!(out, "{word}: {text}")?;
+/// Levels with few labelled training presses, or none.
+fn levels(presses: &Presses) -> Vec<String> {
+    let warning = |Level { level, .. }: Level| {
+        let places = presses.labelled(Split::Train);
+        let own = places.filter(|&place| presses.all[place].level == level);
+        let objects: BTreeSet<_> = own.map(|place| presses.all[place].object).collect();
+        let warning = match (objects.len(), objects.contains(&None)) {
+            (0, _) => "no labelled training press: the model never learns to say it",
+            (1, false) => {
+                "all training presses are of one object: the model may learn the object and not the hardness"
             }
+            _ => return None,
+        };
+        Some(format!("level {level}: {warning}"))
+    };
+    presses.levels().into_iter().filter_map(warning).collect()
+}
+
+/// What the frames say: copies of presses, and presses without a contact. Of each kind the number of presses, and the
+/// first of them.
+fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
+    let (state, mut first) = (RandomState::new(), HashMap::<u64, usize>::new());
+    let mut counts = BTreeMap::<Kind, (usize, String)>::new();
+    let mut count = |kind: Kind, place: usize, other: Option<usize>| {
+        let (count, _) = counts.entry(kind).or_insert_with(|| {
+            let with = other.map(|other| format!(" and {}", named(presses, other)));
+            (0, named(presses, place) + &with.unwrap_or_default())
+        });
+        *count += 1;
+    };
+    for (place, press) in presses.all.iter().enumerate() {
+        let frames: Vec<Vec<(u16, u32)>> = presses.contents(place).collect();
+        let taxels: usize = frames.iter().map(Vec::len).sum();
+        let is_one_frame = frames.windows(2).all(|pair| pair[0] == pair[1]);
+        if taxels == 0 {
+            count(DEAD, place, None);
+        } else if is_one_frame && frames.len() >= LEAST_REPEATED {
+            count(REPEATED, place, None);
         }
-        Ok(())
+        if taxels < LEAST_TAXELS {
+            continue;
+        }
+        let other = *first.entry(state.hash_one(&frames)).or_insert(place);
+        if other == place {
+            continue;
+        }
+        let before = &presses.all[other];
+        let kind = if press.split != before.split {
+            IN_BOTH_SPLITS
+        } else if press.level != before.level && press.level > 0 && before.level > 0 {
+            TWO_LEVELS
+        } else if press.object != before.object {
+            TWO_OBJECTS
+        } else {
+            TWICE
+        };
+        count(kind, place, Some(other));
     }
+    counts
 }
 
 /// The press as its reader would find it.
@@ -182,38 +166,6 @@ fn named(presses: &Presses, place: usize) -> String {
         object.unwrap_or_default(),
         name.unwrap_or_default()
     )
-}
-
-/// What identifies a press, whatever its numbers are.
-struct Content {
-    hash: u64,
-    /// The number of taxels that are not 0, over all frames.
-    taxels: usize,
-    /// Whether it has some frames, and all are the same.
-    is_one_frame: bool,
-}
-
-impl Content {
-    fn of(presses: &Presses, place: usize) -> Self {
-        let (mut hash, mut taxels, mut frames) = (DefaultHasher::new(), 0, 0);
-        let (mut before, mut is_one_frame) = (None, true);
-        for frame in presses.contents(place) {
-            for (place, newtons) in &frame {
-                hash.write_u16(*place);
-                hash.write_u32(newtons.to_bits());
-            }
-            hash.write_u16(u16::MAX);
-            taxels += frame.len();
-            frames += 1;
-            is_one_frame &= before.is_none_or(|before| before == frame);
-            before = Some(frame);
-        }
-        Self {
-            hash: hash.finish(),
-            taxels,
-            is_one_frame: is_one_frame && frames >= LEAST_REPEATED,
-        }
-    }
 }
 
 /// Why the forces cannot be newtons, if they cannot.
@@ -259,7 +211,7 @@ mod tests {
                     let newtons = (content * 31 + moment * 7 + taxel) % 97;
                     frame.newtons[300 + taxel as usize] = scale * newtons as f32;
                 }
-                (moment as f32 * 0.1, None, frame)
+                (moment as f32 * 0.1, None, frame.newtons)
             });
             presses.push(press, moments);
         }
@@ -273,16 +225,16 @@ mod tests {
     /// Asserts that the presses have this one error, or this one warning, or neither.
     #[track_caller]
     fn check(presses: &Presses, labels: Option<usize>, error: &str, warning: &str) {
-        let Findings {
-            errors,
-            mut warnings,
-        } = Findings::of(presses, labels);
-        warnings.retain(|warning| !warning.starts_with("level "));
-        for (found, expected) in [(errors, error), (warnings, warning)] {
-            let is_expected = |text: &String| !expected.is_empty() && text.contains(expected);
-            assert!(found.iter().all(is_expected), "{found:?}");
-            assert_eq!(found.len(), usize::from(!expected.is_empty()), "{expected}");
-        }
+        let found = match warnings(presses, labels.unwrap_or(usize::MAX)) {
+            Err(found) => found.to_string(),
+            Ok(mut found) => {
+                assert_eq!(error, "");
+                found.retain(|warning| !warning.starts_with("level "));
+                assert_eq!(found.len(), usize::from(!warning.is_empty()), "{found:?}");
+                found.concat()
+            }
+        };
+        assert!(found.contains(error) && found.contains(warning), "{found}");
     }
 
     #[test]
@@ -294,6 +246,10 @@ mod tests {
             ((1, 2, train, 1), "with two levels", ""),
             ((2, 0, train, 1), "of two objects", ""),
             ((1, 1, train, 1), "", "1 press twice"),
+            ((1, 1, test, 2), "", "object 1 is in both splits"),
+            // An unlabelled press agrees with every level.
+            ((1, 0, test, 2), "", "object 1 is in both splits"),
+            ((1, 2, test, 2), "", ""),
         ] {
             check(
                 &presses(&[(1, 1, train, 1), second], 0.01),
@@ -322,11 +278,18 @@ mod tests {
         };
         twice.sources = vec![source.clone(), source];
         check(&twice, None, "are the same file", "");
+        let levels = warnings(&presses(&all, 0.01), 3).unwrap().join("\n");
+        for expected in [
+            "level 1: all training presses are of one object",
+            "level 4: no labelled training press: the model never learns to say it",
+        ] {
+            assert!(levels.contains(expected), "{levels}");
+        }
         // One frame again and again.
         let mut still = presses(&all, 0.01);
         let mut frame = ModelFrame::default();
         frame.newtons[..40].fill(0.1);
-        let moments = (0..5).map(|moment| (moment as f32, None, frame));
+        let moments = (0..5).map(|moment| (moment as f32, None, frame.newtons));
         still.push(Press::default(), moments);
         check(&still, None, "", "of one frame, repeated");
     }

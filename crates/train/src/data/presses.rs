@@ -26,7 +26,7 @@ use super::source::{Kind, Object, PITCH_MM, Source, papers_levels};
 const MILLINEWTON: f32 = 1e-3;
 
 /// Labels and measurements of one press.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Press {
     /// The hardness level, from 1, or 0 for unlabelled.
     pub level: u8,
@@ -60,28 +60,6 @@ pub struct Press {
     pub best: usize,
     /// The press's moments among all. [`Presses::push`] sets it.
     pub moments: Range<usize>,
-}
-
-impl Default for Press {
-    fn default() -> Self {
-        Self {
-            level: 0,
-            object: None,
-            material: None,
-            split: Split::Train,
-            shore: None,
-            force_n: None,
-            arm_n_per_mm: 0.0,
-            sensor: 0,
-            reference: None,
-            name: None,
-            unloaded: None,
-            kind: Kind::Unknown,
-            source: 0,
-            best: 0,
-            moments: 0..0,
-        }
-    }
 }
 
 impl Press {
@@ -125,8 +103,7 @@ pub struct Presses {
 }
 
 impl Presses {
-    /// Reads files, and joins them. Objects and sensors of different files stay apart. Prints a warning if an
-    /// object of a file has presses in both splits.
+    /// Reads files, and joins them. Objects and sensors of different files stay apart.
     ///
     /// # Errors
     ///
@@ -135,9 +112,7 @@ impl Presses {
     pub fn read(paths: &[impl AsRef<Path>]) -> anyhow::Result<Self> {
         let mut all = Self::default();
         for path in paths {
-            let part = file::read(path.as_ref())?;
-            part.warn_of_object_in_both_splits();
-            all.join(part)?;
+            all.join(file::read(path.as_ref())?)?;
         }
         Ok(all)
     }
@@ -155,7 +130,7 @@ impl Presses {
                 force_n: Some(sample.force_n),
                 ..Press::default()
             };
-            all.push(press, [(0.0, None, resampled(&sample.frame))].into_iter());
+            all.push(press, [(0.0, None, resampled(&sample.frame).newtons)]);
         }
         all
     }
@@ -182,30 +157,21 @@ impl Presses {
                 let newtons = millinewtons.map(|&mn| f32::from(mn) * MILLINEWTON);
                 (moment.time_s, Some(moment.approach_mm), newtons)
             });
-            all.add(press, moments);
+            all.push(press, moments);
         }
         all
     }
 
     /// Adds a press. Each of `moments` is the time since the press began in s, the approach in mm where
-    /// known, and the frame.
-    pub fn push(
-        &mut self,
-        press: Press,
-        moments: impl Iterator<Item = (f32, Option<f32>, ModelFrame)>,
-    ) {
-        let moments = moments.map(|(time_s, mm, frame)| (time_s, mm, frame.newtons.into_iter()));
-        self.add(press, moments);
-    }
-
-    fn add<F: Iterator<Item = f32>>(
+    /// known, and the newtons of the frame.
+    pub fn push<F: IntoIterator<Item = f32>>(
         &mut self,
         mut press: Press,
-        moments: impl Iterator<Item = (f32, Option<f32>, F)>,
+        moments: impl IntoIterator<Item = (f32, Option<f32>, F)>,
     ) {
         let first = self.frames.len();
         for (time_s, approach_mm, newtons) in moments {
-            self.frames.push(newtons);
+            self.frames.push(newtons.into_iter());
             self.time_s.push(time_s);
             self.approach_mm.push(approach_mm);
         }
@@ -218,18 +184,11 @@ impl Presses {
     /// # Errors
     ///
     /// Returns an error if the sensors of the files have different pitches.
-    pub fn join(&mut self, other: Self) -> anyhow::Result<()> {
+    pub fn join(&mut self, mut other: Self) -> anyhow::Result<()> {
         if self.all.is_empty() {
             *self = other;
             return Ok(());
         }
-        let (found, expected) = (other.pitch_mm(), self.pitch_mm());
-        ensure!(
-            found == expected,
-            "{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}",
-            other.shown_paths(),
-            self.shown_paths()
-        );
         let next = |of: fn(&Press) -> Option<u32>| {
             let last = self.all.iter().filter_map(of).max();
             last.map_or(0, |last| last.saturating_add(1))
@@ -242,13 +201,31 @@ impl Presses {
             other.shown_paths()
         );
         let objects: BTreeMap<u32, u32> = objects.into_iter().zip(object..).collect();
+        for press in &mut other.all {
+            press.object = press.object.map(|own| objects[&own]);
+            press.sensor = press.sensor.saturating_add(sensor);
+        }
+        self.append(other)
+    }
+
+    /// Adds the presses of other files, whose objects and sensors have the same numbers as those that are there.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the sensors of the files have different pitches.
+    pub(super) fn append(&mut self, other: Self) -> anyhow::Result<()> {
+        let (found, expected) = (other.pitch_mm(), self.pitch_mm());
+        ensure!(
+            found == expected || self.sources.is_empty(),
+            "{}: taxel pitch: found {found} mm, expected {expected} mm, that of {}",
+            other.shown_paths(),
+            self.shown_paths()
+        );
         let (frames, sources) = (self.frames.len(), self.sources.len());
         self.frames.append(&other.frames);
         self.time_s.extend(other.time_s);
         self.approach_mm.extend(other.approach_mm);
         self.all.extend(other.all.into_iter().map(|press| Press {
-            object: press.object.map(|own| objects[&own]),
-            sensor: press.sensor.saturating_add(sensor),
             source: press.source + sources,
             moments: press.moments.start + frames..press.moments.end + frames,
             ..press
@@ -274,18 +251,6 @@ impl Presses {
             .iter()
             .filter_map(|source| source.levels.clone());
         stated.next().unwrap_or_else(papers_levels)
-    }
-
-    /// Prints a warning for each file that states other levels than a model of these presses.
-    pub fn warn_of_other_levels(&self) {
-        let ours = self.levels();
-        for Source { name, levels, .. } in &self.sources {
-            if levels.as_ref().is_some_and(|others| *others != ours) {
-                hardnessd_core::stderr_line!(
-                    "warning: {name}: states other levels than the first file, whose levels the model will state"
-                );
-            }
-        }
     }
 
     /// Distance between the taxels of the sensors that were pressed, in mm.
@@ -354,10 +319,15 @@ impl Presses {
         }
     }
 
-    /// Place and newtons of the taxels that are not 0, of each frame of a press.
-    pub(super) fn contents(&self, press: usize) -> impl Iterator<Item = Vec<(u16, f32)>> {
+    /// Place and bits of the newtons of the taxels that are not 0, of each frame of a press.
+    pub(super) fn contents(&self, press: usize) -> impl Iterator<Item = Vec<(u16, u32)>> {
         let rows = self.all[press].moments.clone();
-        rows.map(|row| self.frames.taxels(row).collect())
+        rows.map(|row| {
+            let taxels = self.frames.taxels(row);
+            taxels
+                .map(|(place, newtons)| (place, newtons.to_bits()))
+                .collect()
+        })
     }
 
     /// The array whose frames all presses have as they are.
@@ -369,19 +339,13 @@ impl Presses {
     /// The input `parts` of a model on the grid of the presses' own array.
     pub fn parts(&self, press: usize, Array { rows, cols }: Array) -> Vec<f32> {
         let (top, left) = ((ROWS - rows) / 2, (COLS - cols) / 2);
-        let own = |row: usize| {
+        let own = |row: usize| -> (f32, Vec<f32>) {
             let frame = self.frames.frame(row).newtons;
-            let lines = (top..top + rows).map(move |row| row * COLS + left);
-            let taxels = lines.flat_map(|first| first..first + cols);
-            taxels.map(|place| frame[place]).collect::<Vec<f32>>()
+            let lines = (top..top + rows).map(|row| &frame[row * COLS + left..][..cols]);
+            (self.time_s[row], lines.flatten().copied().collect())
         };
-        let frames: Vec<(f32, Vec<f32>)> = self
-            .rows(press)
-            .map(|row| (self.time_s[row], own(row)))
-            .collect();
-        let moments = frames
-            .iter()
-            .map(|(time_s, newtons)| (*time_s, &newtons[..]));
+        let frames: Vec<(f32, Vec<f32>)> = self.rows(press).map(own).collect();
+        let moments = frames.iter().map(|(time_s, frame)| (*time_s, &frame[..]));
         parts::parts(&moments.collect::<Vec<_>>())
     }
 
@@ -428,20 +392,23 @@ impl Presses {
     }
 
     /// The number of an object that has presses in both splits, if there is one.
-    fn object_in_both_splits(&self) -> Option<u32> {
+    pub(super) fn object_in_both_splits(&self) -> Option<u32> {
         let (trained, tested) = (self.objects(Split::Train), self.objects(Split::Test));
         let is_tested = |object: &&Object| tested.iter().any(|other| other.is_same_as(object));
         trained.iter().find(is_tested).map(|object| object.number)
     }
 
-    pub(super) fn warn_of_object_in_both_splits(&self) {
-        if let Some(object) = self.object_in_both_splits() {
-            hardnessd_core::stderr_line!(
-                "warning: {}: object {object} is in both splits: its presses are near-copies, so a test on some \
-                 of them overrates a model that learnt from the others",
-                self.shown_paths()
-            );
+    /// The presses of each object by its file, level and number. A press whose object is not known is of one of its
+    /// own.
+    pub fn by_object(&self, places: &[usize]) -> BTreeMap<(usize, u8, u64), Vec<usize>> {
+        let mut objects = BTreeMap::<_, Vec<usize>>::new();
+        for &place in places {
+            let press = &self.all[place];
+            let object = press.object.map_or(u64::MAX - place as u64, u64::from);
+            let own = objects.entry((press.source, press.level, object));
+            own.or_default().push(place);
         }
+        objects
     }
 
     /// The presses of some indices.

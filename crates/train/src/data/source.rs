@@ -32,27 +32,16 @@ pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
     }
 }
 
-/// The kind of a press.
+/// What felt a press, with its number in files.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// A press of our simulator.
-    Simulated,
-    /// A press that a sensor felt.
-    Recorded,
-    /// A press of another program, or of one that the file does not name.
+    /// Another program made the press, or the file does not say which.
     #[default]
-    Unknown,
-}
-
-impl Kind {
-    /// The kind of the presses of a recording, of a simulated sensor or of raw bytes.
-    pub(super) fn of_recording(is_simulated: bool, is_raw: bool) -> Self {
-        match (is_simulated, is_raw) {
-            (true, _) => Self::Simulated,
-            (false, true) => Self::Unknown,
-            (false, false) => Self::Recorded,
-        }
-    }
+    Unknown = 0,
+    /// Our simulator.
+    Simulated = 1,
+    /// A sensor.
+    Recorded = 2,
 }
 
 /// A file that presses came from.
@@ -86,15 +75,6 @@ impl Source {
     /// Distance between the sensor's taxels, in mm.
     pub fn pitch(&self) -> f64 {
         self.pitch_mm.unwrap_or(PITCH_MM)
-    }
-
-    /// The kind of the file's presses, if it says nothing else of one: that of the program that began the file.
-    pub(super) fn kind(&self) -> Kind {
-        match self.generator.as_deref().unwrap_or_default() {
-            generator if generator.starts_with(SIMULATOR) => Kind::Simulated,
-            generator if generator.starts_with(COLLECTOR) => Kind::Recorded,
-            _ => Kind::Unknown,
-        }
     }
 }
 

@@ -34,17 +34,10 @@ impl Parts {
         let (train, held_out) = hold_out(presses, &labelled, share, seed);
         let labelled: BTreeSet<usize> = labelled.into_iter().collect();
         let held: BTreeSet<Object> = presses.of(&held_out).filter_map(Press::pressed).collect();
+        // An unlabelled press may be of an object that is known with its level.
         let is_held_out = |press: &Press| {
-            press.pressed().is_some_and(|object| {
-                // An unlabelled press may be of an object that is known with its level.
-                let level = if object.level == 0 {
-                    u8::MAX
-                } else {
-                    object.level
-                };
-                let mut same = held.range(object..=Object { level, ..object });
-                same.next().is_some()
-            })
+            let object = press.pressed();
+            object.is_some_and(|own| held.iter().any(|held| held.is_same_as(&own)))
         };
         let wanted = |&place: &usize| {
             let press = &presses.all[place];
@@ -64,22 +57,16 @@ impl Parts {
 /// Objects by source and level. Each object is a list of presses.
 type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 
-/// The objects of `places` by source and level, in a random order drawn from `stream`. A press without a
-/// known object counts as an object of its own.
+/// The objects of `places` by source and level, in a random order drawn from `stream`.
 fn objects(presses: &Presses, places: &[usize], stream: &Stream) -> Groups {
-    let mut groups: BTreeMap<(usize, u8), BTreeMap<u64, Vec<usize>>> = BTreeMap::new();
-    for &place in places {
-        let press = &presses.all[place];
-        let object = press.object.map_or(u64::MAX - place as u64, u64::from);
-        let group = groups.entry((press.source, press.level)).or_default();
-        group.entry(object).or_default().push(place);
+    let mut groups = Groups::new();
+    for ((source, level, _), own) in presses.by_object(places) {
+        groups.entry((source, level)).or_default().push(own);
     }
-    let shuffled = |(number, (key, objects)): (usize, ((usize, u8), BTreeMap<_, Vec<_>>))| {
-        let mut objects: Vec<Vec<usize>> = objects.into_values().collect();
-        stream.child(number as u64).shuffle(&mut objects);
-        (key, objects)
-    };
-    groups.into_iter().enumerate().map(shuffled).collect()
+    for (number, objects) in (0..).zip(groups.values_mut()) {
+        stream.child(number).shuffle(objects);
+    }
+    groups
 }
 
 /// Chooses `labels` of `places`, with equal numbers for each level and source. A group with too few presses
@@ -197,21 +184,12 @@ mod tests {
     fn held_out_objects_are_whole_and_of_every_level() {
         let presses = even();
         let parts = |labels, seed| Parts::of(&presses, labels, 0.2, seed);
-        let Parts {
-            train,
-            held_out,
-            unlabelled,
-        } = parts(200, 1);
-        assert_eq!(
-            (train.len(), held_out.len(), unlabelled.len()),
-            (160, 40, 0)
-        );
-        let (kept, held) = (
-            objects_of(&presses, &train),
-            objects_of(&presses, &held_out),
-        );
-        assert_eq!((kept.len(), held.len()), (32, 8));
-        assert!(kept.is_disjoint(&held));
+        let found = parts(200, 1);
+        let counts = [&found.train, &found.held_out, &found.unlabelled].map(Vec::len);
+        assert_eq!(counts, [160, 40, 0]);
+        let held = objects_of(&presses, &found.held_out);
+        assert_eq!(held.len(), 8);
+        assert!(held.is_disjoint(&objects_of(&presses, &found.train)));
         assert_ne!(held, objects_of(&presses, &parts(200, 2).held_out));
         // One object of a level is never held out.
         let first: Vec<usize> = (0..5).collect();
@@ -222,13 +200,11 @@ mod tests {
     fn labels_are_chosen_by_object_and_equally_from_each_level() {
         let presses = even();
         let chosen = Parts::of(&presses, 48, 0.0, 1).train;
-        let count = |places: &[usize], level| {
-            presses
-                .of(places)
-                .filter(|press| press.level == level)
-                .count()
+        let counts = |places: &[usize]| {
+            let of = |level| presses.of(places).filter(move |of| of.level == level);
+            [1, 2, 3, 4].map(|level| of(level).count())
         };
-        assert_eq!([1, 2, 3, 4].map(|level| count(&chosen, level)), [12; 4]);
+        assert_eq!(counts(&chosen), [12; 4]);
         // Each level has two whole objects and two presses of a third.
         assert_eq!(objects_of(&presses, &chosen).len(), 12);
         // A choice of more labels includes the smaller choice, so methods of one seed share labels.
@@ -237,8 +213,7 @@ mod tests {
         // A level with too few presses gives all, and the others give more.
         let few: Vec<usize> = (0..10).chain(50..200).collect();
         let chosen = choose(&presses, &few, 101, 1);
-        let of_level = [1, 2, 3, 4].map(|level| count(&chosen, level));
-        assert_eq!(of_level, [10, 31, 30, 30]);
+        assert_eq!(counts(&chosen), [10, 31, 30, 30]);
     }
 
     #[test]

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use prost::Message as _;
 
-use crate::hrn_train;
+use crate::hrn_train_in;
 
 fn check(path: &Path) -> (Option<i32>, String) {
-    let output = hrn_train(&["check-model", path.to_str().unwrap()]);
+    let output = hrn_train_in(Path::new("."), &format!("check-model {}", path.display()));
     let lines = [output.stdout, output.stderr].concat();
     (output.status.code(), String::from_utf8(lines).unwrap())
 }

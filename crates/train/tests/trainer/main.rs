@@ -29,17 +29,6 @@ fn trainer(arguments: &[&str]) -> Command {
     command
 }
 
-fn hrn_train(arguments: &[&str]) -> Output {
-    let mut trainer = trainer(arguments);
-    trainer.output().expect("cargo built the binary")
-}
-
-/// What the trainer says on stdout. It must succeed.
-#[track_caller]
-fn succeed(arguments: &[&str]) -> String {
-    succeeded(&hrn_train(arguments))
-}
-
 /// Arguments of one line, for files in `directory`.
 fn hrn_train_in(directory: &Path, arguments: &str) -> Output {
     let arguments: Vec<&str> = arguments.split_whitespace().collect();
@@ -48,13 +37,10 @@ fn hrn_train_in(directory: &Path, arguments: &str) -> Output {
     output.expect("cargo built the binary")
 }
 
+/// What the trainer says on stdout. It must succeed.
 #[track_caller]
 fn succeed_in(directory: &Path, arguments: &str) -> String {
-    succeeded(&hrn_train_in(directory, arguments))
-}
-
-#[track_caller]
-fn succeeded(output: &Output) -> String {
+    let output = hrn_train_in(directory, arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{errors}");
     String::from_utf8_lossy(&output.stdout).into_owned()

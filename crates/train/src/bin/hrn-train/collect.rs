@@ -1,20 +1,16 @@
 //! `hrn-train collect`.
 
-use std::io::{self, ErrorKind};
-use std::path::Path;
-use std::sync::Arc;
-
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, ensure};
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
-use hrn_train::data::collect::{self, LeaveOut, Settings, Unnumbered};
+use hrn_train::data::collect::{self, Collection, Settings};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::source::papers_levels;
 use hrn_train::run::disk::lock;
 
 use super::arguments::Collect;
 use super::configuration::first_sensor;
+use super::files::check_new;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let sensor = match &arguments.config {
@@ -23,61 +19,57 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     };
     let captures = collect::captures(&arguments.captures)?;
     let out = &arguments.out;
-    check_out(arguments)?;
     let earlier = Some(out.as_path()).filter(|out| arguments.append && out.exists());
+    if earlier.is_none() {
+        check_new(out).context("--append adds to a data set")?;
+    }
     // No other call adds to the data set meanwhile, because the later one would undo the earlier one.
     let _locked = earlier.map(lock).transpose()?;
     let settings = Settings {
-        sensor,
-        hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
         levels: papers_levels(),
         level: arguments.level,
         object: arguments.object,
-        unnumbered: Unnumbered::One,
+        is_one_object: true,
         split: arguments.split,
-        layout: match arguments.sequences {
-            true => Layout::OverTime,
-            false => Layout::Frames,
-        },
-        leave_out: match arguments.skip_unusable {
-            true => LeaveOut::Unusable,
-            false => LeaveOut::None,
-        },
     };
-    let collection = collect::collect(&captures, earlier, &settings)?;
-    collection.say_left_out();
-    let left_out = collection.left_out.len();
-    if left_out == captures.len() {
-        bail!("no recording can be used");
+    let layout = match arguments.sequences {
+        true => Layout::OverTime,
+        false => Layout::Frames,
+    };
+    let mut collection = match earlier {
+        Some(earlier) => Collection::of(earlier, layout)?,
+        None => Collection::default(),
+    };
+    let before = collection.presses().all.len();
+    let skips = arguments.skip_unusable;
+    let mut used = 0;
+    for recording in collect::recordings(&captures, &sensor, layout, skips)? {
+        match collection.add(recording, &settings) {
+            Err(error) if skips => collect::say_left_out(&error),
+            added => {
+                added?;
+                used += 1;
+            }
+        }
     }
-    let part = match earlier {
-        Some(_) => Part::over(out),
-        None => Part::new(out),
-    };
+    ensure!(used > 0, "no recording can be used");
     let written = || -> anyhow::Result<()> {
-        let part = part?;
-        collection.write(part.as_file(), settings.layout)?;
+        let part = match earlier {
+            Some(_) => Part::over(out)?,
+            None => Part::new(out)?,
+        };
+        collection.write(part.as_file(), layout)?;
         Ok(part.finish()?)
     };
     written().with_context(|| out.display().to_string())?;
-    let [added, known] = collection.added();
+    let presses = collection.presses();
+    let all = presses.all.len();
+    let known = (before..all).filter(|&press| presses.is_known(press));
     Ok(format!(
-        "{}: presses collected: {added}, with the arm's approach: {known}, in all: {}; recordings left out: {left_out}\n",
+        "{}: presses collected: {}, with the arm's approach: {}, in all: {all}; recordings left out: {}\n",
         out.display(),
-        collection.presses()
+        all - before,
+        known.count(),
+        captures.len() - used
     ))
-}
-
-/// Returns an error if the data set cannot be at `--out`, before anything is read.
-fn check_out(arguments: &Collect) -> anyhow::Result<()> {
-    let out: &Path = &arguments.out;
-    let found = if out.exists() && !out.is_file() {
-        "is no file: name a file"
-    } else if out.symlink_metadata().is_ok() && !arguments.append {
-        "exists already: add to it with --append, or name another --out"
-    } else {
-        return Ok(());
-    };
-    let error = io::Error::new(ErrorKind::AlreadyExists, found);
-    Err(error).with_context(|| out.display().to_string())
 }

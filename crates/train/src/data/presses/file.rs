@@ -1,6 +1,5 @@
 //! Presses as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
-use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::io::{self, Cursor, Seek, Write};
 use std::ops::RangeInclusive;
@@ -8,7 +7,8 @@ use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
 use anyhow::{anyhow, bail, ensure};
-use serde_json::Value;
+use serde::Deserialize;
+use serde_json::{Value, json};
 use zip::ZipArchive;
 
 use super::{MILLINEWTON, Press, Presses};
@@ -46,15 +46,6 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Presses> {
     parse(&whole(path)?, path)
 }
 
-/// The layout of a file.
-///
-/// # Errors
-///
-/// Returns an error if the file cannot be read, or is no archive of arrays.
-pub(crate) fn layout_of(path: &Path) -> anyhow::Result<Layout> {
-    Ok(File::open(&whole(path)?, path)?.layout())
-}
-
 /// The description that an `.npz` file carries as `meta`. Null if it has none.
 ///
 /// # Errors
@@ -76,10 +67,8 @@ pub(in crate::data) fn whole(path: &Path) -> anyhow::Result<Vec<u8>> {
 /// Reads the presses in `bytes`, the content of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
     let mut file = File::open(bytes, path)?;
-    let meta = file.meta()?;
-    let source = source(bytes, &file, &meta)?;
     let mut presses = Presses {
-        sources: vec![source],
+        sources: vec![source(bytes, &mut file)?],
         ..Presses::default()
     };
     let level: Vec<u8> = file.required("level", &[], None)?;
@@ -113,16 +102,21 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
     let force_n = file.column("force", count, &FORCES)?;
     let shore = file.column("shore", count, &SHORE)?;
     let arm_n_per_mm = file.column("arm_n_per_mm", count, &(0.0..=1e6))?;
-    let reference = references(&mut file, &level)?;
-    let unloaded = match grid(&meta) {
+    let reference = file.column("reference", count, &(0..=2_u8))?;
+    let reference_mm = file.column("reference_mm", count, &(0.0..=1e6_f32))?;
+    let unloaded = match presses.grid() {
         Some(Array { rows, cols }) => file.read::<f32>("unloaded", &[rows, cols], Some(count))?,
         None => None,
     };
-    let unloaded = unloaded
-        .as_ref()
-        .map(|all| all.chunks_exact(all.len() / count));
-    let mut unloaded = unloaded.into_iter().flatten();
-    let (kind, recorded) = (presses.sources[0].kind(), recorded(&meta["captures"]));
+    let mut unloaded = unloaded
+        .iter()
+        .flat_map(|all| all.chunks(all.len() / count));
+    let generator = presses.sources[0].generator.as_deref().unwrap_or_default();
+    let of_file = match generator.starts_with(SIMULATOR) {
+        true => Kind::Simulated,
+        false => Kind::Unknown,
+    };
+    let kind = file.column("kind", count, &(0..=2_u8))?;
     let mut first = 0;
     for (number, of_press) in press.chunk_by(|a, b| a == b).enumerate() {
         let rows = first..first + of_press.len();
@@ -143,7 +137,17 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
             let expected = format!("1 to {} of these, and all ascending", COURSE_FRAMES.1);
             return Err(file.error("time_s", found, expected));
         }
-        let mut press = Press {
+        let piece = match (reference[number].unwrap_or(0), reference_mm[number]) {
+            (0, _) => None,
+            (_, None) => return Err(file.error("reference_mm", "none", "that of each reference")),
+            (1, Some(width_mm)) => Some(Reference::Flat { width_mm }),
+            (_, Some(radius_mm)) => Some(Reference::Ball { radius_mm }),
+        };
+        if level[number] > 0 && piece.is_some() {
+            let found = format!("{} of press {number}, a reference", level[number]);
+            return Err(file.error("level", found, 0));
+        }
+        let press = Press {
             level: level[number],
             object: object[number],
             material: material[number],
@@ -155,22 +159,24 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
             force_n: force_n[number],
             arm_n_per_mm: arm_n_per_mm[number].unwrap_or(0.0),
             sensor: sensor[number].unwrap_or(0),
-            reference: reference[number],
+            reference: piece,
             unloaded: unloaded.next().map(<[f32]>::to_vec),
+            kind: match kind[number] {
+                Some(0) => Kind::Unknown,
+                Some(1) => Kind::Simulated,
+                Some(_) => Kind::Recorded,
+                None => of_file,
+            },
             best: best - rows.start,
             ..Press::default()
         };
-        let of_object = press
-            .object
-            .and_then(|object| recorded.get(&(object, press.level)));
-        press.kind = of_object.copied().unwrap_or(kind);
         let of_press = rows.map(|row| {
             let newtons = frames[row * TAXELS..][..TAXELS].iter();
             let newtons = newtons.map(|&value| value * newtons_each);
             let approach_mm = approach_mm[row].filter(|_| known[row] == Some(1));
             (time_s[row], approach_mm, newtons)
         });
-        presses.add(press, of_press);
+        presses.push(press, of_press);
     }
     if presses.all.len() < count {
         return Err(file.error("press", format!("{} presses", presses.all.len()), count));
@@ -178,97 +184,57 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
     Ok(presses)
 }
 
-/// The rigid piece of each press: flat or a ball. Such a press has no level.
-fn references(file: &mut File, level: &[u8]) -> anyhow::Result<Vec<Option<Reference>>> {
-    let kinds = file.column("reference", level.len(), &(0..=2_u8))?;
-    let mm = file.column("reference_mm", level.len(), &(0.0..=1e6_f32))?;
-    let of = |((place, kind), mm): ((usize, Option<u8>), Option<f32>)| {
-        let reference = match (kind.unwrap_or(0), mm) {
-            (0, _) => return Ok(None),
-            (_, None) => return Err(file.error("reference_mm", "none", "that of each reference")),
-            (1, Some(width_mm)) => Reference::Flat { width_mm },
-            (_, Some(radius_mm)) => Reference::Ball { radius_mm },
-        };
-        match level[place] {
-            0 => Ok(Some(reference)),
-            level => {
-                let found = format!("{level} of press {place}, a reference");
-                Err(file.error("level", found, 0))
-            }
-        }
-    };
-    kinds.into_iter().enumerate().zip(mm).map(of).collect()
+/// What a file says of its presses.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct Meta {
+    generator: Option<String>,
+    // A run keeps the seed in TOML, which has no larger numbers.
+    seed: Option<i64>,
+    levels: Option<Vec<Level>>,
+    pitch_mm: Option<f64>,
+    grid: Option<[usize; 2]>,
+    settings: Value,
 }
 
 /// The source of a file's presses.
-fn source(bytes: &[u8], file: &File, meta: &Value) -> anyhow::Result<Source> {
-    let refused = |key: &str, expected: &str| {
-        let found = format!("{key} {}", meta[key]);
-        file.error("meta", found, expected)
+fn source(bytes: &[u8], file: &mut File) -> anyhow::Result<Source> {
+    let meta: Option<Meta> = serde_json::from_value(file.meta()?)
+        .map_err(|error| file.error("meta", error, "the keys of docs/formats.md"))?;
+    let meta = meta.unwrap_or_default();
+    if let Some(mm) = meta.pitch_mm.filter(|mm| !PITCHES_MM.contains(mm)) {
+        let found = format!("pitch_mm {mm}");
+        return Err(file.error("meta", found, "millimetres from 0.01 to 1000"));
+    }
+    let is_wrong = |of: &&Vec<Level>| !are_levels(of) || of.len() > MOST_LEVELS;
+    if let Some(levels) = meta.levels.as_ref().filter(is_wrong) {
+        let expected = "`level`, `label` and `shore` of each of 2 to 16 levels, from 1 on";
+        return Err(file.error("meta", format!("levels {}", json!(levels)), expected));
+    }
+    // The distances between the taxels of many simulated sensors.
+    let sensors = meta.settings.get("sensors").cloned().unwrap_or_default();
+    let sensors: Option<BroadSensors> = serde_json::from_value(sensors).ok();
+    let pitches_mm = sensors.map(|sensors| sensors.designs.pitches_mm());
+    let generator = meta.generator.as_deref().unwrap_or_default();
+    let grid = match meta.grid {
+        Some([rows, cols]) => Some(Array { rows, cols }),
+        // Simulated frames are those of a whole array.
+        None if generator.starts_with(SIMULATOR) && pitches_mm.is_none() => Some(Array::JX255N),
+        None => None,
     };
-    let pitch_mm = meta["pitch_mm"].as_f64();
-    let pitch_mm = pitch_mm.filter(|mm| PITCHES_MM.contains(mm));
-    if !meta["pitch_mm"].is_null() && pitch_mm.is_none() {
-        return Err(refused("pitch_mm", "millimetres from 0.01 to 1000"));
-    }
-    let seed = meta["seed"].as_u64();
-    // A run keeps the seed in TOML, which has no larger numbers.
-    if seed.is_some_and(|seed| i64::try_from(seed).is_err()) {
-        return Err(refused("seed", "a number up to 9223372036854775807"));
-    }
-    let stated: Option<Vec<Level>> = serde_json::from_value(meta["levels"].clone()).ok();
-    let stated = stated.filter(|of| are_levels(of) && of.len() <= MOST_LEVELS);
-    if !meta["levels"].is_null() && stated.is_none() {
-        return Err(refused(
-            "levels",
-            "`level`, `label` and `shore` of each of 2 to 16 levels, from 1 on",
-        ));
-    }
+    let fits = |array: &Array| (1..=ROWS).contains(&array.rows) && (1..=COLS).contains(&array.cols);
     let name = file.path.file_name().unwrap_or_default();
     Ok(Source {
         name: name.to_string_lossy().into_owned(),
         path: file.path.to_owned(),
-        seed,
+        seed: meta.seed.and_then(|seed| u64::try_from(seed).ok()),
         sha256: sha256_hex(bytes),
-        generator: meta["generator"].as_str().map(str::to_owned),
-        pitch_mm,
-        grid: grid(meta),
-        pitches_mm: pitches_mm(meta),
-        levels: stated,
+        pitch_mm: meta.pitch_mm,
+        grid: grid.filter(fits),
+        pitches_mm,
+        levels: meta.levels,
+        generator: meta.generator,
     })
-}
-
-/// The array of `meta.grid`, `[rows, cols]`. Simulated frames are those of a whole array.
-fn grid(meta: &Value) -> Option<Array> {
-    if let Ok([rows, cols]) = serde_json::from_value::<[usize; 2]>(meta["grid"].clone()) {
-        let fits = (1..=ROWS).contains(&rows) && (1..=COLS).contains(&cols);
-        return fits.then_some(Array { rows, cols });
-    }
-    let generator = meta["generator"].as_str().unwrap_or_default();
-    (generator.starts_with(SIMULATOR) && pitches_mm(meta).is_none()).then_some(Array::JX255N)
-}
-
-/// The distances between the taxels of many simulated sensors.
-fn pitches_mm(meta: &Value) -> Option<[f64; 2]> {
-    let sensors = meta.pointer("/settings/sensors")?.clone();
-    let sensors: BroadSensors = serde_json::from_value(sensors).ok()?;
-    Some(sensors.designs.pitches_mm())
-}
-
-/// What felt the objects of recordings, by number and level. `hardnessd simulate` may have played a recording.
-/// Raw bytes do not say it.
-fn recorded(captures: &Value) -> BTreeMap<(u32, u8), Kind> {
-    let captures = captures.as_array().into_iter().flatten();
-    let object = |capture: &Value| {
-        let number = u32::try_from(capture["object"].as_u64()?).ok()?;
-        let level = u8::try_from(capture["level"].as_u64()?).ok()?;
-        let is_simulated = capture["labels"]["simulated"] == "true";
-        Some((
-            (number, level),
-            Kind::of_recording(is_simulated, capture["raw"] == true),
-        ))
-    };
-    captures.filter_map(object).collect()
 }
 
 /// Writes presses as an `.npz` file, compressed: most taxels of a frame are 0. An array of labels or measurements
@@ -293,64 +259,57 @@ pub fn write<W: Write + Seek>(
         }
         Layout::OverTime => write_moments(&mut npz, presses)?,
     }
-    add(&mut npz, "level", all, |press| Some(press.level))?;
-    add(&mut npz, "object", all, |press| press.object)?;
-    add(&mut npz, "material", all, |press| press.material)?;
-    add_measured(&mut npz, "force", all, |press| press.force_n)?;
-    add(&mut npz, "split", all, |press| Some(press.split as u8))?;
-    add_measured(&mut npz, "shore", all, |press| press.shore)?;
+    let none = Some(f32::NAN);
+    add(&mut npz, "level", all, None, |press| Some(press.level))?;
+    add(&mut npz, "object", all, None, |press| press.object)?;
+    add(&mut npz, "material", all, None, |press| press.material)?;
+    add(&mut npz, "force", all, none, |press| press.force_n)?;
+    let split = |press: &Press| Some(press.split as u8);
+    add(&mut npz, "split", all, None, split)?;
+    add(&mut npz, "shore", all, none, |press| press.shore)?;
+    let kind = |press: &Press| Some(press.kind as u8).filter(|&kind| kind > 0);
+    add(&mut npz, "kind", all, Some(0), kind)?;
     // The whole array of each press, where all have the same one.
     let unloaded = all.iter().map(|press| press.unloaded.as_ref());
     let unloaded: Option<Vec<&Vec<f32>>> = unloaded.collect();
-    if let (Some(array), Some(unloaded)) = (grid(meta), unloaded)
+    if let (Some(array), Some(unloaded)) = (presses.grid(), unloaded)
         && layout == Layout::OverTime
         && unloaded.iter().all(|own| own.len() == array.taxels())
     {
         let unloaded: Vec<f32> = unloaded.into_iter().flatten().copied().collect();
         npz.add("unloaded", &[all.len(), array.rows, array.cols], &unloaded)?;
     }
-    if all
-        .iter()
-        .any(|press| press.sensor > 0 || press.reference.is_some())
-    {
+    let is_known = |press: &Press| press.sensor > 0 || press.reference.is_some();
+    if all.iter().any(is_known) {
         let piece = |press: &Press| match press.reference {
             None => (0, 0.0),
             Some(Reference::Flat { width_mm }) => (1, width_mm),
             Some(Reference::Ball { radius_mm }) => (2, radius_mm),
         };
-        add(&mut npz, "sensor", all, |press| Some(press.sensor))?;
-        add(&mut npz, "reference", all, |press| Some(piece(press).0))?;
-        add(&mut npz, "reference_mm", all, |press| Some(piece(press).1))?;
+        add(&mut npz, "sensor", all, None, |press| Some(press.sensor))?;
+        let reference = |press: &Press| Some(piece(press).0);
+        add(&mut npz, "reference", all, None, reference)?;
+        let reference_mm = |press: &Press| Some(piece(press).1);
+        add(&mut npz, "reference_mm", all, None, reference_mm)?;
     }
     npz.add_list("meta", meta.to_string().as_bytes())?;
     npz.finish()
 }
 
-/// Adds an array if every press has a value for it.
+/// Adds an array if a press has a value for it. A press without one gets `unknown`; if that is none, every press must
+/// have a value.
 fn add<W: Write + Seek, T: Element>(
     npz: &mut Writer<W>,
     name: &str,
     presses: &[Press],
+    unknown: Option<T>,
     value: impl Fn(&Press) -> Option<T>,
 ) -> io::Result<()> {
-    match presses.iter().map(value).collect::<Option<Vec<T>>>() {
-        Some(values) => npz.add_list(name, &values),
-        None => Ok(()),
-    }
-}
-
-/// Adds an array of measurements if a press has one.
-fn add_measured<W: Write + Seek>(
-    npz: &mut Writer<W>,
-    name: &str,
-    presses: &[Press],
-    value: impl Fn(&Press) -> Option<f32>,
-) -> io::Result<()> {
-    match presses.iter().any(|press| value(press).is_some()) {
-        true => add(npz, name, presses, |press| {
-            Some(value(press).unwrap_or(f32::NAN))
-        }),
-        false => Ok(()),
+    let is_there = presses.iter().any(|press| value(press).is_some());
+    let values = presses.iter().map(|press| value(press).or(unknown));
+    match values.collect::<Option<Vec<T>>>() {
+        Some(values) if is_there => npz.add_list(name, &values),
+        _ => Ok(()),
     }
 }
 
@@ -373,9 +332,10 @@ fn write_moments<W: Write + Seek>(npz: &mut Writer<W>, presses: &Presses) -> io:
     npz.add_list("approach_mm", &approach_mm)?;
     let known: Vec<u8> = approach.map(|mm| mm.is_some().into()).collect();
     npz.add_list("known", &known)?;
-    let best = |press: &Press| (press.moments.start + press.best) as u32;
-    add(npz, "best", all, |press| Some(best(press)))?;
-    add(npz, "arm_n_per_mm", all, |press| Some(press.arm_n_per_mm))
+    let best = |press: &Press| Some((press.moments.start + press.best) as u32);
+    add(npz, "best", all, None, best)?;
+    let arm_n_per_mm = |press: &Press| Some(press.arm_n_per_mm);
+    add(npz, "arm_n_per_mm", all, None, arm_n_per_mm)
 }
 
 /// An `.npz` file being read.
@@ -401,16 +361,10 @@ impl<'a> File<'a> {
     }
 
     fn layout(&self) -> Layout {
-        match self.name_of("frames_mn") {
+        match self.zip.index_for_name("frames_mn.npy") {
             Some(_) => Layout::OverTime,
             None => Layout::Frames,
         }
-    }
-
-    /// The name of an array's file in the archive.
-    fn name_of(&self, array: &str) -> Option<String> {
-        let mut names = [format!("{array}.npy"), array.to_owned()].into_iter();
-        names.find(|name| self.zip.index_for_name(name).is_some())
     }
 
     /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major. `None` if it
@@ -421,9 +375,10 @@ impl<'a> File<'a> {
         inner: &[usize],
         n: Option<usize>,
     ) -> anyhow::Result<Option<Vec<T>>> {
-        let Some(name) = self.name_of(array) else {
+        let name = format!("{array}.npy");
+        if self.zip.index_for_name(&name).is_none() {
             return Ok(None);
-        };
+        }
         let read = self.unpacked::<T>(&name, inner, n);
         read.map(Some)
             .map_err(|found| self.error(array, found, shape_of::<T>(inner, n)))

@@ -1,0 +1,400 @@
+//! The presses in one recording, and what its labels say of them.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context as _, bail, ensure};
+use serde_json::Value;
+
+use super::{ARCHIVE, Settings};
+use crate::data::presses::file::SHORE;
+use crate::data::presses::{Layout, Press, Presses};
+use crate::data::source::{Kind, MOST_LEVELS, PITCH_MM, Source};
+use crate::exit::coded;
+use hardnessd_core::event::{self, Event, PressState};
+use hardnessd_core::exit::USAGE;
+use hardnessd_core::frame::{Array, Stamp};
+use hardnessd_core::judge::EndedPress;
+use hardnessd_core::pipeline::{Clock, Input, Pipeline};
+use hardnessd_core::recording::{Entry, FileKind, Labels, Playback, Reader};
+use hardnessd_core::sensor::Sensor;
+use hardnessd_core::verdict::{BUILT_IN_HRN, Borders, COLS, Hrn, ROWS, sha256_hex};
+use hardnessd_simulator::Reference;
+
+/// The time given to a pipeline whose clock is the frame rate.
+const NOT_LOOKED_AT: Stamp = Stamp {
+    mono: std::time::Duration::ZERO,
+    wall: jiff::Timestamp::UNIX_EPOCH,
+};
+/// Bytes of a raw recording that are played at once.
+const CHUNK_BYTES: usize = 1 << 16;
+
+/// A recording that was played.
+#[derive(Debug)]
+pub struct Recording {
+    pub(super) path: PathBuf,
+    /// What its labels say. Raw bytes have none.
+    pub labels: Labels,
+    pub(super) sha256: String,
+    layout: Layout,
+    kind: Kind,
+    /// Its sensors, by number.
+    pub(super) sensors: Vec<Watched>,
+    /// Its presses, with the level and the object that their context names, and with it as their only source.
+    pub(super) presses: Presses,
+}
+
+/// A sensor of a recording, and what it read before the press.
+#[derive(Debug)]
+pub(super) struct Watched {
+    pub(super) sensor: Sensor,
+    is_pressed: bool,
+    /// The last frame before the first tare, and the two last ones between presses.
+    untared: Vec<f32>,
+    at_rest: [Vec<f32>; 2],
+}
+
+impl Recording {
+    /// Plays the recording `bytes`.
+    pub(super) fn played(
+        path: &Path,
+        bytes: &[u8],
+        sensor: &Sensor,
+        layout: Layout,
+    ) -> anyhow::Result<Self> {
+        ensure!(
+            !bytes.starts_with(ARCHIVE),
+            "is a data set, not a recording: train and fit take several data sets"
+        );
+        let hrn = Arc::new(Hrn::load(BUILT_IN_HRN)?);
+        let mut recording = Self {
+            path: path.to_owned(),
+            labels: Labels::new(),
+            sha256: sha256_hex(bytes),
+            layout,
+            kind: Kind::Unknown,
+            sensors: Vec::new(),
+            presses: Presses::default(),
+        };
+        match FileKind::of(bytes) {
+            FileKind::Recording => recording.play(bytes, hrn)?,
+            FileKind::Raw => recording.play_raw(bytes, sensor, hrn),
+        }
+        let source = recording.source()?;
+        recording.presses.sources.push(source);
+        Ok(recording)
+    }
+
+    /// A label as `read` reads it, if there is one.
+    fn label<T>(
+        &self,
+        key: &str,
+        expected: &str,
+        read: impl Fn(&str) -> Option<T>,
+    ) -> anyhow::Result<Option<T>> {
+        let Some(text) = self.labels.get(key) else {
+            return Ok(None);
+        };
+        let read =
+            read(text).with_context(|| format!("label {key}: found {text:?}, expected {expected}"));
+        read.map(Some)
+    }
+
+    /// Gives its presses what options and labels say of them. What was said of a press while it was made counts more
+    /// than the labels. An object without a number is `new`.
+    pub(super) fn label_presses(
+        &self,
+        presses: &mut Presses,
+        of: &Settings,
+        new: u32,
+    ) -> anyhow::Result<()> {
+        let expected = "flat:MM or ball:MM with 0.1 to 1000 mm";
+        let reference = self.label("reference", expected, reference)?;
+        ensure!(
+            reference.is_none() || presses.are_over_time(),
+            "label reference: collect presses of rigid pieces with --sequences"
+        );
+        let shore = |text: &str| text.parse().ok().filter(|shore| SHORE.contains(shore));
+        let shore = self.label("shore", "a number from 0 to 100", shore)?;
+        let expected =
+            "the name of a level, or a number from 0 (unlabelled) to 16: --level gives another one";
+        let level = match of.level {
+            None => self.label("level", expected, |text| level(text, of))?,
+            given => given,
+        };
+        let of_shore = || {
+            let borders = Borders::of(&of.levels).ok()?;
+            Some(of.levels[borders.place_of(shore?)].level)
+        };
+        let level = level.or_else(of_shore);
+        let object = match of.object {
+            None => self.label("object", "a number: --object gives another one", |text| {
+                text.parse().ok()
+            })?,
+            given => given,
+        };
+        for press in &mut presses.all {
+            press.split = of.split;
+            if reference.is_some() {
+                (press.level, press.object) = (0, object.or(Some(new)));
+                press.reference = reference;
+                continue;
+            }
+            if press.level == 0 || of.level.is_some() {
+                press.level = level.unwrap_or(0);
+            }
+            let named = press.object.filter(|_| of.object.is_none());
+            press.object = named.or(object).or(Some(new));
+            press.shore = shore;
+        }
+        if reference.is_none() && level.is_none() && presses.all.iter().all(|of| of.level == 0) {
+            let text = "the recording has no label `level`: give its level with --level";
+            return Err(coded(USAGE, text));
+        }
+        Ok(())
+    }
+
+    /// Plays a recording of hardnessd.
+    fn play(&mut self, bytes: &[u8], hrn: Arc<Hrn>) -> anyhow::Result<()> {
+        let mut playback = Playback::new(hrn);
+        playback.keep_courses();
+        for found in Reader::new(bytes) {
+            let found = found?;
+            // A wrong description is an error of the playback.
+            if let Entry::State(state) = &found.entry
+                && let Ok(sensor) = state.sensor.check()
+            {
+                self.watch(sensor);
+                let simulated = state.labels.get("simulated");
+                self.kind = match simulated.is_some_and(|label| label == "true") {
+                    true => Kind::Simulated,
+                    false => Kind::Recorded,
+                };
+            }
+            let events = playback.feed(found)?;
+            self.take(events, &playback.ended());
+        }
+        let events = playback.end();
+        self.take(events, &playback.ended());
+        for note in playback.left_out() {
+            hardnessd_core::stderr_line!("warning: {note}");
+        }
+        ensure!(
+            !self.sensors.is_empty(),
+            "found no state of a sensor, expected a recording of hardnessd"
+        );
+        self.labels = playback.labels();
+        Ok(())
+    }
+
+    /// Plays bytes of this sensor.
+    fn play_raw(&mut self, bytes: &[u8], sensor: &Sensor, hrn: Arc<Hrn>) {
+        self.watch(sensor.clone());
+        let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
+        pipeline.keep_courses();
+        for chunk in bytes.chunks(CHUNK_BYTES) {
+            let events = pipeline.take(Input::Bytes(chunk.to_vec()), NOT_LOOKED_AT);
+            self.take(events.unwrap_or_default(), &pipeline.ended());
+        }
+        let events = pipeline.end_of_recording(None);
+        self.take(events, &pipeline.ended());
+    }
+
+    /// Takes a sensor as it is from now on.
+    fn watch(&mut self, sensor: Sensor) {
+        let mut known = self.sensors.iter_mut();
+        match known.find(|known| known.sensor.name() == sensor.name()) {
+            Some(known) => known.sensor = sensor,
+            None => self.sensors.push(Watched {
+                sensor,
+                is_pressed: false,
+                untared: Vec::new(),
+                at_rest: [Vec::new(), Vec::new()],
+            }),
+        }
+    }
+
+    /// Takes events, and the presses that ended with them.
+    fn take(&mut self, events: Vec<Event>, ended: &[EndedPress]) {
+        for event in events {
+            let mut watched = self.sensors.iter_mut();
+            let place = watched.position(|of| of.sensor.name() == event.sensor());
+            let Some(place) = place else {
+                continue;
+            };
+            let watched = &mut self.sensors[place];
+            match event {
+                Event::Frame(frame) if !frame.tared => watched.untared = frame.newtons,
+                Event::Frame(frame) if !watched.is_pressed => {
+                    let [before, newest] = &mut watched.at_rest;
+                    *before = std::mem::replace(newest, frame.newtons);
+                }
+                // The press's first frame came just before the event of its begin.
+                Event::Press(press) => {
+                    watched.is_pressed = press.state == PressState::Begin;
+                    let is_this = |ended: &&EndedPress| {
+                        (ended.press, &ended.sensor) == (press.press, &press.sensor)
+                    };
+                    let ended = ended.iter().find(is_this);
+                    if let Some(ended) = ended.filter(|_| press.state == PressState::End) {
+                        self.add(place, &press, ended);
+                    }
+                }
+                Event::Frame(_) | Event::Hardness(_) | Event::Status(_) => {}
+            }
+        }
+    }
+
+    /// Adds a press of the sensor in this place.
+    fn add(&mut self, place: usize, press: &event::Press, ended: &EndedPress) {
+        let watched = &self.sensors[place];
+        let said = |key| press.context.as_ref()?.get(key);
+        let level = said("level").and_then(Value::as_u64);
+        let level = level.and_then(|level| u8::try_from(level).ok());
+        let is_level = |level: &u8| usize::from(*level) <= MOST_LEVELS;
+        let (.., best) = &ended.moments[ended.best];
+        let name = name_of(&self.path);
+        let press = Press {
+            level: level.filter(is_level).unwrap_or(0),
+            object: said("object").and_then(Value::as_str).map(object_of),
+            force_n: Some(best.force_n() as f32),
+            arm_n_per_mm: ended.arm_n_per_mm,
+            sensor: place as u32,
+            name: Some(format!("{name} press {}", press.press)),
+            unloaded: Some(watched.unloaded()),
+            kind: self.kind,
+            ..Press::default()
+        };
+        let mut moments = ended.course(grid_mm(&watched.sensor)).moments;
+        match self.layout {
+            Layout::OverTime => {
+                let mut before_s = -1.0_f32;
+                let moments = moments.into_iter().map(|moment| {
+                    // Two frames may have arrived at the same moment, but times in a file must ascend.
+                    before_s = moment.time_s.max(before_s.next_up());
+                    (before_s, moment.approach_mm, moment.frame.newtons)
+                });
+                let best = ended.best;
+                self.presses.push(Press { best, ..press }, moments);
+            }
+            Layout::Frames => {
+                let best = moments.swap_remove(ended.best);
+                self.presses.push(press, [(0.0, None, best.frame.newtons)]);
+            }
+        }
+    }
+
+    /// The recording as a source of presses. All its sensors have one pitch.
+    fn source(&self) -> anyhow::Result<Source> {
+        let mut sensors = self.sensors.iter().map(|of| &of.sensor);
+        let expected = sensors.clone().next().map_or(PITCH_MM, grid_mm);
+        if let Some(found) = sensors.find(|sensor| grid_mm(sensor) != expected) {
+            bail!(
+                "taxel pitch: found {} mm, expected {expected} mm, that of its first sensor",
+                grid_mm(found)
+            );
+        }
+        let mut grids = self.sensors.iter().map(|of| grid(&of.sensor));
+        let first = grids.next().flatten();
+        Ok(Source {
+            path: self.path.clone(),
+            pitch_mm: Some(expected),
+            grid: first.filter(|_| grids.all(|grid| grid == first)),
+            ..Source::default()
+        })
+    }
+}
+
+/// The name of a file without its directory.
+pub(super) fn name_of(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
+}
+
+/// The rigid piece that a label names, as `identify` does.
+fn reference(label: &str) -> Option<Reference> {
+    let (form, mm) = label.split_once(':')?;
+    let mm: Option<f32> = mm.parse().ok().filter(|mm| (0.1..=1000.0).contains(mm));
+    match (form, mm?) {
+        ("flat", width_mm) => Some(Reference::Flat { width_mm }),
+        ("ball", radius_mm) => Some(Reference::Ball { radius_mm }),
+        _ => None,
+    }
+}
+
+/// The level that a label names or numbers.
+fn level(label: &str, of: &Settings) -> Option<u8> {
+    let mut levels = of.levels.iter();
+    let named = levels.find(|level| level.label.eq_ignore_ascii_case(label));
+    let numbered = label.parse().ok();
+    let numbered = numbered.filter(|level| usize::from(*level) <= MOST_LEVELS);
+    named.map(|level| level.level).or(numbered)
+}
+
+/// The number of an object that only has a name: the same in every recording.
+pub(super) fn object_of(name: &str) -> u32 {
+    let hash = sha256_hex(name.as_bytes());
+    let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
+    // A half of the numbers is left to people, who count up from 0 or down from the last.
+    number >> 1
+}
+
+impl Watched {
+    /// The whole array before the touch, with what the tare takes off. The newest frame between presses is the one
+    /// that began the press.
+    fn unloaded(&self) -> Vec<f32> {
+        let [at_rest, touched] = &self.at_rest;
+        let of = |newtons: &[f32], place: usize| newtons.get(place).copied().unwrap_or(0.0);
+        let whole = |place| of(at_rest, place) + of(&self.untared, place);
+        (0..touched.len()).map(whole).collect()
+    }
+}
+
+/// The array of a sensor whose frames a data set has as they are.
+fn grid(sensor: &Sensor) -> Option<Array> {
+    let array = sensor.layout().array();
+    let pitch = sensor.calibration().pitch_mm;
+    let is_kept = array.rows <= ROWS && array.cols <= COLS && pitch.rows_mm == pitch.cols_mm;
+    is_kept.then_some(array)
+}
+
+/// The distance between the taxels of the grid on which a data set holds the frames of `sensor`. An
+/// array that fits into a data set is kept as it is.
+fn grid_mm(sensor: &Sensor) -> f64 {
+    match grid(sensor) {
+        Some(_) => sensor.calibration().pitch_mm.rows_mm,
+        None => PITCH_MM,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hardnessd_core::test_support::of_a_press;
+    use hardnessd_simulator::Split;
+    use serde_json::json;
+
+    #[test]
+    fn what_the_context_of_a_press_says_counts_more_than_the_labels() {
+        let truth = |context: Value| {
+            let (bytes, sensor) = of_a_press(|_| {}, Some(context), false);
+            let path = Path::new("a.mcap");
+            let recording = Recording::played(path, &bytes, &sensor, Layout::OverTime).unwrap();
+            let settings = Settings {
+                levels: Vec::new(),
+                level: None,
+                object: None,
+                is_one_object: true,
+                split: Split::Train,
+            };
+            let mut presses = recording.presses.clone();
+            recording.label_presses(&mut presses, &settings, 5).unwrap();
+            (presses.all[0].level, presses.all[0].object)
+        };
+        let cup = json!({"sensor": "forearm", "level": 3, "object": "cup"});
+        assert_eq!(truth(cup), (3, Some(object_of("cup"))));
+        // The label says 2.
+        assert_eq!(truth(json!({"level": 99, "object": 7})), (2, Some(5)));
+        assert_ne!(object_of("cup"), object_of("mug"));
+    }
+}
