@@ -3,3 +3,4 @@
 pub mod paper;
 pub mod metrics;
 pub mod interval;
+pub mod evaluated;

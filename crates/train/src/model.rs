@@ -1,6 +1,5 @@
-//! Model files: how they are written, how they judge presses, and how good their verdicts are.
+//! Model files: how they judge presses, and how they are written.
 
 pub mod file;
 pub mod verdicts;
-pub mod evaluated;
 pub mod export;

@@ -9,11 +9,11 @@ use std::collections::BTreeSet;
 use anyhow::Context as _;
 use serde_json::json;
 
-use super::evaluated::{Evaluated, cases};
 use super::file;
 use super::verdicts::{self, Given, reference, rigid};
 use crate::data::presses::{Presses, Timed};
 use crate::data::source::{Kind, Source};
+use crate::judge::evaluated::Evaluated;
 use crate::learn::calibration::Calibration;
 use crate::learn::{Inputs, Learning, Outputs, Question, Recogniser};
 use crate::net::network::Weights;
@@ -42,50 +42,6 @@ pub struct Learnt<'a> {
     pub train: &'a [usize],
 }
 
-/// A model as it is written.
-pub struct Exported {
-    /// What the file says of itself.
-    pub card: Card,
-    recogniser: Recogniser,
-    outputs: Outputs,
-    checks: Checks,
-    temperature: f32,
-}
-
-impl Exported {
-    /// What was learnt, by a method, from these files.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the card cannot be written as JSON.
-    pub fn of(learnt: &Learnt, method: &str, sources: &[Source]) -> anyhow::Result<Self> {
-        let recogniser = learnt.learning.graph(learnt.weights);
-        let outputs = learnt.learning.outputs();
-        Ok(Self {
-            card: learnt.card(&recogniser, method, sources)?,
-            checks: learnt.checks(&recogniser, &outputs),
-            temperature: learnt.calibration.temperature,
-            recogniser,
-            outputs,
-        })
-    }
-
-    /// The file.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the card cannot be written as JSON.
-    pub fn bytes(&self) -> anyhow::Result<Vec<u8>> {
-        file::bytes(
-            &self.recogniser,
-            &self.outputs,
-            self.temperature,
-            &self.card,
-            &self.checks,
-        )
-    }
-}
-
 /// Writes the model and its evaluation on the test split to the run's directory. The file is loaded once, as
 /// the daemon does, which reproduces the checks.
 ///
@@ -97,29 +53,41 @@ pub fn finish(
     run: &Run,
     description: &Description,
 ) -> anyhow::Result<Option<Evaluated>> {
-    let mut exported = Exported::of(learnt, &description.method, &description.data)?;
-    let hrn = Hrn::load(&exported.bytes()?)?;
+    let mut card = learnt.card(&description.method, &description.data)?;
+    let hrn = Hrn::load(&learnt.bytes(&card)?)?;
     let test: Vec<usize> = learnt.presses.labelled(Split::Test).collect();
-    let verdicts = verdicts::of(&hrn, learnt.presses, &test, Given::USUAL)?;
-    let cases = cases(learnt.presses, &verdicts);
-    let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &exported.card.levels));
+    let cases = verdicts::of(&hrn, learnt.presses, &test, Given::USUAL)?;
+    let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &card.levels));
     if let Some(evaluation) = &evaluation {
-        exported.card.metrics["test"] = json!(evaluation);
+        card.metrics["test"] = json!(evaluation);
         let json = serde_json::to_vec_pretty(evaluation)?;
         run.write("evaluation.json", &json)?;
     }
-    run.write("hrn.onnx", &exported.bytes()?)?;
+    run.write("hrn.onnx", &learnt.bytes(&card)?)?;
     Ok(evaluation)
 }
 
 impl Learnt<'_> {
-    /// What the file says of itself before it is measured.
-    fn card(
-        &self,
-        recogniser: &Recogniser,
-        method: &str,
-        sources: &[Source],
-    ) -> anyhow::Result<Card> {
+    /// The file with this card.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the card cannot be written as JSON.
+    pub fn bytes(&self, card: &Card) -> anyhow::Result<Vec<u8>> {
+        let recogniser = self.learning.graph(self.weights);
+        let outputs = self.learning.outputs();
+        let checks = self.checks(&recogniser, &outputs);
+        let temperature = self.calibration.temperature;
+        file::bytes(&recogniser, &outputs, temperature, card, &checks)
+    }
+
+    /// What the file says of itself before it is measured. `sources` are the files of the data.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the names of the files cannot be written as JSON.
+    pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
+        let recogniser = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
         let best = self.train.iter().map(|&press| self.presses.frame(press));
         let mut range = range(best);

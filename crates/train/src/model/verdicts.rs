@@ -5,22 +5,25 @@ use std::collections::{BTreeMap, BTreeSet};
 use anyhow::ensure;
 
 use crate::data::presses::Presses;
+use crate::judge::evaluated::{Case, cases};
 use crate::learn::course::piece;
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
-use hardnessd_core::verdict::{
-    Format, Hrn, Piece, ReferencePress, References, TimeSeries, Verdict,
-};
+use hardnessd_core::verdict::{Format, Hrn, Piece, ReferencePress, References, TimeSeries};
 use hardnessd_simulator::random::Stream;
 
 /// The references of its sensor that a model is given beside a press.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::Args)]
 pub struct Given {
-    /// Presses of each rigid piece.
+    /// Give the model this many presses of each rigid piece as references of each sensor
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub rigid: usize,
-    /// Objects of each level. Their presses are not judged.
+    /// Give the model a press of this many objects of each level as references of each sensor; the
+    /// objects are not judged
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub labelled: usize,
-    /// The sensor's own presses of other objects, of which the model knows nothing.
+    /// Give the model up to this many presses of other objects on the same sensor, of which it knows nothing
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
     pub own: usize,
 }
 
@@ -130,8 +133,7 @@ fn half_of(object: Option<u32>) -> usize {
     object.map_or(0, |object| object as usize % 2)
 }
 
-/// The verdicts of a model on labelled presses, each with the press, beside the references of the press's
-/// sensor. A model of frames judges each press's best frame.
+/// The verdicts of a model on labelled presses, beside the references of the press's sensor. A model of frames judges each press's best frame.
 ///
 /// # Errors
 ///
@@ -141,7 +143,7 @@ pub fn of(
     presses: &Presses,
     places: &[usize],
     given: Given,
-) -> anyhow::Result<Vec<(usize, Verdict)>> {
+) -> anyhow::Result<Vec<Case>> {
     let levels = hrn.card().levels.len();
     let (identified, objects) = identified(hrn, presses, places, given)?;
     let mut own = BTreeMap::<u32, [References; 2]>::new();
@@ -178,5 +180,5 @@ pub fn of(
         };
         verdicts.push((place, verdict));
     }
-    Ok(verdicts)
+    Ok(cases(presses, &verdicts))
 }

@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use hardnessd_core::verdict::Hrn;
-use hrn_train::model::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
+use hrn_train::judge::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
+use serde_json::json;
 
 /// The card of the model read from `path`.
 pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
@@ -22,26 +23,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
         row(&name, format!("{}, Shore {}", level.label, level.shore));
     }
     row("pitch", format!("{} mm", card.pitch_mm));
-    let [least, most] = card.range.contact_area_taxels;
-    row(
-        "contact area",
-        format!("{least} to {most} taxels in training"),
-    );
-    let of_presses = card.range.of_presses().into_iter();
-    let names = [
-        ("force", "N"),
-        ("duration", "s"),
-        ("frame period", "s"),
-        ("arm's speed", "mm/s"),
-        ("approach", "mm"),
-        ("arm", "N/mm"),
-    ];
-    let ranges = [Some(card.range.force_n)].into_iter().chain(of_presses);
-    for ((name, unit), range) in names.into_iter().zip(ranges) {
-        if let Some([least, most]) = range {
-            row(name, format!("{least:.2} to {most:.2} {unit} in training"));
-        }
-    }
+    row("in training", json!(card.range).to_string());
     if let Some(temperature) = card.metrics["temperature"].as_f64() {
         row("temperature", format!("{temperature:.3}"));
     }
@@ -56,7 +38,7 @@ pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
 
 /// The figures of an evaluation, and the confusion matrix with a row for each true level.
 pub(super) fn of_evaluated(evaluated: &Evaluated) -> String {
-    let of = &evaluated.levels;
+    let of = evaluated;
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
     let mut text = String::new();
     let mut row = |name: &str, value: String| {

@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand};
 use hardnessd_core::wording::named;
 use hardnessd_simulator::{
     DatasetSettings, Materials, SensorDesigns, SensorProfile, Shapes, Split,
 };
 use hrn_train::compare::Plan;
+use hrn_train::model::verdicts::Given;
 use hrn_train::train::Train;
 
 /// Trains and evaluates the hardness recognition network.
@@ -163,8 +163,8 @@ pub(super) struct Collect {
     /// [default: the recording's label "object", else a new number]
     #[arg(long, value_name = "K")]
     pub(super) object: Option<u32>,
-    /// For training or for test
-    #[arg(long, default_value = "train", value_parser = split())]
+    /// What the presses are for: train or test
+    #[arg(long, default_value = "train", value_parser = named::<Split>)]
     pub(super) split: Split,
     /// Collect whole presses over time, not single frames; with the arm's approach where the recording
     /// has it
@@ -201,19 +201,11 @@ pub(super) struct Evaluate {
     /// The data set. Of whole presses, a model of single frames judges the frame of maximal contact area
     #[arg(long, value_name = "D.npz")]
     pub(super) data: PathBuf,
-    /// Split to evaluate
-    #[arg(long, default_value = "test", value_parser = split())]
+    /// Split to evaluate: train or test
+    #[arg(long, default_value = "test", value_parser = named::<Split>)]
     pub(super) split: Split,
-    /// Give the model this many presses of each rigid piece as references of each sensor
-    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
-    pub(super) rigid: usize,
-    /// Give the model a press of this many objects of each level as references of each sensor; the
-    /// objects are not judged
-    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
-    pub(super) labelled: usize,
-    /// Give the model up to this many presses of other objects on the same sensor, of which it knows nothing
-    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = 0)]
-    pub(super) own: usize,
+    #[command(flatten)]
+    pub(super) given: Given,
     /// Also write every verdict to this new file, as a line of CSV
     ///
     /// The columns are object, level, the verdict's level, probabilities and Shore hardness with its interval, true
@@ -230,14 +222,6 @@ fn frame_rate(text: &str) -> Result<f64, String> {
     found
         .filter(|hz| (0.01..=10_000.0).contains(hz))
         .ok_or_else(|| "expected frames/s, 0.01 to 10000".to_owned())
-}
-
-fn split() -> impl TypedValueParser<Value = Split> {
-    let splits = [Split::Train, Split::Test];
-    PossibleValuesParser::new(splits.map(Split::name)).map(move |name| {
-        let found = splits.into_iter().find(|split| split.name() == name);
-        found.expect("clap lets only these names pass")
-    })
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Files named on the command line.
 
 use std::fs::File;
-use std::io::{self, Read as _};
+use std::io::Read as _;
 use std::path::Path;
 
 use anyhow::Context as _;
@@ -11,21 +11,13 @@ use hardnessd_core::verdict::{Hrn, MAX_FILE_BYTES};
 
 use hrn_train::exit::unreadable;
 
-/// Reads a model or settings. A file that is too long for either is refused, as the daemon refuses it.
+/// Reads a model or settings, and of a file that is too long for either only the beginning.
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<u8>> {
-    let read = || {
-        let mut bytes = Vec::new();
-        let file = File::open(path)?;
-        file.take(MAX_FILE_BYTES as u64 + 1)
-            .read_to_end(&mut bytes)?;
-        if bytes.len() > MAX_FILE_BYTES {
-            return Err(io::Error::other(format!(
-                "found more than {MAX_FILE_BYTES} bytes, expected at most so many"
-            )));
-        }
-        Ok(bytes)
-    };
-    read().map_err(|error| unreadable(path, &error))
+    let mut bytes = Vec::new();
+    let opened = File::open(path).map(|file| file.take(MAX_FILE_BYTES as u64 + 1));
+    let read = opened.and_then(|mut file| file.read_to_end(&mut bytes));
+    read.map_err(|error| unreadable(path, &error))?;
+    Ok(bytes)
 }
 
 /// Refuses an output that is there already or cannot be made, before the work for it.

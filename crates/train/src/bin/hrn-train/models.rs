@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{Hrn, Verdict};
+use hardnessd_core::verdict::Hrn;
 use hardnessd_core::{exit, wording};
 use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
-use hrn_train::model::evaluated::{Case, Difference, Evaluated, cases};
-use hrn_train::model::verdicts::{self, Given};
+use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
+use hrn_train::model::verdicts;
 
 use super::account;
 use super::arguments::Evaluate;
@@ -27,29 +27,23 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     }
     let presses = read_one(&arguments.data)?;
     let judged = models.iter().map(|hrn| judge(arguments, &presses, hrn));
-    let judged: Vec<Vec<(usize, Verdict)>> = judged.collect::<anyhow::Result<_>>()?;
-    let of_cases = |verdicts: &Vec<(usize, Verdict)>| cases(&presses, verdicts);
-    let all: Vec<Vec<Case>> = judged.iter().map(of_cases).collect();
-    if let Some(path) = &arguments.verdicts {
-        write(path, account::csv(&all[0]).as_bytes())?;
-    }
-    let evaluations: Vec<Evaluated> = models
-        .iter()
-        .zip(&all)
+    let judged: Vec<Vec<Case>> = judged.collect::<anyhow::Result<_>>()?;
+    let of_models = models.iter().zip(&judged);
+    let evaluations: Vec<Evaluated> = of_models
         .map(|(hrn, cases)| Evaluated::of(cases, &hrn.card().levels))
         .collect();
-    let [first, second] = &all[..] else {
+    if let Some(path) = &arguments.verdicts {
+        write(path, account::csv(&judged[0]).as_bytes())?;
+    }
+    let [first, second] = &judged[..] else {
         return Ok(match arguments.json {
             true => serde_json::to_string(&evaluations[0])? + "\n",
             false => account::of_evaluated(&evaluations[0]),
         });
     };
-    let same_presses = judged[0]
-        .iter()
-        .map(|of| of.0)
-        .eq(judged[1].iter().map(|of| of.0));
+    let presses = |cases: &[Case]| cases.iter().map(|case| case.press).collect::<Vec<_>>();
     anyhow::ensure!(
-        same_presses && models[0].card().levels == models[1].card().levels,
+        presses(first) == presses(second) && models[0].card().levels == models[1].card().levels,
         "the two models have other levels, or judge other presses: they cannot be compared"
     );
     let difference = Difference::of(first, second);
@@ -57,18 +51,15 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         let both = serde_json::json!({"models": evaluations, "difference": difference});
         return Ok(both.to_string() + "\n");
     }
-    let of_models = arguments.model.iter().zip(&evaluations);
-    let of_models =
-        of_models.map(|(path, of)| format!("{}\n{}\n", path.display(), account::of_evaluated(of)));
-    Ok(of_models.collect::<String>() + &account::of_difference(&difference))
+    let mut text = String::new();
+    for (path, of) in arguments.model.iter().zip(&evaluations) {
+        text += &format!("{}\n{}\n", path.display(), account::of_evaluated(of));
+    }
+    Ok(text + &account::of_difference(&difference))
 }
 
 /// A model's verdicts on the presses that the arguments choose.
-fn judge(
-    arguments: &Evaluate,
-    presses: &Presses,
-    hrn: &Hrn,
-) -> anyhow::Result<Vec<(usize, Verdict)>> {
+fn judge(arguments: &Evaluate, presses: &Presses, hrn: &Hrn) -> anyhow::Result<Vec<Case>> {
     warn_of_pitch(&arguments.data, presses, hrn);
     anyhow::ensure!(
         hrn.card().method != "course" || presses.are_over_time(),
@@ -76,20 +67,15 @@ fn judge(
          or `collect --sequences`",
         arguments.data.display()
     );
-    let given = Given {
-        rigid: arguments.rigid,
-        labelled: arguments.labelled,
-        own: arguments.own,
-    };
     let places = presses.some_labelled(arguments.split)?;
     warn_of_force(&arguments.data, presses, &places, hrn);
-    let verdicts = verdicts::of(hrn, presses, &places, given)?;
+    let cases = verdicts::of(hrn, presses, &places, arguments.given)?;
     anyhow::ensure!(
-        !verdicts.is_empty(),
+        !cases.is_empty(),
         "{}: no press is left to judge: give fewer --labelled",
         arguments.data.display()
     );
-    Ok(verdicts)
+    Ok(cases)
 }
 
 /// Prints a warning if most presses have forces that the model was not trained with.
@@ -122,17 +108,7 @@ fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Hrn) {
 }
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
-    let model = run.join("hrn.onnx");
-    if run.is_dir() && !model.try_exists().unwrap_or(true) {
-        let hint = if run.join("settings.toml").exists() {
-            "it was stopped: `hrn-train train --resume` with its options finishes it"
-        } else {
-            "it has no hrn.onnx"
-        };
-        let text = format!("{}: no finished run: {hint}", run.display());
-        return Err(coded(exit::NO_INPUT, text));
-    }
-    let (hrn, bytes) = load(&model)?;
+    let (hrn, bytes) = load(&run.join("hrn.onnx"))?;
     write(out, &bytes)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
