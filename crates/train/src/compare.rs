@@ -3,7 +3,7 @@
 //! In: data. Out, in a directory: `data/` with the test sets, `runs/` with a run's directory for each method,
 //! number of labels and seed, `logs/`, `results.json`, `objects.csv` and `tables.md`. This process trains
 //! nothing: each run is a call of `hrn-train train`, so that runs can be stopped, resumed and spread over
-//! machines. A run that has its model is not done again, and one that has its `compared.json` is not judged again.
+//! machines. A run that has its model is not done again.
 
 mod sets;
 pub mod tables;
@@ -19,11 +19,10 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context as _, ensure};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::data::presses::Presses;
-use crate::model::evaluated::{Case, Evaluated, cases};
+use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
@@ -73,20 +72,10 @@ const HELP: &str = "\
     have their model. Models that take references get two presses of each rigid piece.";
 
 /// A run of the plan.
-#[derive(Debug, Clone)]
 struct Planned {
-    method: String,
-    labels: Option<usize>,
-    seed: u64,
-}
-
-impl Planned {
-    fn name(&self) -> String {
-        let labels = self
-            .labels
-            .map_or(String::new(), |labels| format!("-{labels}"));
-        format!("{}{labels}-{}", self.method, self.seed)
-    }
+    name: String,
+    /// The words after `hrn-train` that make or continue it.
+    words: Vec<String>,
 }
 
 impl Plan {
@@ -98,48 +87,41 @@ impl Plan {
             true => recipe::all().iter().filter(suits).collect(),
             false => self.methods.clone(),
         };
+        let labels = self.labels.iter().copied().map(Some);
+        let labels: Vec<Option<usize>> = [None].into_iter().chain(labels).collect();
         let mut runs = Vec::new();
         for recipe in methods {
-            for labels in [None]
-                .into_iter()
-                .chain(self.labels.iter().copied().map(Some))
-            {
-                runs.extend((1..=self.seeds).map(|seed| Planned {
-                    method: recipe.name.clone(),
-                    labels,
-                    seed,
-                }));
+            for &labels in &labels {
+                runs.extend((1..=self.seeds).map(|seed| self.run(&recipe.name, labels, seed)));
             }
         }
         runs
     }
 
-    fn directory(&self, run: &Planned) -> PathBuf {
-        self.out.join("runs").join(run.name())
-    }
-
-    fn is_done(&self, run: &Planned) -> bool {
-        self.directory(run).join("hrn.onnx").exists()
-    }
-
-    /// The words after `hrn-train` that make or continue a run.
-    fn words(&self, run: &Planned) -> Vec<String> {
+    fn run(&self, method: &str, labels: Option<usize>, seed: u64) -> Planned {
+        let part = labels.map_or_else(String::new, |labels| format!("-{labels}"));
+        let name = format!("{method}{part}-{seed}");
         let path = |path: &Path| path.display().to_string();
-        let mut words: Vec<String> = ["train", "--resume", "--method", &run.method, "--data"]
+        let mut words = ["train", "--resume", "--method", method, "--data"]
             .map(str::to_owned)
             .to_vec();
         words.extend(self.data.iter().map(|data| path(data)));
-        words.extend(["--out".to_owned(), path(&self.directory(run))]);
-        words.extend(["--seed".to_owned(), run.seed.to_string()]);
-        words.extend(["--profile".to_owned(), self.profile.name().to_owned()]);
-        if let Some(labels) = run.labels {
-            words.extend(["--labels".to_owned(), labels.to_string()]);
+        let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);
+        option("--out", path(&self.directory(&name)));
+        option("--seed", seed.to_string());
+        option("--profile", self.profile.name().to_owned());
+        if let Some(labels) = labels {
+            option("--labels", labels.to_string());
         }
-        words
+        Planned { name, words }
+    }
+
+    fn directory(&self, name: &str) -> PathBuf {
+        self.out.join("runs").join(name)
     }
 }
 
-/// Does the runs that are not done, judges all runs of the plan on all sets, and writes results and tables.
+/// Does the runs that are not done, judges all runs of the directory on all sets, and writes results and tables.
 /// Without data, only writes the tables of the results that are there. Returns the tables, or the command lines
 /// of the runs if only these are asked for.
 ///
@@ -153,12 +135,11 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     }
     refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
     let presses = Presses::read(&plan.data)?;
-    let runs = plan.runs(presses.are_over_time());
-    let open = runs.iter().filter(|run| !plan.is_done(run));
-    let open: Vec<Vec<String>> = open.map(|run| plan.words(run)).collect();
+    let mut open = plan.runs(presses.are_over_time());
+    open.retain(|run| !plan.directory(&run.name).join("hrn.onnx").exists());
     if plan.plan {
-        let line = |words: &Vec<String>| {
-            let words = shlex::try_join(words.iter().map(String::as_str))?;
+        let line = |run: &Planned| {
+            let words = shlex::try_join(run.words.iter().map(String::as_str))?;
             Ok(format!("RAYON_NUM_THREADS=1 hrn-train {words}\n"))
         };
         return open.iter().map(line).collect();
@@ -174,12 +155,10 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     let jobs = rayon::ThreadPoolBuilder::new().num_threads(jobs).build()?;
     let failures: Vec<Option<String>> = jobs.install(|| {
         let runs = open.par_iter().with_max_len(1);
-        runs.map(|words| do_run(plan, words))
+        runs.map(|run| do_run(plan, run))
             .collect::<anyhow::Result<_>>()
     })?;
-    let done = runs.par_iter().filter(|run| plan.is_done(run));
-    done.try_for_each(|run| judge(plan, run, &sets))?;
-    write_results(&plan.out)?;
+    write_results(&plan.out, &sets)?;
     let text = write_tables(&plan.out);
     let failures: Vec<String> = failures.into_iter().flatten().collect();
     ensure!(
@@ -192,12 +171,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
 }
 
 /// Does a run. Returns its name and the last line of its log, if it fails.
-fn do_run(plan: &Plan, words: &[String]) -> anyhow::Result<Option<String>> {
-    let out = words.iter().skip_while(|word| *word != "--out").nth(1);
-    let name = Path::new(out.map_or("", String::as_str))
-        .file_name()
-        .unwrap_or_default();
-    let name = name.to_string_lossy().into_owned();
+fn do_run(plan: &Plan, Planned { name, words }: &Planned) -> anyhow::Result<Option<String>> {
     let path = plan.out.join("logs").join(format!("{name}.log"));
     let log = File::create(&path).with_context(|| path.display().to_string())?;
     hardnessd_core::stderr_line!("{name}: begun");
@@ -220,108 +194,82 @@ fn do_run(plan: &Plan, words: &[String]) -> anyhow::Result<Option<String>> {
     Ok(Some(format!("{name}: {reason}")))
 }
 
-/// What a run's model reached, in the run's `compared.json`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-struct Compared {
-    /// The SHA-256 of each set.
-    data: Vec<String>,
+/// What the model of a run reached.
+struct Judged {
     /// The entry of the run in `results.json`.
     entry: Value,
-    /// For each set the level, object, right presses and presses of each object.
-    objects: BTreeMap<String, Vec<(u8, u32, u64, u64)>>,
+    /// Its lines in `objects.csv`.
+    objects: String,
 }
 
-/// The file of a run, which is `None` if it is not there or of another version.
-fn compared(run: &Path) -> Option<Compared> {
-    let bytes = fs::read(run.join("compared.json")).ok()?;
-    serde_json::from_slice(&bytes).ok()
-}
-
-/// Judges a run that is done on every set, unless it was.
-fn judge(plan: &Plan, run: &Planned, sets: &[TestSet]) -> anyhow::Result<()> {
-    let directory = plan.directory(run);
-    let data: Vec<String> = sets.iter().map(|set| set.sha256().to_owned()).collect();
-    if compared(&directory).is_some_and(|known| known.data == data) {
-        return Ok(());
-    }
-    let path = directory.join("hrn.onnx");
-    let description = Run::description_at(&directory)?;
-    let description = description.with_context(|| format!("{}: no run", directory.display()))?;
+/// Judges a run that is done on every set.
+fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
+    let path = run.join("hrn.onnx");
+    let description = Run::description_at(run)?;
+    let description = description.with_context(|| format!("{}: no run", run.display()))?;
     let bytes = fs::read(&path).with_context(|| path.display().to_string())?;
     let hrn = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
-    let (steps, seconds) = MetricsFile::of(&directory).cost()?;
+    let (steps, seconds) = MetricsFile::of(run).cost()?;
+    let name = run.file_name().unwrap_or_default().to_string_lossy();
     let mut entry = json!({
-        "method": run.method,
-        "seed": run.seed,
-        "profile": plan.profile,
+        "method": description.method,
+        "seed": description.seed,
+        "profile": description.profile,
         "labels": description.labels,
         "steps": steps,
         "seconds": seconds,
-        "run": run.name(),
+        "run": name,
         sets::PAPER_SPLIT: null,
     });
-    let mut objects = BTreeMap::new();
+    let mut objects = String::new();
     for set in sets {
-        let verdicts = verdicts::of(&hrn, &set.presses, &set.places, Given::USUAL)?;
-        let cases = cases(&set.presses, &verdicts);
+        let cases = verdicts::of(&hrn, &set.presses, &set.places, Given::USUAL)?;
         entry[set.name] = serde_json::to_value(Evaluated::of(&cases, &hrn.card().levels))?;
-        objects.insert(set.name.to_owned(), by_object(&cases));
+        let mut counts = BTreeMap::<(u8, u32), (u64, u64)>::new();
+        for case in cases {
+            let Some(object) = case.object else {
+                continue;
+            };
+            let (right, all) = counts.entry((case.level, object)).or_default();
+            *right += u64::from(case.is_right());
+            *all += 1;
+        }
+        for ((level, object), (right, all)) in counts {
+            let geometry = match set.name {
+                "matched" => (object % FRESH_OBJECTS).to_string(),
+                _ => String::new(),
+            };
+            let set = set.name;
+            let _ = writeln!(
+                objects,
+                "{name},{set},{level},{object},{geometry},{right},{all}"
+            );
+        }
     }
-    let found = Compared {
-        data,
-        entry,
-        objects,
-    };
-    write_whole(
-        &directory.join("compared.json"),
-        &serde_json::to_vec(&found)?,
-    )
+    Ok(Judged { entry, objects })
 }
 
-fn by_object(cases: &[Case]) -> Vec<(u8, u32, u64, u64)> {
-    let mut objects = BTreeMap::<(u8, u32), (u64, u64)>::new();
-    for case in cases {
-        let Some(object) = case.object else {
-            return Vec::new();
-        };
-        let (right, all) = objects.entry((case.level, object)).or_default();
-        *right += u64::from(case.verdict.level == case.level);
-        *all += 1;
-    }
-    let count = |((level, object), (right, all))| (level, object, right, all);
-    objects.into_iter().map(count).collect()
-}
-
-/// Writes `results.json` and `objects.csv`, with every run of the directory that was judged. `geometry` is there
+/// Writes `results.json` and `objects.csv`, with every run of the directory that is done. `geometry` is there
 /// where the objects of one number are pressed alike in all materials.
-fn write_results(out: &Path) -> anyhow::Result<()> {
+fn write_results(out: &Path, sets: &[TestSet]) -> anyhow::Result<()> {
     let runs = out.join("runs");
     let of_runs = fs::read_dir(&runs).with_context(|| runs.display().to_string())?;
-    let paths: Result<Vec<PathBuf>, _> = of_runs
-        .map(|run| Ok::<_, anyhow::Error>(run?.path()))
-        .collect();
-    let mut all: Vec<Compared> = paths?.iter().filter_map(|run| compared(run)).collect();
-    all.sort_by_key(|Compared { entry, .. }| {
+    let of_runs = of_runs.map(|run| Ok::<_, anyhow::Error>(run?.path()));
+    let mut paths: Vec<PathBuf> = of_runs.collect::<Result<_, _>>()?;
+    paths.retain(|run| run.join("hrn.onnx").exists());
+    let all = paths.par_iter().map(|run| judge(run, sets));
+    let mut all: Vec<Judged> = all.collect::<anyhow::Result<_>>()?;
+    all.sort_by_key(|Judged { entry, .. }| {
         let method = recipe::all()
             .iter()
             .position(|recipe| entry["method"] == recipe.name);
         let [labels, seed] = ["labels", "seed"].map(|key| entry[key].as_u64());
         (method, Reverse(labels), seed)
     });
-    let mut csv = "run,set,level,object,geometry,right,samples\n".to_owned();
-    for Compared { entry, objects, .. } in &all {
-        let run = entry["run"].as_str().unwrap_or_default();
-        for (set, objects) in objects {
-            for &(level, object, right, all) in objects {
-                let geometry = match set.as_str() {
-                    "matched" => (object % FRESH_OBJECTS).to_string(),
-                    _ => String::new(),
-                };
-                let _ = writeln!(csv, "{run},{set},{level},{object},{geometry},{right},{all}");
-            }
-        }
-    }
-    let entries: Vec<&Value> = all.iter().map(|compared| &compared.entry).collect();
+    let head = "run,set,level,object,geometry,right,samples\n";
+    let objects = all.iter().map(|judged| judged.objects.as_str());
+    let csv: String = [head].into_iter().chain(objects).collect();
+    let entries: Vec<&Value> = all.iter().map(|judged| &judged.entry).collect();
     write_whole(
         &out.join("results.json"),
         &serde_json::to_vec_pretty(&entries)?,

@@ -11,23 +11,22 @@ pub mod levels;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::{Context as _, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
 use self::candidate::Candidate;
-use self::comparison::{Compared, Comparison, Outcome};
+use self::comparison::Comparison;
 pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
-use crate::data::collect::{self, LeaveOut, Settings, Unnumbered};
+use crate::data::collect::{self, Collection, Settings};
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
-use crate::model::export::{Exported, Learnt, validation};
+use crate::model::export::{Learnt, validation};
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn, Level};
+use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 use hardnessd_simulator::random::Stream;
 
@@ -37,26 +36,6 @@ const LEAST: [usize; 2] = [3, 2];
 const SEED: u64 = 1;
 /// The name of the control.
 const UNLOADED: &str = "the unloaded sensor alone";
-
-/// What to learn from.
-#[derive(Debug)]
-pub struct Request {
-    /// Recordings, directories of recordings, and data sets.
-    pub data: Vec<PathBuf>,
-    /// The sensor of recordings that do not describe their own.
-    pub sensor: Sensor,
-    /// The levels, if they are not those of the labels.
-    pub levels: Option<Vec<Level>>,
-}
-
-/// What `fit` found, and what to write.
-#[derive(Debug)]
-pub struct Fitted {
-    /// What was compared.
-    pub report: Report,
-    /// What to write. `None` if nothing is better than guessing.
-    pub written: Option<Written>,
-}
 
 /// A file for the daemon.
 #[derive(Debug)]
@@ -68,13 +47,19 @@ pub enum Written {
     References(Option<Vec<u8>>, Option<Vec<Level>>),
 }
 
-/// Compares the candidates and makes the best one.
+/// Compares the candidates and makes the best one of the recordings, directories of recordings, and data sets that
+/// `data` names. `sensor` is that of recordings that do not describe their own. `levels` are those of the labels
+/// unless they are given. Nothing is to be written if nothing is better than guessing.
 ///
 /// # Errors
 ///
 /// Fails if the data cannot be used, or have too few objects, presses or levels.
-pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
-    let presses = read(request)?;
+pub fn fit(
+    data: &[PathBuf],
+    sensor: &Sensor,
+    levels: Option<Vec<Level>>,
+) -> anyhow::Result<(Report, Option<Written>)> {
+    let presses = read(data, sensor, levels)?;
     let places: Vec<usize> = presses.labelled(Split::Train).collect();
     check(&presses, &places)?;
     let candidates = candidate::all(&presses, &places)?;
@@ -89,37 +74,31 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
     let bar = ProgressBar::new(work as u64);
     let style = ProgressStyle::with_template("{msg:10} {bar:30} {pos}/{len} fits, {eta} left");
     bar.set_style(style.expect("the template is right"));
-    let compare = |name, candidate: Result<&Candidate, &String>| -> anyhow::Result<Compared> {
+    let compare = |name, candidate: Result<&Candidate, &String>| -> anyhow::Result<Row> {
         bar.set_message(name);
-        let outcome = |folds: &Vec<Fold>| match candidate {
-            Ok(candidate) => Outcome::of(candidate, &presses, folds, SEED, &bar).map(Some),
-            Err(_) => Ok(None),
+        let judge = |folds: &Option<Vec<Fold>>| {
+            let (Ok(candidate), Some(folds)) = (candidate, folds) else {
+                return Ok(None);
+            };
+            comparison::judge(candidate, &presses, folds, SEED, &bar).map(Some)
         };
         let [new, later] = &divisions;
-        let new = new.as_ref().map(outcome).transpose()?.flatten();
-        let later = later.as_ref().map(outcome).transpose()?.flatten();
-        let left_out = candidate.err().cloned();
-        Ok(Compared::of(name, [new, later], left_out, &presses))
+        let judged = [judge(new)?, judge(later)?];
+        Ok(Row::of(name, judged, candidate.err().cloned(), &presses))
     };
     let compared = candidates
         .iter()
         .map(|(name, candidate)| compare(name, candidate.as_ref()));
-    let compared: Vec<Compared> = compared.collect::<anyhow::Result<_>>()?;
+    let compared: Vec<Row> = compared.collect::<anyhow::Result<_>>()?;
     let unloaded = control.ok_or_else(|| "only recordings have it".to_owned());
     let control = compare(UNLOADED, unloaded.as_ref())?;
     bar.finish_and_clear();
-    let built_in = match &candidates[0].1 {
-        Ok(Candidate::BuiltIn(hrn)) => Some(hrn),
-        _ => None,
-    };
-    let references = built_in
-        .map(|hrn| candidate::references(hrn, &presses, &places))
-        .transpose()?;
-    let is_used = match (built_in, &references) {
-        (Some(hrn), Some(references)) => !hrn.identified_by(references)?.1.are_worse(),
-        _ => false,
-    };
-    let references = references.filter(|_| is_used);
+    let mut references = None;
+    if let Ok(Candidate::BuiltIn(hrn)) = &candidates[0].1 {
+        let own = candidate::references(hrn, &presses, &places)?;
+        let is_used = !hrn.identified_by(&own)?.1.are_worse();
+        references = Some(own).filter(|_| is_used);
+    }
     let comparison = Comparison {
         presses: &presses,
         places: &places,
@@ -127,84 +106,79 @@ pub fn fit(request: &Request) -> anyhow::Result<Fitted> {
         candidates: compared,
         control,
     };
-    let choice = comparison.choice();
-    let report = comparison.report(&choice);
-    let chosen = choice.writes.map(|place| (place, &candidates[place]));
-    let written = match chosen {
-        Some((_, (_, Ok(Candidate::BuiltIn(hrn))))) => {
-            let own = references.map(|own| references::write(&own)).transpose()?;
-            let levels = hrn.card().levels.clone();
-            let levels = Some(levels).filter(|levels| *levels != papers_levels());
-            Some(Written::References(own, levels))
-        }
-        Some((place, (name, Ok(candidate)))) => {
-            let judged = comparison.candidates[place].outcome(choice.division);
-            let judged = judged.context("the best candidate was judged")?;
-            let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
-                let mut stream = Stream::new(SEED, "calibration");
-                let calibration = judged.calibration(&presses, &learning.outputs(), &mut stream);
-                let learnt = Learnt {
-                    learning,
-                    weights,
-                    calibration: match choice.division {
-                        Division::NewObjects => calibration,
-                        // Presses of known objects promise nothing of others.
-                        Division::LaterPresses => calibration.without_sets(),
-                    },
-                    presses: &presses,
-                    train: &places,
-                };
-                let mut exported = Exported::of(&learnt, name, &presses.sources)?;
-                exported.card.validation = format!(
-                    "{} of {}",
-                    choice.division.words(),
-                    validation(&presses.of(&places).map(|press| press.kind).collect())
-                );
-                exported.card.metrics["fit"] = json!(report.candidates);
-                exported.bytes()
-            })?;
-            Some(Written::Model(bytes))
-        }
-        Some((_, (_, Err(_)))) | None => None,
+    let (report, chosen) = comparison.report();
+    let Some(place) = chosen else {
+        return Ok((report, None));
     };
-    Ok(Fitted { report, written })
+    let (name, Ok(candidate)) = &candidates[place] else {
+        return Ok((report, None));
+    };
+    if let Candidate::BuiltIn(hrn) = candidate {
+        let own = references.map(|own| references::write(&own)).transpose()?;
+        let levels = hrn.card().levels.clone();
+        let levels = Some(levels).filter(|levels| *levels != papers_levels());
+        return Ok((report, Some(Written::References(own, levels))));
+    }
+    let division = report.chosen_by.unwrap_or(Division::NewObjects);
+    let judged = report.candidates[place].judged(division);
+    let judged = judged.context("the best candidate was judged")?;
+    let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
+        let mut stream = Stream::new(SEED, "calibration");
+        let calibration =
+            comparison::calibration(judged, &presses, &learning.outputs(), &mut stream);
+        let (calibration, by) = match division {
+            Division::NewObjects => (calibration, "new objects"),
+            // Presses of known objects promise nothing of others.
+            Division::LaterPresses => (calibration.without_sets(), "later presses"),
+        };
+        let learnt = Learnt {
+            learning,
+            weights,
+            calibration,
+            presses: &presses,
+            train: &places,
+        };
+        let mut card = learnt.card(name, &presses.sources)?;
+        let kinds = presses.of(&places).map(|press| press.kind).collect();
+        card.validation = format!("{by} of {}", validation(&kinds));
+        card.metrics["fit"] = json!(report.candidates);
+        learnt.bytes(&card)
+    })?;
+    Ok((report, Some(Written::Model(bytes))))
 }
 
 /// Reads the labelled presses.
-fn read(request: &Request) -> anyhow::Result<Presses> {
-    let paths = collect::captures(&request.data)?;
+fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow::Result<Presses> {
+    let paths = collect::captures(data)?;
     let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths
         .into_iter()
         .partition(|path| collect::is_data_set(path));
     let mut sets = Presses::read(&sets)?;
+    let layout = match sets.all.is_empty() || sets.are_over_time() {
+        true => Layout::OverTime,
+        false => Layout::Frames,
+    };
+    let recordings = collect::recordings(&recordings, sensor, layout, false)?;
     let stated = sets.sources.iter().find_map(|source| source.levels.clone());
-    let levels = match request.levels.clone().or(stated) {
+    let levels = match levels.or(stated) {
         Some(levels) => levels,
-        None => levels::of_labels(&collect::labels(&recordings))?,
+        None => levels::of_labels(recordings.iter().map(|recording| &recording.labels))?,
     };
     for source in &mut sets.sources {
         source.levels = Some(levels.clone());
     }
-    if recordings.is_empty() {
-        return Ok(sets);
-    }
     let settings = Settings {
-        sensor: request.sensor.clone(),
-        hrn: Arc::new(Hrn::load(BUILT_IN_HRN)?),
-        levels: levels.clone(),
+        levels,
         level: None,
         object: None,
-        unnumbered: Unnumbered::Each,
+        is_one_object: false,
         split: Split::Train,
-        layout: match sets.all.is_empty() || sets.are_over_time() {
-            true => Layout::OverTime,
-            false => Layout::Frames,
-        },
-        leave_out: LeaveOut::WithoutPress,
     };
-    let collection = collect::collect(&recordings, None, &settings)?;
-    collection.say_left_out();
-    let mut all = collection.into_presses(&levels);
+    let mut collection = Collection::default();
+    for recording in recordings {
+        collection.add(recording, &settings)?;
+    }
+    let mut all = collection.into_presses(&settings.levels);
     all.join(sets)?;
     Ok(all)
 }
@@ -212,7 +186,7 @@ fn read(request: &Request) -> anyhow::Result<Presses> {
 /// Refuses data with too little to learn from.
 fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
     let [least_objects, least_presses] = LEAST;
-    let objects = folds::objects(presses, places);
+    let objects = presses.by_object(places);
     let enough = objects
         .values()
         .filter(|own| own.len() >= least_presses)
@@ -225,14 +199,10 @@ fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
         objects.len()
     );
     let count = presses.levels().len();
-    let beyond = presses
-        .of(places)
-        .map(|press| press.level)
-        .find(|&level| usize::from(level) > count);
-    if let Some(level) = beyond {
+    let found: BTreeSet<u8> = presses.of(places).map(|press| press.level).collect();
+    if let Some(level) = found.iter().find(|&&level| usize::from(level) > count) {
         anyhow::bail!("found a press of level {level}, and {count} levels: name all levels");
     }
-    let found: BTreeSet<u8> = presses.of(places).map(|press| press.level).collect();
     ensure!(
         found.len() > 1,
         "all presses are of one level: press objects of another level too"

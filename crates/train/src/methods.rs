@@ -4,7 +4,7 @@
 use std::io::Cursor;
 use std::sync::Arc;
 
-use anyhow::{Context as _, ensure};
+use anyhow::{Context as _, anyhow};
 use burn::tensor::Device;
 use serde_json::json;
 
@@ -192,13 +192,14 @@ impl<'a> Stages<'a> {
         }
     }
 
-    fn learnt(&self, learning: &dyn Learning) -> anyhow::Result<Vec<Weights>> {
-        learn::run(
-            learning,
-            |press| self.presses.all[press].level,
-            self.run,
-            self.device,
-        )
+    /// Does a stage, or the rest of it, and gives the weights of its sides.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the run's directory cannot be read or written, or the training diverges.
+    pub fn learnt(&self, learning: &dyn Learning) -> anyhow::Result<Vec<Weights>> {
+        let level = |press: usize| self.presses.all[press].level;
+        learn::run(learning, level, self.run, self.device)
     }
 
     /// Trains USTGAN, the GAN without labels.
@@ -248,15 +249,15 @@ impl<'a> Stages<'a> {
                 self.settings.generation.samples_a_component as usize,
                 &mut Stream::new(self.seed, &format!("{stage} generated")),
             );
-            for (number, frame) in frames.into_iter().enumerate() {
-                let press = Press {
-                    level,
-                    ..Press::default()
-                };
-                if number < KEPT {
-                    kept.push(press.clone(), [(0.0, None, frame)].into_iter());
-                }
-                all.push(press, [(0.0, None, frame)].into_iter());
+            let press = Press {
+                level,
+                ..Press::default()
+            };
+            for frame in &frames[..KEPT.min(frames.len())] {
+                kept.push(press.clone(), [(0.0, None, frame.newtons)]);
+            }
+            for frame in frames {
+                all.push(press.clone(), [(0.0, None, frame.newtons)]);
             }
         }
         let meta = json!({ "generator": "STGANs of hrn-train", "levels": self.presses.levels() });
@@ -268,6 +269,5 @@ impl<'a> Stages<'a> {
 }
 
 fn sides(weights: Vec<Weights>) -> anyhow::Result<[Weights; 2]> {
-    ensure!(weights.len() == 2, "a GAN has two sides");
-    Ok(<[Weights; 2]>::try_from(weights).expect("counted just now"))
+    <[Weights; 2]>::try_from(weights).map_err(|_| anyhow!("a GAN has two sides"))
 }

@@ -1,20 +1,19 @@
 //! One training, from data to a model file: read, split once, learn, calibrate, export.
 
-use std::fmt::Write as _;
 use std::fs;
 use std::path::PathBuf;
 
 use anyhow::{Context as _, bail, ensure};
 use burn::tensor::Device;
 
-use crate::data::findings::Findings;
-use crate::data::presses::{Press, Presses};
+use crate::data::findings;
+use crate::data::presses::Presses;
 use crate::data::split::Parts;
 use crate::exit::{coded, unreadable};
+use crate::judge::evaluated::Evaluated;
 use crate::learn;
 use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
-use crate::model::evaluated::Evaluated;
 use crate::model::export::{self, Learnt};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::progress::ensure_finite;
@@ -69,24 +68,23 @@ enum DeviceName {
 
 impl DeviceName {
     fn device(self) -> anyhow::Result<Device> {
+        let Self::Cuda = self else {
+            return Ok(Device::flex());
+        };
         #[cfg(feature = "cuda")]
-        let (cuda, remedy) = (
-            Device::enumerate(burn::tensor::DeviceType::Cuda)
-                .into_iter()
-                .next(),
+        let (found, remedy) = (
+            Device::enumerate(burn::tensor::DeviceType::Cuda),
             "no CUDA device found: check the device and its driver with nvidia-smi",
         );
         #[cfg(not(feature = "cuda"))]
-        let (cuda, remedy) = (None, "this build has no CUDA: build with --features cuda");
-        match self {
-            Self::Cpu => Ok(Device::flex()),
-            Self::Cuda => cuda.ok_or_else(|| {
-                coded(
-                    UNAVAILABLE,
-                    format_args!("--device cuda: {remedy}, or use --device cpu"),
-                )
-            }),
-        }
+        let (found, remedy) = (
+            Vec::new(),
+            "this build has no CUDA: build with --features cuda",
+        );
+        found.into_iter().next().ok_or_else(|| {
+            let text = format!("--device cuda: {remedy}, or use --device cpu");
+            coded(UNAVAILABLE, text)
+        })
     }
 }
 
@@ -118,10 +116,10 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let parts = Parts::of(&presses, labels, share, seed);
     let settings = recipe.settings(profile, parts.train.len(), &given)?;
     check(recipe, &presses, &parts)?;
-    let findings = Findings::of(&presses, Some(labels));
-    let findings = findings.usable()?;
-    if !findings.warnings.is_empty() {
-        hardnessd_core::stderr_line!("{}", findings.to_string().trim_end());
+    let warnings = findings::warnings(&presses, labels)?.into_iter();
+    let warnings: String = warnings.map(|text| format!("warning: {text}\n")).collect();
+    if !warnings.is_empty() {
+        hardnessd_core::stderr_line!("{}", warnings.trim_end());
     }
     export::check_sources(&presses.sources)?;
 
@@ -134,15 +132,8 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         data: presses.sources.clone(),
     };
     let run = Run::open(&asked.out, &description, asked.resume)?;
-    if !findings.warnings.is_empty() {
-        run.write("findings.txt", findings.to_string().as_bytes())?;
-    }
-    presses.warn_of_other_levels();
-    hardnessd_core::stderr_line!("{}", counts(&presses).trim_end());
-    if profile == Profile::Smoke {
-        hardnessd_core::stderr_line!(
-            "--profile smoke: tries the commands in seconds; too short to learn anything"
-        );
+    if !warnings.is_empty() {
+        run.write("findings.txt", warnings.as_bytes())?;
     }
 
     let stages = Stages {
@@ -154,7 +145,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         device,
     };
     let learning = &*last_stage(recipe, &stages)?;
-    let weights = learn::run(learning, |press| presses.all[press].level, &run, device)?;
+    let weights = stages.learnt(learning)?;
     // Finite weights can still give a logit that is not. One press is enough for this check.
     let first = learn::Question {
         presses: vec![parts.train[0]],
@@ -171,8 +162,11 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let mut stream = Stream::new(seed, &format!("{} calibration", learning.stage()));
     let held_out = &parts.held_out;
     let calibration = Calibration::of(learning, &presses, held_out, &weights, &mut stream);
-    if recipe.learning == Kind::Course {
-        say_what_is_missing(&calibration, &presses, &parts);
+    if let Some(missing) = calibration
+        .missing()
+        .filter(|_| recipe.learning == Kind::Course)
+    {
+        hardnessd_core::stderr_line!("{missing}");
     }
     let learnt = Learnt {
         learning,
@@ -207,29 +201,6 @@ impl Train {
     }
 }
 
-/// The number of presses of each level in each split.
-fn counts(presses: &Presses) -> String {
-    let mut text = String::new();
-    for (split, name) in [(Split::Train, "training"), (Split::Test, "test")] {
-        let all = presses.all.iter();
-        let own: Vec<&Press> = all.filter(|press| press.split == split).collect();
-        if own.is_empty() {
-            continue;
-        }
-        let own = own.into_iter().filter(|press| press.reference.is_none());
-        let count = |level| own.clone().filter(|press| press.level == level).count();
-        let counts = presses.levels().into_iter();
-        let counts = counts.map(|of| format!("level {} {}, ", of.level, count(of.level)));
-        let counts: String = counts.collect();
-        let _ = writeln!(
-            text,
-            "{name} presses: {counts}unlabelled (level 0) {}",
-            count(0)
-        );
-    }
-    text
-}
-
 /// Checks, before anything is written, that the data has what all stages of a method need.
 fn check(recipe: &Recipe, presses: &Presses, parts: &Parts) -> anyhow::Result<()> {
     if recipe.learning == Kind::Course && !presses.are_over_time() {
@@ -258,17 +229,4 @@ fn check(recipe: &Recipe, presses: &Presses, parts: &Parts) -> anyhow::Result<()
         );
     }
     Ok(())
-}
-
-/// Says what a model of whole presses cannot promise.
-fn say_what_is_missing(calibration: &Calibration, presses: &Presses, parts: &Parts) {
-    if let Some(missing) = calibration.missing() {
-        hardnessd_core::stderr_line!("{missing}");
-    }
-    if presses.of(&parts.train).all(|press| press.shore.is_none()) {
-        hardnessd_core::stderr_line!(
-            "no labelled training press has a measured Shore hardness: the model learns only how likely \
-             each level is, and its Shore hardness says no more"
-        );
-    }
 }

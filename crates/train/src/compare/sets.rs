@@ -10,7 +10,6 @@ use anyhow::ensure;
 
 use crate::data::presses::{Layout, Presses, read_one};
 use crate::data::simulated;
-use crate::data::source::PITCH_MM;
 use crate::run::disk::write_whole;
 use crate::settings::Profile;
 use hardnessd_core::verdict::sha256_hex;
@@ -46,11 +45,6 @@ impl TestSet {
             presses,
         }
     }
-
-    /// The SHA-256 of the set's first file.
-    pub(super) fn sha256(&self) -> &str {
-        &self.presses.sources[0].sha256
-    }
 }
 
 /// All sets. The simulated ones are kept in `directory`. The first set is left out if the data have no
@@ -72,22 +66,12 @@ pub(super) fn all(
             presses.shown_paths()
         );
     }
-    if presses.pitch_mm() != PITCH_MM {
-        hardnessd_core::stderr_line!(
-            "warning: {}: taxel pitch: found {} mm, expected {PITCH_MM} mm, that of the simulated test objects",
-            presses.shown_paths(),
-            presses.pitch_mm()
-        );
-    }
     let layout = match presses.are_over_time() {
         true => Layout::OverTime,
         false => Layout::Frames,
     };
-    let own = TestSet::of(PAPER_SPLIT, presses);
-    let mut sets: Vec<TestSet> = [own]
-        .into_iter()
-        .filter(|own| !own.places.is_empty())
-        .collect();
+    let mut sets = vec![TestSet::of(PAPER_SPLIT, presses)];
+    sets.retain(|own| !own.places.is_empty());
     for (name, seed, shapes) in FRESH {
         let usual = CourseSettings::default();
         let objects = DatasetSettings {

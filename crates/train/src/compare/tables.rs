@@ -83,34 +83,20 @@ fn rows(entries: &[Entry]) -> Vec<Row<'_>> {
 }
 
 impl Row<'_> {
-    /// The mean of a figure over the seeds, or a dash, with the paper's behind it.
-    fn mean(&self, set: usize, figure: Figure, decimals: usize) -> String {
-        self.cell(set, figure, decimals, |_| None)
-    }
-
-    /// The same with the standard deviation, if there are several seeds.
-    fn spread(&self, set: usize, figure: Figure, decimals: usize) -> String {
-        self.cell(set, figure, decimals, deviation)
-    }
-
+    /// What is shown of a figure over the seeds, or a dash, with the paper's behind it.
     fn cell(
         &self,
         set: usize,
         figure: Figure,
         decimals: usize,
-        spread: impl Fn(&[f64]) -> Option<f64>,
+        shown: fn(&[f64], usize) -> String,
     ) -> String {
-        let values = self.sets[set]
-            .iter()
-            .filter_map(|confusion| figure(confusion));
-        let values: Vec<f64> = values.collect();
+        let values = self.sets[set].iter();
+        let values: Vec<f64> = values.filter_map(|confusion| figure(confusion)).collect();
         let mut cell = match values.is_empty() {
             true => "-".to_owned(),
-            false => rounded(mean(&values), decimals),
+            false => shown(&values, decimals),
         };
-        if let Some(deviation) = spread(&values) {
-            cell += &format!(" ± {deviation:.decimals$}");
-        }
         // The paper has results on its own test split only.
         let papers = paper::confusion(self.method).filter(|_| set == 0);
         if let Some(papers) = papers.and_then(|papers| figure(&papers)) {
@@ -120,32 +106,43 @@ impl Row<'_> {
     }
 }
 
-/// A table with a title and a note.
-fn table(title: &str, note: &str, head: &[String], rows: &[Vec<String>]) -> String {
-    let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
-    let rule = format!("| ---{} |\n", " | ---:".repeat(head.len() - 1));
-    let rows: String = rows.iter().map(|row| line(row)).collect();
-    format!("\n## {title}\n\n{note}\n\n{}{rule}{rows}", line(head))
+/// The mean.
+fn mean_alone(values: &[f64], decimals: usize) -> String {
+    format!("{:.decimals$}", mean(values))
 }
 
-fn owned(head: &[&str]) -> Vec<String> {
-    head.iter().map(|&name| name.to_owned()).collect()
+/// The mean, and with several values the standard deviation of the sample.
+fn spread(values: &[f64], decimals: usize) -> String {
+    let mean = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    let deviation = (squares / (values.len() as f64 - 1.0)).sqrt();
+    match values.len() {
+        1 => mean_alone(values, decimals),
+        _ => format!("{mean:.decimals$} ± {deviation:.decimals$}"),
+    }
+}
+
+/// A table with a title and a note. Its first column is text.
+fn table(title: &str, note: &str, head: &str, rows: &[Vec<String>]) -> String {
+    let rule = " | ---:".repeat(head.matches(" | ").count());
+    let line = |cells: &Vec<String>| format!("| {} |\n", cells.join(" | "));
+    let rows: String = rows.iter().map(line).collect();
+    format!("\n## {title}\n\n{note}\n\n| {head} |\n| ---{rule} |\n{rows}")
 }
 
 /// Table 2, with the paper's figures in brackets.
 fn accuracies(rows: &[Row], levels: usize) -> String {
     let note = "Category accuracies and overall accuracy in per cent on the data set's own test \
                 split, of the paper's size; in brackets the paper's.";
-    let mut head = owned(&["method", "labels"]);
-    head.extend((1..=levels).map(|level| format!("level {level}")));
-    head.push("overall".to_owned());
+    let of_levels = (1..=levels).map(|level| format!(" | level {level}"));
+    let head = format!("method | labels{} | overall", of_levels.collect::<String>());
     let cells = |row: &Row| {
         let mut cells = vec![row.title.clone(), thousands(row.labels)];
         cells.extend((0..levels).map(|level| {
             let of = |counts: &[Vec<u64>]| Some(100.0 * (*category_accuracy(counts).get(level)?)?);
-            row.mean(0, &of, 1)
+            row.cell(0, &of, 1, mean_alone)
         }));
-        cells.push(row.spread(0, &|counts| Some(100.0 * accuracy(counts)), 1));
+        cells.push(row.cell(0, &|counts| Some(100.0 * accuracy(counts)), 1, spread));
         cells
     };
     let cells: Vec<_> = rows.iter().map(cells).collect();
@@ -156,37 +153,31 @@ fn accuracies(rows: &[Row], levels: usize) -> String {
 fn kappas(rows: &[Row]) -> String {
     let note = "Cohen's kappa on the counts, and the same with quadratic weights, because levels \
                 are ordinal; in brackets what the paper's counts give.";
-    let head = owned(&[
-        "method",
-        "test split: kappa",
-        "quadratic",
-        "fresh, paper's shapes: kappa",
-        "quadratic",
-        "fresh, matched shapes: kappa",
-        "quadratic",
-    ]);
+    let head = "method | test split: kappa | quadratic | fresh, paper's shapes: kappa | quadratic | \
+                fresh, matched shapes: kappa | quadratic";
     let cells = |row: &Row| {
         let of_set = |set| {
             [
-                row.spread(set, &kappa, 4),
-                row.spread(set, &kappa_quadratic, 4),
+                row.cell(set, &kappa, 4, spread),
+                row.cell(set, &kappa_quadratic, 4, spread),
             ]
         };
-        let mut cells = vec![row.title.clone()];
-        cells.extend([0, 1, 2].into_iter().flat_map(of_set));
-        cells
+        let sets = (0..row.sets.len()).flat_map(of_set);
+        [row.title.clone()].into_iter().chain(sets).collect()
     };
     let cells: Vec<_> = rows.iter().map(cells).collect();
-    table("Table 3: kappa", note, &head, &cells)
+    table("Table 3: kappa", note, head, &cells)
 }
 
 /// Table 3's confusion matrices as counts, with the paper's to the right.
 fn confusions(rows: &[Row], levels: usize) -> String {
     let note = "Samples of the test split, mean over seeds; the paper's are of 250 a level. Rows \
                 are the truth, columns are the verdicts.";
-    let mut head = owned(&["method", "truth"]);
-    head.extend((1..=levels).map(|level| level.to_string()));
-    head.extend(owned(&["paper: 1", "2", "3", "4"]));
+    let of_levels = (1..=levels).map(|level| format!(" | {level}"));
+    let head = format!(
+        "method | truth{} | paper: 1 | 2 | 3 | 4",
+        of_levels.collect::<String>()
+    );
     let mut all = Vec::new();
     for row in rows.iter().filter(|row| !row.sets[0].is_empty()) {
         let papers = paper::confusion(row.method);
@@ -195,7 +186,8 @@ fn confusions(rows: &[Row], levels: usize) -> String {
             let mut cells = vec![title.to_owned(), format!("level {}", truth + 1)];
             cells.extend((0..levels).map(|said| {
                 let counts = row.sets[0].iter().map(|counts| counts[truth][said] as f64);
-                number(mean(&counts.collect::<Vec<_>>()))
+                let mean = mean(&counts.collect::<Vec<_>>());
+                format!("{mean:.1}").trim_end_matches(".0").to_owned()
             }));
             let papers = papers.as_ref().and_then(|counts| counts.get(truth));
             cells.extend((0..4).map(|said| {
@@ -211,48 +203,10 @@ fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// The standard deviation of a sample; `None` for fewer than two values.
-fn deviation(values: &[f64]) -> Option<f64> {
-    let mean = mean(values);
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
-}
-
-/// A number with one decimal, or none for an integer.
-fn number(value: f64) -> String {
-    rounded(value, if value.fract() == 0.0 { 0 } else { 1 })
-}
-
-/// A number with `decimals` decimals. A number that rounds to zero has no sign.
-fn rounded(value: f64, decimals: usize) -> String {
-    let text = format!("{value:.decimals$}");
-    match text.strip_prefix('-') {
-        Some(zero) if zero.bytes().all(|byte| matches!(byte, b'0' | b'.')) => zero.to_owned(),
-        _ => text,
-    }
-}
-
 /// An integer with commas between thousands.
 fn thousands(value: usize) -> String {
     match value {
         0..1000 => value.to_string(),
         _ => format!("{},{:03}", thousands(value / 1000), value % 1000),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn numbers_are_readable() {
-        assert_eq!(thousands(1_093_000), "1,093,000");
-        assert_eq!(thousands(7), "7");
-        assert_eq!((number(12.0), number(12.25)), ("12".into(), "12.2".into()));
-        for (value, expected) in [(-4e-5, "0.0000"), (-6e-5, "-0.0001"), (4e-5, "0.0000")] {
-            assert_eq!(rounded(value, 4), expected);
-        }
-        assert_eq!(deviation(&[1.0, 3.0]), Some(2.0_f64.sqrt()));
-        assert_eq!(deviation(&[1.0]), None);
     }
 }

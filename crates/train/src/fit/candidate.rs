@@ -1,21 +1,23 @@
 //! The candidates: what may judge the presses of this robot, and the controls beside them.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
 
-use super::folds::{Fold, objects};
+use super::folds::Fold;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
 use crate::learn::regression::{Regression, Seen, Table};
-use crate::learn::{self, Learning, Question};
+use crate::learn::{Learning, Question};
 use crate::methods::{Stages, last_stage};
 use crate::net::network::Weights;
 use crate::recipe;
 use crate::run::{Description, Run};
 use crate::settings::Profile;
-use hardnessd_core::verdict::{BUILT_IN, Borders, COLS, Hrn, Level, Piece, ReferencePress};
+use hardnessd_core::frame::{Array, Frame};
+use hardnessd_core::verdict::{BUILT_IN, Borders, Hrn, Level, Piece, ReferencePress};
 
 /// The paper's network needs this many presses.
 pub const LEAST_FOR_HRN: usize = 1_500;
@@ -87,17 +89,12 @@ fn taxels(presses: &Presses, places: &[usize]) -> Result<Seen, String> {
 /// How far the centres of presses are from their mean, in taxels.
 fn spread_taxels(presses: &Presses, places: &[usize]) -> f64 {
     let centre = |&place: &usize| {
-        let frame = presses.frame(place);
-        let pressed = frame.newtons.iter().map(|n| f64::from(n.max(0.0)));
-        let force_n = pressed.clone().sum::<f64>().max(f64::MIN_POSITIVE);
-        let along = |of: fn(usize) -> usize| {
-            let moments = pressed
-                .clone()
-                .enumerate()
-                .map(|(place, n)| n * of(place) as f64);
-            moments.sum::<f64>() / force_n
+        let frame = Frame {
+            array: Array::JX255N,
+            newtons: presses.frame(place).newtons.into(),
         };
-        [along(|place| place / COLS), along(|place| place % COLS)]
+        let (row, col) = frame.centre();
+        [row, col]
     };
     let centres: Vec<[f64; 2]> = places.iter().map(centre).collect();
     let count = centres.len() as f64;
@@ -109,18 +106,14 @@ fn spread_taxels(presses: &Presses, places: &[usize]) -> f64 {
 /// The control: what the sensor alone tells of the levels before anything touches it. `None` if the presses are
 /// not from recordings.
 pub fn unloaded(presses: &Presses, places: &[usize]) -> Option<Candidate> {
-    let lengths = presses
-        .of(places)
-        .map(|press| press.unloaded.as_ref().map(Vec::len));
-    let length = lengths
-        .clone()
-        .next()
-        .flatten()
-        .filter(|&length| length > 0)?;
-    let is_same = { lengths }.all(|other| other == Some(length));
-    let seen = Seen::Unloaded(length);
-    let table = || Table::of(presses, seen, places.iter().copied());
-    is_same.then(|| Candidate::Regression(Arc::new(table())))
+    let lengths = presses.of(places).map(|press| press.unloaded.as_ref());
+    let lengths: BTreeSet<usize> = lengths.map(|of| of.map_or(0, Vec::len)).collect();
+    let length = lengths.first().copied().filter(|&length| length > 0)?;
+    (lengths.len() == 1).then(|| {
+        let places = places.iter().copied();
+        let table = Table::of(presses, Seen::Unloaded(length), places);
+        Candidate::Regression(Arc::new(table))
+    })
 }
 
 impl Candidate {
@@ -144,8 +137,12 @@ impl Candidate {
                 fold.test.iter().map(judge).collect()
             }
             Self::Regression(_) | Self::Hrn => {
+                let question = Question {
+                    presses: fold.test.clone(),
+                    references: Vec::new(),
+                };
                 self.learn(presses, &fold.train, seed, |learning, weights| {
-                    Ok(asked(learning, weights, &fold.test))
+                    Ok(learning.judge(weights, &[question], None))
                 })
             }
         }
@@ -173,14 +170,6 @@ impl Candidate {
             Self::Hrn => with_hrn(presses, train, seed, take),
         }
     }
-}
-
-fn asked(learning: &dyn Learning, weights: &[Weights], presses: &[usize]) -> Vec<Vec<f32>> {
-    let question = Question {
-        presses: presses.to_vec(),
-        references: Vec::new(),
-    };
-    learning.judge(weights, &[question], None)
 }
 
 /// Trains the paper's network, in a directory that is removed.
@@ -218,9 +207,7 @@ fn with_hrn<T>(
         device: &Device::flex(),
     };
     let learning = &*last_stage(recipe, &stages)?;
-    let level = |press: usize| presses.all[press].level;
-    let weights = learn::run(learning, level, &run, stages.device)?;
-    take(learning, &weights)
+    take(learning, &stages.learnt(learning)?)
 }
 
 /// As many presses as the model takes as references, of all objects in turn, light and hard ones.
@@ -234,27 +221,26 @@ pub fn references(
     places: &[usize],
 ) -> anyhow::Result<Vec<ReferencePress>> {
     let borders = Borders::of(&hrn.card().levels)?;
-    let mut objects: Vec<((usize, u8), Vec<usize>)> = Vec::new();
-    for ((level, ..), own) in objects_in_order(presses, places) {
-        let of_level = objects
-            .iter()
-            .filter(|((_, other), _)| *other == level)
-            .count();
-        objects.push(((of_level, level), own));
+    let force_n = |place: &usize| presses.all[*place].force_n.unwrap_or_default();
+    let mut turns = BTreeMap::<u8, usize>::new();
+    let mut objects: Vec<(usize, u8, Vec<usize>)> = Vec::new();
+    for ((_, level, _), mut own) in presses.by_object(places) {
+        own.sort_by(|one, other| force_n(one).total_cmp(&force_n(other)));
+        let turn = turns.entry(level).or_default();
+        objects.push((*turn, level, own));
+        *turn += 1;
     }
     // The first object of each level, then the second ones.
-    objects.sort_by_key(|(turn, _)| *turn);
+    objects.sort();
     let most = hrn.most_references();
     let rounds = most.div_ceil(objects.len().max(1));
-    let mut chosen = Vec::new();
-    for round in 0..rounds {
-        for (_, own) in &objects {
-            let place = own[(2 * round + 1) * own.len() / (2 * rounds)];
-            if !chosen.contains(&place) {
-                chosen.push(place);
-            }
-        }
-    }
+    let of_round = |round: usize| {
+        let places = objects.iter();
+        places.map(move |(.., own)| own[(2 * round + 1) * own.len() / (2 * rounds)])
+    };
+    let mut seen = BTreeSet::new();
+    let chosen = (0..rounds).flat_map(of_round);
+    let chosen = chosen.filter(|&place| seen.insert(place));
     let reference = |place: usize| {
         let press = &presses.all[place];
         let range = match press.shore {
@@ -266,19 +252,5 @@ pub fn references(
             piece: Piece::Shore { range },
         }
     };
-    Ok(chosen.into_iter().take(most).map(reference).collect())
-}
-
-/// The objects, each with its presses from light to hard.
-fn objects_in_order(
-    presses: &Presses,
-    places: &[usize],
-) -> impl Iterator<Item = ((u8, crate::data::source::Object, usize), Vec<usize>)> {
-    let force_n = |place: &usize| presses.all[*place].force_n.unwrap_or_default();
-    objects(presses, places)
-        .into_iter()
-        .map(move |(object, mut own)| {
-            own.sort_by(|one, other| force_n(one).total_cmp(&force_n(other)));
-            (object, own)
-        })
+    Ok(chosen.take(most).map(reference).collect())
 }

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use crate::data::presses::Presses;
-use crate::data::source::Object;
 use hardnessd_simulator::random::Stream;
 
 /// Up to this many objects, each is left out alone. More are left out in [`GROUPS`] groups.
@@ -21,35 +20,12 @@ pub struct Fold {
     pub test: Vec<usize>,
 }
 
-/// The presses of each object, in their order. A press whose object is not known is of one of its own.
-pub fn objects(presses: &Presses, places: &[usize]) -> BTreeMap<(u8, Object, usize), Vec<usize>> {
-    let mut objects = BTreeMap::<_, Vec<usize>>::new();
-    for &place in places {
-        let press = &presses.all[place];
-        let unknown = Object {
-            number: u32::MAX,
-            material: None,
-            level: press.level,
-        };
-        let (object, alone) = match press.pressed() {
-            Some(object) => (object, 0),
-            None => (unknown, place),
-        };
-        objects
-            .entry((press.level, object, alone))
-            .or_default()
-            .push(place);
-    }
-    objects
-}
-
 /// Whole objects are left out and judged. An object that is alone in its level is always learnt from and
 /// never judged. `None` if that leaves fewer than two levels to tell apart.
 pub fn by_object(presses: &Presses, places: &[usize], seed: u64) -> Option<Vec<Fold>> {
-    let objects = objects(presses, places);
-    let mut of_levels = BTreeMap::<u8, Vec<&Vec<usize>>>::new();
-    for ((level, ..), own) in &objects {
-        of_levels.entry(*level).or_default().push(own);
+    let mut of_levels = BTreeMap::<u8, Vec<Vec<usize>>>::new();
+    for ((_, level, _), own) in presses.by_object(places) {
+        of_levels.entry(level).or_default().push(own);
     }
     of_levels.retain(|_, objects| objects.len() > 1);
     if of_levels.len() < 2 {
@@ -77,7 +53,8 @@ pub fn by_object(presses: &Presses, places: &[usize], seed: u64) -> Option<Vec<F
 /// The later presses of each object are judged by what was learnt from the earlier ones. `None` if no object
 /// has two presses.
 pub fn by_time(presses: &Presses, places: &[usize]) -> Option<Vec<Fold>> {
-    let later = objects(presses, places).into_values().flat_map(|own| {
+    let objects = presses.by_object(places).into_values();
+    let later = objects.flat_map(|own| {
         let earlier = (EARLIER * own.len() as f64).round().max(1.0) as usize;
         own.into_iter().skip(earlier)
     });
@@ -96,6 +73,8 @@ fn fold(places: &[usize], mut test: Vec<usize>) -> Fold {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
     use crate::data::presses::Press;
 
@@ -103,13 +82,12 @@ mod tests {
     fn presses(levels: &[u8]) -> (Presses, Vec<usize>) {
         let mut presses = Presses::default();
         for _ in 0..5 {
-            presses
-                .all
-                .extend((0..).zip(levels).map(|(object, &level)| Press {
-                    level,
-                    object: Some(object),
-                    ..Press::default()
-                }));
+            let objects = (0..).zip(levels);
+            presses.all.extend(objects.map(|(object, &level)| Press {
+                level,
+                object: Some(object),
+                ..Press::default()
+            }));
         }
         let places = (0..presses.all.len()).collect();
         (presses, places)
@@ -122,15 +100,14 @@ mod tests {
             let (presses, places) = presses(levels);
             let found = by_object(&presses, &places, 1).unwrap();
             assert_eq!(found.len(), folds);
-            let mut judged: Vec<usize> = found.iter().flat_map(|fold| fold.test.clone()).collect();
-            judged.sort_unstable();
-            assert_eq!(judged, places);
+            let judged = found.iter().flat_map(|fold| fold.test.clone());
+            let judged: BTreeSet<usize> = judged.collect();
+            assert!(judged.into_iter().eq(places));
             for Fold { train, test } in &found {
-                let object = |&place: &usize| presses.all[place].object;
-                assert!(
-                    test.iter()
-                        .all(|place| !train.iter().map(object).any(|o| o == object(place)))
-                );
+                let objects = |places: &[usize]| -> BTreeSet<_> {
+                    presses.of(places).map(|press| press.object).collect()
+                };
+                assert!(objects(train).is_disjoint(&objects(test)));
             }
         }
     }
@@ -138,33 +115,25 @@ mod tests {
     #[test]
     fn an_object_alone_in_its_level_is_learnt_from_only() {
         let (mut one, places) = presses(&[1, 1, 2, 2, 3]);
-        let folds = by_object(&one, &places, 1).unwrap();
-        assert!(
-            folds
-                .iter()
-                .all(|fold| fold.test.iter().all(|&p| one.all[p].level < 3))
-        );
-        assert!(
-            folds
-                .iter()
-                .all(|fold| fold.train.iter().any(|&p| one.all[p].level == 3))
-        );
-        one.all
-            .iter_mut()
-            .for_each(|press| press.level = press.level.max(2));
+        for Fold { train, test } in by_object(&one, &places, 1).unwrap() {
+            assert!(one.of(&test).all(|press| press.level < 3));
+            assert!(one.of(&train).any(|press| press.level == 3));
+        }
+        for press in &mut one.all {
+            press.level = press.level.max(2);
+        }
         assert!(by_object(&one, &places, 1).is_none());
     }
 
     #[test]
     fn the_later_presses_are_judged() {
         let (presses, places) = presses(&[1, 2]);
-        let [fold] = &by_time(&presses, &places).unwrap()[..] else {
-            panic!("one fold");
+        let found = by_time(&presses, &places).unwrap();
+        let expected = Fold {
+            train: places[..6].to_vec(),
+            test: places[6..].to_vec(),
         };
-        assert_eq!(
-            (&fold.train[..], &fold.test[..]),
-            (&places[..6], &places[6..])
-        );
+        assert_eq!(found, [expected]);
         assert!(by_time(&presses, &places[..2]).is_none());
     }
 }

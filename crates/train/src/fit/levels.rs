@@ -15,7 +15,7 @@ use hardnessd_core::verdict::Level;
 /// # Errors
 ///
 /// Fails if the labels name more levels than a model may have.
-pub fn of_labels(all: &[Labels]) -> anyhow::Result<Vec<Level>> {
+pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Vec<Level>> {
     let mut named = BTreeMap::<&str, Vec<Option<f32>>>::new();
     let mut most = 0;
     for labels in all {
@@ -44,17 +44,18 @@ pub fn of_labels(all: &[Labels]) -> anyhow::Result<Vec<Level>> {
         count <= MOST_LEVELS,
         "label level: found {count} levels, expected at most {MOST_LEVELS}"
     );
-    let unmeasured = |name: String| (name, "-".to_owned());
-    let levels = match (most, measured(&named)) {
-        (0, Some(measured)) => measured,
-        (0, None) => named
-            .keys()
-            .map(|name| unmeasured((*name).to_owned()))
-            .collect(),
-        (most, _) => (1..=most)
-            .map(|number| unmeasured(number.to_string()))
-            .collect(),
+    let names: Vec<String> = match most {
+        0 => named.keys().map(|name| (*name).to_owned()).collect(),
+        most => (1..=most).map(|number| number.to_string()).collect(),
     };
+    let unmeasured = || {
+        names
+            .into_iter()
+            .map(|name| (name, "-".to_owned()))
+            .collect()
+    };
+    let measured = measured(&named).filter(|_| most == 0);
+    let levels = measured.unwrap_or_else(unmeasured);
     let level = |(level, (label, shore)): (u8, (String, String))| Level {
         level,
         label,
@@ -96,47 +97,37 @@ mod tests {
 
     #[test]
     fn levels_are_those_of_the_labels() {
-        let check = |given: &[(&str, &str)], expected: &[(&str, &str)]| {
-            let labels = |(level, shore): &(&str, &str)| {
-                let mut labels = Labels::from([("level".to_owned(), (*level).to_owned())]);
-                if !shore.is_empty() {
-                    labels.insert("shore".to_owned(), (*shore).to_owned());
-                }
-                labels
-            };
-            let found = of_labels(&given.iter().map(labels).collect::<Vec<_>>()).unwrap();
-            let found: Vec<_> = found.iter().map(|l| (&*l.label, &*l.shore)).collect();
-            assert_eq!(found, expected);
-        };
-        let papers = [
-            ("hard", ">70"),
-            ("firm", "61-70"),
-            ("soft", "51-60"),
-            ("very-soft", "<=50"),
-        ];
-        check(&[("1", ""), ("3", "55")], &papers);
-        check(&[("Soft", ""), ("hard", "")], &papers);
-        check(
-            &[("1", ""), ("5", "")],
-            &["1", "2", "3", "4", "5"].map(|name| (name, "-")),
-        );
-        check(
-            &[("ripe", ""), ("green", "")],
-            &[("green", "-"), ("ripe", "-")],
-        );
-        check(
-            &[
-                ("ripe", "20"),
-                ("green", "80"),
-                ("ripe", "30"),
-                ("half", "50"),
-            ],
-            &[("green", ">65"), ("half", "40-65"), ("ripe", "<=40")],
-        );
-        // Levels that overlap have no borders.
-        check(
-            &[("a", "20"), ("a", "60"), ("b", "40")],
-            &[("a", "-"), ("b", "-")],
-        );
+        // The labels `level` and `shore` of each recording, and the levels that follow.
+        for (given, expected) in [
+            (
+                "1, 3 55",
+                "hard >70, firm 61-70, soft 51-60, very-soft <=50",
+            ),
+            (
+                "Soft, hard",
+                "hard >70, firm 61-70, soft 51-60, very-soft <=50",
+            ),
+            ("1, 5", "1 -, 2 -, 3 -, 4 -, 5 -"),
+            ("ripe, green", "green -, ripe -"),
+            (
+                "ripe 20, green 80, ripe 30, half 50",
+                "green >65, half 40-65, ripe <=40",
+            ),
+            // Levels that overlap have no borders.
+            ("a 20, a 60, b 40", "a -, b -"),
+        ] {
+            let labels = given.split(", ").map(|of| {
+                let values = ["level", "shore"].into_iter().zip(of.split(' '));
+                values
+                    .map(|(key, value)| (key.to_owned(), value.to_owned()))
+                    .collect()
+            });
+            let labels: Vec<Labels> = labels.collect();
+            let found = of_labels(labels.iter()).unwrap().into_iter();
+            let found: Vec<String> = found
+                .map(|of| format!("{} {}", of.label, of.shore))
+                .collect();
+            assert_eq!(found.join(", "), expected);
+        }
     }
 }

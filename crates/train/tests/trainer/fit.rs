@@ -33,7 +33,7 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
                 for row in 12..16 {
                     frame.newtons[row * 28 + 12 + col] = newtons;
                 }
-                (0.1 * f32::from(moment), None, frame)
+                (0.1 * f32::from(moment), None, frame.newtons)
             });
             presses.push(press, moments);
         }
@@ -142,28 +142,6 @@ fn references_that_the_daemon_would_not_use_are_not_written() {
     assert!(text.contains("make verdicts on each other worse"), "{text}");
     assert_eq!(output.status.code(), Some(1));
     assert!(!path("m.npz").exists() && !path("m.onnx").exists());
-}
-
-#[test]
-fn the_model_has_the_ending_of_one_and_its_sibling_is_named() {
-    let directory = tempfile::tempdir().unwrap();
-    let refused = |out: &str, code: i32, expected: &str| {
-        let output = hrn_train_in(directory.path(), &format!("fit d.npz --out {out}"));
-        let errors = errors(&output);
-        assert_eq!(output.status.code(), Some(code), "{errors}");
-        assert!(errors.contains(expected), "{errors}");
-    };
-    refused(
-        "m.txt",
-        2,
-        "--out: found m.txt, expected a name that ends with .onnx",
-    );
-    fs::write(directory.path().join("m.npz"), "").unwrap();
-    refused(
-        "m.onnx",
-        74,
-        "--out m.onnx: references would be written beside it",
-    );
 }
 
 #[test]

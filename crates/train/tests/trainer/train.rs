@@ -98,8 +98,6 @@ fn a_run_learns_and_leaves_what_it_promises() {
     let at = data().0.path();
     let trial = Trial::of("hrn100", "whole-run", SETTINGS);
     let message = errors(&trial.output(""));
-    let counts = "training presses: level 1 40, level 2 40, level 3 40, level 4 40, unlabelled";
-    assert!(message.contains(counts), "{message}");
     assert!(!message.contains("warning"), "{message}");
 
     let rows = trial.metrics();
@@ -350,13 +348,13 @@ fn rare_settings_of_simulated_presses_are_those_of_a_file() {
         );
     }
     for (config, expected) in [
-        ("fps = 20\n", "own.toml: unknown field `fps`"),
+        ("fps = 20", "own.toml: unknown field `fps`"),
         (
-            "frame_rate_hz = [5, 1e9]\n",
+            "frame_rate_hz = [5, 1e9]",
             "`frame_rate_hz`: found 1000000000, expected 1 to 200",
         ),
         (
-            "[objects]\nlowest_force_n = nan\n",
+            "objects.lowest_force_n = nan",
             "`objects.lowest_force_n`: found NaN",
         ),
     ] {
@@ -386,92 +384,46 @@ fn bad_input_has_its_exit_code_and_one_line() {
         b"method = \"hrn100\"\nprof\xff",
     )
     .unwrap();
-    let no_press = "untested.npz: no press of the test split has a level: add some";
-    let unknown = "text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`";
-    for (command, code, expected) in [
-        ("train hrn100 refused missing", 66, "missing"),
-        (
-            "train hrn100 refused tiny.npz --config missing",
-            66,
-            "missing",
-        ),
-        (
-            "train hrn100 refused tiny.npz --config text.toml",
-            78,
-            unknown,
-        ),
-        (
-            "train hrn100 refused tiny.npz --config zero.toml",
-            78,
-            "zero.toml: `training.epochs`: found 0",
-        ),
-        (
-            "train hrn100 refused tiny.npz --labels 3",
-            2,
-            "--labels: found 3, expected at least 4",
-        ),
-        (
-            "train hrn100 refused tiny.npz --seed 9223372036854775808",
-            2,
-            "--seed",
-        ),
-        #[cfg(not(feature = "cuda"))]
-        (
-            "train hrn100 refused tiny.npz --device cuda",
-            69,
-            "this build has no CUDA: build with",
-        ),
-        (
-            "train hrn100 corrupt tiny.npz --resume",
-            78,
-            "corrupt/settings.toml: line 2",
-        ),
-        ("train hrn15 /dev/null/no tiny.npz", 74, "/dev/null/no"),
-        (
-            "train ours refused tiny.npz --labels 160",
-            1,
-            "no unlabelled training presses are left",
-        ),
-        (
-            "train ours refused without-3.npz",
-            1,
-            "no labelled training presses of level 3 for its STGAN",
-        ),
-        (
-            "evaluate --model model.onnx --data untested.npz",
-            1,
-            no_press,
-        ),
-        (
-            "simulate --out refused --objects 0 --test-objects 0",
-            2,
-            "found 0 and 0, expected one or more",
-        ),
-        (
-            "simulate --presses 1 --out /dev/null/no",
-            74,
-            "/dev/null/no",
-        ),
-        ("inspect text.toml", 78, "not an ONNX model"),
-        ("export missing --out refused", 66, "missing/hrn.onnx: "),
-        (
-            "export corrupt --out refused",
-            66,
-            "it was stopped: `hrn-train train --resume`",
-        ),
-    ] {
+    // The exit code, the command, and what it says.
+    let cases = "
+        66 | train hrn100 missing | missing
+        66 | train hrn100 tiny.npz --config missing | missing
+        78 | train hrn100 tiny.npz --config text.toml | text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`
+        78 | train hrn100 tiny.npz --config zero.toml | zero.toml: `training.epochs`: found 0
+        2 | train hrn100 tiny.npz --labels 3 | --labels: found 3, expected at least 4
+        2 | train hrn100 tiny.npz --seed 9223372036854775808 | --seed
+        78 | train hrn100 tiny.npz --resume --out corrupt | corrupt/settings.toml: line 2
+        74 | train hrn15 tiny.npz --out /dev/null/no | /dev/null/no
+        1 | train ours tiny.npz --labels 160 | no unlabelled training presses are left
+        1 | train course tiny.npz | has single frames, not whole presses
+        1 | train ours without-3.npz | no labelled training presses of level 3 for its STGAN
+        1 | evaluate --model model.onnx --data untested.npz | untested.npz: no press of the test split has a level: add
+        2 | fit tiny.npz --out m.txt | --out: found m.txt, expected a name that ends with .onnx
+        74 | fit tiny.npz --out tiny.onnx | --out tiny.onnx: references would be written beside it
+        2 | simulate --out refused --objects 0 --test-objects 0 | found 0 and 0, expected one or more
+        74 | simulate --presses 1 --out /dev/null/no | /dev/null/no
+        78 | inspect text.toml | not an ONNX model
+        66 | export corrupt --out refused | corrupt/hrn.onnx:";
+    for line in cases.trim().lines() {
+        let [code, command, expected] = line.split(" | ").collect::<Vec<_>>()[..] else {
+            panic!("{line}");
+        };
         let words: Vec<&str> = command.split(' ').collect();
         let command = match words[..] {
-            ["train", method, out, data, ref more @ ..] => {
-                format!(
-                    "train --method {method} --out {out} --data {data} {}",
-                    more.join(" ")
-                )
+            ["train", method, data, ref more @ ..] => {
+                let out = if more.contains(&"--out") {
+                    ""
+                } else {
+                    "--out refused"
+                };
+                let more = more.join(" ");
+                format!("train --method {method} --data {data} {out} {more}")
             }
             _ => command.to_owned(),
         };
         let output = hrn_train_in(at, &command);
         let error = errors(&output);
+        let code: i32 = code.trim().parse().unwrap();
         assert_eq!(output.status.code(), Some(code), "{command}: {error}");
         assert!(error.contains(expected), "{command}: {error}");
         assert!(code != 2 || error.lines().count() == 1, "{error}");

@@ -9,7 +9,7 @@ use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Borders, Level};
 use hrn_train::exit::coded;
-use hrn_train::fit::{self, Division, Estimate, Fitted, Report, Request, Row, Written};
+use hrn_train::fit::{self, Division, Estimate, Report, Row, Written};
 
 use super::arguments::Fit;
 use super::configuration::{first_sensor, levels};
@@ -37,12 +37,7 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
     check_new(&references).with_context(|| {
         format!("--out {out}: references would be written beside it: name another --out")
     })?;
-    let request = Request {
-        data: arguments.data.clone(),
-        sensor: sensor.clone(),
-        levels,
-    };
-    let Fitted { report, written } = fit::fit(&request)?;
+    let (report, written) = fit::fit(&arguments.data, &sensor, levels)?;
     let text = match arguments.json {
         true => serde_json::to_string(&report)? + "\n",
         false => of_report(&report),
