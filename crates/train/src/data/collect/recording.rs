@@ -18,7 +18,7 @@ use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::recording::{Entry, FileKind, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Borders, COLS, Hrn, ROWS, sha256_hex};
+use hardnessd_core::verdict::{Borders, COLS, Hrn, ROWS, sha256_hex};
 use hardnessd_simulator::Reference;
 
 /// The time given to a pipeline whose clock is the frame rate.
@@ -55,18 +55,18 @@ pub(super) struct Watched {
 }
 
 impl Recording {
-    /// Plays the recording `bytes`.
+    /// Plays the recording `bytes`. A pipeline needs a model, whose verdicts do not matter here.
     pub(super) fn played(
         path: &Path,
         bytes: &[u8],
         sensor: &Sensor,
         layout: Layout,
+        hrn: &Arc<Hrn>,
     ) -> anyhow::Result<Self> {
         ensure!(
             !bytes.starts_with(ARCHIVE),
             "is a data set, not a recording: train and fit take several data sets"
         );
-        let hrn = Arc::new(Hrn::load(BUILT_IN_HRN)?);
         let mut recording = Self {
             path: path.to_owned(),
             labels: Labels::new(),
@@ -77,8 +77,8 @@ impl Recording {
             presses: Presses::default(),
         };
         match FileKind::of(bytes) {
-            FileKind::Recording => recording.play(bytes, hrn)?,
-            FileKind::Raw => recording.play_raw(bytes, sensor, hrn),
+            FileKind::Recording => recording.play(bytes, hrn.clone())?,
+            FileKind::Raw => recording.play_raw(bytes, sensor, hrn.clone()),
         }
         let source = recording.source()?;
         recording.presses.sources.push(source);
@@ -370,7 +370,7 @@ fn grid_mm(sensor: &Sensor) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::test_support::of_a_press;
+    use hardnessd_core::test_support::{hrn, of_a_press};
     use hardnessd_simulator::Split;
     use serde_json::json;
 
@@ -379,7 +379,8 @@ mod tests {
         let truth = |context: Value| {
             let (bytes, sensor) = of_a_press(|_| {}, Some(context), false);
             let path = Path::new("a.mcap");
-            let recording = Recording::played(path, &bytes, &sensor, Layout::OverTime).unwrap();
+            let recording = Recording::played(path, &bytes, &sensor, Layout::OverTime, &hrn());
+            let recording = recording.unwrap();
             let settings = Settings {
                 levels: Vec::new(),
                 level: None,
