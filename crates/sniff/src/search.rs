@@ -24,7 +24,7 @@ use crate::places::{Place, places};
 const LONGEST_SIDE: usize = 128;
 /// The most places, and fewer of long frames.
 const MOST_PLACES: usize = 60;
-const FEWEST_PLACES: usize = 12;
+const FEWEST_PLACES: usize = 24;
 const PLACE_BYTES: usize = 60_000;
 /// What is left out at the ends of the cells to tell formats.
 const MARGIN: usize = 16;
