@@ -45,6 +45,8 @@ impl Beside {
 
 /// The most bytes beside the cells.
 const MOST_BESIDE: usize = 40;
+/// The most places with as many bytes beside the cells: constant cells all over a frame look like a mark.
+const MOST_OF_LENGTH: usize = 8;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;
 /// Places that need this many more bits than the best one are left out.
@@ -56,6 +58,7 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
     let numbers: usize = columns.numbers.iter().map(|number| number.bytes).sum();
     let mut found: Vec<(f64, Place)> = Vec::new();
     for length in 1..=MOST_BESIDE.min(period.saturating_sub(FEWEST_BYTES)) {
+        let shorter = found.len();
         for start in 0..period {
             let beside = beside(columns, start, length);
             let here = beside
@@ -73,6 +76,8 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
             };
             found.push((place.bits(columns, 2), place));
         }
+        found[shorter..].sort_by(|a, b| a.0.total_cmp(&b.0));
+        found.truncate(shorter + MOST_OF_LENGTH);
     }
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     let least = found.first().map_or(0.0, |(bits, _)| *bits);
