@@ -45,7 +45,6 @@ use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -53,7 +52,6 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tracing::{debug, info, warn};
 
-use self::baud::Load;
 use self::clients::Clients;
 use self::config::{Publish, Setup};
 use self::hub::Hub;
@@ -61,9 +59,8 @@ use self::own::Store;
 use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target};
 pub use self::reload::Reload;
-use self::running::Running;
-use self::sensor::{SensorCore, SensorHandle};
-use self::serial::{Source, Sources};
+use self::sensor::{SensorCore, SensorHandle, Sensors};
+use self::serial::Source;
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
 use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO, UNAVAILABLE};
@@ -72,8 +69,8 @@ use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
 use hardnessd_core::sensor::Sensor;
 
-/// The most commands that wait for a sensor. When the queue is full, the tasks that send wait.
-const QUESTIONS: usize = 16;
+/// The most commands that wait for a sensor.
+const QUESTIONS: usize = 64;
 
 /// The reason the daemon cannot start, or has stopped by itself.
 #[derive(Debug, thiserror::Error)]
@@ -132,65 +129,44 @@ pub enum Sockets {
     Configured,
 }
 
-/// A daemon whose sockets are bound. Connections wait until the daemon runs.
+/// A daemon that has started: its sockets answer, and its ports are being opened.
 pub struct Daemon {
     setup: Setup,
-    hello: Hello,
+    /// The token of this run.
+    run: String,
     hub: Hub,
-    clients: Clients,
+    sensors: Sensors,
+    /// The tasks of the sensors.
+    tasks: JoinSet<SensorCore>,
     publishers: Publishers,
-    /// The target of the recording, if there is one.
-    target: Option<Target>,
+    /// The thread of the clients.
+    clients: Clients,
+    store: Store,
+    recorder: Option<Recorder>,
+    /// The listeners stop when this is dropped.
+    listening: watch::Sender<()>,
 }
 
-/// The current time of CLOCK_MONOTONIC and of the wall clock. If another process interrupts this one
-/// between the two readings, the clocks are read again.
+/// The current time of CLOCK_MONOTONIC and of the wall clock.
 pub(crate) fn now() -> Stamp {
-    let mono = || {
-        let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-        Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot")
-    };
-    let mut before = mono();
-    for _ in 0..MOST_READINGS {
-        let wall = jiff::Timestamp::now();
-        let after = mono();
-        if after.saturating_sub(before) <= READING {
-            return Stamp { mono: before, wall };
-        }
-        before = after;
-    }
+    let mono = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     Stamp {
-        mono: before,
+        mono: Duration::try_from(mono).expect("CLOCK_MONOTONIC counts from 0 at boot"),
         wall: jiff::Timestamp::now(),
     }
 }
 
-/// Reading both clocks takes no longer than this, unless another process interrupts it.
-const READING: Duration = Duration::from_micros(100);
-/// How often the clocks are read again.
-const MOST_READINGS: usize = 3;
-
 impl Daemon {
-    /// Binds the sockets. Must be called inside a tokio runtime.
+    /// Binds the sockets, and starts a task for each sensor and each listener. Call it inside a tokio
+    /// runtime, whose thread becomes that of the sensors.
     ///
     /// # Errors
     ///
-    /// Fails if the system gives no random numbers, or if a socket cannot be bound: its path or
+    /// Fails if the system gives no random numbers or no thread, or if a socket cannot be bound: its path or
     /// address is in use, the path holds another file, or the system refuses.
-    pub fn bind(setup: Setup) -> Result<Self, Error> {
-        let run = run_token().map_err(|error| Error::Io(format!("/dev/urandom: {error}")))?;
-        let hello = hello(&setup, run);
-        let hub = Hub::new(hello.clone());
-        let clients = Clients::start().map_err(Error::no_thread("the clients"))?;
-        let publishers = Publishers::bind(&setup.config, &hub, &clients)?;
-        Ok(Self {
-            clients,
-            target: setup.config.record.clone().map(Target::Directory),
-            setup,
-            hello,
-            hub,
-            publishers,
-        })
+    pub fn start(setup: Setup) -> Result<Self, Error> {
+        let target = setup.config.record.clone().map(Target::Directory);
+        Self::start_with(setup, target)
     }
 
     /// A daemon with `sockets` that records into `file`, an empty file at `path`, and reports in
@@ -217,87 +193,54 @@ impl Daemon {
             },
         };
         setup.config.record = None;
-        Ok(Self {
-            target: Some(Target::File {
-                path,
-                file,
-                labels,
-                progress,
-            }),
-            ..Self::bind(setup)?
-        })
+        let target = Target::File {
+            path,
+            file,
+            labels,
+            progress,
+        };
+        Self::start_with(setup, Some(target))
     }
 
-    /// The address of the live page, if there is one.
-    pub fn http_address(&self) -> Option<SocketAddr> {
-        self.publishers.http_address()
-    }
-
-    /// Serves until `shutdown` is ready. Then presses are aborted, and subscribers get their last
-    /// lines.
-    ///
-    /// # Errors
-    ///
-    /// Fails if a task ends by itself, which is a fault of this program, or if the recording fails.
-    pub async fn run(
-        self,
-        shutdown: impl Future<Output = ()>,
-        mut reload: Option<Reload>,
-    ) -> Result<(), Error> {
-        let mut running = self.start()?;
-        // `serve` only borrows `reload`, because `reload` owns the log, which `finish` still uses.
-        let ended = running.serve(shutdown, &mut reload).await;
-        let recorded = running.finish().await;
-        ended.and(recorded)
-    }
-
-    /// Starts a task for each sensor and each listener, and notifies systemd that the daemon is
-    /// ready.
-    fn start(self) -> Result<Running, Error> {
-        let Self {
-            setup,
-            hello,
-            hub,
-            clients,
-            publishers,
-            target,
-        } = self;
+    fn start_with(setup: Setup, target: Option<Target>) -> Result<Self, Error> {
+        let run = run_token().map_err(|error| Error::Io(format!("/dev/urandom: {error}")))?;
+        let hello = hello(&setup, run.clone());
         raise_descriptors();
         realtime::lock_memory();
-        let run = hello.run.clone();
-        let recorder = target
-            .map(|target| Recorder::start(target, about(&setup, &hello)))
-            .transpose()?;
+        let hub = Hub::new(hello.clone());
+        let clients = Clients::start().map_err(Error::no_thread("the clients"))?;
+        let store = Store::of_environment();
+        let store = store.map_err(|NoThread(error)| Error::no_thread("own presses")(error))?;
+        let names = setup.sensors.iter().map(|sensor| sensor.name().to_owned());
+        let handles = names.map(|name| {
+            let (commands, inbox) = mpsc::channel(QUESTIONS);
+            (SensorHandle { name, commands }, inbox)
+        });
+        let (handles, inboxes): (Vec<_>, Vec<_>) = handles.unzip();
+        let sensors: Sensors = handles.into();
+        let (listening, stop) = watch::channel(());
+        let publishers = Publishers::start(&setup.config, &hub, &sensors, &clients.runtime, &stop)?;
+        let recorder = target.map(|target| Recorder::start(target, about(&setup, &hello)));
+        let recorder = recorder.transpose()?;
         if let Some(recorder) = &recorder {
             hub.log().record(recorder.of_hub());
         }
-        let store = Store::of_environment();
-        let store = store.map_err(|NoThread(error)| Error::no_thread("own presses")(error))?;
         let mut tasks = JoinSet::new();
-        let mut sources = Sources::default();
-        let started = setup.sensors.iter().enumerate().map(|(index, sensor)| {
+        let sources = serial::start(&setup.sensors.iter().collect::<Vec<_>>());
+        let parts = setup.sensors.iter().zip(inboxes).zip(sources);
+        for (index, ((sensor, commands), source)) in parts.enumerate() {
             let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
-            let (commands, inbox) = mpsc::channel(QUESTIONS);
             let core = SensorCore {
                 pipeline: pipeline_of(&setup, sensor, &store),
                 recorder: recorder.unwrap_or_default(),
                 unjudged: 0,
-                commands: inbox,
-            };
-            let source = sources.take(&setup.sensors, index);
-            start_sensor(core, source, (&hub, &store), &mut tasks);
-            SensorHandle {
-                name: sensor.name().to_owned(),
                 commands,
-            }
-        });
-        let sensors: Arc<[SensorHandle]> = started.collect();
-        let (listening, stop) = watch::channel(());
-        publishers.announce();
-        let publishers = publishers.serve(&sensors, &stop, &clients);
+            };
+            start_sensor(core, source, (&hub, &store), &mut tasks);
+        }
         announce(&setup, &run);
         systemd::ready();
-        Ok(Running {
+        Ok(Self {
             setup,
             run,
             hub,
@@ -309,6 +252,29 @@ impl Daemon {
             recorder,
             listening,
         })
+    }
+
+    /// The address of the live page, if there is one.
+    pub fn http_address(&self) -> Option<SocketAddr> {
+        self.publishers.http
+    }
+
+    /// Serves until `shutdown` is ready. Then presses are aborted, and subscribers get their last
+    /// lines.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a task ends by itself, which is a fault of this program, or if the recording fails.
+    pub async fn run(
+        mut self,
+        shutdown: impl Future<Output = ()>,
+        reload: Option<Reload>,
+    ) -> Result<(), Error> {
+        // The log lasts until the end.
+        let (mut setups, log) = reload.map(Reload::start).unzip();
+        let ended = self.serve(shutdown, &mut setups, log.as_ref()).await;
+        let recorded = self.finish().await;
+        ended.and(recorded)
     }
 }
 
@@ -355,19 +321,15 @@ fn announce(setup: &Setup, run: &str) {
         run,
         model = short(setup),
         validation = setup.hrn.card().validation.as_str(),
-        scheduling = realtime::scheduling(),
         "started"
     );
     (0..setup.sensors.len()).for_each(|index| announce_sensor(setup, index));
 }
 
 fn announce_sensor(setup: &Setup, index: usize) {
-    let (sensor, checked) = (&setup.config.sensors[index], &setup.sensors[index]);
+    let sensor = &setup.config.sensors[index];
     let name = sensor.name.as_str();
     info!(sensor = name, port = %sensor.port, "sensor");
-    if let Some(excess) = Load::of(sensor, checked.layout()).excess {
-        warn!(sensor = name, %excess, "the line cannot carry frame_rate_hz");
-    }
     if setup.ignores_references_of(name) {
         warn!(
             sensor = name,

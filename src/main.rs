@@ -96,8 +96,10 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Simulate(args) => simulate::run(args, signals.received()).await,
         Command::Record(args) => {
             let mut end = pin!(signals.received());
-            let Some(setup) = load(args.config.path()?, None, end.as_mut()).await? else {
-                return Ok(());
+            let path = args.config.path()?;
+            let setup = tokio::select! {
+                setup = load(move || Setup::load(&path, None)) => setup?,
+                () = &mut end => return Ok(()),
             };
             // Lines of the log would come between the questions of a session.
             let level = if args.is_session() { "warn" } else { "info" };
@@ -137,13 +139,12 @@ type End<'a> = Pin<&'a mut dyn Future<Output = ()>>;
 /// fails.
 async fn attend(
     signals: Signals,
-    load: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
+    read: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
     command: impl AsyncFnOnce(Setup, End<'_>) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     let mut end = pin!(signals.end());
-    let loaded = spawn_thread("load", load)?;
     let setup = tokio::select! {
-        loaded = loaded => loaded.expect("a configuration is read without a panic")?,
+        setup = load(read) => setup?,
         signal = &mut end => return Err(Failure::interrupted(signal)),
     };
     let _log = Log::start(setup.config.log, "warn")?;
@@ -176,18 +177,15 @@ async fn finish_blocking(
     .await
 }
 
-/// Loads the configuration and its model. Returns `None` if `end` comes first. This runs on a
-/// thread of its own, because a file may be a pipe that sends nothing.
+/// Loads a configuration and its model on a thread of its own, because a file may be a pipe that sends
+/// nothing.
 async fn load(
-    path: PathBuf,
-    model: Option<PathBuf>,
-    end: impl Future<Output = ()>,
-) -> Result<Option<Setup>, Failure> {
-    let load = spawn_thread("load", move || Setup::load(&path, model.as_deref()))?;
-    tokio::select! {
-        loaded = load => Ok(Some(loaded.expect("a configuration is read without a panic")?)),
-        () = end => Ok(None),
-    }
+    read: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
+) -> Result<Setup, Failure> {
+    let loaded = spawn_thread("load", read)?;
+    Ok(loaded
+        .await
+        .expect("a configuration is read without a panic")?)
 }
 
 async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<(), Failure> {
@@ -195,11 +193,13 @@ async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<
     let mut shutdown = pin!(async {
         shutdown.await;
     });
-    let Some(setup) = load(path.clone(), model.clone(), shutdown.as_mut()).await? else {
-        return Ok(());
+    let named = (path.clone(), model.clone());
+    let setup = tokio::select! {
+        setup = load(move || Setup::load(&named.0, named.1.as_deref())) => setup?,
+        () = &mut shutdown => return Ok(()),
     };
     let log = Log::start(setup.config.log, "info")?;
-    let daemon = Daemon::bind(setup)?;
+    let daemon = Daemon::start(setup)?;
     let (request, requests) = mpsc::channel(1);
     tokio::spawn(async move {
         while hangup.recv().await.is_some() {

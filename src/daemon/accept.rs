@@ -11,6 +11,8 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::warn;
 
+use super::log;
+
 /// The pause after the system had no room for a connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -49,7 +51,6 @@ pub(crate) async fn accept<L: Listener>(
     mut stop: Stop,
 ) {
     let mut clients = JoinSet::new();
-    let mut refusing = false;
     loop {
         let accepted = tokio::select! {
             // Connections that have ended make room before the next one is accepted.
@@ -61,15 +62,11 @@ pub(crate) async fn accept<L: Listener>(
         match accepted {
             Ok(stream) if clients.len() >= most => service.refuse(stream),
             Ok(stream) => {
-                refusing = false;
                 clients.spawn(service.serve(stream));
             }
-            // The system is out of descriptors or memory. Try again later, and log this only once.
+            // The system is out of descriptors or memory. Try again later.
             Err(error) => {
-                if !refusing {
-                    warn!(%error, "connections cannot be accepted");
-                }
-                refusing = true;
+                log::limited("accept", || warn!(%error, "connections cannot be accepted"));
                 tokio::time::sleep(PAUSE).await;
             }
         }

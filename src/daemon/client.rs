@@ -9,25 +9,29 @@
 
 mod requests;
 
-use std::io::{self, ErrorKind, Read, Write};
-use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::io::{self, ErrorKind, Write};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream as StdStream;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{self, Poll, ready};
 
+use futures_util::StreamExt as _;
+use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
-use tokio::io::{AsyncRead, Interest, ReadBuf};
+use tokio::net::unix::pipe::Receiver;
 use tokio::net::{TcpStream, UnixStream};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio::task::coop::consume_budget;
 use tracing::debug;
 
-pub(super) use self::requests::{move_arm, set_context};
+#[cfg_attr(
+    not(feature = "ros2"),
+    allow(unused_imports, reason = "no library in this build receives positions")
+)]
+pub(super) use self::requests::{set_context, try_move_arm};
 use super::accept::Serve;
-use super::hub::{Closed, Hub, Line, Subscriber};
-use super::lines::{LineRead, Lines};
+use super::hub::{Hub, Line, Subscriber};
+use super::lines::{LineError, Lines, lines};
 use super::realtime;
 use super::request::{self, Request, Subscription};
 use super::sensor::Sensors;
@@ -100,17 +104,6 @@ impl<S: Stream> Serve<S> for Service {
     }
 }
 
-/// The reason a connection ended.
-#[derive(Debug, thiserror::Error)]
-enum End {
-    #[error(transparent)]
-    Closed(#[from] Closed),
-    #[error("{0}")]
-    Io(#[from] io::Error),
-    #[error("a line over {LONGEST_LINE_BYTES} bytes")]
-    TooLong,
-}
-
 /// What the reader has for the writer.
 enum Asked {
     /// A subscription, and the `id` of its request. The writer makes it, because its answer comes
@@ -121,10 +114,13 @@ enum Asked {
 }
 
 /// Serves a connection until it ends.
-async fn serve(stream: impl Stream, service: Service) -> Result<(), End> {
+async fn serve(stream: impl Stream, service: Service) -> io::Result<()> {
     let output = stream.into_socket()?;
-    let input = watched(output.try_clone()?, Interest::READABLE)?;
-    let joined = service.hub.join(Subscription::default()).await?;
+    // The socket is read like a pipe. So the runtime watches it for one direction alone: else each read of the
+    // client would wake the clients' thread.
+    let input = Receiver::from_owned_fd_unchecked(output.try_clone()?.into())?;
+    let joined = service.hub.join(Subscription::default()).await;
+    let joined = joined.map_err(io::Error::other)?;
     let (subscriber, now) = joined.expect("only a `since` can be refused");
     let (asked, inbox) = mpsc::channel(1);
     let writer = Writer {
@@ -134,12 +130,7 @@ async fn serve(stream: impl Stream, service: Service) -> Result<(), End> {
         inbox,
     };
     let written = service.writers.spawn(writer.run(now.greeting()));
-    let read = read(
-        Lines::new(Input(input), LONGEST_LINE_BYTES),
-        asked,
-        &service,
-    )
-    .await;
+    let read = read(lines(input, LONGEST_LINE_BYTES), asked, &service).await;
     // The writer ends soon after the reader.
     let written = written.await.map_err(io::Error::other)?;
     written.and(read)
@@ -147,10 +138,10 @@ async fn serve(stream: impl Stream, service: Service) -> Result<(), End> {
 
 /// Reads requests until the writer has ended, or the other end sends no more.
 async fn read(
-    mut lines: Lines<Input>,
+    mut lines: Lines<Receiver>,
     asked: mpsc::Sender<Asked>,
     service: &Service,
-) -> Result<(), End> {
+) -> io::Result<()> {
     loop {
         // The place is taken before the request is read: the writer waits for its answer, even
         // when the log is closed.
@@ -158,57 +149,42 @@ async fn read(
             return Ok(());
         };
         let line = tokio::select! {
-            line = lines.next() => line?,
+            line = lines.next() => line,
             () = asked.closed() => return Ok(()),
         };
         let line = match line {
-            LineRead::Line(line) => line,
-            LineRead::TooLong => {
+            Some(Ok(line)) => line,
+            Some(Err(LineError::Io(error))) => return Err(error),
+            Some(Err(LineError::MaxChunkLengthExceeded)) => {
                 let message =
                     format!("found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one");
                 place.send(Asked::Answer(vec![requests::end(Err(message), None)]));
-                return Err(End::TooLong);
+                return Ok(());
             }
             // The writer ends when it has sent the answers so far.
-            LineRead::End => return Ok(()),
+            None => return Ok(()),
         };
         let request::Line { id, request } = request::parse(&line);
         place.send(match request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
             // A command may take long, because it may wait for frames or for a file to be written.
-            Ok(request) => Asked::Answer(requests::answer(service, request, id).await?),
+            Ok(request) => Asked::Answer(
+                requests::answer(service, request, id)
+                    .await
+                    .map_err(io::Error::other)?,
+            ),
             Err(message) => Asked::Answer(vec![requests::end(Err(message), id)]),
         });
     }
 }
 
-/// A socket that the runtime watches for one direction alone.
+/// The socket, which the runtime watches until it can be written to.
 #[expect(
     deprecated,
-    reason = "the replacement is unsafe, because it trusts that the socket stays open: these do"
+    reason = "the replacement is unsafe, because it trusts that the socket stays open: this one does"
 )]
-fn watched<S: AsRawFd>(socket: S, interest: Interest) -> io::Result<AsyncFd<S>> {
-    AsyncFd::with_interest(socket, interest)
-}
-
-/// The reading half of a connection.
-struct Input(AsyncFd<StdStream>);
-
-impl AsyncRead for Input {
-    fn poll_read(
-        self: Pin<&mut Self>,
-        context: &mut task::Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        loop {
-            let mut ready = ready!(self.0.poll_read_ready(context))?;
-            let unfilled = buffer.initialize_unfilled();
-            let read = |socket: &AsyncFd<StdStream>| (&mut socket.get_ref()).read(unfilled);
-            if let Ok(read) = ready.try_io(read) {
-                return Poll::Ready(read.map(|read| buffer.advance(read)));
-            }
-        }
-    }
+fn watched(socket: &StdStream) -> io::Result<AsyncFd<BorrowedFd<'_>>> {
+    AsyncFd::with_interest(socket.as_fd(), Interest::WRITABLE)
 }
 
 /// The writing half of a connection.
@@ -223,7 +199,7 @@ struct Writer {
 impl Writer {
     /// Writes `lines`, then what the log and the reader have, until the log is closed or the reader
     /// has ended.
-    async fn run(mut self, lines: Vec<Arc<Line>>) -> Result<(), End> {
+    async fn run(mut self, lines: Vec<Arc<Line>>) -> io::Result<()> {
         self.write(&lines).await?;
         loop {
             tokio::select! {
@@ -248,7 +224,7 @@ impl Writer {
         Ok(())
     }
 
-    async fn answer(&mut self, asked: Asked) -> Result<(), End> {
+    async fn answer(&mut self, asked: Asked) -> io::Result<()> {
         match asked {
             Asked::Answer(lines) => self.write(&lines).await,
             Asked::Subscribe(subscription, id) => {
@@ -259,7 +235,7 @@ impl Writer {
         }
     }
 
-    async fn write(&mut self, lines: &[Arc<Line>]) -> Result<(), End> {
+    async fn write(&mut self, lines: &[Arc<Line>]) -> io::Result<()> {
         for line in lines {
             self.outgoing.extend_from_slice(line.json().as_bytes());
         }
@@ -270,11 +246,11 @@ impl Writer {
                 Err(error) if error.kind() == ErrorKind::WouldBlock => {
                     // The runtime watches the socket only now. If it always did, each read of the
                     // client would wake this thread.
-                    let waiting = watched(self.output.as_fd(), Interest::WRITABLE)?;
+                    let waiting = watched(&self.output)?;
                     let _writable = waiting.writable().await?;
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) => return Err(error.into()),
+                Err(error) => return Err(error),
             }
         }
         // A client that reads as fast as this thread writes must not keep it from others.

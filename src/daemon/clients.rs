@@ -14,8 +14,8 @@ use tokio::sync::oneshot;
 pub(crate) struct Clients {
     pub(super) runtime: Handle,
     /// Ends the thread when it is dropped.
-    ending: Option<oneshot::Sender<()>>,
-    thread: Option<thread::JoinHandle<()>>,
+    ending: oneshot::Sender<()>,
+    thread: thread::JoinHandle<()>,
 }
 
 impl Clients {
@@ -36,18 +36,15 @@ impl Clients {
             })?;
         Ok(Self {
             runtime: handle,
-            ending: Some(ending),
-            thread: Some(thread),
+            ending,
+            thread,
         })
     }
-}
 
-impl Drop for Clients {
-    fn drop(&mut self) {
-        drop(self.ending.take());
-        if let Some(thread) = self.thread.take() {
-            // A panic on that thread has been reported by itself.
-            let _ = thread.join();
-        }
+    /// Ends the thread, and waits for that.
+    pub(super) fn end(self) {
+        drop(self.ending);
+        // A panic on that thread has been reported by itself.
+        let _ = self.thread.join();
     }
 }

@@ -17,6 +17,7 @@ use std::env;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -24,7 +25,6 @@ use self::error::Problem;
 pub use self::error::{Error, Text};
 pub use self::publish::{Foxglove, Http, Listen, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
 use super::log;
-use hardnessd_core::exit::{Coded, USAGE};
 use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
@@ -76,8 +76,6 @@ settings! {
     pub struct Record {
         /// The directory of the recordings. [`Record::dir`] has the default.
         dir: Option<PathBuf>;
-        /// Whether everything is recorded. If `false`, only the last minute before a fault is recorded.
-        pub continuous: bool = true;
         /// When a file has this many million bytes, the next one begins.
         pub rotate_mb: u64 = 256, in from_to((1.0, MOST), "");
         /// When a file is this many seconds old, the next one begins.
@@ -205,35 +203,22 @@ pub struct Setup {
     identified: BTreeMap<String, Arc<Hrn>>,
 }
 
-/// A name on the command line is that of no configured sensor.
-#[derive(Debug, thiserror::Error)]
-#[error("--sensor: found {found:?}, expected one of {}", names.join(", "))]
-pub struct UnknownSensor {
-    found: String,
-    names: Vec<String>,
-}
-
-impl Coded for UnknownSensor {
-    fn exit_code(&self) -> u8 {
-        USAGE
-    }
-}
-
 impl Setup {
     /// The sensor of this name, or the first one without a name.
     ///
     /// # Errors
     ///
     /// Fails if no sensor has the name.
-    pub fn sensor_named(&self, name: Option<&str>) -> Result<&Sensor, UnknownSensor> {
+    pub fn sensor_named(&self, name: Option<&str>) -> anyhow::Result<&Sensor> {
         let Some(name) = name else {
             return Ok(&self.sensors[0]);
         };
         let mut sensors = self.sensors.iter();
         let named = sensors.find(|sensor| sensor.name() == name);
-        named.ok_or_else(|| UnknownSensor {
-            found: name.to_owned(),
-            names: self.sensors.iter().map(|s| s.name().to_owned()).collect(),
+        named.with_context(|| {
+            let names: Vec<&str> = self.sensors.iter().map(Sensor::name).collect();
+            let names = names.join(", ");
+            format!("--sensor: found {name:?}, expected one of {names}")
         })
     }
 

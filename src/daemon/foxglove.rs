@@ -54,7 +54,7 @@ pub(super) fn open(settings: &config::Foxglove, config: &Config) -> Result<Worke
     let sensors: Vec<String> = sensors.collect();
     Worker::start(
         "foxglove",
-        move |_| Foxglove::open(address, &robot, &sensors),
+        move || Foxglove::open(address, &robot, &sensors),
         Foxglove::work,
     )
 }

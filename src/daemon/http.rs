@@ -1,7 +1,7 @@
 //! The HTTP server: the live page, server-sent events, status, metrics and health.
 //!
-//! Every request passes the same checks: its Host header names this machine by an address, its
-//! target is short, and its method only reads. No route waits for a slow reader, and the number of
+//! Every request passes the same checks: its Host header names this machine by an address, and its method
+//! only reads. No route waits for a slow reader, and the number of
 //! connections is bounded. No route changes anything, but for the context of a sensor, where the
 //! configuration allows it. `/events` subscribes to the hub as any
 //! subscriber does.
@@ -28,7 +28,7 @@ use hyper::body::Incoming;
 use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
-use hyper::{Method, Request, StatusCode};
+use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use sha2::{Digest, Sha256};
@@ -50,9 +50,6 @@ const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 
 /// The most bytes that wait in a connection, in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
-
-/// The path at which the page sets a context.
-const CONTEXT: &str = "/api/context";
 
 /// The longest body of a request: a context has less than 1 KiB.
 const BODY_BYTES: usize = 2048;
@@ -81,8 +78,6 @@ pub(crate) struct Http {
     /// The address that the server listens on.
     listen: SocketAddr,
     routes: TowerToHyperService<Router>,
-    /// Whether the page may set a context.
-    sets_context: bool,
     stop: Stop,
 }
 
@@ -111,12 +106,15 @@ impl Http {
             });
         if let Some(sensors) = sensors {
             let set = post(async move |headers, body| context(&sensors, headers, body).await);
-            routes = routes.route(CONTEXT, set.layer(DefaultBodyLimit::max(BODY_BYTES)));
+            routes = routes.route("/api/context", set.layer(DefaultBodyLimit::max(BODY_BYTES)));
         }
+        let routes = routes.method_not_allowed_fallback(async || {
+            let message = "method not allowed: this server is read-only: use GET or HEAD";
+            refusal(StatusCode::METHOD_NOT_ALLOWED, message)
+        });
         Self {
             listen,
             routes: TowerToHyperService::new(routes.with_state(hub)),
-            sets_context,
             stop,
         }
     }
@@ -127,10 +125,6 @@ impl Http {
             let message = "the Host header is not an address of this machine: use localhost or \
                            the address in [http] listen";
             refusal(StatusCode::MISDIRECTED_REQUEST, message)
-        } else if !self.allows(&request) {
-            let message = "method not allowed: this server is read-only: use GET or HEAD";
-            let allow = [(header::ALLOW, "GET, HEAD")];
-            (allow, refusal(StatusCode::METHOD_NOT_ALLOWED, message)).into_response()
         } else {
             let Ok(response) = self.routes.call(request).await;
             response
@@ -143,15 +137,6 @@ impl Http {
             .entry(header::CONTENT_SECURITY_POLICY)
             .or_insert(HeaderValue::from_static(POLICY));
         response
-    }
-
-    fn allows(&self, request: &Request<Incoming>) -> bool {
-        let is_context = self.sets_context && request.uri().path() == CONTEXT;
-        match *request.method() {
-            Method::GET | Method::HEAD => true,
-            Method::POST => is_context,
-            _ => false,
-        }
     }
 }
 

@@ -11,7 +11,6 @@
 mod cursor;
 mod history;
 mod log;
-pub(super) mod quota;
 mod subscriber;
 mod tally;
 

@@ -6,11 +6,13 @@
 //! Nothing here is written to stdout, which is for events.
 
 mod lines;
+mod quota;
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
-use std::sync::{LazyLock, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -24,10 +26,11 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Registry, reload};
 
 use self::lines::Lines;
+use self::quota::LineQuota;
 use super::Error;
-use super::hub::quota::LineQuota;
 use hardnessd_core::event::{Event, LinkState, Phase, PressState, Tared, name, round_3};
 use hardnessd_core::judge::Unjudged;
+use hardnessd_core::motion::StepBack;
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::wording;
@@ -196,21 +199,15 @@ fn level_of(event: &Event) -> Level {
     if is_wrong { Level::WARN } else { Level::INFO }
 }
 
-/// Whether the line of an event is only for the level `debug`.
-pub(crate) fn is_routine(event: &Event) -> bool {
-    level_of(event) == Level::DEBUG
-}
-
-/// Logs that lines of a sensor were left out, or of another sender.
-pub(crate) fn left_out(sensor: &str, lines: u64) {
-    warn!(
-        sensor,
-        lines, "left out of the log: too many lines of this sensor"
-    );
-}
-
-/// Writes one line for a numbered event.
+/// Writes one line for a numbered event. Lines that are only for the level `debug` have no limit.
 pub(crate) fn event(event: &Event) {
+    match level_of(event) {
+        Level::DEBUG => line_of(event),
+        _ => limited(event.sensor(), || line_of(event)),
+    }
+}
+
+fn line_of(event: &Event) {
     match event {
         Event::Status(status) => line!(
             level_of(event),
@@ -258,7 +255,7 @@ pub(crate) fn event(event: &Event) {
 
 /// Logs the outcome of a tare that a client requested.
 pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
-    match outcome {
+    limited(sensor, || match outcome {
         Ok(Tared { old, new, .. }) => info!(
             sensor,
             old_mean_counts = old.mean_counts,
@@ -270,46 +267,69 @@ pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
             "tare"
         ),
         Err(refusal) => warn!(sensor, reason = %refusal, "tare refused"),
-    }
+    });
 }
 
 /// Logs that the model failed on a press.
 pub(crate) fn unjudged(unjudged: &Unjudged) {
-    error!(
-        sensor = unjudged.sensor.as_str(),
-        press = unjudged.press,
-        phase = name(&unjudged.phase),
-        reason = %unjudged.error,
-        "no verdict"
-    );
+    limited(&unjudged.sensor, || {
+        error!(
+            sensor = unjudged.sensor.as_str(),
+            press = unjudged.press,
+            phase = name(&unjudged.phase),
+            reason = %unjudged.error,
+            "no verdict"
+        );
+    });
 }
 
-/// Writes a line that somebody outside can cause again and again, unless there were too many of these.
-pub(crate) fn outside(way: &str, line: impl FnOnce()) {
-    static LINES: LazyLock<Mutex<LineQuota>> = LazyLock::new(Mutex::default);
-    let mut lines = LINES.lock().unwrap_or_else(PoisonError::into_inner);
-    lines.write(way, super::now().mono, false, line);
+/// Writes a line about a sensor, or one that somebody outside can cause again and again, unless there were too
+/// many of this cause.
+pub(crate) fn limited(cause: &str, line: impl FnOnce()) {
+    static QUOTAS: Mutex<BTreeMap<String, LineQuota>> = Mutex::new(BTreeMap::new());
+    let now = super::now().mono;
+    // Nobody has to wait until the line is written.
+    let allowed = {
+        let mut quotas = QUOTAS.lock().unwrap_or_else(PoisonError::into_inner);
+        quotas.entry(cause.to_owned()).or_default().allows(now)
+    };
+    let Some(left_out) = allowed else { return };
+    if left_out > 0 {
+        warn!(
+            sensor = cause,
+            lines = left_out,
+            "left out of the log: too many lines of this sensor"
+        );
+    }
+    line();
+}
+
+/// Logs that positions of an arm step back in time.
+pub(crate) fn motion_refused(sensor: &str, reason: StepBack) {
+    limited(sensor, || warn!(sensor, %reason, "positions refused"));
 }
 
 /// Logs that datagrams of `other` are ignored, because `sender` sends.
 pub(crate) fn other_sender(sender: SocketAddr, other: SocketAddr) {
-    outside("udp", || {
+    limited("udp", || {
         warn!(%sender, %other, "ignored: another sender sends for this sensor, and one at a time may");
     });
 }
 
 /// Logs that the other end of a port is a telnet server, which changes some bytes.
 pub(crate) fn telnet(port: &Port) {
-    outside("tcp", || warn!(%port, "{}", hardnessd_core::wire::TELNET));
+    limited("tcp", || warn!(%port, "{}", hardnessd_core::wire::TELNET));
 }
 
 /// Logs the context that a controller reports of its work.
 pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
-    info!(
-        sensor,
-        context = context.map(|context| wording::escaped(&context.to_string())),
-        "context"
-    );
+    limited(sensor, || {
+        info!(
+            sensor,
+            context = context.map(|context| wording::escaped(&context.to_string())),
+            "context"
+        );
+    });
 }
 
 #[cfg(test)]
@@ -319,30 +339,16 @@ mod tests {
     #[test]
     fn rust_log_chooses_by_target_and_says_what_it_does_not_understand() {
         for (asked, ours, theirs) in [
-            (" , ", Some(Level::INFO), Some(Level::WARN)),
-            (
-                "hardnessd=debug,info",
-                Some(Level::DEBUG),
-                Some(Level::INFO),
-            ),
-            (" WARN, hardnessd=3,", Some(Level::INFO), Some(Level::WARN)),
-            ("off", None, None),
+            (" , ", Level::INFO, Level::WARN),
+            ("hardnessd=debug,info", Level::DEBUG, Level::INFO),
+            (" WARN, hardnessd=3,", Level::INFO, Level::WARN),
         ] {
             let filter = filter(asked, "info").unwrap();
-            let most = |target| {
-                let levels = [
-                    Level::TRACE,
-                    Level::DEBUG,
-                    Level::INFO,
-                    Level::WARN,
-                    Level::ERROR,
-                ];
-                levels
-                    .into_iter()
-                    .find(|level| filter.would_enable(target, level))
-            };
-            assert_eq!(most(module_path!()), ours, "{asked:?}");
-            assert_eq!(most("zenoh::net"), theirs, "{asked:?}");
+            for (target, most) in [(module_path!(), ours), ("zenoh::net", theirs)] {
+                let passes = |level| filter.would_enable(target, &level);
+                assert!(passes(most), "{asked:?}");
+                assert!(!passes(Level::TRACE) && (most == Level::DEBUG || !passes(Level::DEBUG)));
+            }
         }
         for asked in ["info,hardnessd=loud", "hardnessd=debug=info"] {
             let message = filter(asked, "info").unwrap_err().to_string();

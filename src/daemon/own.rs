@@ -4,19 +4,18 @@
 //! service, one for each sensor, each whole or not there; and at the next start what they hold, if the
 //! owner is still the same. One thread writes, so no sensor waits for a disk.
 
-use std::collections::BTreeMap;
 use std::env;
 use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::time::{Duration, Instant};
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 use tracing::{debug, warn};
 
 use super::config::directory_of_service;
+use super::log;
 use super::port::is_simulated;
 use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::judge::{OwnPresses, owner};
@@ -25,8 +24,6 @@ use hardnessd_core::pipeline::Pipeline;
 
 /// The largest file that is read. Ours have a tenth of it.
 const MOST_BYTES: u64 = 1 << 20;
-/// The time from a press to the write. What changes meanwhile is written too.
-const PAUSE: Duration = Duration::from_secs(1);
 
 /// What a file holds.
 #[derive(Debug, Serialize, Deserialize)]
@@ -132,29 +129,19 @@ fn read(path: &Path) -> anyhow::Result<Option<Kept>> {
     Ok(Some(serde_json::from_slice(&fs::read(path)?)?))
 }
 
-/// Writes what comes, until all senders are gone. Of several changes of a sensor the last one counts.
+/// Writes what comes, until all senders are gone.
 fn write_all(directory: &Path, changed: &Receiver<(String, Kept)>) {
-    let mut is_failing = false;
-    while let Ok(first) = changed.recv() {
-        let mut all = BTreeMap::from([first]);
-        let until = Instant::now() + PAUSE;
-        // The end of the daemon ends the wait.
-        while let Ok((sensor, kept)) =
-            changed.recv_timeout(until.saturating_duration_since(Instant::now()))
-        {
-            all.insert(sensor, kept);
-        }
-        for (sensor, kept) in all {
-            let path = file_of(directory, &sensor);
-            let written = fs::create_dir_all(directory).and_then(|()| {
-                let text = serde_json::to_vec(&kept)?;
-                Part::over(&path)?.write(&text)
+    for (sensor, kept) in changed {
+        let path = file_of(directory, &sensor);
+        let written = fs::create_dir_all(directory).and_then(|()| {
+            let text = serde_json::to_vec(&kept)?;
+            Part::over(&path)?.write(&text)
+        });
+        if let Err(error) = written {
+            let path = path.display();
+            log::limited("own presses", || {
+                warn!(%path, %error, "own presses are not written");
             });
-            // A full disk is one line, and not one for each press.
-            if let (Err(error), false) = (&written, is_failing) {
-                warn!(path = %path.display(), %error, "own presses are not written");
-            }
-            is_failing = written.is_err();
         }
     }
 }
@@ -162,6 +149,7 @@ fn write_all(directory: &Path, changed: &Receiver<(String, Kept)>) {
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
+    use std::time::Duration;
 
     use super::*;
     use hardnessd_core::frame::Stamp;

@@ -9,26 +9,22 @@ mod file;
 mod worker;
 
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
-use rustix::fs::{Access, AtFlags, CWD};
-use rustix::io::Errno;
 use tokio::sync::{oneshot, watch};
 use tracing::info;
 
 use self::worker::Worker;
 use super::{Error, config};
-use hardnessd_core::event::{Event, Kind};
+use hardnessd_core::event::Event;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Input, Pipeline};
 use hardnessd_core::recording::{About, Entry, Labels, State};
 
-/// The most entries and events that wait: about 4 s of a sensor at 100 frames/s.
-const QUEUED: usize = 8192;
 /// The most bytes of memory that wait.
 const QUEUED_BYTES: usize = 32 << 20;
 /// How often a sensor's state is noted while it is at rest. It is also noted after each press, so a
@@ -37,12 +33,6 @@ const STATE_EVERY: Duration = Duration::from_secs(5);
 /// A state is also noted after this many bytes of entries, so that a flood of entries cannot make
 /// the black box much larger than its bound.
 const STATE_EVERY_BYTES: usize = 4 << 20;
-/// How often the damage is looked at.
-const DAMAGE_EVERY: Duration = Duration::from_secs(10);
-/// A sensor has a fault if at least [`DAMAGED_FRAMES`] frames, and more than [`DAMAGED_SHARE`] of
-/// all its frames, were damaged since the last look.
-const DAMAGED_FRAMES: u64 = 5;
-const DAMAGED_SHARE: f64 = 0.1;
 
 /// The target of a recording.
 #[derive(Debug)]
@@ -76,32 +66,6 @@ pub struct Progress {
     pub said: Option<u8>,
 }
 
-/// So many black boxes of faults are kept, with so many megabytes. A sender that comes and goes would
-/// fill the disk.
-const MOST_BLACKBOXES: usize = 200;
-const MOST_BLACKBOX_MB: u64 = 1000;
-
-/// Checks that this process may write to the directory of the recordings, or make it. A daemon runs on
-/// without it.
-pub(crate) fn check(settings: &config::Record) -> Result<(), Error> {
-    let directory = settings.dir();
-    // Missing directories will be made, so check the nearest path that exists.
-    let there = directory.ancestors().find(|place| place.exists());
-    let there = there.unwrap_or(Path::new("."));
-    let found = if there.is_dir() {
-        let may = Access::WRITE_OK | Access::EXEC_OK;
-        rustix::fs::accessat(CWD, there, may, AtFlags::EACCESS).map_err(std::io::Error::from)
-    } else {
-        Err(Errno::NOTDIR.into())
-    };
-    found.map_err(|error| {
-        let there = there.display();
-        Error::Io(format!(
-            "record.dir: cannot write to {there}: {error}: set a directory that can be written to"
-        ))
-    })
-}
-
 /// A job for the thread.
 #[derive(Debug)]
 enum Job {
@@ -111,10 +75,6 @@ enum Job {
         entry: Entry,
     },
     Event(Box<Event>),
-    /// Many frames of a sensor were damaged.
-    Damage {
-        sensor: usize,
-    },
     /// A client requests the last minute of a sensor as a file.
     Blackbox {
         sensor: usize,
@@ -131,7 +91,7 @@ impl Job {
                 Event::Frame(frame) => size_of::<Event>() + size_of_val(&*frame.newtons),
                 _ => EVENT_BYTES,
             },
-            Self::Damage { .. } | Self::Blackbox { .. } => 0,
+            Self::Blackbox { .. } => 0,
         };
         size_of::<Self>() + beside
     }
@@ -143,7 +103,7 @@ const EVENT_BYTES: usize = 4 << 10;
 /// The queue to the thread.
 #[derive(Debug, Clone)]
 struct Jobs {
-    sender: SyncSender<Job>,
+    sender: Sender<Job>,
     load: Arc<Load>,
 }
 
@@ -161,22 +121,14 @@ impl Jobs {
     fn send(&self, job: Job) -> bool {
         let bytes = job.weight();
         let queued = self.load.bytes.fetch_add(bytes, Ordering::Relaxed);
-        let sent = match queued.saturating_add(bytes) <= QUEUED_BYTES {
-            true => self.sender.try_send(job),
-            false => Err(TrySendError::Full(job)),
-        };
-        if sent.is_err() {
+        if queued.saturating_add(bytes) > QUEUED_BYTES {
             self.load.bytes.fetch_sub(bytes, Ordering::Relaxed);
+            self.load.dropped.fetch_add(1, Ordering::Relaxed);
+            return false;
         }
-        match sent {
-            Ok(()) => true,
-            // The recording has ended, which is reported elsewhere.
-            Err(TrySendError::Disconnected(_)) => true,
-            Err(TrySendError::Full(_)) => {
-                self.load.dropped.fetch_add(1, Ordering::Relaxed);
-                false
-            }
-        }
+        // The recording may have ended, which is reported elsewhere.
+        let _ = self.sender.send(job);
+        true
     }
 }
 
@@ -185,7 +137,6 @@ impl Jobs {
 pub(crate) struct Recorder {
     jobs: Jobs,
     labels: Labels,
-    frames: bool,
     /// Ready when there is no more to record.
     stop: oneshot::Receiver<()>,
     ended: oneshot::Receiver<Result<(), Error>>,
@@ -194,15 +145,11 @@ pub(crate) struct Recorder {
 impl Recorder {
     /// Starts the thread.
     pub(crate) fn start(target: Target, mut about: About) -> Result<Self, Error> {
-        let frames = match &target {
-            Target::File { labels, .. } => {
-                about.labels.extend(labels.clone());
-                true
-            }
-            Target::Directory(settings) => settings.continuous,
-        };
+        if let Target::File { labels, .. } = &target {
+            about.labels.extend(labels.clone());
+        }
         let labels = about.labels.clone();
-        let (sender, inbox) = sync_channel(QUEUED);
+        let (sender, inbox) = channel();
         let load = Arc::new(Load::default());
         let (stopping, stop) = oneshot::channel();
         let worker = Worker::new(target, about, load.clone(), stopping);
@@ -217,7 +164,6 @@ impl Recorder {
         Ok(Self {
             jobs: Jobs { sender, load },
             labels,
-            frames,
             stop,
             ended,
         })
@@ -233,15 +179,13 @@ impl Recorder {
             was_busy: false,
             bytes: 0,
             left_out: 0,
-            looked: None,
-            counted: (0, 0),
         };
         SensorRecorder(Some(Box::new(active)))
     }
 
     /// The recorder for the hub.
     pub(crate) fn of_hub(&self) -> EventRecorder {
-        EventRecorder(Some((self.jobs.clone(), self.frames)))
+        EventRecorder(Some(self.jobs.clone()))
     }
 
     /// Waits until there is no more to record, or the thread has ended.
@@ -277,10 +221,6 @@ struct Active {
     bytes: usize,
     /// The number of entries that came before the sensor was at rest.
     left_out: u64,
-    /// When the damage was looked at last.
-    looked: Option<Duration>,
-    /// The numbers of whole and of damaged frames up to then.
-    counted: (u64, u64),
 }
 
 impl SensorRecorder {
@@ -319,7 +259,6 @@ impl Active {
     /// Sends `entry`, after a state if one is due. Before the first state, entries are left out: a
     /// replay could not use them.
     fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
-        self.look_for_damage(pipeline, at);
         self.begin(pipeline, at);
         if self.noted.is_none() {
             self.left_out += 1;
@@ -353,21 +292,6 @@ impl Active {
         self.queue(at, Entry::State(Box::new(state)));
     }
 
-    fn look_for_damage(&mut self, pipeline: &Pipeline, at: Stamp) {
-        let looked = *self.looked.get_or_insert(at.mono);
-        if at.mono.saturating_sub(looked) < DAMAGE_EVERY {
-            return;
-        }
-        let counts = pipeline.frame_counts();
-        let (whole, damaged) = (counts.0 - self.counted.0, counts.1 - self.counted.1);
-        let share = damaged as f64 / (whole + damaged).max(1) as f64;
-        if damaged >= DAMAGED_FRAMES && share > DAMAGED_SHARE {
-            let sensor = self.index;
-            self.jobs.send(Job::Damage { sensor });
-        }
-        (self.looked, self.counted) = (Some(at.mono), counts);
-    }
-
     fn queue(&mut self, at: Stamp, entry: Entry) {
         let sensor = self.index;
         if !self.jobs.send(Job::Entry { sensor, at, entry }) {
@@ -378,14 +302,12 @@ impl Active {
 
 /// Records events. Without a recorder, it does nothing.
 #[derive(Debug, Default)]
-pub(crate) struct EventRecorder(Option<(Jobs, bool)>);
+pub(crate) struct EventRecorder(Option<Jobs>);
 
 impl EventRecorder {
     /// Records an event that is being published.
     pub(crate) fn event(&self, event: &Event) {
-        if let Some((jobs, frames)) = &self.0
-            && (*frames || event.kind() != Kind::Frame)
-        {
+        if let Some(jobs) = &self.0 {
             jobs.send(Job::Event(Box::new(event.clone())));
         }
     }

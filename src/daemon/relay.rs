@@ -26,27 +26,15 @@ use hardnessd_core::event::Kind;
 /// The most batches of lines that wait for the thread.
 const BATCHES: usize = 8;
 
-/// The most messages with positions that wait for the sensors' tasks.
-const POSITIONS: usize = 256;
-
-/// The queue for the positions of the arm that a thread receives from the robot.
-#[derive(Clone)]
-#[allow(dead_code, reason = "Foxglove says nothing of an arm")]
-pub(super) struct PositionQueue {
-    way: &'static str,
-    positions: mpsc::Sender<Positions>,
-}
-
-impl PositionQueue {
-    /// Passes positions on, without waiting.
-    #[allow(dead_code, reason = "Foxglove says nothing of an arm")]
-    pub(super) fn put(&self, positions: Positions) {
-        if self.positions.try_send(positions).is_err() {
-            let way = self.way;
-            log::outside(way, || {
-                warn!(way, "positions come too fast and are dropped");
-            });
-        }
+/// Passes positions of the arm on that came by `way`, without waiting.
+#[cfg_attr(
+    not(feature = "ros2"),
+    allow(dead_code, reason = "only ROS 2 passes them on")
+)]
+pub(super) fn pass_on(way: &'static str, sensors: &Sensors, positions: &Positions) {
+    if let Err(refused) = client::try_move_arm(sensors, positions) {
+        let sensor = positions.sensor.as_str();
+        log::limited(way, || warn!(way, sensor, %refused, "positions refused"));
     }
 }
 
@@ -54,8 +42,6 @@ impl PositionQueue {
 pub(super) struct Worker {
     lines: mpsc::Sender<Vec<Arc<Line>>>,
     ended: oneshot::Receiver<()>,
-    way: &'static str,
-    positions: mpsc::Receiver<Positions>,
 }
 
 impl Worker {
@@ -64,20 +50,14 @@ impl Worker {
     /// may have its own runtime.
     pub(super) fn start<O>(
         way: &'static str,
-        open: impl FnOnce(PositionQueue) -> Result<O, Error> + Send + 'static,
+        open: impl FnOnce() -> Result<O, Error> + Send + 'static,
         work: impl FnOnce(O, mpsc::Receiver<Vec<Arc<Line>>>) + Send + 'static,
     ) -> Result<Self, Error> {
         let (lines, inbox) = mpsc::channel(BATCHES);
         let (end, ended) = oneshot::channel();
         let (opened, outcome) = std::sync::mpsc::channel();
-        let (sender, positions) = mpsc::channel(POSITIONS);
-        let queue = PositionQueue {
-            way,
-            positions: sender,
-        };
-        let thread = thread::Builder::new().name(way.to_owned());
-        let started = thread.spawn(move || {
-            match open(queue) {
+        let started = thread::Builder::new().name(way.to_owned()).spawn(move || {
+            match open() {
                 Ok(open) => {
                     let _ = opened.send(Ok(()));
                     work(open, inbox);
@@ -92,22 +72,11 @@ impl Worker {
         outcome
             .recv()
             .expect("a thread that panics ends the process")?;
-        Ok(Self {
-            lines,
-            ended,
-            way,
-            positions,
-        })
+        Ok(Self { lines, ended })
     }
 
     /// Passes on what the hub publishes, until the log is closed and the thread has ended.
-    pub(super) async fn serve(self, hub: Hub, sensors: Sensors) {
-        let Self {
-            lines,
-            ended,
-            way,
-            positions,
-        } = self;
+    pub(super) async fn serve(self, hub: Hub) {
         let wanted = Subscription {
             kinds: BTreeSet::from(Kind::ALL),
             policy: Policy::LatestFrames,
@@ -116,21 +85,11 @@ impl Worker {
         if let Ok(joined) = hub.join(wanted).await {
             let (subscriber, now) = joined.expect("only a `since` can be refused");
             // The thread may have ended already.
-            let _ = lines.send(now.statuses().collect()).await;
-            subscriber.feed(lines);
+            let _ = self.lines.send(now.statuses().collect()).await;
+            subscriber.feed(self.lines);
         }
-        pass_on(way, positions, &sensors).await;
         // The wait always ends with an error, because the thread sends nothing and only drops its
         // end.
-        let _ = ended.await;
-    }
-}
-
-/// Gives positions to the sensors' tasks, until the thread has ended.
-async fn pass_on(way: &'static str, mut positions: mpsc::Receiver<Positions>, sensors: &Sensors) {
-    while let Some(Positions { sensor, points }) = positions.recv().await {
-        if let Err(refused) = client::move_arm(sensors, &sensor, &points).await {
-            log::outside(way, || warn!(way, sensor, %refused, "positions refused"));
-        }
+        let _ = self.ended.await;
     }
 }

@@ -1,6 +1,6 @@
 //! Reads the configuration again while the daemon runs (SIGHUP).
 //!
-//! In: the path of the file, and the current setup. Out: the new setup, or the reason why nothing
+//! In: the path of the file, and requests. Out: for each request the new setup, or the reason why nothing
 //! changes. A thread of its own reads the file and the model, and is abandoned after [`PATIENCE`]: a pipe
 //! may have no writer and a file system may hang, and a thread that reads from them cannot be ended.
 
@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 
 use super::config::Setup;
 use super::log::Log;
+use super::systemd;
 use crate::thread::spawn_thread;
 
 /// How long reading the files of a configuration may take. The built-in model takes well under a
@@ -32,8 +33,29 @@ pub struct Reload {
 /// The reason a reload was refused, in words: nobody tells reasons apart.
 pub(super) type Refusal = String;
 
+impl Reload {
+    /// Reads the configuration at each request, in a task of its own. Returns what was read, and the log.
+    pub(super) fn start(self) -> (mpsc::Receiver<Result<Setup, Refusal>>, Log) {
+        let Self {
+            mut requests,
+            path,
+            model,
+            log,
+        } = self;
+        let (sender, setups) = mpsc::channel(1);
+        tokio::spawn(async move {
+            while requests.recv().await.is_some() {
+                systemd::reloading();
+                // The daemon may have ended.
+                let _ = sender.send(read(path.clone(), model.clone()).await).await;
+            }
+        });
+        (setups, log)
+    }
+}
+
 /// Reads the configuration at `path` and its model, or `model` in its place.
-pub(super) async fn read((path, model): (PathBuf, Option<PathBuf>)) -> Result<Setup, Refusal> {
+async fn read(path: PathBuf, model: Option<PathBuf>) -> Result<Setup, Refusal> {
     let shown = path.display().to_string();
     let reading = spawn_thread("reload", move || Setup::load(&path, model.as_deref()));
     let reading = reading.map_err(|error| format!("{shown}: {error}"))?;
@@ -46,28 +68,4 @@ pub(super) async fn read((path, model): (PathBuf, Option<PathBuf>)) -> Result<Se
             PATIENCE.as_secs()
         )),
     }
-}
-
-/// Waits for the next request to reload, and returns the path to read, and that of the model in the
-/// place of the configuration's own. If no request can come, this waits forever.
-pub(super) async fn requested(reload: &mut Option<Reload>) -> (PathBuf, Option<PathBuf>) {
-    if let Some(reload) = reload
-        && reload.requests.recv().await.is_some()
-    {
-        return (reload.path.clone(), reload.model.clone());
-    }
-    std::future::pending().await
-}
-
-/// Returns `changed` if all of it can change while the daemon runs, and writes the log as it says.
-pub(super) fn change(setup: &Setup, changed: Setup, log: Option<&Log>) -> Result<Setup, Refusal> {
-    if let Some(key) = setup.config.fixed_difference(&changed.config) {
-        return Err(format!(
-            "{key} has changed, which a running daemon cannot take over: restart it"
-        ));
-    }
-    if let Some(log) = log {
-        log.change(changed.config.log);
-    }
-    Ok(changed)
 }

@@ -1,86 +1,70 @@
 //! The running daemon: its main loop, reloads, and its end.
 
 use std::collections::BTreeMap;
-use std::pin::{Pin, pin};
+use std::pin::pin;
 use std::time::Duration;
 
-use tokio::sync::watch;
-use tokio::task::JoinSet;
+use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tracing::{error, info, warn};
 
-use super::clients::Clients;
 use super::config::Setup;
-use super::hub::Hub;
-use super::own::Store;
+use super::log::Log;
 use super::record::Recorder;
-use super::reload::{self, Refusal, Reload};
-use super::sensor::{Command, SensorCore, Sensors};
-use super::serial::Sources;
-use super::{Error, announce_sensor, hello, now, short, start_sensor, systemd};
+use super::reload::Refusal;
+use super::sensor::{Command, SensorCore};
+use super::serial;
+use super::{Daemon, Error, announce_sensor, hello, now, short, start_sensor, systemd};
 use crate::maybe;
 
 /// How long subscribers may take to fetch their last lines. This is short, because the daemon must
 /// end within 1 s.
 const FAREWELL: Duration = Duration::from_millis(300);
 
-/// A running daemon.
-pub(super) struct Running {
-    pub(super) setup: Setup,
-    /// The token of this run.
-    pub(super) run: String,
-    pub(super) hub: Hub,
-    pub(super) sensors: Sensors,
-    /// The tasks of the sensors.
-    pub(super) tasks: JoinSet<SensorCore>,
-    /// The tasks of the publishers.
-    pub(super) publishers: JoinSet<()>,
-    /// The thread of those tasks.
-    pub(super) clients: Clients,
-    pub(super) store: Store,
-    pub(super) recorder: Option<Recorder>,
-    /// The listeners stop when this is dropped.
-    pub(super) listening: watch::Sender<()>,
-}
-
-/// A configuration that is being read.
-type Loading = Pin<Box<dyn Future<Output = Result<Setup, Refusal>>>>;
-
-impl Running {
+impl Daemon {
     /// Serves until `shutdown` is ready, there is no more to record, or a task has ended by itself.
     pub(super) async fn serve(
         &mut self,
         shutdown: impl Future<Output = ()>,
-        reload: &mut Option<Reload>,
+        setups: &mut Option<mpsc::Receiver<Result<Setup, Refusal>>>,
+        log: Option<&Log>,
     ) -> Result<(), Error> {
         let mut heartbeat = tokio::time::interval(systemd::heartbeat());
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut loading: Option<Loading> = None;
         let mut shutdown = pin!(shutdown);
         loop {
             tokio::select! {
                 () = &mut shutdown => return Ok(()),
                 Some(_) = self.tasks.join_next() => return Err(Error::Stopped("a sensor")),
-                Some(_) = self.publishers.join_next() => return Err(Error::Stopped("a listener")),
+                Some(_) = self.publishers.tasks.join_next() => return Err(Error::Stopped("a listener")),
                 () = maybe::wait(self.recorder.as_mut().map(Recorder::stopped)) => return Ok(()),
                 _ = heartbeat.tick() => {
                     // This is the sensors' thread, so it works.
                     systemd::alive(self.hub.log().live());
                 }
-                path = reload::requested(reload), if loading.is_none() => {
-                    systemd::reloading();
-                    loading = Some(Box::pin(reload::read(path)));
-                }
-                loaded = maybe::wait(loading.as_mut()) => {
-                    loading = None;
-                    let log = reload.as_ref().map(|reload| &reload.log);
-                    match loaded.and_then(|changed| reload::change(&self.setup, changed, log)) {
-                        Ok(changed) => self.adopt(changed).await?,
+                Some(read) = maybe::wait(setups.as_mut().map(mpsc::Receiver::recv)) => {
+                    match read.and_then(|changed| self.may_adopt(changed)) {
+                        Ok(changed) => {
+                            if let Some(log) = log {
+                                log.change(changed.config.log);
+                            }
+                            self.adopt(changed).await?;
+                        }
                         Err(reason) => error!(%reason, "reload refused, all stays as it was"),
                     }
                     systemd::ready();
                 }
             }
+        }
+    }
+
+    /// Returns `changed` if all of it can change while the daemon runs.
+    fn may_adopt(&self, changed: Setup) -> Result<Setup, Refusal> {
+        match self.setup.config.fixed_difference(&changed.config) {
+            Some(key) => Err(format!(
+                "{key} has changed, which a running daemon cannot take over: restart it"
+            )),
+            None => Ok(changed),
         }
     }
 
@@ -98,7 +82,11 @@ impl Running {
         self.hub
             .log()
             .describe(hello(&self.setup, self.run.clone()));
-        let mut sources = Sources::default();
+        let all = self.setup.sensors.iter();
+        let anew: Vec<_> = all
+            .filter(|sensor| stopped.contains_key(sensor.name()))
+            .collect();
+        let mut sources = serial::start(&anew).into_iter();
         for (index, sensor) in self.setup.sensors.iter().enumerate() {
             let hrn = self.setup.hrn_of(sensor.name()).clone();
             let Some(mut core) = stopped.remove(sensor.name()) else {
@@ -110,7 +98,7 @@ impl Running {
             announce_sensor(&self.setup, index);
             core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
             core.recorder.begin_anew(&core.pipeline, now());
-            let source = sources.take(&self.setup.sensors, index);
+            let source = sources.next().expect("each that starts has one");
             start_sensor(core, source, (&self.hub, &self.store), &mut self.tasks);
         }
         info!(model = short(&self.setup), "reloaded");
@@ -147,11 +135,11 @@ impl Running {
         while self.tasks.join_next().await.is_some() {}
         self.hub.log().close();
         drop(self.listening);
-        let farewell = async { while self.publishers.join_next().await.is_some() {} };
+        let farewell = async { while self.publishers.tasks.join_next().await.is_some() {} };
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
-        drop(self.clients);
+        self.clients.end();
         match self.recorder {
             // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,

@@ -82,7 +82,7 @@ pub(crate) type Sensors = Arc<[SensorHandle]>;
 /// Serves one sensor until [`Command::Finish`]. Returns what is left of it.
 pub(crate) async fn serve(
     core: SensorCore,
-    mut link: Source,
+    mut source: Source,
     hub: Hub,
     store: Store,
 ) -> SensorCore {
@@ -116,8 +116,7 @@ pub(crate) async fn serve(
                 Some(Command::Tare(reply)) => {
                     match take(&mut pipeline, &mut recorder, Input::Tare, super::now()) {
                         Err(Refused::Tare(refusal)) => {
-                            let line = || log::tare(pipeline.sensor().name(), &Err(refusal));
-                            hub.log().write(pipeline.sensor().name(), super::now().mono, line);
+                            log::tare(pipeline.sensor().name(), &Err(refusal));
                             let _ = reply.send(Err(refusal));
                         }
                         _ => taring = Some(reply),
@@ -127,9 +126,7 @@ pub(crate) async fn serve(
                 Some(Command::Context(context, reply)) => {
                     let checked = check_truth(context.as_ref(), pipeline.hrn().card().levels.len());
                     if checked.is_ok() {
-                        let name = pipeline.sensor().name();
-                        let line = || log::context(name, context.as_ref());
-                        hub.log().write(name, super::now().mono, line);
+                        log::context(pipeline.sensor().name(), context.as_ref());
                         let input = Input::Context(context);
                         taken(&mut pipeline, &mut recorder, input, super::now());
                     }
@@ -142,8 +139,10 @@ pub(crate) async fn serve(
                         Err(Refused::Motion(step_back)) => Err(step_back),
                         _ => Ok(()),
                     };
-                    // The client may have gone.
-                    let _ = reply.send(taken);
+                    // Whoever sent them may not wait for the answer.
+                    if let Err(Err(refused)) = reply.send(taken) {
+                        log::motion_refused(pipeline.sensor().name(), refused);
+                    }
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
@@ -157,7 +156,7 @@ pub(crate) async fn serve(
                 Some(Command::Finish) | None => {
                     let events = taken(&mut pipeline, &mut recorder, Input::Shutdown, super::now());
                     hub.publish(events);
-                    link.close().await;
+                    source.close().await;
                     return SensorCore {
                         pipeline,
                         recorder,
@@ -166,7 +165,7 @@ pub(crate) async fn serve(
                     };
                 }
             },
-            input = link.next() => {
+            input = source.next() => {
                 taken(&mut pipeline, &mut recorder, input, super::now())
             }
             () = maybe::until(deadline.map(moment)) => {
@@ -174,12 +173,11 @@ pub(crate) async fn serve(
             }
         };
         if std::mem::replace(&mut frames, pipeline.frame_counts().0) < frames {
-            link.proven();
+            source.proven();
         }
-        answer(&mut pipeline, &hub, &mut taring);
+        answer(&mut pipeline, &mut taring);
         for failed in pipeline.unjudged() {
-            let line = || log::unjudged(&failed);
-            hub.log().write(&failed.sensor, super::now().mono, line);
+            log::unjudged(&failed);
             unjudged += 1;
         }
         let is_final =
@@ -217,13 +215,10 @@ fn taken(
 /// Answers the client that requested a tare, when the outcome is known.
 fn answer(
     pipeline: &mut Pipeline,
-    hub: &Hub,
     taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
 ) {
     if let Some(outcome) = pipeline.retared() {
-        let line = || log::tare(pipeline.sensor().name(), &outcome);
-        hub.log()
-            .write(pipeline.sensor().name(), super::now().mono, line);
+        log::tare(pipeline.sensor().name(), &outcome);
         if let Some(reply) = taring.take() {
             // The client may have gone.
             let _ = reply.send(outcome);
@@ -282,35 +277,19 @@ mod tests {
 
     #[test]
     fn the_truth_in_a_context_is_a_text_and_a_level_of_the_model() {
-        for (context, expected) in [
-            (json!({"object": "cup", "level": 4, "tag": 5}), None),
-            (
-                json!({"object": 5}),
-                Some("context.object: found 5, expected a text"),
-            ),
-            (
-                json!({"object": null}),
-                Some("context.object: found null, expected a text"),
-            ),
-            (
-                json!({"level": 0}),
-                Some("context.level: found 0, expected a level of the model: 1 to 4"),
-            ),
-            (
-                json!({"level": 5}),
-                Some("context.level: found 5, expected a level of the model: 1 to 4"),
-            ),
-            (
-                json!({"level": 1.5}),
-                Some("context.level: found 1.5, expected a level of the model: 1 to 4"),
-            ),
-            (
-                json!({"level": "2"}),
-                Some("context.level: found \"2\", expected a level of the model: 1 to 4"),
-            ),
-        ] {
-            let error = check_truth(Some(&context), 4).err();
-            assert_eq!(error.as_deref(), expected, "{context}");
+        let refusal = |context: Value| check_truth(Some(&context), 4).err();
+        assert_eq!(
+            refusal(json!({"object": "cup", "level": 4, "tag": 5})),
+            None
+        );
+        for found in [json!(5), json!(null)] {
+            let expected = format!("context.object: found {found}, expected a text");
+            assert_eq!(refusal(json!({"object": found})), Some(expected));
+        }
+        for found in [json!(0), json!(5), json!(1.5), json!("2")] {
+            let expected =
+                format!("context.level: found {found}, expected a level of the model: 1 to 4");
+            assert_eq!(refusal(json!({"level": found})), Some(expected));
         }
     }
 }

@@ -1,30 +1,29 @@
-//! One port, which is opened, read, and opened again when it is lost.
+//! The ports of the sensors. A task of its own opens each port, reads it, and opens it again when it is lost.
 //!
-//! In: the configured port, and what the sensor expects to be sent. Out: one input of a pipeline at a
-//! time: bytes, or what happened to the port. This module tries to open the port for as long as it runs,
-//! and never interprets the bytes. A read of no bytes means that the port is lost: every read of an
-//! unplugged tty gives no bytes, and so does a read of a connection that the other end has closed.
+//! In: the configured port, and what its sensors expect to be sent. Out: inputs of pipelines, to each sensor
+//! that they concern: bytes, or what happened to the port. The task tries to open the port for as long as a
+//! sensor wants it, and never interprets the bytes. A read of no bytes means that the port is lost: every read
+//! of an unplugged tty gives no bytes, and so does a read of a connection that the other end has closed.
 
 mod network;
-mod shared;
 pub(crate) mod tty;
+mod turns;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io;
-use std::ops::Range;
 use std::time::Duration;
 
 use rustix::io::Errno;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
-use tokio::sync::oneshot;
+use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
 use self::network::{Datagram, Udp};
-use self::shared::Share;
 use self::tty::LineSettings;
+use self::turns::Turns;
 use super::baud::BITS_A_BYTE;
 use super::{log, realtime};
 use crate::maybe;
@@ -40,14 +39,14 @@ use hardnessd_core::wording;
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
 /// The longest pause. A sensor that is plugged in again is read within this time.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-
-/// The most bytes read at once: 20 frames of the JX255N.
-const BUFFER_BYTES: usize = 16 * 1024;
-/// The longest datagram.
-const DATAGRAM_BYTES: usize = 64 * 1024;
-
-/// A link has held if frames come for this long. Only then is the port opened again at once after a loss.
+/// A port has held if frames come for this long. Only then is it opened again at once after a loss. A port
+/// that fails as soon as it is opened, or after a frame, never gets so far.
 const HELD: Duration = LONGEST_PAUSE;
+
+/// The most bytes read at once: the longest datagram.
+const BUFFER_BYTES: usize = 64 * 1024;
+/// The most inputs that wait for a sensor. When the queue is full, the port is not read.
+const INPUTS: usize = 16;
 
 /// The number of frames whose bytes are passed on at once. What they cost is then bounded, however small
 /// they are.
@@ -63,10 +62,10 @@ const OVERFLOW_PAUSE: Duration = Duration::from_millis(1);
 /// also at most a third of the stale time.
 const REPORT_EVERY: Duration = Duration::from_millis(25);
 
-/// How often the settings of a serial line are compared while its sensor is stale.
-const COMPARE_EVERY: Duration = Duration::from_secs(1);
+/// How often the settings of a serial line are set again while its sensor is stale.
+const RESTORE_EVERY: Duration = Duration::from_secs(1);
 
-/// What a link must know of its sensor.
+/// What a port must know of a sensor.
 #[derive(Debug, Clone)]
 pub(crate) struct Settings {
     /// The silence after which the sensor is stale.
@@ -85,16 +84,16 @@ pub(crate) struct Settings {
 
 impl Settings {
     /// The settings for `sensor`.
-    pub(crate) fn of(sensor: &Sensor) -> Self {
-        let frame = &sensor.description().sensor.frame;
+    fn of(sensor: &Sensor) -> Self {
+        let described = &sensor.description().sensor;
+        let frame = &described.frame;
         let every = frame.request_ms.map(|ms| Duration::from_millis(ms.into()));
         let request = frame.request.as_ref();
         let asked = request.map_or(0, |bytes| bytes.0.len());
         let frame_bytes = sensor.layout().max_frame_bytes();
-        let bytes = (asked + frame_bytes) as f64;
-        let baud = f64::from(sensor.description().sensor.baud);
-        let on_the_line = match sensor.description().sensor.port {
-            Port::Device(_) => Duration::from_secs_f64(bytes * BITS_A_BYTE / baud),
+        let bits = (asked + frame_bytes) as f64 * BITS_A_BYTE;
+        let on_the_line = match described.port {
+            Port::Device(_) => Duration::from_secs_f64(bits / f64::from(described.baud)),
             Port::Tcp(_) | Port::Udp(_) => Duration::ZERO,
         };
         Self {
@@ -106,105 +105,126 @@ impl Settings {
             bytes_per_s: frame_bytes as f64 * sensor.frame_rate_hz(),
         }
     }
-
-    /// The bytes to send at the opening.
-    fn opening(&self) -> Vec<u8> {
-        let request = self.request.iter().flat_map(|(bytes, _)| bytes);
-        self.start.iter().chain(request).copied().collect()
-    }
-
-    /// The time that `bytes` take on the line at the highest rate. A line of `baud` carries that many bits
-    /// in any case.
-    fn time_of(&self, bytes: usize, baud: u32) -> Duration {
-        let most = MOST_BYTES * self.bytes_per_s;
-        let seconds = bytes as f64 / most.max(f64::from(baud) / 10.0);
-        Duration::try_from_secs_f64(seconds).unwrap_or(Duration::ZERO)
-    }
 }
 
-/// The port of a sensor: one of its own, or its share of one.
+/// A sensor's end of its port, which others may share.
 #[derive(Debug)]
-pub(crate) enum Source {
-    Own(Box<Link>),
-    Shared(Share),
+pub(crate) struct Source {
+    index: usize,
+    inputs: mpsc::Receiver<Input>,
+    /// Tells the port that a frame of this sensor came.
+    frames: mpsc::Sender<usize>,
+    /// Ends when the port is closed.
+    closed: watch::Receiver<()>,
 }
 
 impl Source {
     /// Waits for the next input. Cancelling the wait loses nothing.
     pub(crate) async fn next(&mut self) -> Input {
-        match self {
-            Self::Own(link) => link.next().await,
-            Self::Shared(share) => share.next().await,
+        match self.inputs.recv().await {
+            Some(input) => input,
+            // The task of the port ends after its sensors.
+            None => std::future::pending().await,
         }
     }
 
-    /// Records that the port works: frames come.
-    pub(crate) fn proven(&mut self) {
-        match self {
-            Self::Own(link) => link.proven(),
-            Self::Shared(share) => share.proven(),
-        }
+    /// Records that the port works: frames come. So its settings are right, and a sender of datagrams keeps
+    /// its place.
+    pub(crate) fn proven(&self) {
+        // When the queue is full, the port notices the next frame.
+        let _ = self.frames.try_send(self.index);
     }
 
-    /// Closes the port. One that is shared is closed when all its sensors have closed it.
+    /// Gives the port up. It is closed when all its sensors have done so, and then this returns.
     pub(crate) async fn close(self) {
-        if let Self::Shared(share) = self {
-            share.close().await;
-        }
+        let mut closed = self.closed;
+        drop(self.inputs);
+        let _ = closed.changed().await;
     }
 }
 
-/// The ports of sensors that start together. Sensors with the same port share it.
-#[derive(Debug, Default)]
-pub(crate) struct Sources(BTreeMap<usize, Source>);
-
-impl Sources {
-    /// The port of the sensor at `index` of `sensors`.
-    pub(crate) fn take(&mut self, sensors: &[Sensor], index: usize) -> Source {
-        if let Some(source) = self.0.remove(&index) {
-            return source;
-        }
-        let table = |index: usize| &sensors[index].description().sensor;
-        let (port, baud) = (&table(index).port, table(index).baud);
-        let same = |&other: &usize| table(other).port == *port;
-        let sharing: Vec<usize> = (0..sensors.len()).filter(same).collect();
-        let settings = sharing.iter().map(|&one| Settings::of(&sensors[one]));
-        let settings: Vec<Settings> = settings.collect();
-        if let [settings] = &settings[..] {
-            return Source::Own(Box::new(Link::new(port, baud, settings.clone())));
-        }
-        let mut starts: Vec<&[u8]> = settings.iter().map(|one| one.start.as_slice()).collect();
-        starts.dedup();
-        let of_link = Settings {
-            stale_after: settings
-                .iter()
-                .map(|one| one.stale_after)
-                .max()
-                .unwrap_or_default(),
-            start: starts.concat(),
-            request: None,
-            on_the_line: Duration::ZERO,
-            bytes_at_once: settings
-                .iter()
-                .map(|one| one.bytes_at_once)
-                .min()
-                .unwrap_or_default(),
-            bytes_per_s: settings.iter().map(|one| one.bytes_per_s).sum(),
-        };
-        let shares = shared::share(Link::new(port, baud, of_link), &settings);
-        let shares = shares.into_iter().map(Source::Shared);
-        self.0.extend(sharing.into_iter().zip(shares));
-        self.0.remove(&index).expect("the sensor has its own port")
+/// Starts a task for each port of these sensors. Returns the source of each sensor, in the same order.
+pub(crate) fn start(sensors: &[&Sensor]) -> Vec<Source> {
+    let mut ports: HashMap<&Port, Vec<usize>> = HashMap::new();
+    for (index, sensor) in sensors.iter().enumerate() {
+        let port = &sensor.description().sensor.port;
+        ports.entry(port).or_default().push(index);
     }
+    let mut sources = BTreeMap::new();
+    for (port, members) in ports {
+        let baud = sensors[members[0]].description().sensor.baud;
+        let settings = members.iter().map(|&index| Settings::of(sensors[index]));
+        let started = open(port, baud, &settings.collect::<Vec<_>>());
+        sources.extend(members.into_iter().zip(started));
+    }
+    sources.into_values().collect()
+}
+
+/// Starts the task of a port of sensors with these settings. Returns the source of each.
+pub(crate) fn open(port: &Port, baud: u32, sensors: &[Settings]) -> Vec<Source> {
+    let (frames, frames_in) = mpsc::channel(INPUTS);
+    let (closing, closed) = watch::channel(());
+    let (members, inputs): (Vec<_>, Vec<_>) = sensors.iter().map(|_| mpsc::channel(INPUTS)).unzip();
+    let mut starts: Vec<&[u8]> = sensors.iter().map(|one| one.start.as_slice()).collect();
+    starts.dedup();
+    let stale_after = sensors.iter().map(|one| one.stale_after).max();
+    let bytes_at_once = sensors.iter().map(|one| one.bytes_at_once).min();
+    let bytes_per_s: f64 = sensors.iter().map(|one| one.bytes_per_s).sum();
+    let task = Task {
+        port: port.clone(),
+        baud,
+        start: starts.concat(),
+        stale_after: stale_after.unwrap_or_default(),
+        bytes_at_once: bytes_at_once.unwrap_or(usize::MAX),
+        // A line carries what its baud rate allows in any case.
+        most_bytes_per_s: (MOST_BYTES * bytes_per_s).max(f64::from(baud) / BITS_A_BYTE),
+        members: members.clone(),
+        frames: frames_in,
+        turns: Turns::new(sensors, Instant::now()),
+        pause: FIRST_PAUSE,
+        buffer: vec![0; BUFFER_BYTES].into(),
+        allowance: Allowance::default(),
+        skipped: 0,
+        report_at: Instant::now(),
+    };
+    tokio::spawn(async move {
+        let given_up = async {
+            for member in &members {
+                member.closed().await;
+            }
+        };
+        tokio::select! {
+            () = task.serve() => {}
+            () = given_up => {}
+        }
+        drop(closing);
+    });
+    let sources = inputs
+        .into_iter()
+        .enumerate()
+        .map(|(index, inputs)| Source {
+            index,
+            inputs,
+            frames: frames.clone(),
+            closed: closed.clone(),
+        });
+    sources.collect()
 }
 
 /// A port and its state.
-#[derive(Debug)]
-pub(crate) struct Link {
+struct Task {
     port: Port,
     baud: u32,
-    settings: Settings,
-    state: State,
+    /// Sent once after each opening.
+    start: Vec<u8>,
+    /// The silence after which no sensor of the port is live.
+    stale_after: Duration,
+    bytes_at_once: usize,
+    most_bytes_per_s: f64,
+    members: Vec<mpsc::Sender<Input>>,
+    /// The sensors of which a frame came.
+    frames: mpsc::Receiver<usize>,
+    turns: Turns,
     pause: Duration,
     buffer: Box<[u8]>,
     allowance: Allowance,
@@ -215,231 +235,157 @@ pub(crate) struct Link {
 }
 
 #[derive(Debug)]
-enum State {
-    /// The port will be opened at this time.
-    Waiting(Instant),
-    /// A separate thread is opening the port, because a driver or a network may be slow.
-    Opening(oneshot::Receiver<io::Result<Line>>),
-    Open(Open),
-}
-
-#[derive(Debug)]
-struct Open {
-    line: Line,
-    /// When the next request is due, if the sensor wants any.
-    request_at: Option<Instant>,
-    /// When the settings of a serial line are compared next.
-    compare_at: Option<Instant>,
-    /// The bytes in the buffer that come next.
-    held: Range<usize>,
-    /// Whether a telnet server at the other end would begin with its options now.
-    is_new: bool,
-    /// When the next bytes are read, if the sensor sends too many.
-    read_at: Option<Instant>,
-    since: Instant,
-}
-
-#[derive(Debug)]
 enum Line {
     Tty(SerialStream, LineSettings),
     Tcp(TcpStream),
     Udp(Udp),
 }
 
-/// What happened to an open port.
-enum Happened {
-    Read(io::Result<Datagram>),
-    RequestIsDue,
-    CompareIsDue,
-}
-
-impl Link {
-    /// A link to `port`. The first wait opens it.
-    pub(crate) fn new(port: &Port, baud: u32, settings: Settings) -> Self {
-        let bytes = match port {
-            Port::Device(_) | Port::Tcp(_) => BUFFER_BYTES,
-            Port::Udp(_) => DATAGRAM_BYTES,
-        };
-        Self {
-            port: port.clone(),
-            baud,
-            settings,
-            state: State::Waiting(Instant::now()),
-            pause: FIRST_PAUSE,
-            buffer: vec![0; bytes].into(),
-            allowance: Allowance::default(),
-            skipped: 0,
-            report_at: Instant::now(),
-        }
-    }
-
-    /// Waits for the next input: the port was opened, could not be opened or is lost, or bytes came. Another
-    /// sender of datagrams counts as another opening. Cancelling the wait loses nothing.
-    pub(crate) async fn next(&mut self) -> Input {
+impl Task {
+    /// Opens and reads the port, again and again.
+    async fn serve(mut self) {
         loop {
-            match &mut self.state {
-                State::Waiting(until) => {
-                    tokio::time::sleep_until(*until).await;
-                    let opening = start_opening(&self.port, self.baud, self.settings.opening());
-                    match opening {
-                        Ok(opening) => self.state = State::Opening(opening),
-                        Err(NoThread(error)) => {
-                            self.wait();
-                            let reason = format!("no thread to open it: {error}");
-                            return Input::Unavailable(reason);
-                        }
-                    }
-                }
-                State::Opening(opening) => {
-                    let opened = match opening.await {
-                        Ok(opened) => opened.map_err(|error| reason(&self.port, &error)),
-                        Err(ended) => Err(ended.to_string()),
-                    };
-                    match opened {
-                        Ok(line) => {
-                            self.state = State::Open(Open::new(line, &self.settings));
-                            return Input::Opened;
-                        }
-                        Err(reason) => {
-                            self.wait();
-                            return Input::Unavailable(reason);
-                        }
-                    }
-                }
-                State::Open(open) => {
-                    if !open.held.is_empty() {
-                        // Others get their turn between two pieces.
-                        let begin = open.held.start;
-                        let bytes = open.held.len().min(self.settings.bytes_at_once);
-                        open.held.start += bytes;
-                        let bytes = &self.buffer[begin..][..bytes];
-                        if std::mem::take(&mut open.is_new) && is_telnet(bytes) {
-                            log::telnet(&self.port);
-                        }
-                        return Input::Bytes(bytes.to_vec());
-                    }
-                    // A sensor may send faster than the daemon reads.
-                    realtime::rest();
-                    let happened = open.wait(&mut self.buffer, self.settings.stale_after).await;
-                    let now = Instant::now();
-                    let lost = match happened {
-                        Happened::Read(Ok(Datagram::Bytes(0))) => open.line.end().to_owned(),
-                        Happened::Read(Ok(Datagram::Bytes(read))) => {
-                            let time = self.settings.time_of(read, self.baud);
-                            let at = super::now().mono;
-                            if !self.allowance.allows(at, time, BYTES_AT_ONCE) {
-                                self.skipped = (self.skipped + read as u64).min(u32::MAX.into());
-                                open.read_at = Some(now + OVERFLOW_PAUSE);
-                                if now < self.report_at {
-                                    continue;
-                                }
-                                let every = REPORT_EVERY.min(self.settings.stale_after / 3);
-                                self.report_at = now + every;
-                                return Input::Skipped(std::mem::take(&mut self.skipped));
-                            }
-                            open.held = 0..read;
-                            match std::mem::take(&mut self.skipped) {
-                                0 => continue,
-                                skipped => return Input::Skipped(skipped),
-                            }
-                        }
-                        Happened::Read(Ok(Datagram::OfAnother(read))) => {
-                            open.line.send(&self.settings.opening());
-                            open.held = 0..read;
-                            return Input::Opened;
-                        }
-                        Happened::Read(Ok(Datagram::Ignored)) => continue,
-                        Happened::Read(Err(error)) => error.to_string(),
-                        Happened::RequestIsDue => {
-                            if let Some((request, every)) = &self.settings.request {
-                                open.line.request(request, self.settings.stale_after);
-                                let next = open.request_at.map(|at| (at + *every).max(now));
-                                open.request_at = next;
-                            }
-                            continue;
-                        }
-                        Happened::CompareIsDue => {
-                            open.compare_at = Some(now + COMPARE_EVERY);
-                            open.line.restore();
-                            continue;
-                        }
-                    };
-                    self.wait();
-                    return Input::Lost(lost);
-                }
-            }
+            let ended = match self.open().await {
+                Ok(line) => Input::Lost(self.read(line).await),
+                Err(reason) => Input::Unavailable(reason),
+            };
+            self.tell_all(ended).await;
+            tokio::time::sleep(self.pause).await;
+            self.pause = (self.pause * 2).min(LONGEST_PAUSE);
         }
     }
 
-    /// Sends a request, if the port is open and there is room for it.
-    fn request(&self, request: &[u8]) {
-        if let State::Open(open) = &self.state {
-            open.line.request(request, self.settings.stale_after);
-        }
+    /// Opens the port in a thread of its own, because a driver or a network may be slow. The error says why
+    /// it cannot be opened.
+    async fn open(&self) -> Result<Line, String> {
+        let (port, baud, runtime) = (self.port.clone(), self.baud, Handle::current());
+        let opening = spawn_thread("port", move || {
+            let _in_runtime = runtime.enter();
+            Line::open(&port, baud)
+        });
+        let opening =
+            opening.map_err(|NoThread(error)| format!("no thread to open it: {error}"))?;
+        let opened = opening.await.map_err(|ended| ended.to_string())?;
+        opened.map_err(|error| reason(&self.port, &error))
     }
 
-    /// Records that the port works: frames come. So its settings are right, and a sender of datagrams keeps
-    /// its place. A port that goes on so for a while is opened again quickly after the next loss. A port
-    /// that fails as soon as it is opened, or after a frame, never gets so far.
-    pub(crate) fn proven(&mut self) {
-        let State::Open(open) = &mut self.state else {
-            return;
-        };
-        let now = Instant::now();
-        if now.duration_since(open.since) >= HELD {
-            self.pause = FIRST_PAUSE;
-        }
-        if let Some(at) = &mut open.compare_at {
-            *at = now + self.settings.stale_after;
-        }
-        if let Line::Udp(udp) = &mut open.line {
-            udp.proven();
-        }
-    }
-
-    fn wait(&mut self) {
-        self.state = State::Waiting(Instant::now() + self.pause);
-        self.pause = (self.pause * 2).min(LONGEST_PAUSE);
-    }
-}
-
-impl Open {
-    fn new(line: Line, settings: &Settings) -> Self {
-        let now = Instant::now();
+    /// Reads the open port until it is lost. Returns the reason.
+    async fn read(&mut self, mut line: Line) -> String {
+        let since = Instant::now();
         let is_tty = matches!(line, Line::Tty(..));
-        Self {
-            line,
-            request_at: settings.request.as_ref().map(|(_, every)| now + *every),
-            compare_at: is_tty.then_some(now + COMPARE_EVERY),
-            held: 0..0,
-            is_new: !is_tty,
-            read_at: None,
-            since: now,
+        // A telnet server at the other end would begin with its options.
+        let mut is_new = !is_tty;
+        let mut restore_at = is_tty.then_some(since + RESTORE_EVERY);
+        // Frames of an earlier opening prove nothing.
+        while self.frames.try_recv().is_ok() {}
+        self.begin(&line).await;
+        loop {
+            // A sensor may send faster than the daemon reads.
+            realtime::rest();
+            let read = tokio::select! {
+                read = line.read(&mut self.buffer, self.stale_after) => read,
+                Some(member) = self.frames.recv() => {
+                    let now = Instant::now();
+                    if now.duration_since(since) >= HELD {
+                        self.pause = FIRST_PAUSE;
+                    }
+                    restore_at = restore_at.map(|_| now + self.stale_after);
+                    if let Line::Udp(udp) = &mut line {
+                        udp.proven();
+                    }
+                    self.turns.answered(member, now);
+                    continue;
+                }
+                () = maybe::until(self.turns.due()) => {
+                    if let Some(request) = self.turns.ask(Instant::now()) {
+                        line.request(request, self.stale_after);
+                    }
+                    continue;
+                }
+                () = maybe::until(restore_at) => {
+                    line.restore();
+                    restore_at = Some(Instant::now() + RESTORE_EVERY);
+                    continue;
+                }
+            };
+            let bytes = match read {
+                Ok(Datagram::Bytes(0)) => return line.end().to_owned(),
+                Ok(Datagram::Bytes(bytes)) => bytes,
+                Ok(Datagram::OfAnother(bytes)) => {
+                    self.begin(&line).await;
+                    bytes
+                }
+                Ok(Datagram::Ignored) => continue,
+                Err(error) => return error.to_string(),
+            };
+            if std::mem::take(&mut is_new) && is_telnet(&self.buffer[..bytes]) {
+                log::telnet(&self.port);
+            }
+            self.pass_on(bytes).await;
         }
     }
 
-    async fn wait(&mut self, buffer: &mut [u8], stale_after: Duration) -> Happened {
-        // A read that is cancelled has read nothing, because a read is one system call, made when
-        // bytes are there.
-        let read = async {
-            if let Some(at) = self.read_at {
-                tokio::time::sleep_until(at).await;
+    /// The port was opened, or another sender of datagrams has taken its place.
+    async fn begin(&mut self, line: &Line) {
+        line.send(&self.start);
+        self.turns.begin(Instant::now());
+        self.tell_all(Input::Opened).await;
+    }
+
+    /// Passes on the first `bytes` of the buffer, unless too many come.
+    async fn pass_on(&mut self, bytes: usize) {
+        let time = Duration::try_from_secs_f64(bytes as f64 / self.most_bytes_per_s);
+        let (now, time) = (Instant::now(), time.unwrap_or_default());
+        if !self
+            .allowance
+            .allows(super::now().mono, time, BYTES_AT_ONCE)
+        {
+            self.skipped += bytes as u64;
+            if now >= self.report_at {
+                self.report_at = now + REPORT_EVERY.min(self.stale_after / 3);
+                self.report_skipped().await;
             }
-            self.line.read(buffer, stale_after).await
-        };
-        let happened = tokio::select! {
-            read = read => Happened::Read(read),
-            () = maybe::until(self.request_at) => Happened::RequestIsDue,
-            () = maybe::until(self.compare_at) => Happened::CompareIsDue,
-        };
-        if matches!(happened, Happened::Read(_)) {
-            self.read_at = None;
+            tokio::time::sleep(OVERFLOW_PAUSE).await;
+            return;
         }
-        happened
+        self.report_skipped().await;
+        for piece in self.buffer[..bytes].chunks(self.bytes_at_once) {
+            for member in self.turns.audience() {
+                // A sensor that has ended takes nothing.
+                let _ = self.members[member]
+                    .send(Input::Bytes(piece.to_vec()))
+                    .await;
+            }
+        }
+    }
+
+    async fn report_skipped(&mut self) {
+        match std::mem::take(&mut self.skipped) {
+            0 => {}
+            skipped => self.tell_all(Input::Skipped(skipped)).await,
+        }
+    }
+
+    async fn tell_all(&self, input: Input) {
+        for member in &self.members {
+            // A sensor that has ended takes nothing.
+            let _ = member.send(input.clone()).await;
+        }
     }
 }
 
 impl Line {
+    fn open(port: &Port, baud: u32) -> io::Result<Self> {
+        Ok(match port {
+            Port::Device(path) => {
+                let (port, settings) = tty::open(path, baud)?;
+                Self::Tty(SerialStream::try_from(port)?, settings)
+            }
+            Port::Tcp(address) => Self::Tcp(TcpStream::from_std(network::connect(address)?)?),
+            Port::Udp(address) => Self::Udp(Udp::bind(address)?),
+        })
+    }
+
     async fn read(&mut self, buffer: &mut [u8], stale_after: Duration) -> io::Result<Datagram> {
         match self {
             Self::Tty(port, _) => AsyncReadExt::read(port, buffer).await.map(Datagram::Bytes),
@@ -466,7 +412,7 @@ impl Line {
         }
     }
 
-    /// Sets the settings of a serial line again, if another program has changed them.
+    /// Sets the settings of a serial line again: another program may have changed them.
     fn restore(&self) {
         if let Self::Tty(_, settings) = self {
             // Where this fails, the next read finds out why.
@@ -481,37 +427,6 @@ impl Line {
             Self::Tcp(_) => "closed by the other end",
         }
     }
-}
-
-/// Opens the port in a thread of its own, and sends `first` there.
-///
-/// # Errors
-///
-/// Fails if the system has no thread to spare.
-fn start_opening(
-    port: &Port,
-    baud: u32,
-    first: Vec<u8>,
-) -> Result<oneshot::Receiver<io::Result<Line>>, NoThread> {
-    let (port, runtime) = (port.clone(), Handle::current());
-    spawn_thread("port", move || {
-        let _in_runtime = runtime.enter();
-        let line = open(&port, baud)?;
-        // The first bytes to a sender of datagrams are sent when it is known.
-        line.send(&first);
-        Ok(line)
-    })
-}
-
-fn open(port: &Port, baud: u32) -> io::Result<Line> {
-    Ok(match port {
-        Port::Device(path) => {
-            let (port, settings) = tty::open(path, baud)?;
-            Line::Tty(SerialStream::try_from(port)?, settings)
-        }
-        Port::Tcp(address) => Line::Tcp(TcpStream::from_std(network::connect(address)?)?),
-        Port::Udp(address) => Line::Udp(Udp::bind(address)?),
-    })
 }
 
 /// Opens a port that is no device for a moment. Returns whether a telnet server is at its other end.

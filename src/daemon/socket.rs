@@ -65,11 +65,6 @@ impl Socket {
             identity: identity(path).map_err(place.failed("find"))?,
         })
     }
-
-    /// The path of the socket's file.
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
-    }
 }
 
 impl Listener for Socket {

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::net::{SocketAddr, TcpListener as StdListener};
+use std::os::fd::AsFd;
 use std::time::Duration;
 
 use rustix::net::sockopt;
@@ -15,17 +16,11 @@ use super::accept::Listener;
 /// megabytes.
 const SEND_BUFFER_BYTES: usize = 104 * 1024;
 
-/// The time after which a connection without traffic is probed.
-const KEEPALIVE: Duration = Duration::from_secs(30);
-/// The time between two probes.
-const KEEPALIVE_PAUSE: Duration = Duration::from_secs(10);
-/// The number of probes without an answer after which the connection is closed.
-const KEEPALIVE_TRIES: u32 = 3;
-
-/// A connection whose other end takes nothing for this long is closed, even if it acknowledges that
-/// it takes nothing (`TCP_USER_TIMEOUT` of tcp(7)). Without this, such clients would occupy all
-/// connections for good.
-const UNREAD_PATIENCE: Duration = Duration::from_secs(60);
+/// A connection to a client ends when its other end is gone or takes nothing for this long. Without this, such
+/// clients would occupy all connections for good.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// The number of probes without an answer after which the other end is gone.
+const PROBES: u32 = 5;
 
 /// A listening TCP socket.
 #[derive(Debug)]
@@ -71,16 +66,21 @@ impl Listener for Tcp {
 fn behave(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)?;
     sockopt::set_socket_send_buffer_size(stream, SEND_BUFFER_BYTES)?;
-    sockopt::set_tcp_user_timeout(stream, UNREAD_PATIENCE.as_millis() as u32)?;
-    keep_alive(stream)
+    keep_alive(stream, PATIENCE)
 }
 
-/// Has the system notice within a minute that the other end of a connection is gone.
-pub(crate) fn keep_alive(stream: &TcpStream) -> io::Result<()> {
-    sockopt::set_socket_keepalive(stream, true)?;
-    sockopt::set_tcp_keepidle(stream, KEEPALIVE)?;
-    sockopt::set_tcp_keepintvl(stream, KEEPALIVE_PAUSE)?;
-    Ok(sockopt::set_tcp_keepcnt(stream, KEEPALIVE_TRIES)?)
+/// Has the system end a connection whose other end has gone without a word for this long, or takes nothing,
+/// even if it acknowledges that it takes nothing (`TCP_USER_TIMEOUT` of tcp(7)).
+pub(crate) fn keep_alive(stream: impl AsFd, patience: Duration) -> io::Result<()> {
+    let silence = patience / 2;
+    sockopt::set_socket_keepalive(&stream, true)?;
+    sockopt::set_tcp_keepidle(&stream, silence)?;
+    sockopt::set_tcp_keepintvl(&stream, silence / PROBES)?;
+    sockopt::set_tcp_keepcnt(&stream, PROBES)?;
+    Ok(sockopt::set_tcp_user_timeout(
+        &stream,
+        patience.as_millis() as u32,
+    )?)
 }
 
 #[cfg(test)]

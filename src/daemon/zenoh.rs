@@ -3,8 +3,7 @@
 //!
 //! In: lines of the hub. Out: puts; the `hello`, the last final verdict and the status of each
 //! sensor as answers to queries; and the liveliness token `tactile/SITE`, which ends with the
-//! daemon. The session talks only to addresses that the configuration names. If the configuration
-//! names a key with positions of the arm, the session subscribes to it. Nothing else that comes in
+//! daemon. The session talks only to addresses that the configuration names. Nothing that comes in
 //! changes anything.
 
 use std::collections::BTreeMap;
@@ -15,18 +14,16 @@ use tokio::sync::mpsc;
 use tracing::{info, warn};
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::{Publisher, Subscriber};
+use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
-use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
 use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
-use super::log;
-use super::relay::{PositionQueue, Worker};
-use super::request::{self, Request};
+use super::relay::Worker;
+use super::sensor::Sensors;
 use hardnessd_core::event::{self, Kind, Reply};
 
 /// Opens a session as `settings` say, with keys below `tactile/SITE`.
@@ -35,7 +32,12 @@ use hardnessd_core::event::{self, Kind, Reply};
 ///
 /// Fails if the daemon cannot listen on an address, or the library fails. A peer that cannot be
 /// reached is not an error, because the library tries again.
-pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Result<Worker, Error> {
+pub(super) fn open(
+    settings: &config::Zenoh,
+    config: &Config,
+    hub: &Hub,
+    sensors: &Sensors,
+) -> Result<Worker, Error> {
     // Try the addresses here first, because the library's error is a page long and names paths of
     // its sources.
     for endpoint in &settings.listen {
@@ -49,13 +51,11 @@ pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Resu
     let site = settings.site(&config.robot).to_owned();
     let (listen, connect) = (&settings.listen, &settings.connect);
     info!(way = "zenoh", site, ?listen, ?connect, "publishing");
-    let (settings, hub) = (settings.clone(), hub.clone());
-    let sensors = config.sensors.iter().map(|sensor| sensor.name.clone());
-    let sensors: Vec<String> = sensors.collect();
+    let (settings, hub, sensors) = (settings.clone(), hub.clone(), sensors.clone());
     Worker::start(
         "zenoh",
-        move |positions| {
-            let opened = Zenoh::open(&settings, site, &sensors, hub, positions);
+        move || {
+            let opened = Zenoh::open(&settings, site, &sensors, hub);
             opened.map_err(|error| Error::Io(format!("publish.zenoh: {error}")))
         },
         Zenoh::work,
@@ -68,7 +68,6 @@ struct Zenoh {
     site: String,
     // Dropping one of these ends it. The session must be dropped last.
     _queries: Queryable<()>,
-    _motion: Option<Subscriber<()>>,
     _alive: LivelinessToken,
     _session: Session,
 }
@@ -77,15 +76,14 @@ impl Zenoh {
     fn open(
         settings: &config::Zenoh,
         site: String,
-        sensors: &[String],
+        sensors: &Sensors,
         hub: Hub,
-        positions: PositionQueue,
     ) -> Result<Self, zenoh::Error> {
         let session = zenoh::open(configuration(settings)?).wait()?;
         let mut publishers = BTreeMap::new();
-        for sensor in sensors {
+        for sensor in sensors.iter() {
             for kind in Kind::ALL {
-                let key = key(&site, sensor, kind);
+                let key = key(&site, &sensor.name, kind);
                 // A frame is soon out of date. Any other event may wait for the network a while,
                 // because nothing else waits for this thread.
                 let publisher = session
@@ -112,12 +110,6 @@ impl Zenoh {
                 }
             })
             .wait()?;
-        let motion = settings.motion.as_ref().map(|key| {
-            let subscriber = session.declare_subscriber(key.clone());
-            subscriber
-                .callback(move |sample| take_positions(&sample, &positions))
-                .wait()
-        });
         let alive = session
             .liveliness()
             .declare_token(format!("tactile/{site}"))
@@ -126,7 +118,6 @@ impl Zenoh {
             publishers,
             site,
             _queries: queries,
-            _motion: motion.transpose()?,
             _alive: alive,
             _session: session,
         })
@@ -178,32 +169,6 @@ fn answer(query: &Query, site: &str, now: Snapshot) {
                 warn!(key, %error, "not answered on zenoh");
             }
         }
-    }
-}
-
-/// The longest value with positions, as long as the longest line of the control socket.
-const LONGEST_VALUE_BYTES: usize = 64 * 1024;
-
-/// Takes positions of the arm, in the same line as on the control socket. No other request is
-/// accepted.
-fn take_positions(sample: &Sample, queue: &PositionQueue) {
-    let key = sample.key_expr();
-    let bytes = sample.payload().to_bytes();
-    if bytes.len() > LONGEST_VALUE_BYTES {
-        let found = bytes.len();
-        log::outside("zenoh", || {
-            warn!(%key, "found {found} bytes on zenoh, expected {LONGEST_VALUE_BYTES} at most");
-        });
-        return;
-    }
-    match request::parse(&bytes).request {
-        Ok(Request::Motion(positions)) => queue.put(positions),
-        Ok(_) => log::outside("zenoh", || {
-            warn!(%key, "found another request on zenoh, expected motion");
-        }),
-        Err(unusable) => log::outside("zenoh", || {
-            warn!(%key, %unusable, "positions refused");
-        }),
     }
 }
 

@@ -9,6 +9,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::StreamExt as _;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt;
@@ -19,7 +20,7 @@ use tokio::time::Instant;
 use super::player::Played;
 use crate::daemon;
 use crate::daemon::accept::Listener;
-use crate::daemon::lines::{LineRead, Lines};
+use crate::daemon::lines::lines;
 use crate::daemon::socket::Socket;
 use crate::thread::NoThread;
 use hardnessd_core::event::round_3;
@@ -173,8 +174,9 @@ impl Arm {
 
     async fn obey(&self, controller: UnixStream) -> io::Result<()> {
         let (input, mut output) = controller.into_split();
-        let mut lines = Lines::new(input, LONGEST_LINE_BYTES);
-        while let LineRead::Line(line) = lines.next().await? {
+        let mut lines = lines(input, LONGEST_LINE_BYTES);
+        while let Some(line) = lines.next().await {
+            let line = line.map_err(io::Error::other)?;
             let answer = match Order::read(&line) {
                 Ok(order) => self.take(order).await,
                 Err(error) => json!({"error": error}),

@@ -116,7 +116,8 @@ pub async fn run(
         let unasked = "--out is only for `calibrate taxels`: leave it out";
         return Err(Failure::new(USAGE, unasked));
     }
-    let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
+    let sensor = setup.sensor_named(args.sensor.as_deref());
+    let sensor = sensor.exit(USAGE)?.clone();
     // Test the output file now, before anybody presses.
     let path = args.out.clone();
     let path = path.unwrap_or_else(|| config.with_file_name(GAINS));

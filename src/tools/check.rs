@@ -4,9 +4,8 @@ use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
 use super::exit::{Coded, Failure};
-use crate::daemon::baud::{Load, Pace};
 use crate::daemon::config::Setup;
-use crate::daemon::{publish, record};
+use crate::daemon::publish;
 use hardnessd_core::frame::Array;
 use hardnessd_core::sensor::Settings;
 use hardnessd_core::stderr_line;
@@ -18,10 +17,9 @@ use hardnessd_core::wording::as_written;
 /// What `--help` says below the options.
 const MORE: &str = "\
     It refuses what `run` would refuse, with the same exit code, as far as no port has to be opened \
-    for it. It warns of a `dir` of [record] that cannot be written to, of taxels of another pitch than \
-    the model's, of a full scale that no film has, and of keys that change no verdict of this model. \
-    Below what would run, it prints every key in force and where it comes from: written, a preset, or \
-    the default.";
+    for it. It warns of taxels of another pitch than the model's, of a full scale that no film has, and \
+    of keys that change no verdict of this model. Below what would run, it prints every key in force and \
+    where it comes from: written, a preset, or the default.";
 
 /// Arguments of `check`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -45,7 +43,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut lines = format!("robot {}\n", setup.config.robot);
     let mut warnings = Vec::new();
     for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
-        lines += &line_of(sensor, checked.layout(), &mut warnings);
+        lines += &line_of(sensor, checked.layout());
         warnings.extend(pitch_warning(sensor, setup.hrn.card()));
         warnings.extend(scale_warning(sensor, checked.layout()));
         if setup.ignores_references_of(&sensor.name) {
@@ -61,9 +59,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let idle = setup.without_effect().into_iter();
     warnings
         .extend(idle.map(|key| format!("{key}: changes no verdict, because the model {needs}")));
-    if let Some(record) = &setup.config.record {
-        warnings.extend(record::check(record).err().map(|error| error.to_string()));
-    }
     warnings.extend(stranger_warnings(&setup));
     for warning in warnings {
         stderr_line!("warning: {}: {warning}", path.display());
@@ -143,13 +138,7 @@ fn stranger_warnings(setup: &Setup) -> impl Iterator<Item = String> {
 /// Pitches closer than this count as equal, because datasheets give two digits.
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
-fn line_of(sensor: &Settings, layout: &Layout, warnings: &mut Vec<String>) -> String {
-    let Load {
-        pace,
-        capacity,
-        bytes_per_s,
-        excess,
-    } = Load::of(sensor, layout);
+fn line_of(sensor: &Settings, layout: &Layout) -> String {
     let Settings {
         name,
         port,
@@ -157,20 +146,13 @@ fn line_of(sensor: &Settings, layout: &Layout, warnings: &mut Vec<String>) -> St
         frame_rate_hz,
         ..
     } = sensor;
-    // Frames of some layouts vary in length, and a port that is not there may turn out to be USB CDC.
-    warnings.extend(excess.map(|excess| format!("sensor.frame_rate_hz of {name:?}: {excess}")));
     let frame_bytes = match (layout.min_frame_bytes(), layout.max_frame_bytes()) {
         (shortest, longest) if shortest == longest => longest.to_string(),
         (shortest, longest) => format!("{shortest} to {longest}"),
     };
-    let load = if pace == Pace::Free {
-        format!("{bytes_per_s:.0} bytes/s, whatever the baud rate")
-    } else {
-        format!("{bytes_per_s:.0} of {capacity:.0} bytes/s at {baud} baud")
-    };
     let Array { rows, cols } = layout.array();
     format!(
-        "sensor {name}: {port}, {rows}x{cols} taxels in {frame_bytes} bytes, {frame_rate_hz} frames/s: {load}\n"
+        "sensor {name}: {port} at {baud} baud, {rows}x{cols} taxels in {frame_bytes} bytes, {frame_rate_hz} frames/s\n"
     )
 }
 

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
+use futures_util::StreamExt as _;
 use serde_json::Value;
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpStream, UnixStream};
@@ -20,7 +21,8 @@ use tokio::net::{TcpStream, UnixStream};
 use super::exit::Failure;
 use super::{demo, doctor};
 use crate::daemon::config::Unix;
-use crate::daemon::lines::{LineRead, Lines};
+use crate::daemon::lines::{LineError, Lines, lines};
+use crate::daemon::tcp;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::exit::UNAVAILABLE;
@@ -163,13 +165,13 @@ impl Connection {
             }
             Address::Tcp(address) => {
                 let stream = connect(address.clone()).await?;
-                crate::daemon::tcp::keep_alive(&stream)?;
+                tcp::keep_alive(&stream, tcp::PATIENCE)?;
                 let (input, output) = stream.into_split();
                 (Box::new(input), Box::new(output))
             }
         };
         let address = address.clone();
-        let lines = Lines::new(input, LONGEST_LINE_BYTES);
+        let lines = lines(input, LONGEST_LINE_BYTES);
         Ok(Self {
             address,
             lines,
@@ -221,13 +223,14 @@ impl Connection {
     ///
     /// Fails if the connection has ended, or the line is longer than a daemon may send.
     pub(super) async fn next(&mut self) -> Result<String, Failure> {
-        match self.lines.next().await.map_err(|error| self.broke(error))? {
-            LineRead::Line(line) => Ok(String::from_utf8_lossy(&line).into_owned()),
-            LineRead::End => Err(self.failed("the daemon closed the connection")),
-            LineRead::TooLong => Err(self.failed(format_args!(
+        match self.lines.next().await {
+            Some(Ok(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
+            Some(Err(LineError::Io(error))) => Err(self.broke(error)),
+            Some(Err(LineError::MaxChunkLengthExceeded)) => Err(self.failed(format_args!(
                 "closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
                  daemon sends"
             ))),
+            None => Err(self.failed("the daemon closed the connection")),
         }
     }
 

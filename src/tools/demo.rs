@@ -123,7 +123,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         config.with_model(args.model.path()?.as_deref()),
         Path::new("demo"),
     );
-    let daemon = Daemon::bind(Setup::of(config, path)?.checked(path)?)?;
+    let daemon = Daemon::start(Setup::of(config, path)?.checked(path)?)?;
     if let Some(address) = daemon.http_address() {
         stderr_line!("live page: http://{address}/ (Ctrl-C ends the demonstration)");
     }

@@ -118,7 +118,8 @@ pub async fn run(
     config: &Path,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let sensor = setup.sensor_named(args.sensor.as_deref())?.clone();
+    let sensor = setup.sensor_named(args.sensor.as_deref());
+    let sensor = sensor.exit(USAGE)?.clone();
     // A file that cannot be made or added to shows before anything is pressed.
     let (mut all, part) = begin(&args)?;
     let hrn = setup.hrn.clone();

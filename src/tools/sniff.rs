@@ -16,7 +16,7 @@ use hardnessd_sniff::{Arrival, Capture, Found, Known, Proposal, Ranked, Scale, s
 use super::exit::{Fail, Failure};
 use super::simulate::positive;
 use super::{absolute, cannot_read, doctor};
-use crate::daemon::serial::{self, Link};
+use crate::daemon::serial;
 use crate::thread::spawn_thread;
 use hardnessd_core::exit::{FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::MOST_SIDE;
@@ -269,7 +269,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
         bytes_at_once: usize::MAX,
         bytes_per_s: f64::INFINITY,
     };
-    let mut link = Link::new(port, baud, settings);
+    let mut source = serial::open(port, baud, &[settings]).remove(0);
     let mut captured = Captured::default();
     let mut lost = None;
     let begin = Instant::now();
@@ -278,7 +278,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
     let listened = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let _ = tokio::time::timeout(listened, async {
         while captured.bytes.len() < MOST_BYTES {
-            match link.next().await {
+            match source.next().await {
                 Input::Opened => {
                     let port = escaped(&port.to_string());
                     stderr_line!("listening at {port} for {seconds} s: press the sensor");

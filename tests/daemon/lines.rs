@@ -67,9 +67,8 @@ fn a_press_over_tcp_is_judged_silence_is_stale_and_the_end_of_the_peer_is_loss()
     let config = configure(&bench, &format!("tcp://{address}"), "");
     let checked = hardnessd(&["check", "--config", config.to_str().unwrap()]);
     let checked = String::from_utf8(checked.stdout).unwrap();
-    let load =
-        format!("tcp://{address}, 28x28 taxels in 790 bytes, 50 frames/s: 39500 bytes/s, whatever");
-    assert!(checked.contains(&load), "{checked}");
+    let shown = "28x28 taxels in 790 bytes, 50 frames/s";
+    assert!(checked.contains(shown), "{checked}");
     let _daemon = Daemon::start(&config);
     let mut subscriber = bench.subscriber();
     let mut peer = accept(&listener);

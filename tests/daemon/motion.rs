@@ -69,7 +69,6 @@ fn positions_are_checked_counted_and_recorded() {
     assert!(metrics.contains(counter), "{metrics}");
 
     daemon.end();
-    // A black box may be beside it, if the machine was busy.
     let tape = recordings_in(&bench.path("tape"), "hardnessd-").remove(0);
     let lines = recorded(&tape);
     let at = i64::try_from(now).unwrap();

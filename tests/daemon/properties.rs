@@ -183,7 +183,7 @@ fn served() -> &'static Served {
                 .expect("a runtime");
             runtime.block_on(async {
                 let setup = Setup::load(&path, None).expect("a configuration that is good");
-                let daemon = Daemon::bind(setup).expect("sockets");
+                let daemon = Daemon::start(setup).expect("sockets");
                 bound.send(daemon.http_address()).expect("who waits");
                 let ended = daemon.run(std::future::pending(), None).await;
                 panic!("the daemon ended: {ended:?}");

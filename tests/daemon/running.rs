@@ -257,11 +257,9 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     let http = format!("[http]\nlisten = \"{address}\"\n");
     refused(&http, 74, &["http.listen", &address, "in use"]);
     // 20 frames/s of 790 bytes need more than 115,200 baud. An adapter that is not there follows its
-    // baud rate. A port of which nothing is known may be a pty: that is a warning.
+    // baud rate. A port of which nothing is known may be a pty.
     let config = written("");
-    let (code, _, warning) = run(&["check", "--config", &config]);
-    assert_eq!(code, 0, "{warning}");
-    assert!(warning.contains("14.58 over 115200 baud"), "{warning}");
+    assert_eq!(run(&["check", "--config", &config]).0, 0);
     let text = fs::read_to_string(&config).unwrap();
     fs::write(&config, text.replace("\"port\"", "\"/dev/ttyUSB99\"")).unwrap();
     let label = ["--label", "note=\u{202e}7"];
@@ -327,12 +325,6 @@ fn check_refuses_what_run_would_refuse() {
             fails(&arguments, 78, &[&key, found]);
         }
     }
-    // The daemon runs without its disk and logs it. `check` warns the user beforehand.
-    let record = "[record]\ndir = \"file/rec\"\n";
-    let config = bench.configure("bad.toml", "events.sock", record);
-    let (code, _, warning) = run(&["check", "--config", config.to_str().unwrap()]);
-    let expected = "bad.toml: record.dir: cannot write to ";
-    assert!(code == 0 && warning.contains(expected), "{warning}");
     assert!(!bench.path("events.sock").exists());
     assert!(!bench.path("none").exists());
 }

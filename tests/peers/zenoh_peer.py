@@ -19,8 +19,7 @@ import sys
 import time
 
 import zenoh
-from bench import Arm, Bench, arm_reached_the_press, free_port, wait_for
-from mcap_ros2.reader import read_ros2_messages
+from bench import Bench, free_port, wait_for
 
 
 def free():
@@ -135,37 +134,6 @@ def a_router_that_comes_later(binary):
         assert "tactile/hall/3/forearm/hardness" in keys, keys
 
 
-COURSE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../models/course.onnx")
-
-
-def an_arm(binary):
-    endpoint = free()
-    more = f'[publish.zenoh]\nlisten = ["{endpoint}"]\nmotion = "robot/motion"\n'
-    more += f'[model]\npath = "{COURSE}"\n[record]\ndir = "rec"\nkeep_free_mb = 0\n'
-    with Bench(binary, more=more) as bench:
-        daemon = bench.daemon()
-        with session(connect=[endpoint]) as peer:
-            motion = peer.declare_publisher("robot/motion")
-            wait_for("the daemon's subscription", lambda: motion.matching_status.matching)
-            # Nothing else is taken, and nothing that is no position.
-            for bad in (
-                '{"tare":"forearm"}',
-                "no JSON",
-                json.dumps({"motion": {"sensor": "foot", "at": [[time.monotonic_ns(), 2]]}}),
-                '{"motion":{"sensor":"forearm","at":[[1,2]]}}',
-                "[" * 100_000,
-            ):
-                motion.put(bad)
-            tell = lambda points: motion.put(json.dumps({"motion": {"sensor": "forearm", "at": points}}))  # noqa: E731
-            reached = arm_reached_the_press(bench, daemon, Arm(bench.path("arm.sock"), tell), read_ros2_messages)
-        with open(bench.path("log")) as log:
-            said = log.read()
-        for expected in ("another request", "refused", 'found "foot"', "found a moment", "bytes on zenoh"):
-            assert expected in said, (expected, said)
-        assert "tare" not in said.replace("tare: contact", ""), said
-        return reached
-
-
 FROZEN = """
 import sys, time
 from zenoh_peer import session
@@ -195,7 +163,6 @@ def a_frozen_peer(binary):
 if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
     print("numbered events, as on the socket:", same_as_the_socket(binary))
-    print("an arm: %d of %d positions recorded, at most %d ns off" % an_arm(binary))
     a_router_that_comes_later(binary)
     print("a router that comes later is found")
     print("a frozen peer: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_peer(binary))

@@ -6,7 +6,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use crate::bench::{
-    Bench, Daemon, Process, Subscriber, by_terminal, events, fails, hardnessd, recordings_in, run,
+    Bench, Process, Subscriber, by_terminal, events, fails, hardnessd, recordings_in, run,
     timeless, wait_for,
 };
 use hardnessd_core::pipeline::Input;
@@ -22,21 +22,6 @@ fn configure(bench: &Bench, fps: u32) -> PathBuf {
         format!("[[sensor]]\nname = \"forearm\"\nport = \"port\"\nframe_rate_hz = {fps}.0\n");
     fs::write(&path, text).unwrap();
     path
-}
-
-/// A configuration whose sensor is stale only after 1.25 s, so that a busy machine causes no fault.
-fn configure_patient(bench: &Bench, record: &str) -> PathBuf {
-    let config = bench.configure("hardnessd.toml", "events.sock", record);
-    let text = fs::read_to_string(&config).unwrap();
-    fs::write(
-        &config,
-        text.replace(
-            "frame_rate_hz = 20.0",
-            "frame_rate_hz = 20.0\nstale_after_ms = 1250",
-        ),
-    )
-    .unwrap();
-    config
 }
 
 fn record(config: &Path, out: &Path, more: &[&str]) -> Process {
@@ -271,19 +256,15 @@ fn recover_says_what_it_saved_and_leaves_files_alone() {
 }
 
 #[test]
-fn the_last_minute_is_written_on_request_and_at_a_fault() {
+fn the_last_minute_is_written_on_request() {
     let bench = Bench::new();
-    let record = "[record]\ndir = \"rec\"\ncontinuous = false\nkeep_free_mb = 0\n";
-    let config = configure_patient(&bench, record);
-    let mut daemon = Daemon::start(&config);
-    let mut sensor = bench.sensor(&["--presses", "2"]);
+    let _daemon = bench.daemon_with("[record]\ndir = \"rec\"\nkeep_free_mb = 0\n");
+    let _sensor = bench.sensor(&["--presses", "2"]);
     let mut subscriber = bench.subscriber();
     let live = subscriber.until(&json!({"phase": "final"}));
     let mut control = Subscriber::connect(&bench.path("control.sock"));
     let answer = control.ask(r#"{"blackbox":"forearm","id":1}"#);
     assert_eq!(answer["type"], "ok", "{answer}");
-    let again = control.ask(r#"{"blackbox":"forearm","id":2}"#);
-    assert_eq!((&again["type"], &again["id"]), (&"error".into(), &2.into()));
     let written = PathBuf::from(answer["blackbox"].as_str().unwrap());
     let events = replay(&written);
     let verdict = events
@@ -295,20 +276,6 @@ fn the_last_minute_is_written_on_request_and_at_a_fault() {
     assert_eq!(*verdict, live);
     let unknown = control.ask(r#"{"blackbox":"wrist"}"#);
     assert_eq!(unknown["type"], "error", "{unknown}");
-
-    assert_eq!(sensor.exit_code(), Some(0));
-    let line = daemon.logged("reason=\"lost\"");
-    assert!(line.contains("black box"), "{line}");
-    let boxes = recordings_in(&bench.path("rec"), "");
-    assert_eq!(boxes.len(), 2, "{boxes:?}");
-    let events = replay(boxes.iter().find(|path| **path != written).unwrap());
-    assert!(events.iter().any(|event| event["state"] == "lost"));
-    // A second fault within the minute writes no black box.
-    let _sensor = bench.sensor(&["--presses", "1"]);
-    subscriber.until(&json!({"state": "live"}));
-    subscriber.until(&json!({"state": "lost"}));
-    daemon.end();
-    assert_eq!(recordings_in(&bench.path("rec"), "").len(), 2);
 }
 
 #[test]
@@ -354,10 +321,8 @@ fn a_recording_that_is_deleted_begins_anew() {
     let mut subscriber = bench.subscriber();
     subscriber.until(&json!({"phase": "final"}));
     let directory = bench.path("rec");
-    let first = recordings_in(&directory, "hardnessd-").remove(0);
+    daemon.logged("recording path=");
     fs::remove_dir_all(&directory).unwrap();
-    let line = daemon.logged("the recording was deleted");
-    assert!(line.contains(first.to_str().unwrap()), "{line}");
     daemon.logged("recording path=");
     subscriber.until(&json!({"phase": "final"}));
     daemon.end();

@@ -5,7 +5,7 @@
 //! null, so a null of an event becomes 0, NaN or an empty string.
 
 mod frame;
-pub mod tools;
+pub mod position;
 
 use byteorder::LittleEndian;
 use jiff::Timestamp;

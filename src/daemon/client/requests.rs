@@ -10,13 +10,17 @@ use tokio::sync::oneshot;
 
 use super::{Access, Service};
 use crate::daemon::hub::{Closed, Line};
-use crate::daemon::request::motion::{self, Positions, ReportedPoint};
+use crate::daemon::now;
+use crate::daemon::request::motion::{self, Positions};
 use crate::daemon::request::{self, Context, Query, Request};
 use crate::daemon::sensor::{Command, SensorHandle, Sensors};
 use hardnessd_core::event::{Reply, Tared};
 
 /// The reason a request is answered with an `error`, in words: nobody tells reasons apart.
 pub(in crate::daemon) type Refused = String;
+
+/// The key of a sensor's name in a request with positions.
+const MOTION_KEY: &str = "motion.sensor";
 
 /// The content of an `ok`.
 #[derive(Default)]
@@ -76,7 +80,11 @@ async fn change(service: &Service, request: Request) -> Result<Done, Refused> {
         }
         Request::Context(context) => set_context(sensors, context).await?,
         Request::Motion(Positions { sensor, points }) => {
-            move_arm(sensors, &sensor, &points).await?;
+            // Read the clocks now, because the sensor's task may have other work to do first.
+            let placed = motion::placed(&points, now())?;
+            let command = |reply| Command::Motion(placed, reply);
+            let taken = ask(sensors, MOTION_KEY, &sensor, command).await?;
+            taken.map_err(|error| format!("motion.at[{}]: {error}", error.index))?;
         }
         Request::Blackbox(sensor) => {
             let written = ask(sensors, key, &sensor, Command::Blackbox).await?;
@@ -97,18 +105,17 @@ pub(in crate::daemon) async fn set_context(
     ask(sensors, "context.sensor", &sensor, command).await?
 }
 
-/// Passes positions of the arm on to the task of `sensor`, which also records them. Positions from
-/// every source pass through this function.
-pub(in crate::daemon) async fn move_arm(
+/// Passes positions of the arm on to the task of their sensor, without waiting. If the task refuses them, it
+/// logs that.
+pub(in crate::daemon) fn try_move_arm(
     sensors: &Sensors,
-    sensor: &str,
-    points: &[ReportedPoint],
+    Positions { sensor, points }: &Positions,
 ) -> Result<(), Refused> {
-    // Read the clocks now, because the sensor's task may have other work to do first.
-    let placed = motion::placed(points, crate::daemon::now())?;
-    let command = |reply| Command::Motion(placed, reply);
-    let taken = ask(sensors, "motion.sensor", sensor, command).await?;
-    taken.map_err(|error| format!("motion.at[{}]: {error}", error.index))
+    let found = find(sensors, MOTION_KEY, sensor)?;
+    let (reply, _) = oneshot::channel();
+    let command = Command::Motion(motion::placed(points, now())?, reply);
+    let sent = found.commands.try_send(command);
+    sent.map_err(|_| "they come too fast".to_owned())
 }
 
 /// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's

@@ -1,7 +1,7 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::unix;
 
 use super::*;
@@ -89,30 +89,4 @@ async fn a_client_that_reads_nothing_keeps_no_other_from_its_answers() {
         other.output.write_all(asked).await.unwrap();
         while other.next().await["type"] != "ok" {}
     }
-}
-
-#[tokio::test]
-async fn a_buffer_that_has_grown_shrinks_again() {
-    let (service, _inbox) = service(Access::ReadOnly);
-    let (mut ours, theirs) = UnixStream::pair().unwrap();
-    let output = theirs.into_socket().unwrap();
-    let (_asked, inbox) = mpsc::channel(1);
-    let joined = service.hub.join(Subscription::default()).await.unwrap();
-    let mut writer = Writer {
-        subscriber: joined.unwrap().0,
-        output,
-        outgoing: Vec::new(),
-        inbox,
-    };
-    let message = "x".repeat(10 * KEPT_BYTES);
-    let read = tokio::spawn(async move {
-        let mut read = Vec::new();
-        ours.read_to_end(&mut read).await.unwrap();
-        read
-    });
-    let line = requests::end(Err(message), None);
-    writer.write(&[line]).await.unwrap();
-    assert!(writer.outgoing.capacity() <= KEPT_BYTES);
-    drop(writer);
-    assert!(read.await.unwrap().len() > 10 * KEPT_BYTES);
 }

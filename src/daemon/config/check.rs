@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 
 use super::error::Problem;
 use super::{Config, Publish, Ros2, Unix, Zenoh};
-use crate::daemon::baud::Load;
+use crate::daemon::baud;
 use hardnessd_core::port::Port;
 use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::{range, verdict, wording};
@@ -87,20 +87,13 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
         let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
         let sensor = sensor.and_then(|sensor| {
             taken.add(given)?;
-            check_load(given, &sensor)?;
+            let carried = baud::check(given, sensor.layout());
+            carried.map_err(|problem| Problem::because("sensor.frame_rate_hz", problem))?;
             Ok(sensor)
         });
         sensors.push(sensor.map_err(|problem| problem.of((index, given)))?);
     }
     Ok(sensors)
-}
-
-/// Checks that the line of a sensor can carry its frames. A warning is enough where that is uncertain.
-fn check_load(given: &sensor::Settings, sensor: &Sensor) -> Result<(), Problem> {
-    match Load::of(given, sensor.layout()).excess {
-        Some(excess) if excess.is_certain => Err(Problem::because("sensor.frame_rate_hz", excess)),
-        _ => Ok(()),
-    }
 }
 
 fn check_unix(unix: &Unix) -> Result<(), Problem> {
@@ -125,25 +118,14 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
             range::check(&key, endpoint, fits, expected)?;
         }
     }
-    // These characters have a meaning in zenoh's key expressions. The log shows a site.
-    let is_key = |key: &str| {
-        !key.split('/').any(str::is_empty)
-            && !key.contains(['*', '$', '?', '#'])
-            && wording::is_plain(key)
-    };
     let site = zenoh.site(robot);
+    // These characters have a meaning in zenoh's key expressions. The log shows a site.
+    let is_key = !site.split('/').any(str::is_empty)
+        && !site.contains(['*', '$', '?', '#'])
+        && wording::is_plain(site);
     let expected = "parts of a key (by default the robot's name), without * $ ? #, control or \
                     bidirectional characters";
-    range::check("publish.zenoh.site", site, is_key(site), expected)?;
-    let motion = zenoh.motion.as_deref().unwrap_or("motion");
-    let expected =
-        "a key such as \"arm-7/motion\", without * $ ? #, control or bidirectional characters";
-    Ok(range::check(
-        "publish.zenoh.motion",
-        motion,
-        is_key(motion),
-        expected,
-    )?)
+    Ok(range::check("publish.zenoh.site", site, is_key, expected)?)
 }
 
 fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> {
@@ -153,33 +135,11 @@ fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> 
         Ok(id) => range::check(key, id, id <= LAST_DOMAIN_ID, expected)?,
         Err(found) => return Err(Problem::found(key, found, expected)),
     }
-    let token = |token: &str| {
-        token.starts_with(|first: char| first.is_ascii_alphabetic())
-            && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-            && !token.contains("__")
-    };
-    let is_topic = |name: &str| {
-        let tokens = name.strip_prefix('/');
-        tokens.is_some_and(|tokens| tokens.split('/').all(token))
-    };
-    let namespace = &ros2.namespace;
-    let fits = namespace == "/" || is_topic(namespace);
-    let expected = "a namespace of ROS such as \"/arm_7\"";
-    range::check("publish.ros2.namespace", namespace, fits, expected)?;
-    for (sensor, topic) in &ros2.motion {
+    // The library checks the names, when it makes the topics.
+    for sensor in ros2.motion.keys() {
         let is_known = sensors.iter().any(|known| known.name == *sensor);
         let expected = "the name of a [[sensor]] before each topic";
         range::check("publish.ros2.motion", sensor, is_known, expected)?;
-        let key = format!("publish.ros2.motion.{sensor}");
-        let expected = "a topic of ROS such as \"/arm_7/approach\"";
-        range::check(&key, topic, is_topic(topic), expected)?;
-    }
-    for (index, sensor) in sensors.iter().enumerate() {
-        if !token(&sensor.name) {
-            let problem =
-                "ROS takes no name with two _ in a row: rename the sensor, or remove publish.ros2";
-            return Err(Problem::because("sensor.name", problem).of((index, sensor)));
-        }
     }
     Ok(())
 }
@@ -194,8 +154,8 @@ const LAST_DOMAIN_ID: u16 = 232;
 #[derive(Default)]
 struct Taken<'a> {
     names: HashSet<&'a str>,
-    /// The first sensor of each port. A device that exists may have several names.
-    ports: HashMap<Port, &'a sensor::Settings>,
+    /// The first sensor of each port.
+    ports: HashMap<&'a Port, &'a sensor::Settings>,
 }
 
 impl<'a> Taken<'a> {
@@ -206,18 +166,8 @@ impl<'a> Taken<'a> {
             let problem = "two sensors have this name: give each a name of its own";
             return Err(Problem::because("sensor.name", problem));
         }
-        let port = &sensor.port;
-        let device = port.device().and_then(|path| path.canonicalize().ok());
-        let one = device.map_or_else(|| port.clone(), Port::Device);
-        let first = *self.ports.entry(one).or_insert(sensor);
+        let first = *self.ports.entry(&sensor.port).or_insert(sensor);
         let other = &first.name;
-        if first.port != *port {
-            let problem = format!(
-                "{port} is the port of {other:?} too, which calls it {}: write the same name for both",
-                first.port
-            );
-            return Err(Problem::because("sensor.port", problem));
-        }
         if first.baud != sensor.baud {
             let problem = format!(
                 "found {}, expected {} as for {other:?}, which has the same port",

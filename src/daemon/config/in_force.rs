@@ -1,7 +1,5 @@
 //! Every key in force and where it comes from, as TOML.
 
-use toml::{Table, Value};
-
 use super::Setup;
 use hardnessd_core::press;
 use hardnessd_core::tare::Gains;
@@ -16,6 +14,11 @@ impl Setup {
             table.stale_after_ms = Some(sensor.stale_after().as_secs_f64() * 1e3);
             let frame = table.frame.in_force();
             table.frame = frame.expect("a sensor has been checked");
+            let gains = table.calibration.gains.as_ref();
+            if let Some((least, most)) = gains.and_then(Gains::extent) {
+                let shown = format!("{least:.2} to {most:.2}");
+                table.calibration.gains = Some(Gains::File(shown.into()));
+            }
         }
         config.press = self.press_in_force();
         let unix = &mut config.publish.unix;
@@ -23,23 +26,20 @@ impl Setup {
         if let Some(record) = &mut config.record {
             record.dir = Some(record.dir());
         }
-        let gains = self.shown_gains();
-        for table in &mut config.sensors {
-            table.calibration.gains = None;
-        }
-        // As text, an f32 has its own digits.
         let text = toml::to_string(&config).expect("a configuration is TOML");
-        let mut table: Table = text.parse().expect("what was written can be read");
-        if let Some(Value::Array(sensors)) = table.get_mut("sensor") {
-            for (sensor, gains) in sensors.iter_mut().zip(gains) {
-                if let (Some(gains), Some(calibration)) = (gains, sensor.get_mut("calibration")) {
-                    let calibration = calibration.as_table_mut().expect("it is a table");
-                    calibration.insert("gains".to_owned(), Value::String(gains));
-                }
-            }
-        }
+        let (mut table, mut sensors) = (String::new(), 0);
         let mut lines = String::new();
-        self.table(&mut lines, &table, "", 0);
+        for line in text.lines() {
+            lines += line;
+            if line.starts_with('[') {
+                table = format!("{}.", line.trim_matches(['[', ']']));
+                sensors += usize::from(line == "[[sensor]]");
+            } else if let Some((key, _)) = line.split_once(" = ") {
+                let source = self.source(&format!("{table}{key}"), sensors.saturating_sub(1));
+                lines += &format!("  # {source}");
+            }
+            lines.push('\n');
+        }
         lines
     }
 
@@ -53,51 +53,6 @@ impl Setup {
         match sensors.all(|press| press == first) {
             true => first,
             false => self.config.press.clone(),
-        }
-    }
-
-    /// The least and the greatest gain of each sensor that has some.
-    fn shown_gains(&self) -> Vec<Option<String>> {
-        let shown = |gains: &Gains| {
-            let (least, most) = gains.extent()?;
-            Some(format!("{least:.2} to {most:.2}"))
-        };
-        let sensors = self.config.sensors.iter();
-        sensors
-            .map(|table| table.calibration.gains.as_ref().and_then(shown))
-            .collect()
-    }
-
-    /// Adds the lines of a table. `above` is its key, and `index` that of the `[[sensor]]`.
-    fn table(&self, lines: &mut String, table: &Table, above: &str, index: usize) {
-        let full = |key: &str| match above {
-            "" => key.to_owned(),
-            above => format!("{above}.{key}"),
-        };
-        let is_tables = |value: &Value| match value {
-            Value::Array(list) => list.iter().any(Value::is_table),
-            value => value.is_table(),
-        };
-        for (key, value) in table.iter().filter(|(_, value)| !is_tables(value)) {
-            let source = self.source(&full(key), index);
-            *lines += &format!("{key} = {value}  # {source}\n");
-        }
-        for (key, value) in table.iter().filter(|(_, value)| is_tables(value)) {
-            let full = full(key);
-            match value {
-                Value::Array(list) => {
-                    let tables = list.iter().filter_map(Value::as_table);
-                    for (place, below) in tables.enumerate() {
-                        *lines += &format!("\n[[{full}]]\n");
-                        self.table(lines, below, &full, place);
-                    }
-                }
-                Value::Table(below) => {
-                    *lines += &format!("\n[{full}]\n");
-                    self.table(lines, below, &full, index);
-                }
-                _ => {}
-            }
         }
     }
 

@@ -30,12 +30,8 @@ fn text(path: &Path) -> Result<Text, Problem> {
         )));
     }
     let text = String::from_utf8(bytes);
-    text.map(Text).map_err(|error| {
-        let place = error.utf8_error().valid_up_to();
-        Problem::of_file(format!(
-            "not a text file (no UTF-8 at byte {place}): a configuration is TOML"
-        ))
-    })
+    text.map(Text)
+        .map_err(|error| Problem::of_file(format!("not a text file, such as TOML: {error}")))
 }
 
 fn config(Text(text): &Text, path: &Path) -> Result<Config, Problem> {

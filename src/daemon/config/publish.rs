@@ -83,8 +83,6 @@ settings! {
         pub connect: Vec<String> = Vec::new();
         /// The part after `tactile/` in every key. The default is the robot's name.
         site: Option<String>;
-        /// The key at which the robot reports the positions of its arms. `None`: it reports none.
-        pub motion: Option<String>;
     }
 }
 

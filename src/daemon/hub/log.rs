@@ -9,7 +9,6 @@ use std::time::Duration;
 use super::Line;
 use super::cursor::{Cursor, Place, QUEUE};
 use super::history::History;
-use super::quota::LineQuota;
 use super::tally::Counts;
 use crate::daemon::record::EventRecorder;
 use crate::daemon::request::{Since, Subscription};
@@ -45,7 +44,6 @@ struct OfSensor {
     counts: Counts,
     /// The numbers of its numbered events and of its frames in the log so far.
     entries: [u64; 2],
-    lines: LineQuota,
 }
 
 impl OfSensor {
@@ -160,9 +158,7 @@ impl Log {
             Event::Frame(frame) => of_sensor.history.add(frame),
             event => {
                 of_sensor.counts.count(event);
-                let line = || log::event(event);
-                let is_routine = log::is_routine(event);
-                of_sensor.lines.write(&sensor, now, is_routine, line);
+                log::event(event);
             }
         }
         if kind == Kind::Frame && !self.wants_frames() {
@@ -236,12 +232,6 @@ impl Log {
             let is_new = || frame + QUEUE >= end.of(Kind::Frame) || is_in_share(sensors, entry);
             frame >= read && is_new() || is_newest()
         });
-    }
-
-    /// Writes a line about a sensor into the log of the daemon, unless that sensor has too many.
-    pub(crate) fn write(&mut self, sensor: &str, now: Duration, line: impl FnOnce()) {
-        let of_sensor = self.sensors.entry(sensor.into()).or_default();
-        of_sensor.lines.write(sensor, now, false, line);
     }
 
     /// Takes over the current state of a sensor.

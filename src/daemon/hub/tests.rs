@@ -111,8 +111,17 @@ impl Log {
         self.publish(event, Duration::ZERO);
     }
 
+    /// Publishes so many presses.
+    fn presses(&mut self, count: u64) {
+        (0..count).for_each(|_| self.publish_now(press("a")));
+    }
+
     fn joins(&mut self, wanted: &Subscription) -> u64 {
         self.join(wanted).unwrap()
+    }
+
+    fn wants(&mut self, id: u64, wanted: &Subscription) {
+        self.subscribe(id, wanted).unwrap();
     }
 
     /// All lines that a subscriber gets now, each as `TYPE:SEQ`, `gap:LOST` or `frame:NUMBER`.
@@ -159,29 +168,16 @@ fn numbers(kind: &str, seqs: impl Iterator<Item = u64>) -> Vec<String> {
 }
 
 #[test]
-fn events_are_numbered_over_all_sensors_and_frames_are_not() {
+fn numbers_go_over_all_sensors_and_each_subscriber_gets_the_kinds_it_asked_for() {
     let mut log = log();
-    let id = log.joins(&Subscription::default());
-    let every = [Kind::Status, Kind::Press, Kind::Hardness, Kind::Frame];
-    log.subscribe(id, &wanting(&every, Policy::Queue, None))
-        .unwrap();
+    let usual = log.joins(&Subscription::default());
+    let all = log.joins(&wanting(&Kind::ALL, Policy::Queue, None));
+    let presses = log.joins(&wanting(&[Kind::Press], Policy::Queue, None));
     log.publish_now(status("a"));
     log.publish_now(frame("a", 7));
     log.publish_now(press("b"));
-    assert_eq!(log.drain(id), ["status:1", "frame:7", "press:2"]);
-}
-
-#[test]
-fn a_subscriber_gets_the_kinds_it_asked_for_and_by_default_no_frames() {
-    let mut log = log();
-    let usual = log.joins(&Subscription::default());
-    let presses = log.joins(&Subscription::default());
-    log.subscribe(presses, &wanting(&[Kind::Press], Policy::Queue, None))
-        .unwrap();
-    log.publish_now(status("a"));
-    log.publish_now(frame("a", 0));
-    log.publish_now(press("a"));
     assert_eq!(log.drain(usual), ["status:1", "press:2"]);
+    assert_eq!(log.drain(all), ["status:1", "frame:7", "press:2"]);
     assert_eq!(log.drain(presses), ["press:2"]);
 }
 
@@ -208,10 +204,8 @@ fn a_stalled_subscriber_loses_the_oldest_and_learns_exactly_how_many() {
 #[test]
 fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
     let mut log = log();
-    let id = log.joins(&Subscription::default());
     let kinds = [Kind::Status, Kind::Press, Kind::Frame];
-    log.subscribe(id, &wanting(&kinds, Policy::Latest, None))
-        .unwrap();
+    let id = log.joins(&wanting(&kinds, Policy::Latest, None));
     for number in 0..5 {
         log.publish_now(status("a"));
         log.publish_now(frame("a", number));
@@ -227,10 +221,8 @@ fn latest_keeps_the_newest_of_each_kind_and_sensor_and_counts_all_but_frames() {
 #[test]
 fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
     let mut log = log();
-    let id = log.joins(&Subscription::default());
     let kinds = [Kind::Status, Kind::Frame];
-    log.subscribe(id, &wanting(&kinds, Policy::LatestFrames, None))
-        .unwrap();
+    let id = log.joins(&wanting(&kinds, Policy::LatestFrames, None));
     for number in 0..3 {
         log.publish_now(status("a"));
         log.publish_now(frame("a", number));
@@ -247,16 +239,13 @@ fn latest_frames_lets_frames_be_superseded_and_nothing_else() {
 #[test]
 fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
     let mut log = log();
-    for _ in 0..10 {
-        log.publish_now(press("a"));
-    }
+    log.presses(10);
     let id = log.joins(&Subscription::default());
     log.publish_now(press("a"));
     // The default subscription delivered number 11 before the request came.
     assert_eq!(log.drain(id), ["press:11"]);
     log.publish_now(press("a"));
-    log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)))
-        .unwrap();
+    log.wants(id, &wanting(&[Kind::Press], Policy::Queue, Some(7)));
     log.publish_now(press("a"));
     assert_eq!(
         log.drain(id),
@@ -268,13 +257,10 @@ fn since_gives_what_is_held_then_what_comes_and_nothing_twice() {
 fn a_second_since_before_the_end_of_the_first_gives_nothing_twice() {
     let mut log = log();
     let since = |log: &mut Log, id| {
-        log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
-            .unwrap();
+        log.wants(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)));
     };
     // A batch holds fewer.
-    for _ in 0..600 {
-        log.publish_now(press("a"));
-    }
+    log.presses(600);
     let id = log.joins(&Subscription::default());
     log.publish_now(press("a"));
     assert_eq!(log.drain(id), ["press:601"]);
@@ -285,9 +271,7 @@ fn a_second_since_before_the_end_of_the_first_gives_nothing_twice() {
     lines.extend(log.drain(id));
     assert_eq!(lines, numbers("press", 1..=600));
     // What came after a gap and before it is not given again either.
-    for _ in 0..2 * QUEUE {
-        log.publish_now(press("a"));
-    }
+    log.presses(2 * QUEUE);
     let lines = log.drain(id);
     assert_eq!(lines.len() as u64, 1 + QUEUE);
     since(&mut log, id);
@@ -297,14 +281,10 @@ fn a_second_since_before_the_end_of_the_first_gives_nothing_twice() {
 #[test]
 fn since_older_than_what_is_held_says_how_much_is_gone() {
     let mut log = log();
-    for _ in 0..HELD + 100 {
-        log.publish_now(press("a"));
-    }
+    log.presses(HELD as u64 + 100);
     let held = numbers("press", 101..=HELD as u64 + 100);
     let mut check = |kinds: &[Kind], since, lost: &str| {
-        let id = log.joins(&Subscription::default());
-        log.subscribe(id, &wanting(kinds, Policy::Queue, Some(since)))
-            .unwrap();
+        let id = log.joins(&wanting(kinds, Policy::Queue, Some(since)));
         let lines = log.drain(id);
         assert_eq!(lines[0], format!("gap:{lost}"));
         assert_eq!(lines[1..], held);
@@ -318,42 +298,24 @@ fn since_older_than_what_is_held_says_how_much_is_gone() {
 fn since_of_another_run_gives_an_unknown_gap_and_all_that_is_held() {
     let mut log = log();
     log.publish_now(press("a"));
-    let id = log.joins(&Subscription::default());
-    let since = Since {
-        run: "0ther".to_owned(),
-        seq: 900,
-    };
-    let subscription = Subscription {
-        since: Some(since),
-        ..Subscription::default()
-    };
-    log.subscribe(id, &subscription).unwrap();
+    let mut other = wanting(&[Kind::Press], Policy::Queue, Some(900));
+    assert_eq!(
+        log.join(&other).unwrap_err(),
+        "since: found 900, expected at most 1"
+    );
+    "0ther".clone_into(&mut other.since.as_mut().unwrap().run);
+    let id = log.joins(&other);
     assert_eq!(log.drain(id), ["gap:null", "press:1"]);
-}
-
-#[test]
-fn since_beyond_the_latest_number_is_refused() {
-    let mut log = log();
-    let id = log.joins(&Subscription::default());
-    let refused = log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(1)));
-    let expected = "since: found 1, expected at most 0";
-    assert_eq!(refused.unwrap_err(), expected);
 }
 
 #[test]
 fn what_is_forgotten_during_a_slow_replay_is_counted() {
     let mut log = log();
-    for _ in 0..HELD {
-        log.publish_now(press("a"));
-    }
-    let id = log.joins(&Subscription::default());
-    log.subscribe(id, &wanting(&[Kind::Press], Policy::Queue, Some(0)))
-        .unwrap();
+    log.presses(HELD as u64);
+    let id = log.joins(&wanting(&[Kind::Press], Policy::Queue, Some(0)));
     let had = log.read(id).len() as u64;
     assert!((1..1000).contains(&had), "a batch of {had} lines");
-    for _ in 0..had + 10 {
-        log.publish_now(press("a"));
-    }
+    log.presses(had + 10);
     let lines = log.drain(id);
     assert_eq!(lines[0], "gap:10");
     assert_eq!(
@@ -387,9 +349,7 @@ fn events_that_came_before_a_since_and_between_two_come_once() {
 fn events_that_were_announced_as_lost_come_after_a_since() {
     let mut log = log();
     let id = log.joins(&Subscription::default());
-    for _ in 0..QUEUE + 10 {
-        log.publish_now(press("a"));
-    }
+    log.presses(QUEUE + 10);
     assert_eq!(log.drain(id)[0], "gap:10");
     let all = wanting(&Kind::NUMBERED, Policy::Queue, Some(0));
     log.subscribe(id, &all).unwrap();
@@ -404,8 +364,7 @@ fn a_kind_that_is_wanted_later_comes_from_then_on() {
     log.publish_now(press("a"));
     log.publish_now(frame("a", 0));
     log.publish_now(status("a"));
-    log.subscribe(id, &wanting(&Kind::ALL, Policy::Queue, None))
-        .unwrap();
+    log.wants(id, &wanting(&Kind::ALL, Policy::Queue, None));
     log.publish_now(frame("a", 1));
     log.publish_now(status("a"));
     assert_eq!(log.drain(id), ["press:1", "frame:1", "status:3"]);
@@ -460,15 +419,8 @@ async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
 #[test]
 fn a_sensor_that_floods_takes_no_place_from_the_others() {
     let mut log = log();
-    let kinds = |frames: bool| Subscription {
-        kinds: match frames {
-            true => [Kind::Frame].into(),
-            false => [Kind::Press].into(),
-        },
-        policy: Policy::Queue,
-        since: None,
-    };
-    let (presses, frames) = (log.joins(&kinds(false)), log.joins(&kinds(true)));
+    let [presses, frames] =
+        [Kind::Press, Kind::Frame].map(|kind| log.joins(&wanting(&[kind], Policy::Queue, None)));
     let begun = log.snapshot().hello.seq;
     for number in 0..20 {
         log.publish_now(press("good"));
@@ -482,32 +434,22 @@ fn a_sensor_that_floods_takes_no_place_from_the_others() {
     }
     // What is held beside the newest events is bounded.
     assert!(log.frames.len() < 3 * QUEUE as usize);
-    let good = |lines: &[String]| {
-        let numbers = (0..20).map(|number| format!("frame:{number}"));
-        numbers.filter(|number| lines.contains(number)).count()
+    let numbers_of = |lines: &[String], kind: &str| -> Vec<u64> {
+        let numbers = lines.iter().filter_map(|line| line.strip_prefix(kind));
+        numbers.map(|number| number.parse().unwrap()).collect()
     };
+    let lost = |lines: &[String]| -> u64 { numbers_of(lines, "gap:").iter().sum() };
     let lines = log.drain(frames);
-    assert_eq!(good(&lines), 20);
-    let lost: u64 = lines
-        .iter()
-        .filter_map(|line| line.strip_prefix("gap:")?.parse::<u64>().ok())
-        .sum();
-    let got = lines
-        .iter()
-        .filter(|line| line.starts_with("frame:"))
-        .count() as u64;
-    assert_eq!(got + lost, 20 + 20 * 900, "none is lost without a gap");
+    let got = numbers_of(&lines, "frame:");
+    assert!((0..20).all(|number| got.contains(&number)), "{got:?}");
+    assert_eq!(
+        got.len() as u64 + lost(&lines),
+        20 + 20 * 900,
+        "none is lost without a gap"
+    );
 
-    let seqs = |lines: &[String]| -> Vec<u64> {
-        let seqs = lines.iter().filter_map(|line| line.strip_prefix("press:"));
-        seqs.map(|seq| seq.parse().unwrap()).collect()
-    };
-    let lost = |lines: &[String]| -> u64 {
-        let lost = lines.iter().filter_map(|line| line.strip_prefix("gap:"));
-        lost.map(|lost| lost.parse::<u64>().unwrap()).sum()
-    };
     let lines = log.drain(presses);
-    let got = seqs(&lines);
+    let got = numbers_of(&lines, "press:");
     assert!(got.is_sorted());
     let of_good: Vec<u64> = (0..20).map(|number| begun + 1 + number * 901).collect();
     assert!(of_good.iter().all(|seq| got.contains(seq)), "{got:?}");
@@ -515,28 +457,11 @@ fn a_sensor_that_floods_takes_no_place_from_the_others() {
 
     // Whoever comes back gets what is held, and learns what is not.
     for since in [0, of_good[3], of_good[3] + 5, 20 * 901] {
-        let again = log.joins(&Subscription {
-            kinds: Kind::NUMBERED.into(),
-            since: Some(Since {
-                run: RUN.to_owned(),
-                seq: since,
-            }),
-            ..kinds(false)
-        });
+        let again = log.joins(&wanting(&Kind::NUMBERED, Policy::Queue, Some(since)));
         let lines = log.drain(again);
-        let got = seqs(&lines);
+        let got = numbers_of(&lines, "press:");
         let after = of_good.iter().filter(|&&seq| seq > since);
         assert!(after.into_iter().all(|seq| got.contains(seq)));
         assert_eq!(got.len() as u64 + lost(&lines), 20 * 901 - since, "{since}");
     }
-}
-
-#[test]
-fn lines_about_a_sensor_have_one_allowance() {
-    let mut log = log();
-    let mut written = 0;
-    for ms in 0..60_000 {
-        log.write("a", Duration::from_millis(ms), || written += 1);
-    }
-    assert!((40..50).contains(&written), "{written}");
 }

@@ -4,8 +4,9 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
+use crate::daemon::config;
 use hardnessd_core::part;
 use hardnessd_core::recording::{self, About, Writer};
 
@@ -32,9 +33,12 @@ impl Open {
         })
     }
 
-    /// Whether the file is no longer at its path. Bytes that are then written to it are lost.
-    pub(super) fn is_deleted(&self) -> bool {
-        part::is_at(&self.path, &self.file).is_ok_and(|is_there| !is_there)
+    /// Whether the next file is due: this one is full or old, or somebody has deleted or moved it.
+    pub(super) fn is_over(&self, settings: &config::Record) -> bool {
+        let bytes = self.file.metadata().map_or(0, |file| file.len());
+        bytes >= settings.rotate_mb * MB
+            || self.since.elapsed() >= Duration::from_secs(settings.rotate_s)
+            || part::is_at(&self.path, &self.file).is_ok_and(|is_there| !is_there)
     }
 
     pub(super) fn finish(self) -> Result<(), recording::Error> {
@@ -66,19 +70,6 @@ pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)
     let path = directory.join(format!("{what}-{now}.mcap"));
     let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
     Ok((path, file))
-}
-
-/// The number of the files of black boxes in a directory, and their bytes.
-pub(super) fn blackboxes(directory: &Path) -> (usize, u64) {
-    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
-    let boxes = entries.filter(|entry| {
-        let name = entry.file_name();
-        name.to_string_lossy().starts_with("blackbox-")
-    });
-    boxes.fold((0, 0), |(count, bytes), entry| {
-        let size = entry.metadata().map_or(0, |file| file.len());
-        (count + 1, bytes + size)
-    })
 }
 
 fn named(path: &Path, error: &io::Error) -> io::Error {

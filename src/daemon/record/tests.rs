@@ -5,7 +5,7 @@ use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
 use hardnessd_core::test_support;
 
-fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
+fn recorder(sender: Sender<Job>) -> (SensorRecorder, Pipeline) {
     let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
     let active = Active {
         jobs: Jobs {
@@ -18,8 +18,6 @@ fn recorder(sender: SyncSender<Job>) -> (SensorRecorder, Pipeline) {
         was_busy: false,
         bytes: 0,
         left_out: 0,
-        looked: None,
-        counted: (0, 0),
     };
     (SensorRecorder(Some(Box::new(active))), pipeline)
 }
@@ -33,10 +31,11 @@ fn at(ms: u64) -> Stamp {
 
 /// The count of the recorded inputs, and the numbers of those that follow a gap without a state
 /// between.
-fn drained(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
+fn drained(inbox: &Receiver<Job>, load: &Load) -> (usize, Vec<u64>) {
     let (mut count, mut bad) = (0, Vec::new());
     let mut next = None;
     for job in inbox {
+        load.bytes.fetch_sub(job.weight(), Ordering::Relaxed);
         match job {
             Job::Entry {
                 entry: Entry::State(_),
@@ -61,12 +60,14 @@ fn drained(inbox: &Receiver<Job>) -> (usize, Vec<u64>) {
 
 #[test]
 fn after_a_gap_comes_a_state() {
-    // There is room for a state and inputs, so the first ones are recorded in any order of the
-    // threads.
-    let (sender, inbox) = sync_channel(4);
+    let (sender, inbox) = channel();
     let (mut recorder, pipeline) = recorder(sender);
+    // There is room for a state and some inputs, so the first ones are recorded in any order of the threads.
+    let load = recorder.0.as_ref().unwrap().jobs.load.clone();
+    load.bytes
+        .store(QUEUED_BYTES - (64 << 10), Ordering::Relaxed);
     // The reader takes jobs as fast as they come, so room appears at any moment.
-    let reader = std::thread::spawn(move || drained(&inbox));
+    let reader = std::thread::spawn(move || drained(&inbox, &load));
     for number in 0..20_000_u64 {
         let bytes = number.to_le_bytes().to_vec();
         recorder.note(&pipeline, &Input::Bytes(bytes), at(number));
@@ -79,7 +80,7 @@ fn after_a_gap_comes_a_state() {
 
 #[test]
 fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
-    let (sender, inbox) = sync_channel(4096);
+    let (sender, inbox) = channel();
     let (mut recorder, _) = recorder(sender);
     let pressed = test_support::of_a_press(|_| {}, None, false);
     let entries = hardnessd_core::recording::Reader::new(&pressed.0[..]);
@@ -132,7 +133,7 @@ fn a_flood_is_bounded_in_the_black_box() {
         Input::Context(Some(context)),
     ] {
         assert!(Entry::Input(flood.to_owned()).weight() > 60_000);
-        let (sender, inbox) = sync_channel(4096);
+        let (sender, inbox) = channel();
         let (mut recorder, pipeline) = recorder(sender);
         for _ in 0..1000 {
             recorder.note(&pipeline, &flood, at(0));

@@ -11,10 +11,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::file::{MB, Open, blackboxes, create, has_room};
-use super::{Job, Load, MOST_BLACKBOX_MB, MOST_BLACKBOXES, Progress, Target};
-use crate::daemon::{Error, config, log};
-use hardnessd_core::event::{Event, LinkState, Phase, PressState};
+use super::file::{MB, Open, create, has_room};
+use super::{Job, Load, Progress, Target};
+use crate::daemon::{Error, config};
+use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{self, About, Entry, Ring};
@@ -23,15 +23,10 @@ use hardnessd_core::recording::{self, About, Entry, Ring};
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// At least this many bytes are in a chunk, unless [`FLUSH_EVERY`] ends it.
 const CHUNK_BYTES: usize = 1 << 20;
-/// The shortest time between two reports of dropped entries.
+/// How often dropped entries are reported.
 const REPORT_EVERY: Duration = Duration::from_secs(60);
 /// How long the recorder waits before it tries again after the disk failed or was full.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
-/// The shortest time between black boxes of one sensor's faults.
-const FAULT_EVERY: Duration = Duration::from_secs(60);
-/// The shortest time between requested black boxes of one sensor, because each takes the disk a
-/// moment.
-const ASKED_EVERY: Duration = Duration::from_secs(1);
 /// Before a paused recording continues, 1 / [`ROOM_SHARE`] more than the floor must be free.
 const ROOM_SHARE: u64 = 16;
 
@@ -40,13 +35,12 @@ pub(super) struct Worker {
     target: Target,
     about: About,
     load: Arc<Load>,
-    dropped_reported: u64,
-    /// When dropped entries may be reported next.
+    /// When dropped entries are reported next.
     report_at: Instant,
     sensors: Vec<Watched>,
     open: Option<Open>,
-    /// The time of the next try, if a file should be open and is not.
-    retry: Option<Instant>,
+    /// The time of the next try, if no file is open in the directory.
+    retry_at: Instant,
     /// Whether the recording is paused because the disk failed or is full.
     paused: bool,
     /// Sent when there is no more to record.
@@ -63,8 +57,6 @@ struct Watched {
     is_begun: bool,
     /// Whether the sensor's port is open. `None`: this is not known yet.
     is_open: Option<bool>,
-    last_fault: Option<Instant>,
-    last_asked: Option<Instant>,
 }
 
 impl Worker {
@@ -79,10 +71,9 @@ impl Worker {
             target,
             about,
             load,
-            dropped_reported: 0,
             report_at: Instant::now(),
             open: None,
-            retry: None,
+            retry_at: Instant::now(),
             paused: false,
             stop: Some(stop),
             gone: None,
@@ -93,8 +84,12 @@ impl Worker {
     /// Writes until the queue has no sender left. A failed write is an error only of a recording
     /// into one file, which ends there. In a directory, it is a line in the log.
     pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
-        self.begin()?;
-        let mut flush = Instant::now() + FLUSH_EVERY;
+        if let Target::File { path, file, .. } = &self.target {
+            let file = file.try_clone().map_err(recording::Error::from);
+            let opened = file.and_then(|file| Open::new(path.clone(), file, &self.about));
+            self.open = Some(opened.map_err(|error| cannot_write(path, &error))?);
+        }
+        let mut flush = Instant::now();
         // The bytes that were taken since the last look at the disk.
         let mut unchecked = 0;
         loop {
@@ -118,22 +113,6 @@ impl Worker {
                 flush = Instant::now() + FLUSH_EVERY;
             }
         }
-    }
-
-    fn begin(&mut self) -> Result<(), Error> {
-        match &self.target {
-            Target::File { path, file, .. } => {
-                let file = file.try_clone().map_err(recording::Error::from);
-                let opened = file.and_then(|file| Open::new(path.clone(), file, &self.about));
-                self.open = Some(opened.map_err(|error| cannot_write(path, &error))?);
-            }
-            Target::Directory(settings) if settings.continuous => {
-                self.retry = Some(Instant::now());
-                self.look_after_directory();
-            }
-            Target::Directory(_) => {}
-        }
-        Ok(())
     }
 
     /// Handles a failed write. It ends a recording into one file. In a directory, another file may work.
@@ -167,7 +146,7 @@ impl Worker {
             warn!(%reason, "recording stopped; it goes on when there is room");
         }
         self.paused = true;
-        self.retry = Some(Instant::now() + RETRY_AFTER);
+        self.retry_at = Instant::now() + RETRY_AFTER;
     }
 
     fn end(mut self) -> Result<(), Error> {
@@ -198,13 +177,9 @@ impl Worker {
         match job {
             Job::Entry { sensor, at, entry } => self.entry(sensor, at, entry),
             Job::Event(event) => self.event(&event),
-            Job::Damage { sensor } => {
-                self.fault(sensor, "damaged frames");
-                Ok(())
-            }
             Job::Blackbox { sensor, reply } => {
                 // The client may have gone.
-                let _ = reply.send(self.asked(sensor));
+                let _ = reply.send(self.blackbox(sensor));
                 Ok(())
             }
         }
@@ -268,59 +243,9 @@ impl Worker {
         if let Target::File { progress, .. } = &self.target {
             progress.send_replace(self.progress);
         }
-        if let Some(open) = &mut self.open {
-            open.writer.event(event)?;
-        }
-        let fault = match event {
-            Event::Status(status) if status.state == LinkState::Lost => "lost",
-            Event::Status(status) if status.state == LinkState::Stale => "stale",
-            _ => return Ok(()),
-        };
-        let mut sensors = self.about.sensors.iter();
-        if let Some(sensor) = sensors.position(|sensor| sensor.name() == event.sensor()) {
-            self.fault(sensor, fault);
-        }
-        Ok(())
-    }
-
-    /// Writes the black box that a client requests, unless one was written less than
-    /// [`ASKED_EVERY`] ago.
-    fn asked(&mut self, sensor: usize) -> Result<PathBuf, String> {
-        let last = self.sensors[sensor].last_asked;
-        if last.is_some_and(|last| last.elapsed() < ASKED_EVERY) {
-            return Err("one was written less than a second ago: ask again in a second".to_owned());
-        }
-        let written = self.blackbox(sensor, "asked for")?;
-        self.sensors[sensor].last_asked = Some(Instant::now());
-        Ok(written)
-    }
-
-    /// Writes a black box of a fault, unless the last one of this sensor was less than
-    /// [`FAULT_EVERY`] ago.
-    fn fault(&mut self, sensor: usize, fault: &str) {
-        let last = self.sensors[sensor].last_fault;
-        if self.directory().is_none() || last.is_some_and(|last| last.elapsed() < FAULT_EVERY) {
-            return;
-        }
-        self.sensors[sensor].last_fault = Some(Instant::now());
-        let written = self.has_few().and_then(|()| self.blackbox(sensor, fault));
-        if let Err(reason) = written {
-            let sensor = self.about.sensors[sensor].name();
-            warn!(sensor, reason, "no black box");
-        }
-    }
-
-    /// Whether there are few enough black boxes for another one of a fault. Nothing is deleted.
-    fn has_few(&self) -> Result<(), String> {
-        let directory = self.directory().map(config::Record::dir);
-        let (count, bytes) = blackboxes(&directory.unwrap_or_default());
-        let mb = bytes / MB;
-        match count < MOST_BLACKBOXES && mb < MOST_BLACKBOX_MB {
-            true => Ok(()),
-            false => Err(format!(
-                "found {count} black boxes of {mb} MB in record.dir, expected fewer than \
-                 {MOST_BLACKBOXES} and {MOST_BLACKBOX_MB} MB for another one of a fault: move old ones away"
-            )),
+        match &mut self.open {
+            Some(open) => open.writer.event(event),
+            None => Ok(()),
         }
     }
 
@@ -332,7 +257,7 @@ impl Worker {
     }
 
     /// Writes the last minute of a sensor to a file of its own.
-    fn blackbox(&self, sensor: usize, reason: &str) -> Result<PathBuf, String> {
+    fn blackbox(&self, sensor: usize) -> Result<PathBuf, String> {
         let Some(settings) = self.directory() else {
             let none = "`hardnessd record` keeps none: ask a daemon that has [record]";
             return Err(none.to_owned());
@@ -345,7 +270,7 @@ impl Worker {
         }
         let name = self.about.sensors[sensor].name();
         let about = About {
-            reason: Some(reason.to_owned()),
+            reason: Some("asked for".to_owned()),
             sensors: vec![self.about.sensors[sensor].clone()],
             ..self.about.clone()
         };
@@ -365,57 +290,38 @@ impl Worker {
             Ok(path)
         };
         let path = written().map_err(|error| error.to_string())?;
-        log::outside("black box", || {
-            info!(sensor = name, reason, path = %path.display(), "black box");
-        });
+        info!(sensor = name, path = %path.display(), "black box");
         Ok(path)
     }
 
     /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), recording::Error> {
-        let dropped = self.load.dropped.load(Ordering::Relaxed);
-        if dropped > self.dropped_reported && Instant::now() >= self.report_at {
+        if Instant::now() >= self.report_at {
             self.report_at = Instant::now() + REPORT_EVERY;
-            let count = dropped - self.dropped_reported;
-            warn!(count, "no room in the recorder's queue: entries dropped");
-            self.dropped_reported = dropped;
+            let count = self.load.dropped.swap(0, Ordering::Relaxed);
+            if count > 0 {
+                warn!(count, "no room in the recorder's queue: entries dropped");
+            }
         }
         if let Some(open) = &mut self.open {
             open.writer.flush()?;
         }
-        self.look_after_directory();
+        if let Some(settings) = self.directory().cloned() {
+            self.look_after_directory(&settings);
+        }
         Ok(())
     }
 
     /// Ends the file if it is full or old, or if too little room is left, and begins the next file.
-    fn look_after_directory(&mut self) {
-        let Target::Directory(settings) = &self.target else {
-            return;
-        };
-        let settings = settings.clone();
+    fn look_after_directory(&mut self, settings: &config::Record) {
         let directory = settings.dir();
         let floor = settings.keep_free_mb * MB;
-        if self.open.as_ref().is_some_and(Open::is_deleted) {
-            let path = self.open.take().map(|open| open.path);
-            let path = path.as_deref().unwrap_or(&directory).display();
-            warn!(%path, "the recording was deleted or moved while it was written: a new one begins");
-            self.retry = Some(Instant::now());
+        let must_end =
+            |open: &mut Open| open.is_over(settings) || has_room(&directory, floor).is_err();
+        if let Some(Err(error)) = self.open.take_if(must_end).map(Open::finish) {
+            return self.pause(&error);
         }
-        if let Some(open) = &self.open {
-            let full = open.file.metadata();
-            let full = full.is_ok_and(|file| file.len() >= settings.rotate_mb * MB);
-            let old = open.since.elapsed() >= Duration::from_secs(settings.rotate_s);
-            let room = has_room(&directory, floor);
-            if full || old || room.is_err() {
-                let ended = self.open.take().map_or(Ok(()), Open::finish);
-                match (ended, room) {
-                    (Err(error), _) => return self.pause(&error),
-                    (Ok(()), Err(error)) => return self.pause(&error.into()),
-                    (Ok(()), Ok(())) => self.retry = Some(Instant::now()),
-                }
-            }
-        }
-        if self.retry.is_none_or(|at| Instant::now() < at) {
+        if self.open.is_some() || Instant::now() < self.retry_at {
             return;
         }
         // After a pause, a little more room is required, so that the recording does not begin and
@@ -432,7 +338,6 @@ impl Worker {
             Ok(open) => {
                 info!(path = %open.path.display(), "recording");
                 self.open = Some(open);
-                self.retry = None;
                 self.paused = false;
             }
             Err(error) => self.pause(&error),

@@ -9,6 +9,7 @@ use tokio::net::UdpSocket;
 use tokio::time::Instant;
 
 use crate::daemon::log;
+use crate::daemon::tcp::keep_alive;
 use hardnessd_core::wire;
 
 /// How long a connection may take.
@@ -30,7 +31,7 @@ pub(super) fn connect(address: &str) -> io::Result<TcpStream> {
                 refuse_self(&stream)?;
                 stream.set_nodelay(true)?;
                 stream.set_nonblocking(true)?;
-                probe(&stream)?;
+                keep_alive(&stream, GONE)?;
                 return Ok(stream);
             }
             Err(error) => last = Some(error),
@@ -56,20 +57,6 @@ pub(super) fn is_telnet(mut stream: &TcpStream) -> bool {
     let is_set =
         stream.set_nonblocking(false).is_ok() && stream.set_read_timeout(Some(GREETING)).is_ok();
     is_set && stream.read_exact(&mut bytes).is_ok() && wire::is_telnet(&bytes)
-}
-
-/// Has the system ask a silent peer whether it is still there.
-fn probe(stream: &TcpStream) -> io::Result<()> {
-    use rustix::net::sockopt;
-    let every = Duration::from_secs(1);
-    let first = GONE / 2;
-    sockopt::set_tcp_keepidle(stream, first)?;
-    sockopt::set_tcp_keepintvl(stream, every)?;
-    sockopt::set_tcp_keepcnt(stream, (GONE - first).as_secs() as u32)?;
-    sockopt::set_socket_keepalive(stream, true)?;
-    // This covers a peer that goes while a request is under way.
-    sockopt::set_tcp_user_timeout(stream, GONE.as_millis() as u32)?;
-    Ok(())
 }
 
 /// What came from a line.

@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 
 def generate_launch_description():
     config = LaunchConfiguration("config")
-    image = [LaunchConfiguration("namespace"), "/tactile/", LaunchConfiguration("sensor"), "/image"]
+    image = [LaunchConfiguration("namespace"), "/tactile/", LaunchConfiguration("sensor"), "/frame"]
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", default_value="/etc/hardnessd.toml", description="the daemon's configuration"),

@@ -32,14 +32,14 @@ pub const CONTACT: Topic = Topic {
 };
 
 #[derive(Debug, Serialize)]
-pub(super) struct ImageMessage {
-    pub(super) header: Header,
-    pub(super) height: u32,
-    pub(super) width: u32,
-    pub(super) encoding: &'static str,
-    pub(super) is_bigendian: u8,
-    pub(super) step: u32,
-    pub(super) data: Blob,
+struct ImageMessage {
+    header: Header,
+    height: u32,
+    width: u32,
+    encoding: &'static str,
+    is_bigendian: u8,
+    step: u32,
+    data: Blob,
 }
 
 /// Bytes of a taxel in newtons.
