@@ -2,8 +2,8 @@
 //!
 //! In: lines of the hub. Out: messages of the node `hardnessd`. ROS need not be installed. Verdicts
 //! and statuses are reliable, and a subscriber that comes later gets the last of each. Frames are
-//! best effort. If the configuration names topics with positions of the arm, the node subscribes to them. The node has no
-//! service and no parameter, so nothing else comes in.
+//! best effort. If the configuration names topics with positions of the arm, the node subscribes to them.
+//! The node has no service and no parameter, so nothing else comes in.
 
 use std::collections::BTreeMap;
 

@@ -65,7 +65,7 @@ fn after_a_gap_comes_a_state() {
     // There is room for a state and some inputs, so the first ones are recorded in any order of the threads.
     let load = recorder.0.as_ref().unwrap().jobs.load.clone();
     load.bytes
-        .store(QUEUED_BYTES - (64 << 10), Ordering::Relaxed);
+        .store(QUEUED_BYTES - (160 << 10), Ordering::Relaxed);
     // The reader takes jobs as fast as they come, so room appears at any moment.
     let reader = std::thread::spawn(move || drained(&inbox, &load));
     for number in 0..20_000_u64 {
