@@ -5,6 +5,7 @@
 //! the same minute, from the same weights and images. Only their ratio has a meaning. The seconds
 //! are processor time, so that a busy machine makes no difference.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead as _, Write as _};
 use std::path::Path;
 
@@ -14,10 +15,9 @@ use hardnessd_simulator::random::Stream;
 use hrn_train::learn::learner::Learner;
 use hrn_train::learn::{gan, hrn as learn_hrn};
 use hrn_train::net::losses::Game;
-use hrn_train::net::network::numbers;
+use hrn_train::net::network::{Weights, numbers};
 use hrn_train::net::{generator, hrn};
-use hrn_train::settings::network::Pooling;
-use hrn_train::settings::{GanSettings, OptimiserSettings};
+use hrn_train::settings::Training;
 use rustix::time::{ClockId, clock_gettime};
 
 /// The same allocator as in `hrn-train`.
@@ -38,14 +38,15 @@ fn main() {
 
 fn run() {
     let arguments: Vec<String> = std::env::args().collect();
+    let inputs = Inputs::new();
     if let Some(place) = arguments.iter().position(|argument| argument == "--serve") {
-        serve(Path::new(&arguments[place + 1]));
+        serve(&inputs, Path::new(&arguments[place + 1]));
         return;
     }
-    let mut networks = Networks::new();
     for name in ["hrn", "gan"] {
-        networks.run(name, 10);
-        let mut seconds: Vec<f64> = (0..50).map(|_| networks.run(name, 1).0).collect();
+        let mut network = inputs.network(name);
+        blocks(&mut network, 10);
+        let mut seconds: Vec<f64> = (0..50).map(|_| blocks(&mut network, 1).0).collect();
         seconds.sort_by(f64::total_cmp);
         println!("{name} step of {BATCH}: median {:.2} ms", seconds[25] * 1e3);
     }
@@ -53,73 +54,80 @@ fn run() {
 
 /// Writes images, targets, noise and initial weights to `file`, then answers `NETWORK STEPS` with
 /// `seconds loss loss ...`.
-fn serve(file: &Path) {
-    let mut networks = Networks::new();
-    networks.write(file);
+fn serve(inputs: &Inputs, file: &Path) {
+    inputs.write(file);
+    let mut networks = BTreeMap::<String, Network>::new();
     println!("ready");
     for line in std::io::stdin().lock().lines() {
         let line = line.expect("the peer sends text");
         let (name, steps) = line.split_once(' ').expect("NETWORK STEPS");
-        let (seconds, losses) = networks.run(name, steps.parse().expect("a number of steps"));
+        let network = networks.entry(name.to_owned());
+        let network = network.or_insert_with(|| inputs.network(name));
+        let (seconds, losses) = blocks(network, steps.parse().expect("a number of steps"));
         let losses: Vec<String> = losses.iter().map(f64::to_string).collect();
         println!("{seconds} {}", losses.join(" "));
         std::io::stdout().flush().expect("the peer reads");
     }
 }
 
-/// The networks: the supervised HRN, and both sides of USTGAN. Their inputs are always the same.
-struct Networks {
-    hrn: Learner,
-    /// The generator and the discriminator.
-    gan: [Learner; 2],
-    /// The same two with plain SGD. If a gradient is nothing but rounding, Adam still makes a step
-    /// of the full rate. So with Adam, two exact computations differ after three steps.
-    gan_sgd: [Learner; 2],
-    images: Tensor<4>,
-    targets: Tensor<2>,
-    eta: Tensor<2>,
+/// Takes a step and gives its loss. The loss of a GAN is the sum of both sides'.
+type Network = Box<dyn FnMut() -> f64>;
+
+/// The seconds and the losses of `steps` steps.
+fn blocks(network: &mut Network, steps: usize) -> (f64, Vec<f64>) {
+    let begun = processor_seconds();
+    let losses = (0..steps).map(|_| network()).collect();
+    (processor_seconds() - begun, losses)
 }
 
-impl Networks {
+/// What the networks start from, and the inputs of their steps, which are always the same.
+struct Inputs {
+    hrn: Weights,
+    /// The generator and the discriminator.
+    gan: [Weights; 2],
+    targets: Tensor<2>,
+    /// The inputs of a step of USTGAN. HRN takes its images, too.
+    batch: gan::Batch,
+}
+
+impl Inputs {
     fn new() -> Self {
         let device = Device::flex();
         let mut stream = Stream::new(1, "bench images");
         // Like pressed frames, the images are mostly background.
         let pixel = |_| (stream.normal().max(0.0) * 0.5 - 1.0).min(1.0) as f32;
         let images: Vec<f32> = (0..BATCH * 28 * 28).map(pixel).collect();
-        let images = Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device);
         let levels_of = (0..BATCH).map(|n| (n % LEVELS) as u8 + 1);
-        let adversaries = GanSettings::default();
-        let gan = gan::initial(GAME, LEVELS, 1, &device);
-        let sgd = OptimiserSettings::default();
-        let sides = |settings| {
-            gan.clone()
-                .map(|weights| Learner::fresh(weights, settings, 0.0))
-        };
         Self {
-            hrn: Learner::fresh(hrn::initial(LEVELS, Pooling::Max, 1, &device), sgd, 0.0),
-            gan: sides(adversaries.optimiser),
-            gan_sgd: sides(sgd),
-            images,
+            hrn: hrn::initial(None, LEVELS, false, 1, &device),
+            gan: gan::initial(GAME, LEVELS, 1, &device),
             targets: hrn::targets(levels_of, LEVELS, &device),
-            eta: generator::noise(BATCH / generator::COMPONENTS, &mut stream, &device),
+            batch: gan::Batch {
+                real: Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device),
+                labelled: None,
+                eta: generator::noise(generator::SAMPLES_A_COMPONENT, &mut stream, &device),
+                sensing: None,
+            },
         }
     }
 
-    /// The seconds and the losses of `steps` steps. The losses of a GAN are the sum of both sides'.
-    fn run(&mut self, name: &str, steps: usize) -> (f64, Vec<f64>) {
-        let begun = processor_seconds();
-        let step = |_| match name {
+    /// The supervised HRN, or both sides of USTGAN, also with plain SGD: if a gradient is nothing but rounding,
+    /// Adam still makes a step of the full rate, so with Adam two exact computations differ after three steps.
+    fn network(&self, name: &str) -> Network {
+        let (batch, targets) = (self.batch.clone(), self.targets.clone());
+        let training = match name {
             "hrn" => {
-                let (images, targets) = (self.images.clone(), self.targets.clone());
-                learn_hrn::step(&mut self.hrn, images, targets, RATE).0
+                let mut hrn = Learner::fresh(self.hrn.clone(), Training::default());
+                return Box::new(move || {
+                    learn_hrn::step(&mut hrn, batch.real.clone(), targets.clone(), RATE).0
+                });
             }
-            "gan" => gan_step(&mut self.gan, &self.images, &self.eta),
-            "gan-sgd" => gan_step(&mut self.gan_sgd, &self.images, &self.eta),
+            "gan" => Training::of_a_gan(),
+            "gan-sgd" => Training::default(),
             _ => panic!("{name}: expected hrn, gan or gan-sgd"),
         };
-        let losses = (0..steps).map(step).collect();
-        (processor_seconds() - begun, losses)
+        let mut sides = self.gan.clone().map(|side| Learner::fresh(side, training));
+        Box::new(move || gan::step(&mut sides, GAME, &batch, RATE).iter().sum())
     }
 
     fn write(&self, path: &Path) {
@@ -128,20 +136,21 @@ impl Networks {
         let mut add = |name: &str, dims: &[usize], values: Vec<f32>| {
             npz.add(name, dims, &values).expect("room on the disk");
         };
-        let sides = [
+        let [generator, discriminator] = &self.gan;
+        for (side, weights) in [
             ("hrn", &self.hrn),
-            ("generator", &self.gan[0]),
-            ("discriminator", &self.gan[1]),
-        ];
-        for (side, learner) in sides {
-            for weight in &learner.weights.entries {
+            ("generator", generator),
+            ("discriminator", discriminator),
+        ] {
+            for weight in &weights.entries {
                 let name = format!("{side}/{}", weight.name);
                 add(&name, &weight.dims, numbers(&weight.values));
             }
         }
-        add("images", &self.images.dims(), numbers(&self.images));
+        let (images, eta) = (&self.batch.real, &self.batch.eta);
+        add("images", &images.dims(), numbers(images));
         add("targets", &self.targets.dims(), numbers(&self.targets));
-        add("eta", &self.eta.dims(), numbers(&self.eta));
+        add("eta", &eta.dims(), numbers(eta));
         npz.finish().expect("room on the disk");
     }
 }
@@ -150,21 +159,4 @@ impl Networks {
 fn processor_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
-}
-
-/// The sum of both sides' losses.
-fn gan_step(gan: &mut [Learner; 2], images: &Tensor<4>, eta: &Tensor<2>) -> f64 {
-    let batch = gan::Images {
-        real: images.clone(),
-        labelled: None,
-    };
-    let rules = gan::Rules {
-        game: GAME,
-        sigma_penalty: GanSettings::default().sigma_penalty,
-        rate: RATE,
-        sensing: None,
-    };
-    let [generator, discriminator] = gan;
-    let losses = gan::step(generator, discriminator, &batch, eta.clone(), &rules);
-    losses.0 + losses.1
 }

@@ -27,7 +27,6 @@ use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
 use crate::run::disk::{lock, refuse_foreign, write_whole};
-use crate::run::history::MetricsFile;
 use crate::settings::Profile;
 use hardnessd_core::trial;
 use sets::{FRESH_OBJECTS, TestSet};
@@ -209,7 +208,7 @@ fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
     let description = description.with_context(|| format!("{}: no run", run.display()))?;
     let bytes = fs::read(&path).with_context(|| path.display().to_string())?;
     let hrn = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
-    let (steps, seconds) = MetricsFile::of(run).cost()?;
+    let (steps, seconds) = Run::cost(run)?;
     let name = run.file_name().unwrap_or_default().to_string_lossy();
     let mut entry = json!({
         "method": description.method,

@@ -2,7 +2,6 @@
 //! the last one, which makes the recogniser.
 
 use std::io::Cursor;
-use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow};
 use burn::tensor::Device;
@@ -12,17 +11,17 @@ use crate::data::presses::{self, Layout, Press, Presses};
 use crate::data::split::Parts;
 use crate::learn::course::Course;
 use crate::learn::gan::{self, Gan};
-use crate::learn::hrn::Hrn;
-use crate::learn::regression::{Regression, Seen, Table};
+use crate::learn::hrn::{Frames, Hrn};
+use crate::learn::regression::{Regression, Seen};
 use crate::learn::{self, Learning};
 use crate::net::generator;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::losses::Game;
 use crate::net::network::Weights;
-use crate::recipe::{Kind, Recipe, Start};
+use crate::recipe::{Kind, Recipe};
 use crate::run::Run;
-use crate::settings::{GanSettings, Settings, Training};
+use crate::settings::{Settings, Training};
 use hardnessd_simulator::random::Stream;
 
 /// Stage names of the STGANs, one for each hardness level.
@@ -82,9 +81,7 @@ pub fn last_stage<'a>(
                 Kind::Taxels => Seen::parts(presses).context(NO_GRID)?,
                 _ => Seen::Features,
             };
-            let places = train.iter().chain(held_out).copied();
-            let table = Arc::new(Table::of(presses, seen, places));
-            Box::new(Regression::new(presses, table, [train, held_out], device))
+            Box::new(Regression::new(presses, seen, [train, held_out], device))
         }
         Kind::Course => {
             let of_parts = (parts.train.as_slice(), parts.held_out.as_slice());
@@ -92,23 +89,22 @@ pub fn last_stage<'a>(
             Box::new(course.context("levels of the data")?)
         }
         Kind::Hrn => {
-            let needs_gan = recipe.start == Start::Ustgan || recipe.pretrained;
+            let needs_gan = recipe.from_ustgan || recipe.pretrained;
             let ustgan = needs_gan.then(|| stages.ustgan()).transpose()?;
-            let (levels, pooling) = (stages.levels(), settings.network.pooling);
-            let mut weights = match (&ustgan, recipe.start) {
-                (Some([_, discriminator]), Start::Ustgan) => {
-                    hrn::inherited(discriminator, levels, pooling, seed, device)
-                }
-                _ => hrn::initial(levels, pooling, seed, device),
-            };
+            let (levels, means) = (stages.levels(), settings.mean_pooling);
+            let start = ustgan.as_ref().filter(|_| recipe.from_ustgan);
+            let start = start.map(|[_, discriminator]| discriminator);
+            let mut weights = hrn::initial(start, levels, means, seed, device);
             if let Some(ustgan) = ustgan.as_ref().filter(|_| recipe.pretrained) {
                 weights = stages.pretrained(ustgan, weights)?;
             }
             let stage = if needs_gan { "fine-tuning" } else { "hrn" };
-            let (train, training) = (parts.train.as_slice(), &settings.training);
             Box::new(Hrn {
+                on: stages.on(stage, settings.training),
+                augmentation: settings.augmentation,
+                train: parts.train.clone(),
                 held_out: &parts.held_out,
-                ..stages.hrn(stage, presses, train, training, weights)
+                initial: weights,
             })
         }
     })
@@ -122,59 +118,17 @@ impl<'a> Stages<'a> {
     fn scale(&self) -> PixelScale {
         PixelScale {
             full_scale_n: self.settings.full_scale_n,
-            log_above_n: self.settings.network.log_above_n,
+            log_above_n: self.settings.log_above_n,
         }
     }
 
-    fn gan<'b>(
-        &self,
-        stage: &'static str,
-        game: Game,
-        real: &'b [usize],
-        settings: &'b GanSettings,
-        initial: [Weights; 2],
-    ) -> Gan<'b>
-    where
-        'a: 'b,
-    {
-        Gan {
+    fn on(&self, stage: &'static str, training: Training) -> Frames<'a> {
+        Frames {
             stage,
-            game,
             presses: self.presses,
-            real,
-            labelled: &[],
-            levels: self.levels(),
-            initial,
-            scale: self.scale(),
-            sensor: gan::sensor(self.presses, real),
-            settings,
-            seed: self.seed,
-            device: self.device,
-        }
-    }
-
-    fn hrn<'b>(
-        &self,
-        stage: &'static str,
-        presses: &'b Presses,
-        train: &'b [usize],
-        settings: &'b Training,
-        initial: Weights,
-    ) -> Hrn<'b>
-    where
-        'a: 'b,
-    {
-        Hrn {
-            stage,
-            presses,
-            is_generated: false,
-            train,
-            held_out: &[],
-            initial,
             levels: self.levels(),
             scale: self.scale(),
-            settings,
-            validated_every_epochs: self.settings.validation.every_epochs,
+            training,
             seed: self.seed,
             device: self.device,
         }
@@ -185,42 +139,39 @@ impl<'a> Stages<'a> {
         let Parts {
             train, unlabelled, ..
         } = self.parts;
-        let initial = gan::initial(game, self.levels(), self.seed, self.device);
         Gan {
+            on: self.on(stage, self.settings.ustgan),
+            game,
+            real: unlabelled,
             labelled: train,
-            ..self.gan(stage, game, unlabelled, &self.settings.ustgan, initial)
+            initial: gan::initial(game, self.levels(), self.seed, self.device),
+            sensor: gan::sensor(self.presses, unlabelled),
         }
-    }
-
-    /// Does a stage, or the rest of it, and gives the weights of its sides.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the run's directory cannot be read or written, or the training diverges.
-    pub fn learnt(&self, learning: &dyn Learning) -> anyhow::Result<Vec<Weights>> {
-        let level = |press: usize| self.presses.all[press].level;
-        learn::run(learning, level, self.run, self.device)
     }
 
     /// Trains USTGAN, the GAN without labels.
     fn ustgan(&self) -> anyhow::Result<[Weights; 2]> {
-        let game = Game::RealOrFake;
-        let initial = gan::initial(game, self.levels(), self.seed, self.device);
-        let real = &self.parts.unlabelled;
-        let gan = self.gan("ustgan", game, real, &self.settings.ustgan, initial);
-        sides(self.learnt(&gan)?)
+        let gan = Gan {
+            labelled: &[],
+            ..self.semi_supervised("ustgan", Game::RealOrFake)
+        };
+        sides(learn::run(&gan, self.run)?)
     }
 
     /// Trains HRN on samples that one STGAN of each level generates.
     fn pretrained(&self, ustgan: &[Weights; 2], initial: Weights) -> anyhow::Result<Weights> {
         let generated = self.generated(ustgan)?;
-        let train: Vec<usize> = (0..generated.all.len()).collect();
-        let settings = &self.settings.pretraining;
         let hrn = Hrn {
-            is_generated: true,
-            ..self.hrn("pretraining", &generated, &train, settings, initial)
+            on: Frames {
+                presses: &generated,
+                ..self.on("pretraining", self.settings.pretraining)
+            },
+            augmentation: self.settings.augmentation,
+            train: (0..generated.all.len()).collect(),
+            held_out: &[],
+            initial,
         };
-        let weights = learn::run(&hrn, |_| 0, self.run, self.device)?;
+        let weights = learn::run(&hrn, self.run)?;
         Ok(weights.into_iter().next().expect("HRN has one side"))
     }
 
@@ -232,22 +183,24 @@ impl<'a> Stages<'a> {
         for (stage, level) in STGANS.into_iter().zip(1..=self.levels() as u8) {
             let of_level = |press: &&usize| self.presses.all[**press].level == level;
             let real: Vec<usize> = self.parts.train.iter().filter(of_level).copied().collect();
-            let settings = &self.settings.stgan;
-            let gan = self.gan(stage, Game::RealOrFake, &real, settings, ustgan.clone());
-            let [generator, _] = sides(self.learnt(&gan)?)?;
-            let batch = settings.samples_a_component;
-            let statistics = generator::statistics(&generator, batch, self.seed, self.device);
-            let making = generator::Making {
-                weights: &generator,
-                statistics: &statistics,
-                scale: self.scale(),
-                sensor: gan.sensor,
-                device: self.device,
+            let gan = Gan {
+                on: self.on(stage, self.settings.stgan),
+                game: Game::RealOrFake,
+                real: &real,
+                labelled: &[],
+                initial: ustgan.clone(),
+                sensor: gan::sensor(self.presses, &real),
             };
+            let [generator, _] = sides(learn::run(&gan, self.run)?)?;
             let frames = generator::generate(
-                &making,
-                self.settings.generation.samples_a_component as usize,
-                &mut Stream::new(self.seed, &format!("{stage} generated")),
+                &generator,
+                (self.scale(), gan.sensor),
+                self.settings.generated_a_component as usize,
+                (
+                    self.seed,
+                    &mut Stream::new(self.seed, &format!("{stage} generated")),
+                ),
+                self.device,
             );
             let press = Press {
                 level,

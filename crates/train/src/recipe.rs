@@ -6,7 +6,6 @@ use std::sync::LazyLock;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use serde::Deserialize;
 
-use crate::net::losses::Game;
 use crate::settings::{Profile, Settings};
 
 /// What learns.
@@ -27,28 +26,6 @@ pub enum Kind {
     Course,
 }
 
-impl Kind {
-    /// The game of a GAN.
-    pub fn game(self) -> Option<Game> {
-        match self {
-            Self::Sgan => Some(Game::FakeLevel),
-            Self::Igan => Some(Game::FeatureMatching),
-            Self::Hrn | Self::Features | Self::Taxels | Self::Course => None,
-        }
-    }
-}
-
-/// Where the recogniser's weights come from.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Start {
-    /// Drawn at random.
-    #[default]
-    Random,
-    /// The discriminator of the USTGAN, without its last layer.
-    Ustgan,
-}
-
 /// A method.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -61,9 +38,10 @@ pub struct Recipe {
     pub learning: Kind,
     /// The share of the labels that it uses, unless the user names a number.
     pub labels: f64,
-    /// The recogniser's first weights.
+    /// Whether the recogniser starts from the discriminator of the USTGAN, without its last layer, and not from
+    /// random weights.
     #[serde(default)]
-    pub start: Start,
+    pub from_ustgan: bool,
     /// Whether the recogniser learns from generated samples first.
     #[serde(default)]
     pub pretrained: bool,
@@ -112,7 +90,8 @@ pub fn named(name: &str) -> Option<&'static Recipe> {
 impl Recipe {
     /// Whether the method learns from presses whose level it does not use.
     pub fn needs_unlabelled(&self) -> bool {
-        self.start == Start::Ustgan || self.pretrained || self.learning.game().is_some()
+        let is_gan = matches!(self.learning, Kind::Sgan | Kind::Igan);
+        self.from_ustgan || self.pretrained || is_gan
     }
 
     /// Whether the method needs labelled samples of every level.

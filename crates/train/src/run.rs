@@ -4,7 +4,6 @@
 //! row of `metrics.csv` may be broken; a resumed run drops it.
 
 pub mod checkpoint;
-pub mod checkpoints;
 pub mod disk;
 pub mod history;
 pub mod progress;
@@ -19,11 +18,9 @@ use crate::data::source::Source;
 use crate::exit::coded;
 use crate::settings::{Profile, Settings};
 use checkpoint::Checkpoint;
-use checkpoints::Checkpoints;
 use disk::{lock, refuse_foreign, write_whole};
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
-use history::MetricsFile;
 
 /// The description of a run, in `settings.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -75,10 +72,6 @@ const OF_A_RUN: [&str; 4] = [
 pub struct Run {
     directory: PathBuf,
     _lock: File,
-    /// The checkpoints of its stages.
-    pub checkpoints: Checkpoints,
-    /// Its `metrics.csv`.
-    pub metrics: MetricsFile,
 }
 
 impl Run {
@@ -116,8 +109,6 @@ impl Run {
         let run = Self {
             directory: directory.to_owned(),
             _lock: lock(directory)?,
-            checkpoints: Checkpoints::of(directory),
-            metrics: MetricsFile::of(directory),
         };
         let before = Self::description_at(directory)?;
         refuse_foreign(directory, "settings.toml", &OF_A_RUN)?;
@@ -160,26 +151,26 @@ impl Run {
         write_whole(&self.path(name), bytes)
     }
 
-    /// Checks that a stage's checkpoint was made from the stage's present settings and inputs.
+    /// The path of a stage's checkpoint.
+    pub fn checkpoint(&self, stage: &str) -> PathBuf {
+        self.path("checkpoints").join(stage)
+    }
+
+    /// The steps and the seconds of all stages of the run in a directory, over all restarts.
     ///
     /// # Errors
     ///
-    /// Returns an error if the checkpoint's origin is not `origin`.
-    pub fn check_origin(
-        &self,
-        stage: &str,
-        checkpoint: &Checkpoint,
-        origin: &str,
-    ) -> anyhow::Result<()> {
-        ensure!(
-            checkpoint.origin == origin,
-            "{}: {stage}: the checkpoint is of other frames, settings or starting weights, or of \
-             another version of the program; found origin {:.12}, expected {origin:.12}; choose \
-             another --out",
-            self.path("checkpoints").display(),
-            checkpoint.origin
-        );
-        Ok(())
+    /// Returns an error if a checkpoint cannot be read.
+    pub fn cost(directory: &Path) -> anyhow::Result<(u64, f64)> {
+        let (mut steps, mut seconds) = (0, 0.0);
+        let directory = directory.join("checkpoints");
+        for file in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
+            if let Some(stage) = Checkpoint::read(&file?.path())? {
+                steps += stage.step;
+                seconds += stage.seconds;
+            }
+        }
+        Ok((steps, seconds))
     }
 
     /// Adds this package's version and the commit it was built from, if they are not the last ones.

@@ -7,19 +7,10 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 mod bounds;
-pub mod network;
-pub mod optimiser;
-pub mod reports;
 
 use crate::exit::coded;
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
-
-pub use network::NetworkSettings;
-pub use optimiser::OptimiserSettings;
-pub use reports::ArmReports;
-
-use optimiser::Rule;
 
 /// How long a run may take.
 #[derive(
@@ -46,57 +37,50 @@ impl Profile {
     }
 }
 
-/// The objects that are held out of the labelled ones, to fit the temperature and to follow the training.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Validation {
-    /// Share of the labelled objects of each level, from 0 to 0.5. With 0, as in the paper, none are
-    /// held out.
-    pub share: f64,
-    /// The number of epochs between two judgements of the held-out objects.
-    pub every_epochs: u32,
+/// The rule of a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// `w -= rate g`.
+    Sgd,
+    /// Kingma and Ba 2015, with decoupled weight decay.
+    Adam,
 }
 
-impl Default for Validation {
-    fn default() -> Self {
-        Self {
-            share: 0.0,
-            every_epochs: 5,
-        }
-    }
+/// How the learning rate changes over the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// The learning rate stays the same.
+    Constant,
+    /// The learning rate falls from its full value to 0 along half a cosine.
+    Cosine,
 }
 
-/// The changes made to a training frame before each use.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct AugmentationSettings {
-    /// Whether frames are turned and mirrored.
-    pub symmetries: bool,
-    /// The largest shift along each axis, in taxels. The taxels that come in are background.
-    pub shift_taxels: u8,
-}
-
-/// Settings for the training of a recogniser on labelled presses. The defaults are the paper's
-/// ("Training of HRN").
+/// Settings for the training of a stage. The defaults are the paper's ("Training of HRN").
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Training {
-    /// Samples per step. The last batch of an epoch may be smaller.
+    /// Samples per step, of a GAN the real ones. The last batch of an epoch may be smaller.
     pub batch: usize,
-    /// Passes over the training samples: what the paper calls iterations.
+    /// Passes over the samples: what the paper calls iterations. If the 500 of its GANs were steps, they
+    /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
+    /// iteration.
     pub epochs: u32,
-    /// Decay per step of the running average of the weights. The average is evaluated and exported.
-    /// With 0, the weights themselves are.
+    /// Decay per step of the running average of the weights, of a GAN those of the discriminator. The
+    /// average is evaluated and exported. With 0, the weights themselves are.
     pub averaging: f64,
-    /// The number of epochs between two checkpoints. The last epoch always ends with one.
-    pub checkpoint_every_epochs: u32,
-    /// How far the weights of levels with few samples are raised, from 0 to 1. With 0 all samples
-    /// count the same, with 1 all levels do. Only the network of whole presses uses it.
-    pub level_balance: f64,
-    /// Settings of the optimiser.
-    pub optimiser: OptimiserSettings,
-    /// The changes made to a frame before each use.
-    pub augmentation: AugmentationSettings,
+    /// The rule of a step: `sgd` or `adam`.
+    pub rule: Rule,
+    /// The learning rate of the first step.
+    pub learning_rate: f64,
+    /// The schedule of the learning rate: `constant` or `cosine`.
+    pub schedule: Schedule,
+    /// Adam's decay of the gradient's mean.
+    pub beta1: f64,
+    /// The share, times the learning rate, by which each step shrinks a kernel. Biases and the
+    /// mixture's mu and sigma do not decay.
+    pub weight_decay: f64,
 }
 
 impl Default for Training {
@@ -105,70 +89,86 @@ impl Default for Training {
             batch: 100,
             epochs: 200,
             averaging: 0.0,
-            checkpoint_every_epochs: 5,
-            level_balance: 1.0,
-            optimiser: OptimiserSettings::default(),
-            augmentation: AugmentationSettings::default(),
+            rule: Rule::Sgd,
+            learning_rate: 1e-3,
+            schedule: Schedule::Constant,
+            beta1: 0.9,
+            weight_decay: 0.0,
         }
     }
 }
 
-/// Settings for the training of generator and discriminator. The defaults are the paper's
-/// ("Training of STGAN and USTGAN").
+impl Training {
+    /// The paper's for generator and discriminator ("Training of STGAN and USTGAN").
+    pub fn of_a_gan() -> Self {
+        Self {
+            epochs: 500,
+            rule: Rule::Adam,
+            // The paper gives no betas. DeLiGAN's code has 0.5.
+            beta1: 0.5,
+            ..Self::default()
+        }
+    }
+
+    /// The learning rate of step `step` of `steps`, both counted from 0.
+    pub fn rate_at(&self, step: u64, steps: u64) -> f64 {
+        match self.schedule {
+            Schedule::Constant => self.learning_rate,
+            Schedule::Cosine => {
+                let part = step as f64 / steps.max(1) as f64;
+                self.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * part).cos())
+            }
+        }
+    }
+}
+
+/// The changes made to a labelled frame before each use in training.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Augmentation {
+    /// Whether frames are turned and mirrored.
+    pub symmetries: bool,
+    /// The largest shift along each axis, in taxels. The taxels that come in are background.
+    pub shift_taxels: u8,
+}
+
+/// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
+/// network that has only learnt from correct reports trusts every report.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct GanSettings {
-    /// Real samples per step. The last batch of an epoch may be smaller.
-    pub batch: usize,
-    /// Generated samples of each component per step.
-    pub samples_a_component: usize,
-    /// Passes over the real samples: what the paper calls iterations. If its 500 were steps, they
-    /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
-    /// iteration.
-    pub epochs: u32,
-    /// Lambda of Eq. (7), which weighs the penalty's mean over all of sigma.
-    pub sigma_penalty: f64,
-    /// Decay per step of the running average of the discriminator's weights. The average is kept at
-    /// the end. With 0, the weights themselves are.
-    pub averaging: f64,
-    /// The number of epochs between two checkpoints. The last epoch always ends with one.
-    pub checkpoint_every_epochs: u32,
-    /// The optimiser of generator and discriminator.
-    pub optimiser: OptimiserSettings,
+pub struct ArmReports {
+    /// Share of the presses for which nothing is known about the arm.
+    pub unknown: f64,
+    /// Share of the other presses for which the stiffness is unknown.
+    pub unknown_arm: f64,
+    /// Share of the other presses whose reports have no error.
+    pub exact: f64,
+    /// The largest relative error of the positions.
+    pub position: f64,
+    /// The largest relative error of the stiffness.
+    pub arm: f64,
+    /// The largest error of the moments, in frames.
+    pub clock_frames: f64,
+    /// Share of the presses that are judged before their end.
+    pub early: f64,
+    /// Share of the presses that a slower sensor sees, with only every second to eighth frame.
+    pub slower: f64,
+    /// Share of the presses that take half to sixteen times as long.
+    pub stretched: f64,
 }
 
-impl Default for GanSettings {
+impl Default for ArmReports {
     fn default() -> Self {
         Self {
-            batch: 100,
-            samples_a_component: 2,
-            epochs: 500,
-            sigma_penalty: 0.1,
-            averaging: 0.0,
-            checkpoint_every_epochs: 5,
-            optimiser: OptimiserSettings {
-                rule: Rule::Adam,
-                // The paper gives no betas. DeLiGAN's code has 0.5.
-                beta1: 0.5,
-                ..OptimiserSettings::default()
-            },
-        }
-    }
-}
-
-/// Settings for the samples that the STGANs generate.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Generation {
-    /// Samples of each component of each level's mixture: 225 x 50 = 11,250 per level, which is
-    /// thirty for each of the paper's 375 labelled samples.
-    pub samples_a_component: u32,
-}
-
-impl Default for Generation {
-    fn default() -> Self {
-        Self {
-            samples_a_component: 225,
+            unknown: 0.3,
+            unknown_arm: 0.1,
+            exact: 0.5,
+            position: 0.1,
+            arm: 0.3,
+            clock_frames: 1.0,
+            early: 0.25,
+            slower: 0.3,
+            stretched: 0.3,
         }
     }
 }
@@ -181,40 +181,47 @@ pub struct Settings {
     /// The force on a taxel, in newtons, that becomes 1 in the network's image. 0 N becomes -1.
     /// 10.2 N is the full scale of 8 bits of 0.04 N.
     pub full_scale_n: f64,
-    /// Settings of the networks' image and pooling.
-    pub network: NetworkSettings,
+    /// Above 0, the image is linear in log(1 + newtons / this value). With 0, it is linear in
+    /// newtons.
+    pub log_above_n: f64,
+    /// Whether the recogniser's last layer takes each channel's mean beside its greatest value. A mean can add up
+    /// an area or a force. It applies to a recogniser with a last layer of its own, so not to SGAN
+    /// and IGAN, whose discriminator is the recogniser.
+    pub mean_pooling: bool,
+    /// Samples that the STGANs generate of each component of each level's mixture: 225 x 50 = 11,250 per
+    /// level, which is thirty for each of the paper's 375 labelled samples.
+    pub generated_a_component: u32,
+    /// Share of the labelled objects of each level that are held out, to fit the temperature and to follow the
+    /// training, from 0 to 0.5. With 0, as in the paper, none are.
+    pub held_out: f64,
     /// The GAN on unlabelled samples: USTGAN, or the GAN of SGAN and IGAN.
-    pub ustgan: GanSettings,
-    /// Settings of each STGAN.
-    pub stgan: GanSettings,
-    /// Settings for the samples that the STGANs generate.
-    pub generation: Generation,
+    pub ustgan: Training,
+    /// Each STGAN.
+    pub stgan: Training,
     /// The training of HRN on the generated samples.
     pub pretraining: Training,
     /// The training on the labelled samples, from random weights or as the fine-tuning of other weights.
     pub training: Training,
+    /// The changes made to a frame before HRN learns from it.
+    pub augmentation: Augmentation,
     /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
     pub reports: ArmReports,
-    /// The labelled objects that are held out.
-    pub validation: Validation,
 }
 
 impl Default for Settings {
     fn default() -> Self {
         Self {
             full_scale_n: 10.2,
-            network: NetworkSettings::default(),
-            ustgan: GanSettings::default(),
-            stgan: GanSettings {
-                // An epoch of an STGAN has 4 steps, and one of USTGAN has 85.
-                checkpoint_every_epochs: 50,
-                ..GanSettings::default()
-            },
-            generation: Generation::default(),
+            log_above_n: 0.0,
+            mean_pooling: false,
+            generated_a_component: 225,
+            held_out: 0.0,
+            ustgan: Training::of_a_gan(),
+            stgan: Training::of_a_gan(),
             pretraining: Training::default(),
             training: Training::default(),
+            augmentation: Augmentation::default(),
             reports: ArmReports::default(),
-            validation: Validation::default(),
         }
     }
 }
@@ -288,10 +295,10 @@ mod tests {
 
     #[test]
     fn a_file_overrides_only_what_it_names() {
-        let given = parse("[training]\nbatch = 50\noptimiser.rule = \"adam\"").unwrap();
+        let given = parse("[training]\nbatch = 50\nrule = \"adam\"").unwrap();
         let mut expected = Settings::default();
         expected.training.batch = 50;
-        expected.training.optimiser.rule = Rule::Adam;
+        expected.training.rule = Rule::Adam;
         assert_eq!(Settings::default().with(given).unwrap(), expected);
     }
 
@@ -300,11 +307,8 @@ mod tests {
         for (text, expected) in [
             ("epoch = 3", "unknown field `epoch`"),
             ("[training]\nepochs = \"3\"", "invalid type: string \"3\""),
-            (
-                "[stgan]\noptimiser.beta1 = 1",
-                "`stgan.optimiser.beta1`: found 1",
-            ),
-            ("[validation]\nshare = nan", "`validation.share`: found NaN"),
+            ("[stgan]\nbeta1 = 1", "`stgan.beta1`: found 1"),
+            ("held_out = nan", "`held_out`: found NaN"),
         ] {
             let given = parse(text).and_then(|given| Settings::default().with(given));
             let error = given.unwrap_err().to_string();

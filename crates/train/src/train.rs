@@ -112,7 +112,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let device = &asked.device.device()?;
     let presses = Presses::read(&asked.data)?;
     let labels = asked.labels(&presses)?;
-    let share = recipe.settings(profile, labels, &given)?.validation.share;
+    let share = recipe.settings(profile, labels, &given)?.held_out;
     let parts = Parts::of(&presses, labels, share, seed);
     let settings = recipe.settings(profile, parts.train.len(), &given)?;
     check(recipe, &presses, &parts)?;
@@ -145,12 +145,9 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         device,
     };
     let learning = &*last_stage(recipe, &stages)?;
-    let weights = stages.learnt(learning)?;
+    let weights = learn::run(learning, &run)?;
     // Finite weights can still give a logit that is not. One press is enough for this check.
-    let first = learn::Question {
-        presses: vec![parts.train[0]],
-        references: Vec::new(),
-    };
+    let first = learn::Question::alone(&parts.train[..1]);
     for logit in learning.judge(&weights, &[first], None).concat() {
         ensure_finite(
             learning.stage(),

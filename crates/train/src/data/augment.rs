@@ -3,7 +3,7 @@
 //! There is no zoom, no shear, no intensity jitter and no normalisation by a frame's own maximum,
 //! because hardness shows in the contact's width and force.
 
-use crate::settings::AugmentationSettings;
+use crate::settings::Augmentation;
 use hardnessd_core::verdict::{COLS, ModelFrame, ROWS};
 use hardnessd_simulator::random::Stream;
 
@@ -11,7 +11,7 @@ use hardnessd_simulator::random::Stream;
 const SYMMETRIES: usize = 8;
 
 /// Draws one variant of `frame`.
-pub fn vary(frame: &ModelFrame, settings: AugmentationSettings, stream: &mut Stream) -> ModelFrame {
+pub fn vary(frame: &ModelFrame, settings: Augmentation, stream: &mut Stream) -> ModelFrame {
     let symmetry = if settings.symmetries {
         stream.below(SYMMETRIES)
     } else {

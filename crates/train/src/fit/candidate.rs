@@ -1,7 +1,6 @@
 //! The candidates: what may judge the presses of this robot, and the controls beside them.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 use anyhow::Context as _;
 use burn::tensor::Device;
@@ -9,8 +8,8 @@ use burn::tensor::Device;
 use super::folds::Fold;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
-use crate::learn::regression::{Regression, Seen, Table};
-use crate::learn::{Learning, Question};
+use crate::learn::regression::{Regression, Seen};
+use crate::learn::{self, Learning, Question};
 use crate::methods::{Stages, last_stage};
 use crate::net::network::Weights;
 use crate::recipe;
@@ -34,7 +33,7 @@ pub enum Candidate {
     /// The built-in model, with the presses as references.
     BuiltIn(Box<Hrn>),
     /// A regression.
-    Regression(Arc<Table>),
+    Regression(Seen),
     /// The paper's network.
     Hrn,
 }
@@ -48,18 +47,14 @@ pub type Entry = (&'static str, Result<Candidate, String>);
 ///
 /// Fails if the built-in model does.
 pub fn all(presses: &Presses, places: &[usize]) -> anyhow::Result<Vec<Entry>> {
-    let table = |seen| {
-        let table = Table::of(presses, seen, places.iter().copied());
-        Candidate::Regression(Arc::new(table))
-    };
     let hrn = match places.len() {
         count if count < LEAST_FOR_HRN => Err(format!("needs {LEAST_FOR_HRN} presses")),
         _ => Ok(Candidate::Hrn),
     };
     Ok(vec![
         ("built-in", built_in(&presses.levels())?),
-        ("features", Ok(table(Seen::Features))),
-        ("taxels", taxels(presses, places).map(table)),
+        ("features", Ok(Candidate::Regression(Seen::Features))),
+        ("taxels", taxels(presses, places).map(Candidate::Regression)),
         (HRN, hrn),
     ])
 }
@@ -109,11 +104,7 @@ pub fn unloaded(presses: &Presses, places: &[usize]) -> Option<Candidate> {
     let lengths = presses.of(places).map(|press| press.unloaded.as_ref());
     let lengths: BTreeSet<usize> = lengths.map(|of| of.map_or(0, Vec::len)).collect();
     let length = lengths.first().copied().filter(|&length| length > 0)?;
-    (lengths.len() == 1).then(|| {
-        let places = places.iter().copied();
-        let table = Table::of(presses, Seen::Unloaded(length), places);
-        Candidate::Regression(Arc::new(table))
-    })
+    (lengths.len() == 1).then_some(Candidate::Regression(Seen::Unloaded(length)))
 }
 
 impl Candidate {
@@ -137,10 +128,7 @@ impl Candidate {
                 fold.test.iter().map(judge).collect()
             }
             Self::Regression(_) | Self::Hrn => {
-                let question = Question {
-                    presses: fold.test.clone(),
-                    references: Vec::new(),
-                };
+                let question = Question::alone(&fold.test);
                 self.learn(presses, &fold.train, seed, |learning, weights| {
                     Ok(learning.judge(weights, &[question], None))
                 })
@@ -162,9 +150,9 @@ impl Candidate {
     ) -> anyhow::Result<T> {
         match self {
             Self::BuiltIn(_) => anyhow::bail!("the built-in model learns nothing"),
-            Self::Regression(table) => {
+            Self::Regression(seen) => {
                 let device = Device::flex();
-                let regression = Regression::new(presses, table.clone(), [train, &[]], &device);
+                let regression = Regression::new(presses, *seen, [train, &[]], &device);
                 take(&regression, &[regression.fitted()])
             }
             Self::Hrn => with_hrn(presses, train, seed, take),
@@ -181,7 +169,7 @@ fn with_hrn<T>(
 ) -> anyhow::Result<T> {
     let recipe = recipe::named(HRN).context("no recipe of the paper's network")?;
     let mut settings = recipe.settings(Profile::Quick, train.len(), &toml::Table::new())?;
-    settings.validation.share = 0.0;
+    settings.held_out = 0.0;
     let directory = tempfile::tempdir()?;
     let run = Run::open(
         directory.path(),
@@ -207,7 +195,7 @@ fn with_hrn<T>(
         device: &Device::flex(),
     };
     let learning = &*last_stage(recipe, &stages)?;
-    take(learning, &stages.learnt(learning)?)
+    take(learning, &learn::run(learning, &run)?)
 }
 
 /// As many presses as the model takes as references, of all objects in turn, light and hard ones.

@@ -7,13 +7,12 @@ use burn::tensor::{Device, Tensor};
 
 use self::lots::Lots;
 use super::learner::Learner;
-use super::{Batch, Inputs, Learning, Origin, Outputs, Question, Recogniser, Side, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Recogniser, Taken};
 use crate::data::presses::{Presses, Timed};
 use crate::net::bins::{self, BINS};
 use crate::net::course;
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
-use crate::run::checkpoint;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, Moment};
 use hardnessd_core::verdict::{Borders, Extents, Knowledge, ModelError, Piece, argmax};
@@ -100,22 +99,15 @@ impl Press {
 /// The network, and what it learns from.
 #[derive(Debug)]
 pub struct Course<'a> {
-    prepared: Vec<Press>,
-    train: &'a [usize],
     held_out: &'a [usize],
     lots: Lots,
     standard: Standard,
-    borders: Borders,
-    /// The number of hardness levels.
-    levels: usize,
     /// The share of each bin that lies in each level.
     parts: Tensor<2>,
-    /// What is added to the logits of the bins after temperature ([`bins::lifts`]).
-    lifts: Vec<f32>,
+    outputs: Outputs,
     initial: Weights,
     reports: ArmReports,
-    settings: Training,
-    validated_every_epochs: u32,
+    training: Training,
     seed: u64,
     device: &'a Device,
 }
@@ -136,29 +128,24 @@ impl<'a> Course<'a> {
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
         let prepared = prepared(presses);
-        let rows: Vec<_> = train
-            .iter()
-            .map(|&place| prepared[place].features())
-            .collect();
+        let rows = train.iter().map(|&place| prepared[place].features());
+        let rows: Vec<[f32; FEATURES]> = rows.collect();
         let mut counts = vec![0; levels];
         for &place in train {
             counts[usize::from(prepared[place].level) - 1] += 1;
         }
-        let balance = settings.training.level_balance as f32;
         Ok(Self {
-            train,
             held_out,
-            lots: Lots::of(&prepared, train),
+            lots: Lots::of(prepared.into(), borders.clone(), train),
             standard: Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice)),
             parts: bins::parts(&borders, levels, device),
-            lifts: bins::lifts(&borders, &counts, balance),
+            outputs: Outputs::Bins {
+                lifts: bins::lifts(&borders, &counts),
+                borders,
+            },
             initial: course::initial(seed, device),
-            borders,
-            levels,
-            prepared,
             reports: settings.reports,
-            settings: settings.training,
-            validated_every_epochs: settings.validation.every_epochs,
+            training: settings.training,
             seed,
             device,
         })
@@ -166,26 +153,6 @@ impl<'a> Course<'a> {
 
     fn stream(&self, name: &str) -> Stream {
         Stream::new(self.seed, &format!("{STAGE} {name}"))
-    }
-
-    fn hash(&self) -> String {
-        let settings = (&self.settings, self.reports);
-        let mut origin = checkpoint::Origin::new(STAGE, &settings, self.seed);
-        for &place in self.train.iter().chain(self.held_out) {
-            let press = &self.prepared[place];
-            let moments = press.moments.iter().flat_map(|moment| {
-                let known = [moment.time_s, moment.approach_mm.unwrap_or(f32::NAN)];
-                moment.frame.into_iter().chain(known)
-            });
-            let label = [
-                f32::from(press.level),
-                press.shore.unwrap_or(f32::NAN),
-                press.arm_n_per_mm,
-                press.sensor as f32,
-            ];
-            origin = origin.numbers(moments.chain(label));
-        }
-        origin.weights(&self.initial).finish()
     }
 
     /// The network's inputs for a question.
@@ -197,7 +164,7 @@ impl<'a> Course<'a> {
         // With a stream, presses have the robot's errors, as training presses have them. References are
         // whole presses.
         let mut inputs = |place: usize, reports: &ArmReports| {
-            let press = &self.prepared[place];
+            let press = &self.lots.presses[place];
             let press = match vary.as_deref_mut() {
                 Some(stream) => &reports.varied(press, stream),
                 None => press,
@@ -220,39 +187,32 @@ impl Learning for Course<'_> {
         STAGE
     }
 
-    fn origin(&self) -> Origin<'_> {
-        Origin {
-            hash: self.hash(),
-            is_generated: false,
-            sides: vec![Side {
-                prefix: "",
-                weights: self.initial.clone(),
-                averaging: self.settings.averaging,
-            }],
+    fn plan(&self) -> Plan {
+        let level = |&press: &usize| (press, self.lots.presses[press].level);
+        Plan {
+            sides: vec![Learner::fresh(self.initial.clone(), self.training)],
             // A sample of an epoch is a group of presses.
             samples: self.lots.tickets(),
-            held_out: self.held_out,
-            batch: (self.settings.batch / lots::GROUP).max(1),
-            epochs: self.settings.epochs,
-            optimiser: self.settings.optimiser,
-            checkpoint_every_epochs: self.settings.checkpoint_every_epochs,
-            validated_every_epochs: self.validated_every_epochs,
+            held_out: self.held_out.iter().map(level).collect(),
+            batch: (self.training.batch / lots::GROUP).max(1),
+            training: self.training,
             seed: self.seed,
         }
     }
 
-    /// Takes a step on groups of presses. The presses that were judged rightly are counted in groups.
-    fn step(&self, sides: &mut [Learner], batch: Batch) -> anyhow::Result<Taken> {
+    /// Takes a step on groups of presses.
+    fn step(&self, sides: &mut [Learner], tickets: &[usize], step: u64, rate: f64) -> Taken {
         let learner = &mut sides[0];
-        let mut stream = self.stream("variation").child(batch.step);
+        let mut stream = self.stream("variation").child(step);
         let mut labels: Vec<bins::Label> = Vec::new();
-        let mut groups = Vec::with_capacity(batch.samples.len());
-        for &ticket in batch.samples {
-            let question = self
-                .lots
-                .draw(ticket, &self.prepared, &self.borders, &mut stream);
+        let mut groups = Vec::with_capacity(tickets.len());
+        for &ticket in tickets {
+            let question = self.lots.draw(ticket, &mut stream);
             groups.push(self.group(&question, Some(&mut stream)));
-            let presses = question.presses.iter().map(|&place| &self.prepared[place]);
+            let presses = question
+                .presses
+                .iter()
+                .map(|&place| &self.lots.presses[place]);
             labels.extend(presses.map(|press| match press.piece {
                 // A rigid piece is harder than any object.
                 Some(_) => (1, None),
@@ -263,19 +223,18 @@ impl Learning for Course<'_> {
         let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.device);
         let (loss, judged) = bins::loss(outputs, &labels, &self.parts);
         let mut gradients = loss.backward();
-        learner.step(&tracked, &mut gradients, batch.rate);
-        let rows = judged.chunks(self.levels);
+        learner.step(&tracked, &mut gradients, rate);
+        let rows = judged.chunks(self.parts.dims()[1]);
         let right = labels
             .iter()
             .zip(rows)
             .filter(|((level, _), row)| argmax(row).0 + 1 == usize::from(*level))
             .count();
-        let share = right as f64 / labels.len() as f64;
-        Ok(Taken {
+        Taken {
             loss: f64::from(numbers(&loss)[0]),
-            right: Some(share * batch.samples.len() as f64),
+            accuracy: Some(right as f64 / labels.len() as f64),
             ..Taken::default()
-        })
+        }
     }
 
     fn questions(
@@ -284,9 +243,9 @@ impl Learning for Course<'_> {
         knowledge: Knowledge,
         stream: &mut Stream,
     ) -> Option<Vec<Question>> {
-        let lots = Lots::of(&self.prepared, presses);
+        let lots = self.lots.with(presses);
         let is_askable = knowledge == Knowledge::None || lots.have_references();
-        is_askable.then(|| lots.all(knowledge, &self.prepared, &self.borders, stream))
+        is_askable.then(|| lots.all(knowledge, stream))
     }
 
     fn judge(
@@ -306,10 +265,7 @@ impl Learning for Course<'_> {
     }
 
     fn outputs(&self) -> Outputs {
-        Outputs::Bins {
-            lifts: self.lifts.clone(),
-            borders: self.borders.clone(),
-        }
+        self.outputs.clone()
     }
 
     fn ranges(&self, learnt: &[Timed]) -> Extents {
@@ -322,7 +278,9 @@ impl Learning for Course<'_> {
             true => Inputs::References,
             false => Inputs::Features,
         };
-        let (graph, raw) = course::graph(&weights[0], &self.standard, inputs);
-        Recogniser { graph, inputs, raw }
+        Recogniser {
+            graph: course::graph(&weights[0], &self.standard, inputs),
+            inputs,
+        }
     }
 }

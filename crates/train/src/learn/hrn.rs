@@ -3,47 +3,81 @@
 use burn::tensor::{Device, Tensor};
 
 use super::learner::Learner;
-use super::{Batch, Inputs, Learning, Origin, Outputs, Question, Recogniser, Side, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Recogniser, Taken};
 use crate::data::augment;
 use crate::data::presses::Presses;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::network::{Normalisation, Statistics, Weights, numbers};
-use crate::run::checkpoint;
-use crate::settings::Training;
+use crate::settings::{Augmentation, Training};
 use hardnessd_core::verdict::{ModelFrame, argmax};
 use hardnessd_simulator::random::Stream;
 
 /// Frames per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
-/// HRN, and what it learns from.
-#[derive(Debug)]
-pub struct Hrn<'a> {
+/// What a stage on frames has, whatever learns.
+#[derive(Debug, Clone, Copy)]
+pub struct Frames<'a> {
     /// The name of the stage.
     pub stage: &'static str,
-    /// The presses that the indices below refer to.
+    /// The presses that indices refer to.
     pub presses: &'a Presses,
-    /// Whether a GAN generated them.
-    pub is_generated: bool,
-    /// Labelled presses to learn from.
-    pub train: &'a [usize],
-    /// Labelled presses of held-out objects; may be empty.
-    pub held_out: &'a [usize],
-    /// The first weights.
-    pub initial: Weights,
     /// The number of hardness levels.
     pub levels: usize,
     /// The scale from newtons to images.
     pub scale: PixelScale,
     /// Settings of the training.
-    pub settings: &'a Training,
-    /// The number of epochs between two judgements of the held-out objects.
-    pub validated_every_epochs: u32,
-    /// Seed of the order of the samples and of their augmentation.
+    pub training: Training,
+    /// Seed of everything random.
     pub seed: u64,
     /// The device that computes.
     pub device: &'a Device,
+}
+
+impl Frames<'_> {
+    /// The stream of random numbers of this name.
+    pub fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    }
+
+    /// The frames of presses as images `[batch, 1, 28, 28]`.
+    pub fn images(&self, presses: &[usize]) -> Tensor<4> {
+        self.changed(presses, |frame| frame)
+    }
+
+    fn changed(
+        &self,
+        presses: &[usize],
+        mut change: impl FnMut(ModelFrame) -> ModelFrame,
+    ) -> Tensor<4> {
+        let frames = presses
+            .iter()
+            .map(|&press| change(self.presses.frame(press)));
+        let frames: Vec<ModelFrame> = frames.collect();
+        self.scale.images(frames.iter(), self.device)
+    }
+
+    /// The levels of labelled presses as targets `[batch, L]`.
+    pub fn targets(&self, presses: &[usize]) -> Tensor<2> {
+        let levels = self.presses.of(presses).map(|press| press.level);
+        hrn::targets(levels, self.levels, self.device)
+    }
+}
+
+/// HRN, and what it learns from.
+#[derive(Debug)]
+pub struct Hrn<'a> {
+    /// The stage.
+    pub on: Frames<'a>,
+    /// The changes made to a frame before each use.
+    pub augmentation: Augmentation,
+    /// Labelled presses to learn from.
+    pub train: Vec<usize>,
+    /// Labelled presses of held-out objects; may be empty.
+    pub held_out: &'a [usize],
+    /// The first weights.
+    pub initial: Weights,
 }
 
 /// Takes a step of HRN on images `[batch, 1, 28, 28]` and targets `[batch, L]`. Returns the mean
@@ -64,32 +98,24 @@ pub fn step(
 }
 
 impl Hrn<'_> {
-    fn stream(&self, name: &str) -> Stream {
-        Stream::new(self.seed, &format!("{} {name}", self.stage))
-    }
-
-    /// The frames of presses, each augmented as the settings say.
-    fn varied(&self, presses: &[usize], stream: &mut Stream) -> Vec<ModelFrame> {
-        let vary = |&press: &usize| {
-            let frame = self.presses.frame(press);
-            augment::vary(&frame, self.settings.augmentation, stream)
-        };
-        presses.iter().map(vary).collect()
+    /// Images of presses, each augmented.
+    fn varied(&self, presses: &[usize], stream: &mut Stream) -> Tensor<4> {
+        let vary = |frame: ModelFrame| augment::vary(&frame, self.augmentation, stream);
+        self.on.changed(presses, vary)
     }
 
     /// Images of one batch, augmented for step `step`.
     fn images(&self, presses: &[usize], step: u64) -> Tensor<4> {
-        let frames = self.varied(presses, &mut self.stream("augmentation").child(step));
-        self.scale.images(frames.iter(), self.device)
+        self.varied(presses, &mut self.on.stream("augmentation").child(step))
     }
 
     /// Statistics of the normalised layers over the training presses, augmented as the settings
     /// say, in batches of their size. A smaller remainder is left out.
     fn statistics(&self, weights: &Weights) -> Statistics {
         let mut statistics = Statistics::default();
-        let mut order = self.train.to_vec();
-        self.stream("statistics").shuffle(&mut order);
-        let batch = self.settings.batch.min(order.len());
+        let mut order = self.train.clone();
+        self.on.stream("statistics").shuffle(&mut order);
+        let batch = self.on.training.batch.min(order.len());
         for (presses, number) in order.chunks_exact(batch).zip(0..) {
             // Training steps count from 0 and these batches from the maximum down, so none share a
             // sub-stream.
@@ -103,55 +129,35 @@ impl Hrn<'_> {
 
 impl Learning for Hrn<'_> {
     fn stage(&self) -> &'static str {
-        self.stage
+        self.on.stage
     }
 
-    fn origin(&self) -> Origin<'_> {
-        let Training {
-            batch,
-            epochs,
-            optimiser,
-            averaging,
-            checkpoint_every_epochs,
-            ..
-        } = *self.settings;
-        let hash = checkpoint::Origin::new(self.stage, &(self.settings, self.scale), self.seed)
-            .presses(self.presses, self.train)
-            .weights(&self.initial)
-            .finish();
-        Origin {
-            hash,
-            is_generated: self.is_generated,
-            sides: vec![Side {
-                prefix: "",
-                weights: self.initial.clone(),
-                averaging,
-            }],
-            samples: self.train.to_vec(),
-            held_out: self.held_out,
-            batch,
-            epochs,
-            optimiser,
-            checkpoint_every_epochs,
-            validated_every_epochs: self.validated_every_epochs,
-            seed: self.seed,
+    fn plan(&self) -> Plan {
+        let level = |&press: &usize| (press, self.on.presses.all[press].level);
+        Plan {
+            sides: vec![Learner::fresh(self.initial.clone(), self.on.training)],
+            samples: self.train.clone(),
+            held_out: self.held_out.iter().map(level).collect(),
+            batch: self.on.training.batch,
+            training: self.on.training,
+            seed: self.on.seed,
         }
     }
 
-    fn step(&self, sides: &mut [Learner], batch: Batch) -> anyhow::Result<Taken> {
-        let images = self.images(batch.samples, batch.step);
-        let levels = self.presses.of(batch.samples).map(|press| press.level);
-        let targets = hrn::targets(levels.clone(), self.levels, self.device);
-        let (loss, judged) = step(&mut sides[0], images, targets, batch.rate);
+    fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
+        let images = self.images(samples, step);
+        let targets = self.on.targets(samples);
+        let (loss, judged) = self::step(&mut sides[0], images, targets, rate);
+        let levels = self.on.presses.of(samples).map(|press| press.level);
         let right = levels
-            .zip(judged.chunks(self.levels))
+            .zip(judged.chunks(self.on.levels))
             .filter(|(level, logits)| argmax(logits).0 + 1 == usize::from(*level))
             .count();
-        Ok(Taken {
+        Taken {
             loss,
-            right: Some(right as f64),
+            accuracy: Some(right as f64 / samples.len() as f64),
             ..Taken::default()
-        })
+        }
     }
 
     fn judge(
@@ -164,17 +170,13 @@ impl Learning for Hrn<'_> {
         let presses: Vec<usize> = questions.iter().flat_map(|q| &q.presses).copied().collect();
         let mut rows = Vec::with_capacity(presses.len());
         for part in presses.chunks(JUDGED_AT_ONCE) {
-            let frames: Vec<ModelFrame> = match vary.as_deref_mut() {
+            let images = match vary.as_deref_mut() {
                 Some(stream) => self.varied(part, stream),
-                None => part
-                    .iter()
-                    .map(|&press| self.presses.frame(press))
-                    .collect(),
+                None => self.on.images(part),
             };
-            let images = self.scale.images(frames.iter(), self.device);
             let mut normalisation = Normalisation::Fixed(&statistics);
             let logits = hrn::logits(&weights[0], images, &mut normalisation);
-            rows.extend(numbers(&logits).chunks(self.levels).map(<[f32]>::to_vec));
+            rows.extend(numbers(&logits).chunks(self.on.levels).map(<[f32]>::to_vec));
         }
         rows
     }
@@ -185,11 +187,9 @@ impl Learning for Hrn<'_> {
 
     fn graph(&self, weights: &[Weights]) -> Recogniser {
         let statistics = self.statistics(&weights[0]);
-        let (graph, raw) = hrn::graph(&weights[0], &statistics, self.scale);
         Recogniser {
-            graph,
+            graph: hrn::graph(&weights[0], &statistics, self.on.scale),
             inputs: Inputs::Frame,
-            raw,
         }
     }
 }

@@ -9,7 +9,7 @@ use tract_onnx::pb;
 use crate::learn::{Inputs, Outputs, Recogniser};
 use crate::net::bins::{BINS, LIFTS};
 use crate::net::course::{EMBEDDING, REFERENCES};
-use crate::net::graph::{INPUT, integer, model, value_info};
+use crate::net::graph::{INPUT, RAW, model, value_info};
 use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::parts::PARTS;
@@ -28,16 +28,10 @@ pub fn bytes(
     checks: &Checks,
 ) -> anyhow::Result<Vec<u8>> {
     let mut graph = recogniser.graph.clone();
-    let temperature = graph.constant("temperature", &[], &[temperature]);
-    let mut divide = |output| {
-        let inputs = [recogniser.raw.as_str(), temperature.as_str()];
-        graph.node("Div", &inputs, output);
-    };
     let mut given = match outputs {
         Outputs::Levels => {
-            divide("logits");
-            let along = vec![integer("axis", 1)];
-            graph.with("Softmax", &["logits"], "probabilities", along);
+            graph.add(&format!("logits = Div({RAW}, {temperature})"));
+            graph.add("probabilities = Softmax(logits, axis=1)");
             let levels = card.levels.len();
             vec![
                 value_info("logits", &[1, levels]),
@@ -45,10 +39,8 @@ pub fn bytes(
             ]
         }
         Outputs::Bins { lifts, .. } => {
-            divide("bins on their scale");
-            let lifts = graph.constant(LIFTS, &[1, BINS], lifts);
-            let lifted = ["bins on their scale", lifts.as_str()];
-            graph.node("Add", &lifted, "bins");
+            graph.constant(LIFTS, &[1, BINS], lifts);
+            graph.add(&format!("bins = Add(Div({RAW}, {temperature}), {LIFTS})"));
             vec![value_info("bins", &[1, BINS])]
         }
     };

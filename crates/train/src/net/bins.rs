@@ -47,15 +47,14 @@ fn reading(shore: Option<f32>) -> Vec<f32> {
 }
 
 /// What is added to the logits of the bins so that they are of a world in which all levels are equally
-/// frequent: nothing where `share` is 0, and all that it takes where it is 1. `counts` has the number
-/// of training presses of each level.
-pub fn lifts(borders: &Borders, counts: &[usize], share: f32) -> Vec<f32> {
+/// frequent. `counts` has the number of training presses of each level.
+pub fn lifts(borders: &Borders, counts: &[usize]) -> Vec<f32> {
     let sum: usize = counts.iter().map(|&count| count.max(1)).sum();
     let rarity = |level: usize| -(counts[level].max(1) as f32 / sum as f32).ln();
     let of_bin = |bin: usize| {
         let levels = 0..counts.len();
         let rarities = levels.map(|level| part(borders, bin, level) * rarity(level));
-        share * rarities.sum::<f32>()
+        rarities.sum::<f32>()
     };
     (0..BINS).map(of_bin).collect()
 }
@@ -127,7 +126,7 @@ mod tests {
     fn lifted_bins_are_of_a_world_of_equally_frequent_levels() {
         let borders = touching();
         let counts = [30, 10, 10, 50];
-        let lifts = lifts(&borders, &counts, 1.0);
+        let lifts = lifts(&borders, &counts);
         // Logits of the frequencies alone.
         let frequency = |bin: usize| {
             let level = (0..4)

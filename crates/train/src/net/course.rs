@@ -8,7 +8,7 @@
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
 use crate::net::bins::BINS;
-use crate::net::graph::{Graph, Inputs, integer};
+use crate::net::graph::{Graph, Inputs, RAW};
 use crate::net::network::{Weights, dense};
 use crate::net::standard::Standard;
 use hardnessd_core::verdict::features::FEATURES;
@@ -180,111 +180,48 @@ fn beside(
     Tensor::cat(vec![mean, attended, counts], 1)
 }
 
-/// The graph from the inputs of format 3 to the logits of the bins, before temperature, and their
-/// name. The press's embedding as a reference is in `reference`, if the model takes references.
-pub fn graph(weights: &Weights, standard: &Standard, inputs: Inputs) -> (Graph, String) {
-    let mut b = Graph::default();
-    let features = standard.scaled(&mut b, "features");
-    let beside = match inputs {
-        Inputs::References => {
-            let piece = piece_nodes(&mut b);
-            let all = b.joined(&[&features, &piece], "press and piece");
-            let x = b.dense(weights, "reference1", &all);
-            let x = b.node("Relu", &[&x], "reference1");
-            let x = b.dense(weights, "reference2", &x);
-            b.node("Relu", &[&x], "reference");
-            beside_nodes(&mut b, weights, &features)
-        }
+/// The formulas of [`columns`] from the input `piece`, of [`embeddings`] as `reference`, and of [`beside`] from the
+/// inputs `references` and `given`. What is not given has no weight.
+fn reference_formulas() -> String {
+    let names = ["flat", "width", "ball", "radius", "known", "low", "high"];
+    let slice = |(place, name)| format!("{name} = Slice(piece, [{place}], [{}], [1])\n", place + 1);
+    let slices: String = names.into_iter().enumerate().map(slice).collect();
+    let length = |is: &str, mm: &str| format!("Mul({is}, Log(Div(Max({mm}, 0.1), {MM})))");
+    let (width, radius) = (length("flat", "width"), length("ball", "radius"));
+    let middle = format!("Mul(known, Div(Sub(Mul(Add(low, high), 0.5), {MIDDLE}), {UNIT}))");
+    let span = format!("Mul(known, Div(Sub(high, low), {UNIT}))");
+    format!(
+        "{slices}
+        columns = Concat(flat, {width}, ball, {radius}, known, {middle}, {span}, axis=1)
+        layer = Relu(Dense(Concat(standardised, columns, axis=1), reference1))
+        reference = Relu(Dense(layer, reference2))
+
+        all = Reshape(references, [{REFERENCES}x{EMBEDDING}])
+        count = MatMul(given, each reference)
+        mean = Div(MatMul(given, all), Max(count, 1))
+        scores = Div(Gemm(Dense(standardised, question), all, transB=1), {SCORES})
+        softmax = Softmax(Add(scores, Mul(Sub(given, 1), 10000)), axis=1)
+        attended = MatMul(Mul(softmax, given), all)
+        beside = Concat(mean, attended, Min(count, 1), Div(Log(Add(count, 1)), {COUNT}), axis=1)"
+    )
+}
+
+/// The graph from the inputs of format 3 to the logits of the bins, before temperature. The press's embedding
+/// as a reference is in `reference`, if the model takes references.
+pub fn graph(weights: &Weights, standard: &Standard, inputs: Inputs) -> Graph {
+    let mut graph = Graph::of(weights);
+    standard.add_to(&mut graph, "features");
+    if inputs == Inputs::References {
+        graph.constant("each reference", &[REFERENCES, 1], &[1.0; REFERENCES]);
+        graph.add(&reference_formulas());
+    } else {
         // What the network gets without any reference.
-        Inputs::Frame | Inputs::Parts(_) | Inputs::Features => {
-            b.constant("beside", &[1, BESIDE], &[0.0; BESIDE])
-        }
-    };
-    let mut x = b.joined(&[&features, &beside], "press and references");
-    for (name, _) in JOINT {
-        x = b.dense(weights, name, &x);
-        if name != "head" {
-            x = b.node("Relu", &[&x], name);
-        }
+        graph.constant("beside", &[1, BESIDE], &[0.0; BESIDE]);
     }
-    (b, x)
-}
-
-/// Adds the nodes of [`columns`] from the input `piece`.
-fn piece_nodes(b: &mut Graph) -> String {
-    let axis = b.indices("piece axis", &[1]);
-    let names = [
-        "flat",
-        "width",
-        "ball",
-        "radius",
-        "known hardness",
-        "least",
-        "greatest",
-    ];
-    let [flat, width, ball, radius, known, low, high]: [String; PIECE] =
-        std::array::from_fn(|place| {
-            let name = names[place];
-            let [first, end] = [place, place + 1]
-                .map(|end| b.indices(&format!("piece {end} of {name}"), &[end as i64]));
-            b.node("Slice", &["piece", &first, &end, &axis], name)
-        });
-    let mut length = |is: &str, mm: &str| {
-        let least = b.scalar(&format!("least {mm}"), 0.1);
-        let scale = b.scalar(&format!("scale of {mm}"), MM);
-        let mm = b.node("Max", &[mm, &least], &format!("{mm} at least"));
-        let mm = b.node("Div", &[&mm, &scale], &format!("{mm} scaled"));
-        let mm = b.node("Log", &[&mm], &format!("{mm} log"));
-        b.node("Mul", &[is, &mm], &format!("{mm} known"))
-    };
-    let (width, radius) = (length(&flat, &width), length(&ball, &radius));
-    let sum = b.node("Add", &[&low, &high], "ends together");
-    let half = b.scalar("half", 0.5);
-    let middle = b.node("Mul", &[&sum, &half], "middle");
-    let zero = b.scalar("middle of the scale", MIDDLE);
-    let middle = b.node("Sub", &[&middle, &zero], "middle off");
-    let span = b.node("Sub", &[&high, &low], "span");
-    let unit = b.scalar("unit of hardness", UNIT);
-    let mut scaled = |x: &str| {
-        let x = b.node("Div", &[x, &unit], &format!("{x} in units"));
-        b.node("Mul", &[&known, &x], &format!("{x} known"))
-    };
-    let (middle, span) = (scaled(&middle), scaled(&span));
-    let columns = [&flat, &width, &ball, &radius, &known, &middle, &span];
-    b.joined(&columns.map(String::as_str), "piece columns")
-}
-
-/// Adds the nodes of [`beside`] from the inputs `references` and `given` and standardised features
-/// `[1, FEATURES]`.
-fn beside_nodes(b: &mut Graph, weights: &Weights, features: &str) -> String {
-    let all = b.reshaped("references", &[REFERENCES, EMBEDDING], "all references");
-    let ones = b.constant("each reference", &[REFERENCES, 1], &[1.0; REFERENCES]);
-    let count = b.node("MatMul", &["given", &ones], "count");
-    let one = b.scalar("one", 1.0);
-    let divisor = b.node("Max", &[&count, &one], "count at least 1");
-    let sum = b.node("MatMul", &["given", &all], "sum of references");
-    let mean = b.node("Div", &[&sum, &divisor], "mean of references");
-
-    let question = b.dense(weights, "question", features);
-    let transposed = vec![integer("transB", 1)];
-    let scores = b.with("Gemm", &[&question, &all], "scores", transposed);
-    let divisor = b.scalar("divisor of scores", SCORES);
-    let scores = b.node("Div", &[&scores, &divisor], "scores scaled");
-    // What is not given has no weight.
-    let missing = b.node("Sub", &["given", &one], "missing");
-    let low = b.scalar("low", 1e4);
-    let missing = b.node("Mul", &[&missing, &low], "missing scores");
-    let scores = b.node("Add", &[&scores, &missing], "scores of the given");
-    let along = vec![integer("axis", 1)];
-    let attention = b.with("Softmax", &[&scores], "softmax of scores", along);
-    let attention = b.node("Mul", &[&attention, "given"], "attention");
-    let attended = b.node("MatMul", &[&attention, &all], "attended");
-
-    let is_any = b.node("Min", &[&count, &one], "is any given");
-    let log = b.logarithm_of(&count);
-    let divisor = b.scalar("divisor of the count", COUNT);
-    let log = b.node("Div", &[&log, &divisor], "count scaled");
-    b.joined(&[&mean, &attended, &is_any, &log], "beside")
+    let x = "Concat(standardised, beside, axis=1)";
+    let x = format!("Relu(Dense(Relu(Dense(Relu(Dense({x}, joint1)), joint2)), joint3))");
+    graph.add(&format!("{RAW} = Dense({x}, head)"));
+    graph
 }
 
 #[cfg(test)]
@@ -299,22 +236,6 @@ mod tests {
     }
 
     const BALL: Piece = Piece::Ball { radius_mm: 10.0 };
-
-    #[test]
-    fn the_network_begins_with_outputs_of_moderate_size() {
-        let device = Device::flex();
-        let weights = initial(1, &device);
-        let mut stream = Stream::new(2, "columns");
-        let presses: Vec<Vec<f32>> = (0..32).map(|_| press(&mut stream)).collect();
-        let references = presses[..4].iter().map(|press| (press.clone(), BALL));
-        let group = Group {
-            references: references.collect(),
-            presses,
-        };
-        let values = numbers(&outputs(&weights, &[group], None, &device));
-        let variance = values.iter().map(|x| x * x).sum::<f32>() / values.len() as f32;
-        assert!((0.02..10.0).contains(&variance), "{variance}");
-    }
 
     #[test]
     fn a_press_depends_on_its_own_features_and_references_alone() {

@@ -1,16 +1,20 @@
 //! A network as a graph of ONNX nodes, from newtons to logits.
 //!
-//! In: nodes and constants, one by one. Out: the graph as tract's own ONNX types, so that the
+//! In: formulas, one a line. Out: the graph as tract's own ONNX types, so that the
 //! exported file and the daemon's reader share one schema.
 
 use tract_onnx::pb;
+use tract_onnx::pb::attribute_proto::AttributeType;
+use tract_onnx::pb::tensor_proto::DataType;
 
-use super::network::Weights;
+use super::network::{Weights, numbers};
 use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::MIN_OPSET;
 
 /// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
+/// The name of the logits, before temperature.
+pub const RAW: &str = "raw";
 /// The IR version that goes with opset 17.
 const IR_VERSION: i64 = 8;
 
@@ -30,42 +34,30 @@ pub enum Inputs {
 /// The nodes and constants of a graph under construction. A name identifies each value.
 #[derive(Debug, Clone, Default)]
 pub struct Graph {
+    weights: Weights,
     nodes: Vec<pb::NodeProto>,
     constants: Vec<pb::TensorProto>,
+    /// The number of values without a name of their own.
+    values: usize,
 }
 
 impl Graph {
-    /// Adds an f32 constant and returns its name.
-    pub fn constant(&mut self, name: &str, dims: &[usize], values: &[f32]) -> String {
+    /// A graph of a network with these weights.
+    pub fn of(weights: &Weights) -> Self {
+        Self {
+            weights: weights.clone(),
+            ..Self::default()
+        }
+    }
+
+    /// Adds an f32 constant.
+    pub fn constant(&mut self, name: &str, dims: &[usize], values: &[f32]) {
         debug_assert_eq!(dims.iter().product::<usize>(), values.len(), "{name}");
         let raw = values.iter().flat_map(|value| value.to_le_bytes());
-        self.raw(name, dims, pb::tensor_proto::DataType::Float, raw.collect())
+        self.raw(name, dims, DataType::Float, raw.collect());
     }
 
-    /// Adds a constant of one number and returns its name.
-    pub fn scalar(&mut self, name: &str, value: f32) -> String {
-        self.constant(&format!("{name} as a number"), &[], &[value])
-    }
-
-    /// Adds an i64 vector, the form of shapes and axes, and returns its name.
-    pub fn indices(&mut self, name: &str, values: &[i64]) -> String {
-        let raw = values.iter().flat_map(|value| value.to_le_bytes());
-        let dims = [values.len()];
-        self.raw(
-            name,
-            &dims,
-            pb::tensor_proto::DataType::Int64,
-            raw.collect(),
-        )
-    }
-
-    fn raw(
-        &mut self,
-        name: &str,
-        dims: &[usize],
-        data_type: pb::tensor_proto::DataType,
-        raw_data: Vec<u8>,
-    ) -> String {
+    fn raw(&mut self, name: &str, dims: &[usize], data_type: DataType, raw_data: Vec<u8>) {
         self.constants.push(pb::TensorProto {
             name: name.to_owned(),
             dims: dims.iter().map(|&length| length as i64).collect(),
@@ -73,93 +65,108 @@ impl Graph {
             raw_data,
             ..Default::default()
         });
-        name.to_owned()
     }
 
-    /// Adds a node with one output and returns the output's name.
-    pub fn node(&mut self, op: &str, inputs: &[&str], output: &str) -> String {
-        self.with(op, inputs, output, Vec::new())
+    /// Adds nodes, one or more a line: `output = Op(input, ..., attribute=value, ...)`.
+    ///
+    /// An input is the name of a value or of a weight, which is added; a number, such as `0.5`; a list
+    /// of whole numbers, such as `[1x64]`, which an attribute has without brackets; or another `Op(...)`.
+    /// `Dense(x, name)` passes x through the layer of that name.
+    ///
+    /// # Panics
+    ///
+    /// Panics if a line is none of these. Networks write their formulas themselves.
+    pub fn add(&mut self, formulas: &str) {
+        let lines = formulas.lines().map(str::trim);
+        for line in lines.filter(|line| !line.is_empty()) {
+            let (output, call) = line.split_once(" = ").expect("output = Op(...)");
+            self.call(call, output.to_owned());
+        }
     }
 
-    /// The same with attributes.
-    pub fn with(
-        &mut self,
-        op: &str,
-        inputs: &[&str],
-        output: &str,
-        attribute: Vec<pb::AttributeProto>,
-    ) -> String {
+    /// Adds the node of a call, and those of its inputs.
+    fn call(&mut self, call: &str, output: String) -> String {
+        let (op, parts) = call.split_once('(').expect("Op(...)");
+        let parts = arguments(parts.strip_suffix(')').expect("Op(...)"));
+        let (attributes, inputs): (Vec<&str>, Vec<&str>) =
+            parts.partition(|part| !part.contains('(') && part.contains('='));
+        let (op_type, inputs) = match (op, inputs.as_slice()) {
+            ("Dense", [x, layer]) => {
+                let weights = ["matrix", "bias"].map(|part| format!("{layer}.{part}"));
+                ("Gemm", [vec![(*x).to_owned()], weights.to_vec()].concat())
+            }
+            _ => (op, inputs.into_iter().map(str::to_owned).collect()),
+        };
+        let input = inputs.iter().map(|input| self.value(input)).collect();
         self.nodes.push(pb::NodeProto {
             name: format!("{op}:{output}"),
-            op_type: op.to_owned(),
-            input: inputs.iter().map(|&input| input.to_owned()).collect(),
-            output: vec![output.to_owned()],
-            attribute,
+            op_type: op_type.to_owned(),
+            input,
+            output: vec![output.clone()],
+            attribute: attributes.into_iter().map(attribute).collect(),
             ..Default::default()
         });
-        output.to_owned()
+        output
     }
 
-    /// Adds the nodes of `x` in another shape.
-    pub fn reshaped(&mut self, x: &str, dims: &[usize], output: &str) -> String {
-        let dims: Vec<i64> = dims.iter().map(|&length| length as i64).collect();
-        let shape = self.indices(&format!("shape of {output}"), &dims);
-        self.node("Reshape", &[x, &shape], output)
-    }
-
-    /// Adds the nodes of log(1 + x).
-    pub fn logarithm_of(&mut self, x: &str) -> String {
-        let one = self.scalar(&format!("added to {x}"), 1.0);
-        let raised = self.node("Add", &[x, &one], &format!("{x} raised"));
-        self.node("Log", &[&raised], &format!("log of {x}"))
-    }
-
-    /// Adds the node that joins values along their columns.
-    pub fn joined(&mut self, parts: &[&str], output: &str) -> String {
-        self.with("Concat", parts, output, vec![integer("axis", 1)])
-    }
-
-    /// Adds the weight `name` as a constant.
-    pub fn weight(&mut self, weights: &Weights, name: &str) -> String {
-        self.constant(name, weights.dims(name), &weights.numbers(name))
-    }
-
-    /// Passes `x` `[rows, inputs]` through the layer `name`.
-    pub fn dense(&mut self, weights: &Weights, name: &str, x: &str) -> String {
-        let matrix = self.weight(weights, &format!("{name}.matrix"));
-        let bias = self.weight(weights, &format!("{name}.bias"));
-        self.node("Gemm", &[x, &matrix, &bias], &format!("{name}.sum"))
+    /// The name of an input, after adding what it needs.
+    fn value(&mut self, text: &str) -> String {
+        if text.ends_with(')') {
+            self.values += 1;
+            return self.call(text, format!("value {}", self.values));
+        }
+        let mut constants = self.constants.iter();
+        if constants.any(|constant| constant.name == text) {
+            return text.to_owned();
+        }
+        if let Some(list) = text.strip_prefix('[') {
+            let numbers = whole_numbers(list.trim_end_matches(']'));
+            let raw = numbers.iter().flat_map(|number| number.to_le_bytes());
+            self.raw(text, &[numbers.len()], DataType::Int64, raw.collect());
+        } else if let Ok(number) = text.parse() {
+            self.constant(text, &[], &[number]);
+        } else if let Some(weight) = self.weights.entries.iter().find(|of| of.name == text) {
+            let (dims, values) = (weight.dims.clone(), numbers(&weight.values));
+            self.constant(text, &dims, &values);
+        }
+        text.to_owned()
     }
 }
 
-/// An integer attribute.
-pub fn integer(name: &str, value: i64) -> pb::AttributeProto {
-    pb::AttributeProto {
-        name: name.to_owned(),
-        r#type: pb::attribute_proto::AttributeType::Int as i32,
-        i: value,
-        ..Default::default()
-    }
+/// The arguments of a call, which commas outside of brackets separate.
+fn arguments(text: &str) -> impl Iterator<Item = &str> {
+    let mut depth = 0;
+    let parts = text.split(move |letter| {
+        depth += i32::from(letter == '(') - i32::from(letter == ')');
+        letter == ',' && depth == 0
+    });
+    parts.map(str::trim)
 }
 
-/// A list of integers as an attribute.
-pub fn integers(name: &str, values: &[i64]) -> pb::AttributeProto {
-    pb::AttributeProto {
-        name: name.to_owned(),
-        r#type: pb::attribute_proto::AttributeType::Ints as i32,
-        ints: values.to_vec(),
-        ..Default::default()
-    }
+/// `4x4` as a list.
+fn whole_numbers(list: &str) -> Vec<i64> {
+    let numbers = list.split('x').map(str::parse);
+    numbers.collect::<Result<_, _>>().expect("whole numbers")
 }
 
-/// A floating-point number as an attribute.
-pub fn number(name: &str, value: f32) -> pb::AttributeProto {
-    pb::AttributeProto {
+/// An attribute: `axis=1`, `strides=2x2` or `alpha=0.2`.
+fn attribute(text: &str) -> pb::AttributeProto {
+    let (name, value) = text.split_once('=').expect("name=value");
+    let mut attribute = pb::AttributeProto {
         name: name.to_owned(),
-        r#type: pb::attribute_proto::AttributeType::Float as i32,
-        f: value,
         ..Default::default()
+    };
+    if value.contains('x') {
+        attribute.set_type(AttributeType::Ints);
+        attribute.ints = whole_numbers(value);
+    } else if value.contains('.') {
+        attribute.set_type(AttributeType::Float);
+        attribute.f = value.parse().expect("a number");
+    } else {
+        attribute.set_type(AttributeType::Int);
+        attribute.i = value.parse().expect("a whole number");
     }
+    attribute
 }
 
 /// The graph as an ONNX model.

@@ -5,43 +5,30 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::net::graph::{self, Graph};
+use crate::net::graph::{Graph, RAW};
 use crate::net::image::PixelScale;
 use crate::net::layers::STRIDE;
-use crate::net::network::{self, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights};
-use crate::settings::network::Pooling;
-use hardnessd_core::verdict::ROWS;
+use crate::net::network::{
+    self, BATCH_NORM_EPSILON, FEATURES, LEAKY_SLOPE, Normalisation, Statistics, TRUNK, Weights,
+};
 use hardnessd_simulator::random::Stream;
 
-/// The number of features that a pooling makes.
-fn features(pooling: Pooling) -> usize {
-    match pooling {
-        Pooling::Max => FEATURES,
-        Pooling::MaxMean => 2 * FEATURES,
-    }
-}
-
-/// Initial weights for `levels` levels.
-pub fn initial(levels: usize, pooling: Pooling, seed: u64, device: &Device) -> Weights {
-    let stream = Stream::new(seed, "hrn weights");
-    let mut weights = Weights::default();
-    network::add_trunk(&mut weights, &stream, device);
-    network::add_head(&mut weights, [features(pooling), levels], &stream, device);
-    weights
-}
-
-/// HRN before pretraining or fine-tuning: a USTGAN's discriminator with a head for `levels` levels
-/// in place of its own head, which separated real from generated frames.
-pub fn inherited(
-    discriminator: &Weights,
+/// Initial weights for `levels` levels: with the trunk of a USTGAN's discriminator, or else one of random weights.
+/// The last layer is always new, because the discriminator's separated real from generated frames.
+pub fn initial(
+    discriminator: Option<&Weights>,
     levels: usize,
-    pooling: Pooling,
+    mean_pooling: bool,
     seed: u64,
     device: &Device,
 ) -> Weights {
-    let mut weights = without_head(discriminator);
     let stream = Stream::new(seed, "hrn weights");
-    network::add_head(&mut weights, [features(pooling), levels], &stream, device);
+    let mut weights = discriminator.map(without_head).unwrap_or_default();
+    if discriminator.is_none() {
+        network::add_trunk(&mut weights, &stream, device);
+    }
+    let features = if mean_pooling { 2 * FEATURES } else { FEATURES };
+    network::add_head(&mut weights, [features, levels], &stream, device);
     weights
 }
 
@@ -103,62 +90,42 @@ pub fn targets(
     Tensor::from_data(TensorData::new(values, [batch, levels]), device)
 }
 
-/// The graph from newtons to logits, and the logits' name. The inference library fuses batch
-/// normalisation with the convolution before it.
-pub fn graph(weights: &Weights, statistics: &Statistics, scale: PixelScale) -> (Graph, String) {
-    let mut graph = Graph::default();
+/// The graph from newtons to logits. The inference library fuses batch normalisation with the convolution
+/// before it.
+pub fn graph(weights: &Weights, statistics: &Statistics, scale: PixelScale) -> Graph {
+    let mut graph = Graph::of(weights);
     // `network::trunk` raises the image by 1, too.
-    let mut x = scale.nodes(&mut graph, graph::INPUT);
-    let (mut size, mut normalised_index) = (ROWS, 0);
-    for layer in &TRUNK {
-        let name = layer.name;
-        size = layer.geometry(size).small();
-        let [kernel, bias] =
-            ["kernel", "bias"].map(|part| graph.weight(weights, &format!("{name}.{part}")));
-        let (before, after) = (layer.padding.0 as i64, layer.padding.1 as i64);
-        let attributes = vec![
-            graph::integers("kernel_shape", &[layer.kernel as i64; 2]),
-            graph::integers("strides", &[STRIDE as i64; 2]),
-            graph::integers("pads", &[before, before, after, after]),
-        ];
-        let sum = format!("{name}.sum");
-        x = graph.with("Conv", &[&x, &kernel, &bias], &sum, attributes);
+    graph.add(&scale.formula());
+    let (mut x, mut size) = ("image".to_owned(), 0);
+    for layer in TRUNK {
+        let (name, (before, after)) = (layer.name, layer.padding);
+        let geometry = format!("strides={STRIDE}x{STRIDE}, pads={before}x{before}x{after}x{after}");
+        x = format!("Conv({x}, {name}.kernel, {name}.bias, {geometry})");
         if layer.normalised {
-            let (mean, variance) = statistics.layer(normalised_index);
-            normalised_index += 1;
-            let [mean, variance] =
-                [("mean", mean), ("variance", variance)].map(|(part, values)| {
-                    let values = network::numbers(&values);
-                    graph.constant(&format!("{name}.{part}"), &[layer.outputs], &values)
-                });
-            let [gamma, beta] =
-                ["gamma", "beta"].map(|part| graph.weight(weights, &format!("{name}.{part}")));
-            x = graph.with(
-                "BatchNormalization",
-                &[&x, &gamma, &beta, &mean, &variance],
-                &format!("{name}.normalised"),
-                vec![graph::number("epsilon", network::BATCH_NORM_EPSILON)],
-            );
+            for (part, values) in ["mean", "variance"].into_iter().zip(statistics.layer(name)) {
+                let values = network::numbers(&values);
+                graph.constant(&format!("{name}.{part}"), &[layer.outputs], &values);
+            }
+            let parts = ["gamma", "beta", "mean", "variance"].map(|part| format!("{name}.{part}"));
+            let parts = parts.join(", ");
+            x = format!("BatchNormalization({x}, {parts}, epsilon={BATCH_NORM_EPSILON})");
         }
-        let slope = vec![graph::number("alpha", LEAKY_SLOPE)];
-        x = graph.with("LeakyRelu", &[&x], &format!("{name}.out"), slope);
+        x = format!("LeakyRelu({x}, alpha={LEAKY_SLOPE})");
+        size = layer.small();
     }
+    graph.add(&format!("last = {x}"));
     // A pool of the images' size and a matrix product give the same as ONNX's global pools, for which
     // the inference library takes many times as long.
-    let kernel = vec![graph::integers("kernel_shape", &[size as i64; 2])];
-    let greatest = graph.with("MaxPool", &[&x], "greatest", kernel);
-    let mut features = graph.reshaped(&greatest, &[1, FEATURES], "greatest in a row");
+    let mut features =
+        format!("Reshape(MaxPool(last, kernel_shape={size}x{size}), [1x{FEATURES}])");
     if network::takes_means(weights) {
         let places = size * size;
-        let channels = graph.reshaped(&x, &[FEATURES, places], "channels");
-        let share = vec![1.0 / places as f32; places];
-        let share = graph.constant("share of a place", &[places, 1], &share);
-        let means = graph.node("MatMul", &[&channels, &share], "means");
-        let means = graph.reshaped(&means, &[1, FEATURES], "means in a row");
-        features = graph.joined(&[&features, &means], "pooled");
+        graph.constant("share", &[places, 1], &vec![1.0 / places as f32; places]);
+        let means = format!("MatMul(Reshape(last, [{FEATURES}x{places}]), share)");
+        features = format!("Concat({features}, Reshape({means}, [1x{FEATURES}]), axis=1)");
     }
-    let raw = graph.dense(weights, "head", &features);
-    (graph, raw)
+    graph.add(&format!("{RAW} = Dense({features}, head)"));
+    graph
 }
 
 #[cfg(test)]
@@ -169,7 +136,7 @@ mod tests {
 
     #[test]
     fn the_network_has_the_papers_number_of_parameters() {
-        let weights = initial(4, Pooling::Max, 1, &Device::flex());
+        let weights = initial(None, 4, false, 1, &Device::flex());
         let sizes = weights.entries.iter().map(|weight| weight.dims.iter());
         assert_eq!(sizes.map(Iterator::product::<usize>).sum::<usize>(), 32_196);
     }
@@ -194,7 +161,7 @@ mod tests {
             .map(|sample| resampled(&sample.frame))
             .collect();
         let device = Device::flex();
-        let weights = initial(4, Pooling::Max, 1, &device);
+        let weights = initial(None, 4, false, 1, &device);
         for log_above_n in [0.0, 0.1] {
             let scale = PixelScale {
                 full_scale_n: 10.2,
@@ -207,12 +174,10 @@ mod tests {
                 images,
                 &mut Normalisation::Collect(&mut statistics),
             );
-            for layer in 0..2 {
-                let (_, variance) = statistics.layer(layer);
+            for layer in ["conv2", "conv3"] {
+                let [_, variance] = statistics.layer(layer);
                 let variances = network::numbers(&variance);
-                let normalised = variances
-                    .iter()
-                    .map(|v| v / (v + network::BATCH_NORM_EPSILON));
+                let normalised = variances.iter().map(|v| v / (v + BATCH_NORM_EPSILON));
                 let mean = normalised.sum::<f32>() / variances.len() as f32;
                 assert!(mean > 0.9, "layer {layer}: {mean} of {variances:?}");
             }

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
-use crate::net::graph::Graph;
+use crate::net::graph::INPUT;
 use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
@@ -61,18 +61,13 @@ impl PixelScale {
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
     }
 
-    /// Adds the nodes from `newtons` to the image raised by 1, so that the background is 0. Returns
-    /// that value's name.
-    pub fn nodes(self, graph: &mut Graph, newtons: &str) -> String {
+    /// The formula from the input of newtons to the `image` raised by 1, so that the background is 0.
+    pub fn formula(self) -> String {
         if self.log_above_n == 0.0 {
-            let scale = graph.scalar("scale", (2.0 / self.full_scale_n) as f32);
-            return graph.node("Mul", &[newtons, &scale], "image");
+            return format!("image = Mul({INPUT}, {})", (2.0 / self.full_scale_n) as f32);
         }
-        let scale = graph.scalar("scale", (1.0 / self.log_above_n) as f32);
-        let scaled = graph.node("Mul", &[newtons, &scale], "scaled");
-        let log = graph.logarithm_of(&scaled);
-        let factor = graph.scalar("log factor", self.log_factor());
-        graph.node("Mul", &[&log, &factor], "image")
+        let (scale, factor) = ((1.0 / self.log_above_n) as f32, self.log_factor());
+        format!("image = Mul(Log(Add(Mul({INPUT}, {scale}), 1)), {factor})")
     }
 }
 

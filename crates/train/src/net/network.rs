@@ -7,9 +7,11 @@
 //! (`results/method.md`), so [`Normalisation`] says where the statistics come from, and they
 //! are taken anew before every evaluation and export.
 
+use std::collections::BTreeMap;
+
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::net::layers::{Geometry, convolution, leaky_relu, normalised};
+use crate::net::layers::{Convolution, convolution, leaky_relu, normalised};
 use hardnessd_core::verdict::{COLS, ROWS};
 use hardnessd_simulator::random::Stream;
 
@@ -25,41 +27,13 @@ const INITIAL_DEVIATION: f64 = 0.02;
 /// The number of features after a global pool: one per channel.
 pub const FEATURES: usize = 64;
 
-/// One of the trunk's convolutions: square kernel, stride 2, TF's SAME padding.
-#[derive(Debug, Clone, Copy)]
-pub struct Convolution {
-    /// Prefix of the names of its weights.
-    pub name: &'static str,
-    /// Input channels.
-    pub inputs: usize,
-    /// Output channels.
-    pub outputs: usize,
-    /// Rows and columns of the kernel.
-    pub kernel: usize,
-    /// Zeros before and after, in rows as in columns.
-    pub padding: (usize, usize),
-    /// Whether batch normalisation follows.
-    pub normalised: bool,
-}
-
-impl Convolution {
-    /// The geometry of the convolution on images of `size` rows and columns.
-    pub fn geometry(&self, size: usize) -> Geometry {
-        Geometry {
-            channels: self.inputs,
-            size,
-            kernel: self.kernel,
-            padding: self.padding,
-        }
-    }
-}
-
 /// 28 -> 14 -> 7 -> 4, then a global pool to [`FEATURES`], or to twice as many.
 pub const TRUNK: [Convolution; 3] = [
     Convolution {
         name: "conv1",
         inputs: 1,
         outputs: 16,
+        size: ROWS,
         kernel: 5,
         padding: (1, 2),
         normalised: false,
@@ -68,6 +42,7 @@ pub const TRUNK: [Convolution; 3] = [
         name: "conv2",
         inputs: 16,
         outputs: 32,
+        size: 14,
         kernel: 5,
         padding: (1, 2),
         normalised: true,
@@ -76,6 +51,7 @@ pub const TRUNK: [Convolution; 3] = [
         name: "conv3",
         inputs: 32,
         outputs: FEATURES,
+        size: 7,
         kernel: 3,
         padding: (1, 1),
         normalised: true,
@@ -133,12 +109,6 @@ impl Weights {
         numbers(&self.entry(name).values)
     }
 
-    /// The numbers of the weight called `name`, if there is one.
-    pub fn find(&self, name: &str) -> Option<Vec<f32>> {
-        let found = self.entries.iter().find(|weight| weight.name == name);
-        found.map(|weight| numbers(&weight.values))
-    }
-
     /// Lengths of the axes of the weight called `name`.
     pub fn dims(&self, name: &str) -> &[usize] {
         &self.entry(name).dims
@@ -151,16 +121,22 @@ impl Weights {
             .expect("a network asks for weights that it made")
     }
 
-    /// The same weights as leaves of an autodiff graph.
+    /// The same weights with other numbers.
     #[must_use]
-    pub fn tracked(&self) -> Self {
-        let track = |weight: &Weight| Weight {
-            values: weight.values.clone().autodiff().require_grad(),
+    pub fn each(&self, of: impl Fn(Tensor<1>) -> Tensor<1>) -> Self {
+        let of = |weight: &Weight| Weight {
+            values: of(weight.values.clone()),
             ..weight.clone()
         };
         Self {
-            entries: self.entries.iter().map(track).collect(),
+            entries: self.entries.iter().map(of).collect(),
         }
+    }
+
+    /// The same weights as leaves of an autodiff graph.
+    #[must_use]
+    pub fn tracked(&self) -> Self {
+        self.each(|values| values.autodiff().require_grad())
     }
 }
 
@@ -183,27 +159,40 @@ pub fn truncated_normal(count: usize, stream: &mut Stream) -> Vec<f32> {
     (0..count).map(|_| draw(stream)).collect()
 }
 
+/// Adds the initial weights of a convolution, or of its adjoint, to `channels`.
+pub(super) fn add_convolution(
+    weights: &mut Weights,
+    name: &str,
+    layer: Convolution,
+    channels: usize,
+    stream: &mut Stream,
+    device: &Device,
+) {
+    let mut add = |part: &str, dims: &[usize], values: Vec<f32>| {
+        weights.add(&format!("{name}.{part}"), dims, values, device);
+    };
+    let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
+    let values = truncated_normal(dims.iter().product(), stream);
+    add("kernel", &dims, values);
+    add("bias", &[channels], vec![0.0; channels]);
+    if layer.normalised {
+        add("gamma", &[channels], vec![1.0; channels]);
+        add("beta", &[channels], vec![0.0; channels]);
+    }
+}
+
 /// Adds the trunk's initial weights. Each layer draws from its own sub-stream.
 pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
-    for (layer, index) in TRUNK.iter().zip(0..) {
-        let Convolution {
-            name,
-            inputs,
-            outputs,
-            kernel,
-            ..
-        } = *layer;
-        let mut add = |part: &str, dims: &[usize], values: Vec<f32>| {
-            weights.add(&format!("{name}.{part}"), dims, values, device);
-        };
-        let dims = [outputs, inputs, kernel, kernel];
-        let values = truncated_normal(dims.iter().product(), &mut stream.child(index));
-        add("kernel", &dims, values);
-        if layer.normalised {
-            add("gamma", &[outputs], vec![1.0; outputs]);
-            add("beta", &[outputs], vec![0.0; outputs]);
-        }
-        add("bias", &[outputs], vec![0.0; outputs]);
+    for (layer, index) in TRUNK.into_iter().zip(0..) {
+        let mut stream = stream.child(index);
+        add_convolution(
+            weights,
+            layer.name,
+            layer,
+            layer.outputs,
+            &mut stream,
+            device,
+        );
     }
 }
 
@@ -216,32 +205,25 @@ pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream, device
     weights.add("head.bias", &[outputs], vec![0.0; outputs], device);
 }
 
-/// Mean and variance of every normalised layer's inputs, `[channels]` each.
+/// Mean and variance of every normalised layer's inputs, `[channels]` each: sums over batches, and the number of
+/// these.
 #[derive(Debug, Clone, Default)]
-pub struct Statistics {
-    layers: Vec<(Tensor<1>, Tensor<1>)>,
-    batches: usize,
-}
+pub struct Statistics(BTreeMap<String, ([Tensor<1>; 2], usize)>);
 
 impl Statistics {
-    /// Mean and biased variance of normalised layer `index`, averaged over the batches seen.
-    pub fn layer(&self, index: usize) -> (Tensor<1>, Tensor<1>) {
-        let (mean, variance) = self.layers[index].clone();
-        let batches = self.batches as f32;
-        (mean.div_scalar(batches), variance.div_scalar(batches))
+    /// Mean and biased variance of the layer `name`, averaged over the batches seen.
+    pub fn layer(&self, name: &str) -> [Tensor<1>; 2] {
+        let (sums, batches) = &self.0[name];
+        sums.clone().map(|sum| sum.div_scalar(*batches as f32))
     }
 
-    fn collect(&mut self, index: usize, mean: Tensor<1>, variance: Tensor<1>) {
-        if index == 0 {
-            self.batches += 1;
+    fn collect(&mut self, name: &str, batch: [Tensor<1>; 2]) {
+        let none = || (batch.each_ref().map(Tensor::zeros_like), 0);
+        let (sums, batches) = self.0.entry(name.to_owned()).or_insert_with(none);
+        for (sum, of_batch) in sums.iter_mut().zip(&batch) {
+            *sum = sum.clone().add(of_batch.clone());
         }
-        match self.layers.get_mut(index) {
-            None => self.layers.push((mean, variance)),
-            Some(sums) => {
-                sums.0 = sums.0.clone().add(mean);
-                sums.1 = sums.1.clone().add(variance);
-            }
-        }
+        *batches += 1;
     }
 }
 
@@ -271,37 +253,22 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     // The convolution pads with 0. Raised by 1 the background is 0 too, so that padding looks
     // like untouched sensor and not like a frame of half the full scale around every image.
     // [batch, 1, 28, 28] -> [1, 28, 28, batch]
-    let mut x = images.add_scalar(1.0).permute([1, 2, 3, 0]);
-    let mut normalised_index = 0;
-    for layer in &TRUNK {
-        let part = |part: &str| format!("{}.{part}", layer.name);
-        let vector = |name: &str| weights.tensor::<1>(&part(name));
-        let geometry = layer.geometry(x.dims()[1]);
-        let (outputs, small) = (layer.outputs, geometry.small());
-        let taps = layer.inputs * layer.kernel * layer.kernel;
-        let kernels = weights.tensor::<4>(&part("kernel"));
-        let sums = convolution(x, kernels.reshape([outputs, taps]), geometry)
-            .reshape([outputs, small * small * batch])
-            .add(vector("bias").reshape([outputs, 1]));
-        let rows = if layer.normalised {
-            let (gamma, beta) = (vector("gamma"), vector("beta"));
-            let leaky = (BATCH_NORM_EPSILON, LEAKY_SLOPE);
-            normalised_index += 1;
-            batch_norm(
-                sums,
-                gamma,
-                beta,
-                leaky,
-                normalised_index - 1,
-                normalisation,
-            )
-        } else {
-            leaky_relu(sums, LEAKY_SLOPE)
+    let x = images.add_scalar(1.0).permute([1, 2, 3, 0]);
+    let mut x = x.reshape([1, ROWS * COLS * batch]);
+    for layer in TRUNK {
+        let kernels = weights.tensor(&format!("{}.kernel", layer.name));
+        let bias = column(weights, layer.name, "bias");
+        let sums = convolution(x, kernels, bias, layer);
+        x = match layer.normalised {
+            true => {
+                let leaky = (BATCH_NORM_EPSILON, LEAKY_SLOPE);
+                batch_norm(weights, layer.name, sums, leaky, normalisation)
+            }
+            false => leaky_relu(sums, LEAKY_SLOPE),
         };
-        x = rows.reshape([outputs, small, small, batch]);
     }
-    let [_, rows, columns, _] = x.dims();
-    let x = x.reshape([FEATURES, rows * columns, batch]);
+    let places = x.dims()[1] / batch;
+    let x = x.reshape([FEATURES, places, batch]);
     let greatest = x.clone().max_dim(1).reshape([FEATURES, batch]).transpose();
     if !takes_means(weights) {
         return greatest;
@@ -310,39 +277,34 @@ pub fn trunk(weights: &Weights, images: Tensor<4>, normalisation: &mut Normalisa
     Tensor::cat(vec![greatest, means], 1)
 }
 
-/// Batch normalisation of `x` `[channels, numbers]` by channel, then LeakyReLU of `slope`;
-/// `index` counts the network's normalised layers.
+/// A vector of the layer `name`, for rows of channels.
+pub(super) fn column(weights: &Weights, name: &str, part: &str) -> Tensor<2> {
+    let values = weights.tensor::<1>(&format!("{name}.{part}"));
+    let channels = values.dims()[0];
+    values.reshape([channels, 1])
+}
+
+/// Batch normalisation of `x` `[channels, numbers]` by channel in the layer `name`, then LeakyReLU of `slope`.
 pub(super) fn batch_norm(
+    weights: &Weights,
+    name: &str,
     x: Tensor<2>,
-    gamma: Tensor<1>,
-    beta: Tensor<1>,
     (epsilon, slope): (f32, f32),
-    index: usize,
     normalisation: &mut Normalisation,
 ) -> Tensor<2> {
-    let channels = x.dims()[0];
-    match normalisation {
-        Normalisation::Fixed(statistics) => {
-            let (mean, variance) = statistics.layer(index);
-            let along = [channels, 1];
-            let scale = gamma.div(variance.add_scalar(epsilon).sqrt());
-            let centred = x.sub(mean.reshape(along));
-            leaky_relu(
-                centred.mul(scale.reshape(along)).add(beta.reshape(along)),
-                slope,
-            )
-        }
-        Normalisation::Batch => normalised(x, gamma, beta, epsilon, slope),
-        Normalisation::Collect(statistics) => {
-            let (variance, mean) = x.clone().inner().var_mean_bias(1);
-            statistics.collect(
-                index,
-                mean.reshape([channels]),
-                variance.reshape([channels]),
-            );
-            normalised(x, gamma, beta, epsilon, slope)
-        }
+    let along = [x.dims()[0], 1];
+    let [gamma, beta] = ["gamma", "beta"].map(|part| column(weights, name, part));
+    if let Normalisation::Fixed(statistics) = normalisation {
+        let [mean, variance] = statistics.layer(name).map(|values| values.reshape(along));
+        let scale = gamma.div(variance.add_scalar(epsilon).sqrt());
+        return leaky_relu(x.sub(mean).mul(scale).add(beta), slope);
     }
+    if let Normalisation::Collect(statistics) = normalisation {
+        let (variance, mean) = x.clone().inner().var_mean_bias(1);
+        let batch = [mean, variance].map(|values| values.reshape([along[0]]));
+        statistics.collect(name, batch);
+    }
+    normalised(x, gamma, beta, epsilon, slope)
 }
 
 /// Passes `x` `[rows, inputs]` through the layer `name`.

@@ -53,15 +53,13 @@ impl Standard {
         ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
     }
 
-    /// Adds the nodes that bring `columns` to the scale, and returns their output's name.
-    pub fn scaled(&self, graph: &mut Graph, columns: &str) -> String {
+    /// Adds the nodes that bring `columns` to the scale, as `standardised`.
+    pub fn add_to(&self, graph: &mut Graph, columns: &str) {
         let dims = [1, self.mean.len()];
-        let mean = graph.constant("column means", &dims, &self.mean);
-        let deviation = graph.constant("column deviations", &dims, &self.deviation);
-        let centred = graph.node("Sub", &[columns, &mean], "centred");
-        let scaled = graph.node("Div", &[&centred, &deviation], "standardised");
-        let low = graph.scalar("least", -CLIP);
-        let high = graph.scalar("most", CLIP);
-        graph.node("Clip", &[&scaled, &low, &high], "standardised and clipped")
+        graph.constant("column means", &dims, &self.mean);
+        graph.constant("column deviations", &dims, &self.deviation);
+        let unit = format!("Div(Sub({columns}, column means), column deviations)");
+        let formula = format!("standardised = Clip({unit}, -{CLIP}, {CLIP})");
+        graph.add(&formula);
     }
 }

@@ -1,7 +1,7 @@
 //! Tests of what a run's directory keeps.
 
 use super::*;
-use crate::run::history::Row;
+use crate::run::history::{Metrics, Taken};
 
 fn description(name: &str, sha256: &str) -> Description {
     Description {
@@ -47,41 +47,41 @@ fn every_program_that_had_a_part_in_a_run_is_named_once() {
 }
 
 #[test]
-fn seconds_go_on_from_the_row_of_the_checkpoint() {
+fn a_resumed_stage_writes_its_rows_again_and_no_others() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("metrics.csv");
-    let file = MetricsFile::of(directory.path());
-    let row = |step, seconds| Row {
-        step,
-        epoch: 1,
-        loss: 1.0,
-        seconds,
-        ..Row::default()
+    let rows = |stage, from, steps: &[u64]| {
+        let mut metrics = Metrics::open(&path, stage, from).unwrap();
+        for &step in steps {
+            let done = Checkpoint {
+                step,
+                ..Checkpoint::default()
+            };
+            metrics.add(&done, 1e-3, &Taken::default(), None).unwrap();
+        }
+        fs::read_to_string(&path).unwrap()
     };
-    let mut metrics = file.open("first", 0).unwrap();
-    metrics.add(&row(10, 2.0)).unwrap();
-    metrics.add(&row(20, 4.0)).unwrap();
-    metrics.add(&row(30, 9.0)).unwrap();
-    file.open("second", 0).unwrap().add(&row(5, 1.0)).unwrap();
+    rows("first", 0, &[10, 20, 30]);
+    let whole = rows("second", 0, &[5]);
+    let steps = |text: &str| -> Vec<String> {
+        let cells = text.lines().skip(1).map(|row| row.split(',').take(2));
+        cells
+            .map(|cells| cells.collect::<Vec<_>>().join(" "))
+            .collect()
+    };
     // The run was killed after step 30 and continues from the checkpoint of step 20.
-    let mut metrics = file.open("first", 20).unwrap();
-    metrics.add(&row(30, 3.5)).unwrap();
-    let text = fs::read_to_string(&path).unwrap();
-    let seconds: Vec<&str> = text
-        .lines()
-        .skip(1)
-        .filter(|row| row.starts_with("first"))
-        .map(|row| row.rsplit(',').next().unwrap())
-        .collect();
-    assert_eq!(seconds, ["2.0", "4.0", "7.5"], "{text}");
-    assert!(text.contains("second,5,"), "{text}");
+    let text = rows("first", 20, &[30]);
+    assert_eq!(
+        steps(&text),
+        ["first 10", "first 20", "second 5", "first 30"]
+    );
+    assert_eq!(whole.lines().next(), text.lines().next());
 
     // A row that a full disk broke off is dropped. A file that is not text stays unchanged.
     fs::write(&path, text.clone() + "sec").unwrap();
-    file.open("first", 30).unwrap();
-    assert_eq!(fs::read_to_string(&path).unwrap(), text);
+    assert_eq!(rows("first", 30, &[]), text);
     fs::write(&path, b"\xff").unwrap();
-    let error = format!("{:#}", file.open("first", 30).unwrap_err());
+    let error = format!("{:#}", Metrics::open(&path, "first", 30).unwrap_err());
     assert!(error.contains("metrics.csv"), "{error}");
     assert_eq!(fs::read(&path).unwrap(), b"\xff");
 }

@@ -14,7 +14,6 @@ use crate::{errors, hrn_train_in, succeed_in};
 const SETTINGS: &str = "
     [training]
     epochs = 4
-    checkpoint_every_epochs = 1
     batch = 16
     averaging = 0.9
 ";
@@ -37,7 +36,7 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     let at = directory.path();
     std::fs::write(at.join("settings.toml"), SETTINGS).unwrap();
     // Half of the 20 objects are enough for sets of levels.
-    let held_out = format!("{SETTINGS}\n[reports]\nstretched = 0.0\n[validation]\nshare = 0.5\n");
+    let held_out = format!("held_out = 0.5\n{SETTINGS}\n[reports]\nstretched = 0.0\n");
     std::fs::write(at.join("half.toml"), held_out).unwrap();
     std::fs::write(at.join("slow.toml"), "frame_rate_hz = [5, 20]\n").unwrap();
     let simulate = "simulate --sequences --materials broad --shapes wide --objects 5 --test-objects 2 \

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use hardnessd_core::verdict::BUILT_IN_HRN;
 
-use crate::{few, hrn_train_in, succeed_in};
+use crate::{few, hrn_train_in};
 
 /// The last line of stderr says `expected`, and the exit code is `code`.
 fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
@@ -85,26 +85,4 @@ fn a_directory_of_something_else_stays_as_it_is() {
         assert_eq!(fs::read(other.join(name)).unwrap(), b"somebody's");
         fs::remove_dir_all(&other).unwrap();
     }
-}
-
-#[test]
-fn a_checkpoint_of_another_network_is_refused() {
-    let directory = bench();
-    let at = directory.path();
-    let train = "train --method hrn15 --profile smoke --data d.npz --labels 24 --out";
-    succeed_in(at, &format!("{train} run"));
-    let paths: Vec<_> = fs::read_dir(at.join("run/checkpoints"))
-        .unwrap()
-        .map(|file| file.unwrap().path())
-        .collect();
-    // One of another method has the same name and other weights.
-    let other = "train --method features --profile smoke --data d.npz --labels 24 --out other";
-    succeed_in(at, other);
-    let checkpoints = fs::read_dir(at.join("other/checkpoints")).unwrap();
-    let other = checkpoints.last().unwrap().unwrap().path();
-    for path in &paths {
-        fs::copy(&other, path).unwrap();
-    }
-    fs::remove_file(at.join("run/hrn.onnx")).unwrap();
-    refused(at, &format!("{train} run --resume"), 1, ": array `");
 }

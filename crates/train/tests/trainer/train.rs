@@ -14,31 +14,24 @@ use crate::{data, errors, hrn_train_in, succeed_in, trainer, write_data};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
+    held_out = 0.25
     [training]
     epochs = 6
     batch = 16
     averaging = 0.9
-    checkpoint_every_epochs = 1
-    [training.optimiser]
     rule = \"adam\"
     learning_rate = 0.005
     schedule = \"cosine\"
-    [training.augmentation]
+    [augmentation]
     symmetries = true
     shift_taxels = 2
-    [validation]
-    share = 0.25
-    every_epochs = 2
 ";
 
 /// Settings for all stages of the method in seconds.
 const GAN_SETTINGS: &str = "
     [ustgan]
     epochs = 4
-    checkpoint_every_epochs = 1
     averaging = 0.5
-    [pretraining]
-    checkpoint_every_epochs = 1
 ";
 
 /// A run in the directory of the data, with a name of its own, because tests run in parallel.
@@ -81,15 +74,13 @@ impl Trial {
         String::from_utf8(self.read("metrics.csv")).unwrap()
     }
 
-    /// The names of the checkpoints, sorted.
+    /// The names of the checkpoints.
     fn checkpoints(&self) -> Vec<String> {
         let Ok(directory) = fs::read_dir(self.out.join("checkpoints")) else {
             return Vec::new();
         };
         let names = directory.map(|entry| entry.unwrap().file_name().into_string().unwrap());
-        let mut names: Vec<String> = names.filter(|name| name.ends_with(".npz")).collect();
-        names.sort();
-        names
+        names.collect()
     }
 }
 
@@ -146,11 +137,7 @@ fn the_whole_method_interrupted_between_stages_resumes_bit_for_bit() {
     let mut process: Command = trainer(&command.split(' ').collect::<Vec<_>>());
     let process = process.current_dir(data().0.path()).stderr(Stdio::piped());
     let mut process = process.spawn().unwrap();
-    while !ended
-        .checkpoints()
-        .iter()
-        .any(|name| name.starts_with("stgan2"))
-    {
+    while !ended.checkpoints().contains(&"stgan2".to_owned()) {
         let status = process.try_wait().unwrap();
         assert!(status.is_none(), "ended before it could be interrupted");
         std::thread::yield_now();
@@ -165,20 +152,15 @@ fn the_whole_method_interrupted_between_stages_resumes_bit_for_bit() {
     assert!(errors(&output).contains(&expected), "{output:?}");
     assert!(!ended.out.join("hrn.onnx").exists());
     ended.train("--seed 6 --resume");
-    assert_eq!(ended.checkpoints(), whole.checkpoints());
-    let checkpoints = whole.checkpoints().into_iter();
-    let checkpoints = checkpoints.map(|name| format!("checkpoints/{name}"));
-    for name in checkpoints.chain(["hrn.onnx".to_owned()]) {
-        assert!(ended.read(&name) == whole.read(&name), "{name} differs");
-    }
+    assert!(ended.read("hrn.onnx") == whole.read("hrn.onnx"));
 
-    // A row has the losses of generator and discriminator, and sigma.
+    // A row has the losses of generator and discriminator.
     let metrics = whole.metrics();
     let columns: Vec<&str> = metrics.lines().next().unwrap().split(',').collect();
     for stage in ["ustgan", "stgan1", "stgan4"] {
         let row = metrics.lines().rfind(|row| row.starts_with(stage)).unwrap();
         let row: Vec<&str> = row.split(',').collect();
-        for name in ["loss", "generator_loss", "sigma_min"] {
+        for name in ["loss", "generator_loss"] {
             let place = columns.iter().position(|column| *column == name).unwrap();
             let found: f64 = row[place].parse().unwrap();
             assert!(found.is_finite(), "{stage} {name}");
@@ -195,14 +177,7 @@ fn a_training_that_diverges_ends_where_it_does() {
     let one_step = "epochs = 1\nbatch = 1000\n";
     for (method, table, more, rate, expected) in [
         ("sgan", "ustgan", "", 1e30, "sgan: epoch 1: loss: found NaN"),
-        // The weights become NaN in the very last step.
-        (
-            "hrn100",
-            "training",
-            one_step,
-            1e300,
-            "hrn: epoch 1: conv1.kernel: found ",
-        ),
+        // The weights are too large after the very last step.
         (
             "hrn15",
             "training",
@@ -211,7 +186,7 @@ fn a_training_that_diverges_ends_where_it_does() {
             "hrn: epoch 1: logit: found NaN",
         ),
     ] {
-        let settings = format!("[{table}]\n{more}optimiser.learning_rate = {rate:e}\n");
+        let settings = format!("[{table}]\n{more}learning_rate = {rate:e}\n");
         let trial = Trial::of(method, &format!("diverging-{method}"), &settings);
         let output = trial.output("");
         let error = errors(&output);
@@ -298,7 +273,7 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
     }
     refused(
         "--seed 3 --resume",
-        "hrn: the checkpoint is of other frames",
+        "hrn: the checkpoint is of other starting weights",
     );
 }
 

@@ -6,6 +6,7 @@
 //! whatever a robot has.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::Press;
 use crate::learn::Question;
@@ -81,12 +82,17 @@ struct Lot {
 
 /// The presses to learn from, by sensor.
 #[derive(Debug)]
-pub(super) struct Lots(Vec<Lot>);
+pub(super) struct Lots {
+    /// All presses of the data.
+    pub(super) presses: Arc<[Press]>,
+    borders: Borders,
+    lots: Vec<Lot>,
+}
 
 impl Lots {
     /// Sorts the presses `train` by their sensors. Presses on rigid pieces count for these sensors,
     /// whatever their split.
-    pub(super) fn of(presses: &[Press], train: &[usize]) -> Self {
+    pub(super) fn of(presses: Arc<[Press]>, borders: Borders, train: &[usize]) -> Self {
         let mut lots = BTreeMap::<u32, Lot>::new();
         for &place in train {
             let lot = lots.entry(presses[place].sensor).or_default();
@@ -102,17 +108,26 @@ impl Lots {
                 lot.rigid[form].push(place);
             }
         }
-        Self(lots.into_values().collect())
+        Self {
+            presses,
+            borders,
+            lots: lots.into_values().collect(),
+        }
+    }
+
+    /// The same of other presses.
+    pub(super) fn with(&self, places: &[usize]) -> Self {
+        Self::of(self.presses.clone(), self.borders.clone(), places)
     }
 
     /// Whether a sensor has presses that may serve as references.
     pub(super) fn have_references(&self) -> bool {
-        self.0.iter().any(Lot::is_identified)
+        self.lots.iter().any(Lot::is_identified)
     }
 
     /// Numbers of lots, each as often as it has groups.
     pub(super) fn tickets(&self) -> Vec<usize> {
-        let lots = self.0.iter().enumerate();
+        let lots = self.lots.iter().enumerate();
         lots.flat_map(|(place, lot)| {
             let groups = lot.presses.len().div_ceil(GROUP);
             std::iter::repeat_n(place, groups)
@@ -121,65 +136,121 @@ impl Lots {
     }
 
     /// Draws a group of a lot.
-    pub(super) fn draw(
-        &self,
-        lot: usize,
-        presses: &[Press],
-        borders: &Borders,
-        stream: &mut Stream,
-    ) -> Question {
-        let lot = &self.0[lot];
+    pub(super) fn draw(&self, lot: usize, stream: &mut Stream) -> Question {
+        let lot = &self.lots[lot];
         let mut order = lot.presses.clone();
         let wanted = GROUP + MOST_LABELLED + MOST_OWN;
         let drawn = shuffled(&mut order, wanted, stream);
         let (judged, others) = drawn.split_at(GROUP.min(drawn.len()));
-        let others = without_objects_of(others, judged, presses);
         let kinds = Kinds::draw(stream);
-        let references = lot.references(&others, kinds, presses, borders, stream);
-        let mut judged = judged.to_vec();
+        let references = self.references(lot, judged, others, kinds, stream);
+        let mut presses = judged.to_vec();
         if stream.uniform() < JUDGED_RIGID {
-            judged.extend(lot.another_rigid(&references, stream));
+            // One that is no reference.
+            let mut rigid = lot.rigid.concat();
+            rigid.retain(|place| references.iter().all(|(other, _)| other != place));
+            presses.extend((!rigid.is_empty()).then(|| rigid[stream.below(rigid.len())]));
         }
         Question {
-            presses: judged,
+            presses,
             references,
         }
     }
 
     /// All presses of each lot in groups, with references as a knowledge of the sensor has them.
-    pub(super) fn all(
-        &self,
-        knowledge: Knowledge,
-        presses: &[Press],
-        borders: &Borders,
-        stream: &mut Stream,
-    ) -> Vec<Question> {
+    pub(super) fn all(&self, knowledge: Knowledge, stream: &mut Stream) -> Vec<Question> {
         let mut questions = Vec::new();
-        for lot in &self.0 {
+        for lot in &self.lots {
             let mut order = lot.presses.clone();
             for judged in lot.presses.chunks(GROUP) {
                 let others = shuffled(&mut order, lot.presses.len(), stream);
-                let others = without_objects_of(others, judged, presses);
                 let kinds = Kinds::of(knowledge, stream);
                 questions.push(Question {
                     presses: judged.to_vec(),
-                    references: lot.references(&others, kinds, presses, borders, stream),
+                    references: self.references(lot, judged, others, kinds, stream),
                 });
             }
         }
         questions
     }
-}
 
-/// The presses `others` of objects that are not judged. A labelled press of an object that is judged
-/// would tell its label.
-fn without_objects_of(others: &[usize], judged: &[usize], presses: &[Press]) -> Vec<usize> {
-    let is_judged = |other: &usize| {
-        let mut objects = judged.iter().map(|&place| presses[place].object);
-        objects.any(|object| object == presses[*other].object)
-    };
-    let others = others.iter().copied();
-    others.filter(|other| !is_judged(other)).collect()
+    /// Draws references of a lot, those without a piece from `others`. No object that is judged is among them:
+    /// its press would tell its label.
+    fn references(
+        &self,
+        lot: &Lot,
+        judged: &[usize],
+        others: &[usize],
+        kinds: Kinds,
+        stream: &mut Stream,
+    ) -> Vec<(usize, Piece)> {
+        let mut references = Vec::new();
+        if !lot.is_identified() {
+            return references;
+        }
+        let object = |place: &usize| self.presses[*place].object;
+        let is_judged = |other: &usize| judged.iter().any(|own| object(own) == object(other));
+        let others = others.iter().copied().filter(|other| !is_judged(other));
+        let mut others: Vec<usize> = others.collect();
+        if kinds.rigid {
+            for form in &lot.rigid {
+                if stream.uniform() < FORM {
+                    let count = 1 + stream.below(MOST_RIGID);
+                    for &place in shuffled(&mut form.clone(), count, stream) {
+                        references.extend(self.presses[place].piece.map(|piece| (place, piece)));
+                    }
+                }
+            }
+        }
+        if kinds.labelled && !others.is_empty() {
+            let count = 1 + stream.below(MOST_LABELLED.min(others.len()));
+            for place in others.drain(..count) {
+                let press = &self.presses[place];
+                let range = match press.shore {
+                    Some(shore) if stream.uniform() < MEASURED => [shore; 2],
+                    _ => self.borders.part(usize::from(press.level) - 1),
+                };
+                references.push((place, Piece::Shore { range }));
+            }
+        }
+        if kinds.own {
+            let count = LEAST_OWN + stream.below(MOST_OWN - LEAST_OWN + 1);
+            if stream.uniform() < LOPSIDED {
+                others = self.lopsided(&others, count, stream);
+            }
+            let own = others.into_iter().take(count);
+            references.extend(own.map(|place| (place, Piece::UNKNOWN)));
+        }
+        references
+    }
+
+    /// Up to `count` of `others`, in which one or two levels outweigh the rest.
+    fn lopsided(&self, others: &[usize], count: usize, stream: &mut Stream) -> Vec<usize> {
+        let mut of_level = BTreeMap::<u8, Vec<usize>>::new();
+        for &place in others {
+            let of_level = of_level.entry(self.presses[place].level).or_default();
+            of_level.push(place);
+        }
+        // The cube of an exponential variate is at times far above its mean.
+        let mut weighed: Vec<(f64, Vec<usize>)> = of_level
+            .into_values()
+            .map(|places| ((-stream.uniform().max(1e-12).ln()).powi(3), places))
+            .collect();
+        let mut chosen = Vec::new();
+        while chosen.len() < count && !weighed.is_empty() {
+            let mut at = stream.uniform() * weighed.iter().map(|(weight, _)| weight).sum::<f64>();
+            let heavy = weighed.iter().position(|(weight, _)| {
+                at -= weight;
+                at <= 0.0
+            });
+            let level = heavy.unwrap_or(weighed.len() - 1);
+            chosen.extend(weighed[level].1.pop());
+            if weighed[level].1.is_empty() {
+                weighed.remove(level);
+            }
+        }
+        chosen
+    }
 }
 
 impl Lot {
@@ -187,95 +258,6 @@ impl Lot {
     fn is_identified(&self) -> bool {
         self.rigid.iter().any(|form| !form.is_empty())
     }
-
-    /// Draws references. `others` are presses of other objects than those judged.
-    fn references(
-        &self,
-        others: &[usize],
-        kinds: Kinds,
-        presses: &[Press],
-        borders: &Borders,
-        stream: &mut Stream,
-    ) -> Vec<(usize, Piece)> {
-        let mut references = Vec::new();
-        if !self.is_identified() {
-            return references;
-        }
-        if kinds.rigid {
-            for form in &self.rigid {
-                if stream.uniform() < FORM {
-                    let count = 1 + stream.below(MOST_RIGID);
-                    for &place in shuffled(&mut form.clone(), count, stream) {
-                        references.extend(presses[place].piece.map(|piece| (place, piece)));
-                    }
-                }
-            }
-        }
-        let mut others = others;
-        if kinds.labelled && !others.is_empty() {
-            let count = 1 + stream.below(MOST_LABELLED.min(others.len()));
-            let (labelled, rest) = others.split_at(count);
-            others = rest;
-            for &place in labelled {
-                let press = &presses[place];
-                let range = match press.shore {
-                    Some(shore) if stream.uniform() < MEASURED => [shore; 2],
-                    _ => borders.part(usize::from(press.level) - 1),
-                };
-                references.push((place, Piece::Shore { range }));
-            }
-        }
-        if kinds.own {
-            let count = LEAST_OWN + stream.below(MOST_OWN - LEAST_OWN + 1);
-            let own = match stream.uniform() < LOPSIDED {
-                true => lopsided(others, count, presses, stream),
-                false => others.iter().copied().take(count).collect(),
-            };
-            references.extend(own.into_iter().map(|place| (place, Piece::UNKNOWN)));
-        }
-        references
-    }
-
-    /// A press on a rigid piece that is none of these references.
-    fn another_rigid(&self, references: &[(usize, Piece)], stream: &mut Stream) -> Option<usize> {
-        let is_reference = |place: &usize| references.iter().any(|(other, _)| other == place);
-        let rigid = self.rigid.concat();
-        let rigid: Vec<usize> = rigid
-            .into_iter()
-            .filter(|place| !is_reference(place))
-            .collect();
-        (!rigid.is_empty()).then(|| rigid[stream.below(rigid.len())])
-    }
-}
-
-/// Up to `count` of `others`, in which one or two levels outweigh the rest.
-fn lopsided(others: &[usize], count: usize, presses: &[Press], stream: &mut Stream) -> Vec<usize> {
-    let mut of_level = BTreeMap::<u8, Vec<usize>>::new();
-    for &place in others {
-        of_level
-            .entry(presses[place].level)
-            .or_default()
-            .push(place);
-    }
-    // The cube of an exponential variate is at times far above its mean.
-    let mut weighed: Vec<(f64, Vec<usize>)> = of_level
-        .into_values()
-        .map(|places| ((-stream.uniform().max(1e-12).ln()).powi(3), places))
-        .collect();
-    let mut chosen = Vec::new();
-    while chosen.len() < count && !weighed.is_empty() {
-        let mut at = stream.uniform() * weighed.iter().map(|(weight, _)| weight).sum::<f64>();
-        let heavy = weighed.iter().position(|(weight, _)| {
-            at -= weight;
-            at <= 0.0
-        });
-        let level = heavy.unwrap_or(weighed.len() - 1);
-        chosen.extend(weighed[level].1.pop());
-        if weighed[level].1.is_empty() {
-            weighed.remove(level);
-        }
-    }
-    chosen
 }
 
 /// Draws up to `count` elements, each at most once, to the front.
@@ -314,12 +296,13 @@ mod tests {
         let ball = Some(Piece::Ball { radius_mm: 10.0 });
         presses.extend((40..42).map(|number| press(number, ball)));
         let train: Vec<usize> = (0..40).collect();
-        let lots = Lots::of(&presses, &train);
         let borders = Borders::of(&papers_levels()).unwrap();
+        let lots = Lots::of(presses.into(), borders, &train);
+        let presses = &lots.presses;
         let (mut labelled, mut own) = (0, 0);
         for seed in 0..200 {
             let mut stream = Stream::new(seed, "lots");
-            let drawn = lots.draw(0, &presses, &borders, &mut stream);
+            let drawn = lots.draw(0, &mut stream);
             for &(place, piece) in &drawn.references {
                 let reference = &presses[place];
                 let is_same = |&judged: &usize| match reference.piece {

@@ -73,44 +73,45 @@ impl ArmReports {
     /// hardly a press has two of them to their ends. Of each number, about one in a thousand presses
     /// lies below the range and one in a thousand above.
     pub fn ranges(&self, presses: &[Timed]) -> Extents {
-        let of = |frames: usize| ranges_of(presses.iter().map(|press| press.extents(frames)));
-        let whole = of(usize::MAX);
-        let mut ranges = whole;
+        // Of the first frames of a press.
+        let of = |press: &Timed, frames: usize| {
+            let frames = frames.min(press.moments.len());
+            extents(&press.moments[..frames], press.arm_n_per_mm)
+        };
+        let whole = ranges_of(presses.iter().map(|press| of(press, usize::MAX)));
+        let mut ranges = vec![whole];
         if self.early > 0.0 {
-            ranges = joined(ranges, of(LEAST_FRAMES));
+            ranges.push(ranges_of(
+                presses.iter().map(|press| of(press, LEAST_FRAMES)),
+            ));
         }
         if self.slower > 0.0 {
-            let slower = presses.iter().map(|press| {
+            ranges.push(ranges_of(presses.iter().map(|press| {
                 let step = (press.moments.len() / LEAST_FRAMES).clamp(1, MOST_FRAMES_A_STEP);
-                let [_, period, ..] = press.extents(usize::MAX);
+                let [_, period, ..] = of(press, usize::MAX);
                 let slower = period.map(|ends| ends.map(|period_s| period_s * step as f32));
                 [None, slower, None, None, None]
-            });
-            ranges = joined(ranges, ranges_of(slower));
+            })));
         }
         if self.stretched > 0.0 {
-            let (least, most) = (STRETCH.0 as f32, STRETCH.1 as f32);
-            let [duration, period, speed, ..] = whole;
-            let longer = |[low, high]: [f32; 2]| [low * least, high * most];
-            let speed = speed.map(|[low, high]| [low / most, high / least]);
-            let stretched = [duration.map(longer), period.map(longer), speed, None, None];
-            ranges = joined(ranges, stretched);
+            for factor in [STRETCH.0 as f32, STRETCH.1 as f32] {
+                let longer = |ends: [f32; 2]| ends.map(|time_s| time_s * factor);
+                let slower = |ends: [f32; 2]| ends.map(|mm_s| mm_s / factor);
+                let [duration, period, speed, ..] = whole;
+                let times = [duration.map(longer), period.map(longer)];
+                ranges.push([times[0], times[1], speed.map(slower), None, None]);
+            }
         }
-        if self.unknown >= 1.0 {
-            ranges[2..].fill(None);
-        }
-        if self.unknown_arm >= 1.0 {
-            ranges[4] = None;
-        }
+        let unknown_arm = self.unknown.max(self.unknown_arm);
+        let unknown = [0.0, 0.0, self.unknown, self.unknown, unknown_arm];
         let errors = [0.0, 0.0, self.position, self.position, self.arm];
-        for (range, error) in ranges.iter_mut().zip(errors) {
-            let error = error.max(MARGIN) as f32;
-            *range = range.map(|[least, most]| {
-                let most = (most * (1.0 + error)).min(f32::MAX);
-                [least * (1.0 - error), most]
-            });
-        }
-        ranges
+        std::array::from_fn(|number| {
+            let ends = ranges.iter().filter_map(|range| range[number]);
+            let joined = ends.reduce(|one, other| [one[0].min(other[0]), one[1].max(other[1])]);
+            let [least, most] = joined.filter(|_| unknown[number] < 1.0)?;
+            let error = errors[number].max(MARGIN) as f32;
+            Some([least * (1.0 - error), (most * (1.0 + error)).min(f32::MAX)])
+        })
     }
 }
 
@@ -131,22 +132,6 @@ fn ranges_of(presses: impl Iterator<Item = Extents>) -> Extents {
         let most = *lows.get(lows.len().checked_sub(1 + tail)?)?;
         Some([least.min(most).max(0.0), most.max(0.0)])
     })
-}
-
-/// The ranges that hold both.
-fn joined(one: Extents, other: Extents) -> Extents {
-    std::array::from_fn(|number| match (one[number], other[number]) {
-        (Some([least, most]), Some([low, high])) => Some([least.min(low), most.max(high)]),
-        (range, None) | (None, range) => range,
-    })
-}
-
-impl Timed {
-    /// The numbers of the press's first `frames` frames that `hrn.range` states.
-    fn extents(&self, frames: usize) -> Extents {
-        let frames = frames.min(self.moments.len());
-        extents(&self.moments[..frames], self.arm_n_per_mm)
-    }
 }
 
 impl Press {
@@ -226,27 +211,28 @@ mod tests {
         }
     }
 
-    const EXACT: ArmReports = ArmReports {
-        unknown: 0.0,
-        unknown_arm: 0.0,
-        exact: 1.0,
-        position: 0.0,
-        arm: 0.0,
-        clock_frames: 0.0,
-        early: 0.0,
-        slower: 0.0,
-        stretched: 0.0,
-    };
+    /// Reports that change nothing, but for this.
+    fn but(change: fn(&mut ArmReports)) -> ArmReports {
+        let mut reports = ArmReports {
+            unknown: 0.0,
+            unknown_arm: 0.0,
+            exact: 1.0,
+            position: 0.0,
+            arm: 0.0,
+            clock_frames: 0.0,
+            early: 0.0,
+            slower: 0.0,
+            stretched: 0.0,
+        };
+        change(&mut reports);
+        reports
+    }
 
     #[test]
     fn errors_stay_within_what_was_asked_for() {
-        let reports = ArmReports {
-            exact: 0.0,
-            position: 0.1,
-            arm: 0.3,
-            clock_frames: 1.0,
-            ..EXACT
-        };
+        let reports = but(|of| {
+            (of.exact, of.position, of.arm, of.clock_frames) = (0.0, 0.1, 0.3, 1.0);
+        });
         let mut stream = Stream::new(1, "reports");
         let mut moved = 0.0_f32;
         for _ in 0..200 {
@@ -263,10 +249,7 @@ mod tests {
 
     #[test]
     fn a_slower_sensor_sees_the_press_from_its_own_first_frame() {
-        let reports = ArmReports {
-            slower: 1.0,
-            ..EXACT
-        };
+        let reports = but(|of| of.slower = 1.0);
         let mut stream = Stream::new(3, "reports");
         let mut steps = std::collections::BTreeSet::new();
         for _ in 0..100 {
@@ -313,41 +296,31 @@ mod tests {
     fn ranges_are_those_of_the_presses_as_training_varies_them() {
         let [way, arm] = [Some([3.6, 3.6]), Some([10.0; 2])];
         let [duration, period, speed] = [Some([0.45, 0.9]), Some([0.05, 0.1]), Some([4.0, 8.0])];
-        let slower = ArmReports {
-            slower: 0.1,
-            ..EXACT
-        };
-        let stretched = ArmReports {
-            stretched: 0.1,
-            ..slower
-        };
         let (longer, slow) = (Some([0.225, 14.4]), Some([0.25, 16.0]));
+        let (third, first) = (Some([0.05, 0.3]), [Some([0.1, 0.9]), Some([0.8, 3.6])]);
         for (reports, expected) in [
-            (EXACT, [duration, period, speed, way, arm]),
+            (but(|_| ()), [duration, period, speed, way, arm]),
             // The first three frames of the faster sensor.
             (
-                ArmReports {
-                    early: 0.1,
-                    ..EXACT
-                },
-                [Some([0.1, 0.9]), period, speed, Some([0.8, 3.6]), arm],
+                but(|of| of.early = 0.1),
+                [first[0], period, speed, first[1], arm],
             ),
             // Every third frame of the slower one.
-            (slower, [duration, Some([0.05, 0.3]), speed, way, arm]),
-            // Sixteen times the slower one's period, and not sixteen times three.
-            (stretched, [longer, Some([0.025, 1.6]), slow, way, arm]),
             (
-                ArmReports {
-                    unknown: 1.0,
-                    ..EXACT
-                },
+                but(|of| of.slower = 0.1),
+                [duration, third, speed, way, arm],
+            ),
+            // Sixteen times the slower one's period, and not sixteen times three.
+            (
+                but(|of| (of.slower, of.stretched) = (0.1, 0.1)),
+                [longer, Some([0.025, 1.6]), slow, way, arm],
+            ),
+            (
+                but(|of| of.unknown = 1.0),
                 [duration, period, None, None, None],
             ),
             (
-                ArmReports {
-                    unknown_arm: 1.0,
-                    ..EXACT
-                },
+                but(|of| of.unknown_arm = 1.0),
                 [duration, period, speed, way, None],
             ),
         ] {
@@ -362,24 +335,20 @@ mod tests {
                 assert!(is_near, "{reports:?}: {found:?}, expected {wider:?}");
             }
         }
-        let errors = ArmReports {
-            position: 0.1,
-            arm: 0.3,
-            ..EXACT
-        };
+        let errors = but(|of| (of.position, of.arm) = (0.1, 0.3));
         let [.., speed, _, arm] = errors.ranges(&[pressed(4.0, 0.1)]);
         assert_eq!((speed, arm), (Some([3.6, 4.4]), Some([7.0, 13.0])));
-        assert_eq!(EXACT.ranges(&[]), [None; 5]);
+        assert_eq!(but(|_| ()).ranges(&[]), [None; 5]);
     }
 
     #[test]
     fn one_press_of_many_is_no_range() {
         let mut presses: Vec<Timed> = (0..2000).map(|_| pressed(5.0, 0.1)).collect();
         presses[7] = pressed(5.0, 10.0);
-        let [duration, ..] = EXACT.ranges(&presses);
+        let [duration, ..] = but(|_| ()).ranges(&presses);
         assert!(duration.unwrap()[1] < 1.0, "{duration:?}");
         // Of a thousand presses, one is more than the tail.
-        let [duration, ..] = EXACT.ranges(&presses[..999]);
+        let [duration, ..] = but(|_| ()).ranges(&presses[..999]);
         assert!(duration.unwrap()[1] > 90.0, "{duration:?}");
     }
 }

@@ -11,44 +11,35 @@ fn random<const D: usize>(shape: [usize; D], name: &str) -> Tensor<D> {
     Tensor::from_data(TensorData::new(values, shape), &Device::flex())
 }
 
-/// The trunk's three layers, whose adjoints are the generator's.
-fn geometries() -> Vec<(Geometry, usize)> {
-    let layers = TRUNK.iter().zip([28, 14, 7]);
-    layers
-        .map(|(layer, size)| (layer.geometry(size), layer.outputs))
-        .collect()
-}
-
 /// The same tensor in double precision, for which burn's own operations run.
 fn double<const D: usize>(tensor: &Tensor<D>) -> Tensor<D> {
     tensor.clone().cast(FloatDType::F64)
 }
 
 /// Checks `f` and its gradients in single precision against the same in double.
-#[allow(clippy::needless_pass_by_value, reason = "reads as a call of f")]
-fn check<const D: usize, const P: usize, const O: usize>(
-    x: Tensor<D>,
-    parameters: Tensor<P>,
-    f: impl Fn(Tensor<D>, Tensor<P>) -> Tensor<O>,
+fn check<const A: usize>(
+    x: &Tensor<2>,
+    a: &Tensor<A>,
+    channels: usize,
+    f: impl Fn(Tensor<2>, Tensor<A>, Tensor<2>) -> Tensor<2>,
 ) {
-    assert!(is_ours(&x) && !is_ours(&double(&x)));
-    let run = |x: Tensor<D>, parameters: Tensor<P>| {
-        let (x, parameters) = (
-            x.autodiff().require_grad(),
-            parameters.autodiff().require_grad(),
-        );
-        let y = f(x.clone(), parameters.clone());
+    let b = random([channels, 1], "b");
+    assert!(is_ours(x) && !is_ours(&double(x)));
+    let run = |x: Tensor<2>, a: Tensor<A>, b: Tensor<2>| {
+        let [x, b] = [x, b].map(|leaf| leaf.autodiff().require_grad());
+        let a = a.autodiff().require_grad();
+        let y = f(x.clone(), a.clone(), b.clone());
         let weight = random(y.dims(), "gradient").cast(y.dtype()).autodiff();
         let gradients = y.clone().mul(weight).sum().backward();
-        let of_x = x.grad(&gradients).expect("a leaf");
-        let of_parameters = parameters.grad(&gradients).expect("a leaf");
-        (y.inner(), of_x, of_parameters)
+        let [of_x, of_b] = [x, b].map(|leaf| leaf.grad(&gradients).expect("a leaf"));
+        ([y.inner(), of_x, of_b], a.grad(&gradients).expect("a leaf"))
     };
-    let (y, of_x, of_parameters) = run(x.clone(), parameters.clone());
-    let (exact, exact_of_x, exact_of_parameters) = run(double(&x), double(&parameters));
-    assert_close(&y, &exact);
-    assert_close(&of_x, &exact_of_x);
-    assert_close(&of_parameters, &exact_of_parameters);
+    let (found, of_a) = run(x.clone(), a.clone(), b.clone());
+    let (exact, exact_of_a) = run(double(x), double(a), double(&b));
+    assert_close(&of_a, &exact_of_a);
+    for (found, exact) in found.iter().zip(&exact) {
+        assert_close(found, exact);
+    }
 }
 
 fn assert_close<const D: usize>(found: &Tensor<D>, exact: &Tensor<D>) {
@@ -63,19 +54,15 @@ fn assert_close<const D: usize>(found: &Tensor<D>, exact: &Tensor<D>) {
 #[test]
 fn convolutions_both_ways_are_burns_with_their_gradients() {
     let batch = 3;
-    for (geometry, outputs) in geometries() {
-        let Geometry {
-            channels,
-            size,
-            kernel,
-            ..
-        } = geometry;
-        let kernels = random([outputs, channels * kernel * kernel], "kernels");
-        let x = random([channels, size, size, batch], "x");
-        check(x, kernels.clone(), |x, k| convolution(x, k, geometry));
-        let small = geometry.small();
-        let y = random([outputs, small, small, batch], "y");
-        check(y, kernels, |y, k| transposed_convolution(y, k, geometry));
+    for layer in TRUNK {
+        let (inputs, outputs, small) = (layer.inputs, layer.outputs, layer.small());
+        let kernels = random([outputs, inputs, layer.kernel, layer.kernel], "kernels");
+        let x = random([inputs, layer.size * layer.size * batch], "x");
+        check(&x, &kernels, outputs, |x, k, b| convolution(x, k, b, layer));
+        let y = random([outputs, small * small * batch], "y");
+        check(&y, &kernels, inputs, |y, k, b| {
+            transposed_convolution(y, k, b, layer)
+        });
     }
 }
 
@@ -85,11 +72,9 @@ fn normalisation_is_that_of_its_formula_with_its_gradients() {
     let x = random([channels, count], "x")
         .mul_scalar(0.3)
         .add_scalar(2.0);
+    let gamma = random([channels, 1], "gamma");
     for slope in [0.0, 0.2] {
-        let other = random([2 * channels], "parameters");
-        check(x.clone(), other, |x, parameters| {
-            let gamma = parameters.clone().narrow(0, 0, channels);
-            let beta = parameters.narrow(0, channels, channels);
+        check(&x, &gamma, channels, |x, gamma, beta| {
             normalised(x, gamma, beta, epsilon, slope)
         });
     }
