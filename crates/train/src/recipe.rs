@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use serde::Deserialize;
 
-use crate::settings::{Profile, Settings};
+use crate::settings::{Profile, Settings, overridden};
 
 /// What learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -116,19 +116,19 @@ impl Recipe {
             Profile::Quick => &self.quick,
             Profile::Smoke => &self.smoke,
         };
-        let for_all = ALL.profiles.get(&profile).cloned();
-        let mut settings = Settings::default()
-            .with(for_all.unwrap_or_default())?
-            .with(self.settings.clone())?
-            .with(of_profile.clone())?;
+        let mut settings = Settings::default();
+        let for_all = ALL.profiles.get(&profile);
+        for table in for_all.into_iter().chain([&self.settings, of_profile]) {
+            settings = overridden(&settings, table)?;
+        }
         if let Some(&steps) = self.steps.as_ref().and_then(|steps| steps.get(&profile)) {
             // The given batch counts.
-            let batch = settings.with(given.clone())?.training.batch;
+            let batch = overridden(&settings, given)?.training.batch;
             let an_epoch = samples.div_ceil(batch).max(1) as u64;
             let epochs = u32::try_from(steps.div_ceil(an_epoch));
             settings.training.epochs = epochs.unwrap_or(u32::MAX);
         }
-        settings.with(given.clone())
+        overridden(&settings, given)
     }
 }
 

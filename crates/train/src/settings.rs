@@ -226,17 +226,6 @@ impl Default for Settings {
     }
 }
 
-impl Settings {
-    /// Gives these settings, with the values in `given` in place of their own.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if a key is unknown, or a value lies outside its range.
-    pub fn with(&self, given: toml::Table) -> anyhow::Result<Self> {
-        overridden(self, given)
-    }
-}
-
 /// Settings with the values in `given` in place of their own.
 ///
 /// # Errors
@@ -244,10 +233,10 @@ impl Settings {
 /// Returns an error if a key is unknown, or a value lies outside its range.
 pub(crate) fn overridden<T: Serialize + DeserializeOwned>(
     settings: &T,
-    given: toml::Table,
+    given: &toml::Table,
 ) -> anyhow::Result<T> {
     let own = toml::Table::try_from(settings).expect("settings are plain tables");
-    let merged = merged(own, given);
+    let merged = merged(own, given.clone());
     bounds::check(&merged)?;
     merged
         .try_into()
@@ -299,7 +288,7 @@ mod tests {
         let mut expected = Settings::default();
         expected.training.batch = 50;
         expected.training.rule = Rule::Adam;
-        assert_eq!(Settings::default().with(given).unwrap(), expected);
+        assert_eq!(overridden(&Settings::default(), &given).unwrap(), expected);
     }
 
     #[test]
@@ -310,7 +299,7 @@ mod tests {
             ("[stgan]\nbeta1 = 1", "`stgan.beta1`: found 1"),
             ("held_out = nan", "`held_out`: found NaN"),
         ] {
-            let given = parse(text).and_then(|given| Settings::default().with(given));
+            let given = parse(text).and_then(|given| overridden(&Settings::default(), &given));
             let error = given.unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");
             assert!(!error.contains('\n'), "{text}: {error}");

@@ -155,16 +155,14 @@ impl Calibration {
     /// sets of levels and the interval of the Shore hardness.
     pub fn missing(&self) -> Option<String> {
         let [units, measured] = self.units;
-        if units < LEAST_UNITS {
-            return Some(format!(
-                "held-out objects: found {units}, expected at least {LEAST_UNITS}: there are no sets \
-                 of levels, and nothing promises that the interval of the Shore hardness holds"
-            ));
-        }
-        (measured < LEAST_UNITS).then(|| {
+        let (of, found, lost) = match units < LEAST_UNITS {
+            true => ("", units, "there are no sets of levels, and "),
+            false => (" with a measured Shore hardness", measured, ""),
+        };
+        (found < LEAST_UNITS).then(|| {
             format!(
-                "held-out objects with a measured Shore hardness: found {measured}, expected at \
-                 least {LEAST_UNITS}: nothing promises that the interval of the Shore hardness holds"
+                "held-out objects{of}: found {found}, expected at least {LEAST_UNITS}: {lost}nothing promises that \
+                 the interval of the Shore hardness holds"
             )
         })
     }

@@ -104,11 +104,6 @@ impl Hrn<'_> {
         self.on.changed(presses, vary)
     }
 
-    /// Images of one batch, augmented for step `step`.
-    fn images(&self, presses: &[usize], step: u64) -> Tensor<4> {
-        self.varied(presses, &mut self.on.stream("augmentation").child(step))
-    }
-
     /// Statistics of the normalised layers over the training presses, augmented as the settings
     /// say, in batches of their size. A smaller remainder is left out.
     fn statistics(&self, weights: &Weights) -> Statistics {
@@ -119,7 +114,8 @@ impl Hrn<'_> {
         for (presses, number) in order.chunks_exact(batch).zip(0..) {
             // Training steps count from 0 and these batches from the maximum down, so none share a
             // sub-stream.
-            let images = self.images(presses, u64::MAX - number);
+            let mut stream = self.on.stream("augmentation").child(u64::MAX - number);
+            let images = self.varied(presses, &mut stream);
             let mut normalisation = Normalisation::Collect(&mut statistics);
             hrn::logits(weights, images, &mut normalisation);
         }
@@ -145,7 +141,8 @@ impl Learning for Hrn<'_> {
     }
 
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
-        let images = self.images(samples, step);
+        let mut stream = self.on.stream("augmentation").child(step);
+        let images = self.varied(samples, &mut stream);
         let targets = self.on.targets(samples);
         let (loss, judged) = self::step(&mut sides[0], images, targets, rate);
         let levels = self.on.presses.of(samples).map(|press| press.level);
