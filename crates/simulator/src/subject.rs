@@ -80,8 +80,8 @@ pub(super) fn shared_out<U: Sync, B, T: Send>(
         made
     };
     let mut parts: Vec<(u32, Vec<T>)> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(&share)).collect();
-        let shares = threads.into_iter().map(|thread| thread.join());
+        let threads: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(share)).collect();
+        let shares = threads.into_iter().map(std::thread::ScopedJoinHandle::join);
         shares
             .flat_map(|share| share.expect("no work panics"))
             .collect()
