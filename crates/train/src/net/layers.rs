@@ -8,7 +8,7 @@
 //! convolution and the system's allocator an HRN step takes more than twice as long as with these
 //! (`benches/train_step.rs`, 2026-11-21).
 //!
-//! [`patches`] and [`from_patches`] are each other's adjoint, so the transposed convolution is the
+//! `patches` and `from_patches` are each other's adjoint, so the transposed convolution is the
 //! same two steps in the other order, and so are all gradients.
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
