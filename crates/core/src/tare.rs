@@ -157,70 +157,41 @@ pub enum Aim {
 /// ```
 #[derive(Debug, Clone)]
 pub struct Tare {
-    scale: ForceCurve,
-    /// The number of frames of a tare.
-    frames: u32,
+    settings: Settings,
+    /// The gain of each taxel.
+    gains: Vec<f32>,
     /// The counts of each unloaded taxel. All zeros until a tare is taken.
     baseline: Vec<f32>,
     taking: Option<Taking>,
     /// The outcome of the requested tare, until it is fetched.
     ended: Option<Result<Retaken, RetareError>>,
     contact: Contact,
-    max_n: f32,
-    /// Whether the baseline follows drift.
-    follows: bool,
     array: Array,
+    /// The places of live taxels.
+    live: Vec<usize>,
     /// The place of each dead taxel, and the places of its live neighbours.
     dead: Vec<(usize, Vec<usize>)>,
 }
 
-/// The conversion from counts to newtons.
-#[derive(Debug, Clone)]
-struct ForceCurve {
-    newtons_per_count: f32,
-    exponent: f32,
-    /// The gain of each taxel.
-    gains: Vec<f32>,
-}
-
-impl ForceCurve {
-    fn new(settings: &Settings, array: Array) -> Self {
-        let gains = match &settings.gains {
-            Some(Gains::Taxels(rows)) => rows.concat(),
-            Some(Gains::File(_)) | None => vec![1.0; array.taxels()],
-        };
-        Self {
-            newtons_per_count: settings.newtons_per_count,
-            exponent: settings.exponent,
-            gains,
-        }
-    }
-
-    /// The newtons of this many counts above the baseline, at a taxel. Counts below the baseline give
-    /// negative newtons: without them, noise would add up to a force.
-    fn newtons(&self, counts: f32, place: usize) -> f32 {
-        // An exponent of 1 skips `powf`, which costs more and rounds.
-        let raised = if self.exponent == 1.0 {
-            counts
-        } else {
-            counts.abs().powf(self.exponent).copysign(counts)
-        };
-        // Counts may be as large as a float allows. Newtons are finite.
-        let newtons = raised.clamp(-MOST_N, MOST_N) * self.newtons_per_count * self.gains[place];
-        newtons.clamp(-MOST_N, MOST_N)
-    }
-
-    /// The counts above the baseline that give `newtons`, without the exponent.
-    fn counts(&self, newtons: f32, place: usize) -> f32 {
-        newtons / (self.newtons_per_count * self.gains[place])
-    }
-}
-
-/// A tare under way.
+/// A tare under way: its purpose, and of each taxel the sum, the least and the greatest of its counts.
 #[derive(Debug, Clone)]
 struct Taking {
     aim: Aim,
-    sums: Sums,
+    seen: u32,
+    sum: Vec<f64>,
+    least: Vec<f32>,
+    most: Vec<f32>,
+}
+
+impl Taking {
+    fn add(&mut self, raw: &RawFrame) {
+        self.seen += 1;
+        for (place, &count) in raw.counts.iter().enumerate() {
+            self.sum[place] += f64::from(count);
+            self.least[place] = self.least[place].min(count);
+            self.most[place] = self.most[place].max(count);
+        }
+    }
 }
 
 /// The state of a [`Tare`] of which no frame is taken in yet, or that has ended.
@@ -238,53 +209,37 @@ impl AtRest {
     }
 }
 
-/// The sums over the frames of a tare.
-#[derive(Debug, Clone)]
-struct Sums {
-    wanted: u32,
-    seen: u32,
-    sum: Vec<f64>,
-    least: Vec<f32>,
-    most: Vec<f32>,
-}
-
-impl Sums {
-    fn new(wanted: u32, array: Array) -> Self {
-        Self {
-            wanted,
-            seen: 0,
-            sum: vec![0.0; array.taxels()],
-            least: vec![f32::MAX; array.taxels()],
-            most: vec![f32::MIN; array.taxels()],
-        }
-    }
-
-    fn add(&mut self, raw: &RawFrame) {
-        self.seen += 1;
-        for (place, &count) in raw.counts.iter().enumerate() {
-            self.sum[place] += f64::from(count);
-            self.least[place] = self.least[place].min(count);
-            self.most[place] = self.most[place].max(count);
-        }
-    }
-}
-
 impl Tare {
     /// A tare that is about to be taken. With `tare_frames` 0, the baseline stays zero.
     ///
     /// `settings` have passed [`Settings::check`] for `array`.
     pub fn new(settings: &Settings, array: Array, contact: Contact) -> Self {
+        let is_live = |&place: &usize| {
+            let (row, col) = array.position(place);
+            !settings.dead_taxels.contains(&[row, col])
+        };
+        let (live, dead): (Vec<usize>, Vec<usize>) = (0..array.taxels()).partition(is_live);
+        let neighbours = |dead: usize| {
+            let (row, col) = array.position(dead);
+            let is_near = |&&place: &&usize| {
+                let (r, c) = array.position(place);
+                r.abs_diff(row).max(c.abs_diff(col)) == 1
+            };
+            (dead, live.iter().filter(is_near).copied().collect())
+        };
         let mut tare = Self {
-            scale: ForceCurve::new(settings, array),
-            frames: settings.tare_frames,
+            gains: match &settings.gains {
+                Some(Gains::Taxels(rows)) => rows.concat(),
+                Some(Gains::File(_)) | None => vec![1.0; array.taxels()],
+            },
+            settings: settings.clone(),
             baseline: vec![0.0; array.taxels()],
             taking: None,
             ended: None,
             contact,
-            max_n: settings.tare_max_n,
-            follows: settings.auto_tare,
             array,
-            dead: dead(settings, array),
+            dead: dead.into_iter().map(neighbours).collect(),
+            live,
         };
         tare.begin(Aim::First { touch: None });
         tare
@@ -292,15 +247,19 @@ impl Tare {
 
     /// Begins a tare, unless `tare_frames` is 0.
     fn begin(&mut self, aim: Aim) {
-        let sums = Sums::new(self.frames, self.array);
-        self.taking = (self.frames > 0).then_some(Taking { aim, sums });
+        let taxels = self.array.taxels();
+        self.taking = (self.settings.tare_frames > 0).then(|| Taking {
+            aim,
+            seen: 0,
+            sum: vec![0.0; taxels],
+            least: vec![f32::MAX; taxels],
+            most: vec![f32::MIN; taxels],
+        });
     }
 
     /// Whether no tare is under way, or the one under way has taken in no frame.
     pub fn is_at_rest(&self) -> bool {
-        self.taking
-            .as_ref()
-            .is_none_or(|taking| taking.sums.seen == 0)
+        self.taking.as_ref().is_none_or(|taking| taking.seen == 0)
     }
 
     /// The state of the tare at rest.
@@ -335,7 +294,7 @@ impl Tare {
         if self.aim().is_some() {
             return Err(RetareError::UnderWay);
         }
-        if self.frames == 0 {
+        if self.settings.tare_frames == 0 {
             return Err(RetareError::NoFrames);
         }
         self.ended = None;
@@ -358,13 +317,31 @@ impl Tare {
 
     /// The baseline in force.
     pub fn offsets(&self) -> Offsets {
-        let live = self.live();
-        let counts = || live.iter().map(|&place| self.baseline[place]);
+        let counts = || self.live.iter().map(|&place| self.baseline[place]);
         Offsets {
-            mean_counts: counts().sum::<f32>() / live.len().max(1) as f32,
+            mean_counts: counts().sum::<f32>() / self.live.len().max(1) as f32,
             least_counts: counts().reduce(f32::min).unwrap_or(0.0),
             most_counts: counts().reduce(f32::max).unwrap_or(0.0),
         }
+    }
+
+    /// The newtons of this many counts above the baseline, at a taxel. Counts below the baseline give
+    /// negative newtons: without them, noise would add up to a force.
+    fn newtons(&self, counts: f32, place: usize) -> f32 {
+        let Settings {
+            newtons_per_count,
+            exponent,
+            ..
+        } = self.settings;
+        // An exponent of 1 skips `powf`, which costs more and rounds.
+        let raised = if exponent == 1.0 {
+            counts
+        } else {
+            counts.abs().powf(exponent).copysign(counts)
+        };
+        // Counts may be as large as a float allows. Newtons are finite.
+        let newtons = raised.clamp(-MOST_N, MOST_N) * newtons_per_count * self.gains[place];
+        newtons.clamp(-MOST_N, MOST_N)
     }
 
     /// Converts counts to newtons: `newtons_per_count x (counts - baseline)^exponent x gain`. Below the
@@ -374,7 +351,7 @@ impl Tare {
         let mut frame = Frame::zero(self.array);
         for (place, newtons) in frame.newtons.iter_mut().enumerate() {
             let counts = raw.counts[place] - self.baseline[place];
-            *newtons = self.scale.newtons(counts, place);
+            *newtons = self.newtons(counts, place);
         }
         for (place, neighbours) in &self.dead {
             let sum: f32 = neighbours
@@ -392,47 +369,47 @@ impl Tare {
     ///
     /// Call this function once a second at most, and never during a press.
     pub fn follow(&mut self, raw: &RawFrame) {
-        let above = |place: usize| raw.counts[place] - self.baseline[place];
-        let is_touched =
-            |place: &usize| self.scale.newtons(above(*place), *place) >= self.contact.threshold_n;
-        if !self.follows || self.live().iter().any(is_touched) {
+        let is_touched = |&place: &usize| {
+            let above = raw.counts[place] - self.baseline[place];
+            self.newtons(above, place) >= self.contact.threshold_n
+        };
+        if !self.settings.auto_tare || self.live.iter().any(is_touched) {
             return;
         }
         for (place, baseline) in self.baseline.iter_mut().enumerate() {
             let above = raw.counts[place] - *baseline;
-            let most = self.scale.counts(MOST_STEP_N, place);
+            let most = MOST_STEP_N / (self.settings.newtons_per_count * self.gains[place]);
             *baseline += above.clamp(-most, most);
         }
     }
 
     /// Whether a live taxel reads `full_scale` counts.
     pub fn is_saturated(&self, raw: &RawFrame, full_scale: f32) -> bool {
-        raw.counts.iter().enumerate().any(|(place, &count)| {
-            count >= full_scale && !self.dead.iter().any(|(dead, _)| *dead == place)
-        })
+        let mut live = self.live.iter();
+        live.any(|&place| raw.counts[place] >= full_scale)
     }
 
     /// Takes in a frame for the tare under way, if there is one. A new baseline holds from the next
     /// frame on. If something touches the sensor, the frames so far are discarded: a first tare begins
     /// again, with this frame if it differs from those before it, and a tare on request ends.
     pub fn observe(&mut self, raw: &RawFrame) {
-        let Some(Taking { aim, mut sums }) = self.taking.take() else {
+        let Some(mut taking) = self.taking.take() else {
             return;
         };
-        sums.add(raw);
-        let means = sums.sum.iter().map(|&sum| sum as f32 / sums.seen as f32);
-        let mean: Vec<f32> = means.collect();
-        let is_whole = sums.seen == sums.wanted;
-        let moving = self.moving(&sums);
+        taking.add(raw);
+        let seen = taking.seen as f32;
+        let mean: Vec<f32> = taking.sum.iter().map(|&sum| sum as f32 / seen).collect();
+        let is_whole = taking.seen == self.settings.tare_frames;
+        let moving = self.moving(&taking);
         let loaded = || is_whole.then(|| self.loaded(&mean)).flatten();
         let touch = moving.or_else(loaded);
-        match (aim, touch) {
-            (_, None) if !is_whole => self.taking = Some(Taking { aim, sums }),
+        match (taking.aim, touch) {
+            (_, None) if !is_whole => self.taking = Some(taking),
             (Aim::First { .. }, Some(_)) => {
                 self.begin(Aim::First { touch });
                 // A frame unlike those before it may be the first one without a touch.
                 if let (Some(_), Some(again)) = (moving, &mut self.taking) {
-                    again.sums.add(raw);
+                    again.add(raw);
                 }
             }
             (Aim::Request, Some(_)) => self.ended = Some(Err(RetareError::Touched)),
@@ -447,19 +424,20 @@ impl Tare {
     }
 
     /// The touch, if the frames of a tare differ as under a touch that moves.
-    fn moving(&self, sums: &Sums) -> Option<Touch> {
+    fn moving(&self, taking: &Taking) -> Option<Touch> {
         let limit_n = self.contact.threshold_n;
-        let spread = |place: usize| sums.most[place] - sums.least[place];
+        let spread = |place: usize| taking.most[place] - taking.least[place];
         self.touch(TouchKind::Varies, limit_n, spread, |n| n >= limit_n)
     }
 
     /// The touch, if the mean of the frames is that of a sensor on which something rests.
     fn loaded(&self, mean: &[f32]) -> Option<Touch> {
-        let mut sorted: Vec<f32> = self.live().iter().map(|&place| mean[place]).collect();
+        let mut sorted: Vec<f32> = self.live.iter().map(|&place| mean[place]).collect();
         sorted.sort_by(f32::total_cmp);
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
         let above = |place: usize| mean[place] - median;
-        self.touch(TouchKind::High, self.max_n, above, |n| n > self.max_n)
+        let max_n = self.settings.tare_max_n;
+        self.touch(TouchKind::High, max_n, above, |n| n > max_n)
     }
 
     /// The touch, if enough live taxels show one by the newtons of these counts.
@@ -470,8 +448,8 @@ impl Tare {
         counts: impl Fn(usize) -> f32,
         shows: impl Fn(f32) -> bool,
     ) -> Option<Touch> {
-        let newtons = |place: usize| (place, self.scale.newtons(counts(place), place));
-        let found = self.live().into_iter().map(newtons);
+        let newtons = |&place: &usize| (place, self.newtons(counts(place), place));
+        let found = self.live.iter().map(newtons);
         let found: Vec<(usize, f32)> = found.filter(|&(_, n)| shows(n)).collect();
         let &(place, newtons) = found
             .iter()
@@ -483,33 +461,6 @@ impl Tare {
             limit_n,
         })
     }
-
-    /// The places of the array's live taxels.
-    fn live(&self) -> Vec<usize> {
-        (0..self.array.taxels())
-            .filter(|place| !self.dead.iter().any(|(dead, _)| dead == place))
-            .collect()
-    }
-}
-
-fn dead(settings: &Settings, array: Array) -> Vec<(usize, Vec<usize>)> {
-    let mut is_dead = vec![false; array.taxels()];
-    for &[row, col] in &settings.dead_taxels {
-        is_dead[array.place(row, col)] = true;
-    }
-    let live_neighbours = |place: usize| {
-        let (row, col) = array.position(place);
-        let rows = row.saturating_sub(1)..=(row + 1).min(array.rows - 1);
-        rows.flat_map(|r| {
-            (col.saturating_sub(1)..=(col + 1).min(array.cols - 1)).map(move |c| array.place(r, c))
-        })
-        .filter(|&at| at != place && !is_dead[at])
-        .collect()
-    };
-    (0..array.taxels())
-        .filter(|&place| is_dead[place])
-        .map(|place| (place, live_neighbours(place)))
-        .collect()
 }
 
 #[cfg(test)]

@@ -84,32 +84,21 @@ fn a_gain_multiplies_the_newtons_of_its_own_taxel() {
 
 #[test]
 fn gains_of_another_array_or_beyond_any_film_are_refused() {
-    let array = Array { rows: 5, cols: 4 };
     let one_is = |value: f32| gains(5, 4, move |r, c| if (r, c) == (1, 2) { value } else { 1.0 });
-    let file = Some(Gains::File("g.npy".into()));
     for (gains, expected) in [
         (
             gains(4, 5, |_, _| 1.0),
             "found 4 rows of 5, expected 5 of 4",
         ),
-        (
-            gains(0, 0, |_, _| 1.0),
-            "found 0 rows of 0, expected 5 of 4",
-        ),
         (one_is(0.0), "found 0.0 at [1, 2], expected 0.001 to 1000"),
         (one_is(f32::NAN), "found NaN at [1, 2]"),
-        (file, "found the path of a file"),
     ] {
-        let error = Settings {
+        let settings = Settings {
             gains,
             ..Settings::default()
-        }
-        .check(array)
-        .unwrap_err();
-        assert!(
-            error.to_string().starts_with(&format!("gains: {expected}")),
-            "{error}"
-        );
+        };
+        let error = settings.check(Array { rows: 5, cols: 4 }).unwrap_err();
+        assert!(error.problem.starts_with(expected), "{error}");
     }
 }
 

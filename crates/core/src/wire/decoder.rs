@@ -182,7 +182,7 @@ impl Decoder {
             return None;
         }
         let telnet = || TELNET.to_owned();
-        let refused = self.lines.refused.as_ref().map(ToString::to_string);
+        let refused = self.lines.refused.clone();
         refused.or_else(|| self.is_telnet.then(telnet))
     }
 

@@ -53,36 +53,25 @@ struct Line {
     numbers: usize,
 }
 
-/// Why lines are no frame.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub(super) struct Refused(String);
+/// Why lines are no frame, in words.
+type Refused = String;
 
-impl Refused {
-    /// There are too few or too many numbers.
-    fn numbers(found: usize, cells: &Cells) -> Self {
-        let (cols, count) = (cells.array.cols, cells.count());
-        Self(format!(
-            "a line has {found} numbers, expected {cols} for a row or {count} for a frame"
-        ))
-    }
+/// There are too few or too many numbers.
+fn wrong_numbers(found: usize, cells: &Cells) -> Refused {
+    let (cols, count) = (cells.array.cols, cells.count());
+    format!("a line has {found} numbers, expected {cols} for a row or {count} for a frame")
+}
 
-    /// There is something where a number should be.
-    fn word(word: &[u8]) -> Self {
-        let shown = String::from_utf8_lossy(&word[..word.len().min(SHOWN_BYTES)]);
-        Self(format!(
-            "a line has {:?} among its numbers",
-            escaped(&shown)
-        ))
-    }
+/// There is something where a number should be.
+fn wrong_word(word: &[u8]) -> Refused {
+    let shown = String::from_utf8_lossy(&word[..word.len().min(SHOWN_BYTES)]);
+    format!("a line has {:?} among its numbers", escaped(&shown))
+}
 
-    /// There are too few or too many lines.
-    fn rows(found: usize, cells: &Cells) -> Self {
-        let rows = cells.array.rows;
-        Self(format!(
-            "{found} lines with numbers come before one without, expected {rows}"
-        ))
-    }
+/// There are too few or too many lines.
+fn wrong_rows(found: usize, cells: &Cells) -> Refused {
+    let rows = cells.array.rows;
+    format!("{found} lines with numbers come before one without, expected {rows}")
 }
 
 impl Lines {
@@ -236,13 +225,13 @@ fn on_line(
         }
     }
     if 2 * numbers > cells.count() {
-        return Err(Refused::numbers(numbers, cells));
+        return Err(wrong_numbers(numbers, cells));
     }
     let held = lines.held.len();
     if numbers > 0 || has_damaged(line) {
         // Of more lines than a frame has, the first ones are in none.
         if held >= 2 * rows {
-            lines.refused.get_or_insert(Refused::rows(held, cells));
+            lines.refused.get_or_insert(wrong_rows(held, cells));
             return Ok(Found::Nothing(lines.held[rows].start));
         }
         return Ok(Found::Held(numbers));
@@ -252,8 +241,8 @@ fn on_line(
         let most = lines.held.iter().map(|line| line.numbers).max();
         return match most {
             None => Ok(Found::Nothing(end)),
-            Some(found) if found != cols => Err(Refused::numbers(found, cells)),
-            Some(_) => Err(Refused::rows(held, cells)),
+            Some(found) if found != cols => Err(wrong_numbers(found, cells)),
+            Some(_) => Err(wrong_rows(held, cells)),
         };
     };
     let of_rows = lines.held.range(first..);
@@ -266,7 +255,7 @@ fn on_line(
 }
 
 fn of_values(cells: &Cells, values: Vec<f32>) -> Result<RawFrame, Refused> {
-    let refused = || Refused("a number is not a whole one for the mask, or too large".to_owned());
+    let refused = || "a number is not a whole one for the mask, or too large".to_owned();
     cells.frame(values).ok_or_else(refused)
 }
 
@@ -287,7 +276,7 @@ fn after_heading(
         None if numbers_in(&bytes[start..end]) == 0 => return Ok(Found::Nothing(end)),
         None => {
             let heading = String::from_utf8_lossy(heading);
-            return Err(Refused(format!("no line has the heading {heading:?}")));
+            return Err(format!("no line has the heading {heading:?}"));
         }
     };
     let numbers = numbers_in(&bytes[start + skipped..end]);
@@ -296,7 +285,7 @@ fn after_heading(
         return Ok(Found::Held(numbers));
     }
     if all > cells.count() {
-        return Err(Refused::numbers(all, cells));
+        return Err(wrong_numbers(all, cells));
     }
     // The first held line begins with the heading.
     let (_, values) = cells_at_end(&bytes[heading.len()..end], cells, all)?;
@@ -318,8 +307,8 @@ fn in_rows<'a>(
         match before.next_back().filter(|word| !is_word(word)) {
             None => {}
             Some(_) if index == 0 => noise = first,
-            Some(word) if number(word).is_none() => return Err(Refused::word(word)),
-            Some(_) => return Err(Refused::numbers(numbers_in(row), cells)),
+            Some(word) if number(word).is_none() => return Err(wrong_word(word)),
+            Some(_) => return Err(wrong_numbers(numbers_in(row), cells)),
         }
         all.extend(values);
     }
@@ -342,7 +331,7 @@ fn cells_at_end(text: &[u8], cells: &Cells, count: usize) -> Result<(usize, Vec<
             None if values.len().is_multiple_of(cells.array.cols) && is_word(word) => continue,
             None => None,
         };
-        let (length, value) = found.ok_or_else(|| Refused::word(word))?;
+        let (length, value) = found.ok_or_else(|| wrong_word(word))?;
         values.push(value);
         if is_first {
             let end = word.as_ptr_range().end as usize - text.as_ptr() as usize;
@@ -350,7 +339,7 @@ fn cells_at_end(text: &[u8], cells: &Cells, count: usize) -> Result<(usize, Vec<
             return Ok((end - length, values));
         }
     }
-    Err(Refused::numbers(values.len(), cells))
+    Err(wrong_numbers(values.len(), cells))
 }
 
 fn numbers_in(text: &[u8]) -> usize {
