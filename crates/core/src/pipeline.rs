@@ -223,9 +223,7 @@ impl Pipeline {
         self.hold(bytes, at);
         self.link.last_bytes = Some(at.mono);
         self.drain(at.mono, &mut events);
-        // Few bytes may be the beginning of a frame.
-        let least = 2 * self.sensor.layout().max_frame_bytes() as u64;
-        if self.link.is_silent() && self.decoder.unframed() >= least {
+        if self.link.is_silent() {
             events.extend(self.status_if_changed(at));
         }
         events

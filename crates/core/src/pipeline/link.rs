@@ -216,10 +216,6 @@ impl Pipeline {
     /// The state and its reason.
     pub(super) fn state(&self) -> (LinkState, Option<String>) {
         let tare = || self.touch().map(|_| "tare: contact".to_owned());
-        let no_frame_for = |silence: Duration| {
-            let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
-            format!("no frame for {ms} ms")
-        };
         // A port that was lost is lost until a frame comes, whatever happens to it.
         let or_lost = |state| match self.link.was_lost {
             true => LinkState::Lost,
@@ -244,22 +240,16 @@ impl Pipeline {
                     tare().or_else(unreleased).or_else(too_fast),
                 )
             }
-            Port::Silent => {
-                let mut reason = no_frame_for(self.sensor.late_after());
-                if self.decoder.unframed() > 0 {
-                    let guess = || "is the baud rate or the layout wrong?".to_owned();
-                    reason += ", but bytes come: ";
-                    reason += &self.decoder.problem().unwrap_or_else(guess);
-                }
+            Port::Silent | Port::Stale => {
+                let silence = match self.link.port {
+                    Port::Silent => self.sensor.late_after(),
+                    _ => self.sensor.stale_after(),
+                };
+                let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
+                let bytes = self.decoder.problem();
+                let bytes = bytes.map(|problem| format!(", but bytes come: {problem}"));
+                let reason = format!("no frame for {ms} ms{}", bytes.unwrap_or_default());
                 (or_lost(LinkState::Stale), Some(reason))
-            }
-            Port::Stale => {
-                let mut reason = no_frame_for(self.sensor.stale_after());
-                if let Some(problem) = self.decoder.problem() {
-                    reason += ", but bytes come: ";
-                    reason += &problem;
-                }
-                (LinkState::Stale, Some(reason))
             }
         }
     }

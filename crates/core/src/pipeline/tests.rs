@@ -288,7 +288,7 @@ fn story(pipeline: &mut Pipeline, steps: &[(u64, Input, &[&str])]) {
 fn a_link_says_each_change_once_and_a_lost_device_ends_its_press() {
     let lost = |reason: &'static str| Input::Lost(reason.into());
     let unavailable = |reason: &'static str| Input::Unavailable(reason.into());
-    let noise = Input::Bytes(vec![0; 100]);
+    let noise = Input::Bytes(vec![0; 2000]);
     let mut pipeline = pipeline(Preset::Jx255n);
     let steps: &[(u64, Input, &[&str])] = &[
         (0, unavailable("none"), &["Connecting (none)"]),

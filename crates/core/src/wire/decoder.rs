@@ -176,14 +176,15 @@ impl Decoder {
         }
     }
 
-    /// Why the bytes since the last frame are none, if that shows.
+    /// Why the bytes since the last frame are none. `None` if they are so few that they may be the
+    /// beginning of one.
     pub fn problem(&self) -> Option<String> {
-        if self.unframed() < 2 * self.layout.min_frame_bytes() as u64 {
-            return None;
-        }
-        let telnet = || TELNET.to_owned();
-        let refused = self.lines.refused.clone();
-        refused.or_else(|| self.is_telnet.then(telnet))
+        let guess = match self.is_telnet {
+            true => TELNET,
+            false => "is the baud rate or the layout wrong?",
+        };
+        let is_enough = self.unframed() >= 2 * self.layout.min_frame_bytes() as u64;
+        is_enough.then(|| self.lines.refused.clone().unwrap_or(guess.to_owned()))
     }
 
     /// The number of bytes taken in since the start.
@@ -192,7 +193,7 @@ impl Decoder {
     }
 
     /// The number of bytes taken in since the last frame or restart.
-    pub(crate) fn unframed(&self) -> u64 {
+    fn unframed(&self) -> u64 {
         self.received().saturating_sub(self.place.framed)
     }
 
