@@ -278,8 +278,7 @@ impl Judge {
             .as_ref()
             .map_or(pressed.in_a_row.into(), |object| object.presses);
         let is_felt = peak.force_n >= described.model.min_force_n;
-        if let (Some(course), Phase::Final, true, false) =
-            (&course, phase, is_felt, peak.marks.saturated)
+        if let (Some(course), Phase::Final, true, false) = (&course, phase, is_felt, peak.saturated)
         {
             let most = described.sensor.own_presses as usize;
             self.kept.own.add(pressed, &hrn, course, most)?;
@@ -387,8 +386,8 @@ impl Judge {
         let is_resampled = resampling.is_resampled() && card.grid.is_none();
         let are_ignored = self.hrn.known_references().are_ignored();
         [
-            (Note::AtEdge, peak.marks.at_edge),
-            (Note::Saturated, peak.marks.saturated),
+            (Note::AtEdge, peak.at_edge),
+            (Note::Saturated, peak.saturated),
             (Note::OutsideTraining, !is_trained),
             (Note::Resampled, is_resampled),
             (Note::NotIdentified, self.is_unknown(references)),

@@ -21,10 +21,10 @@ pub use self::input::{Input, Refused};
 use self::link::Link;
 use self::pace::Pace;
 use crate::event::{Event, FrameEvent, Press, PressState, Tared};
-use crate::frame::{Frame, RawFrame, Stamp};
+use crate::frame::{RawFrame, Stamp};
 use crate::judge::{EndedPress, Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
-use crate::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
+use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{self, Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, TimeSeries};
@@ -382,10 +382,14 @@ impl Pipeline {
         let frame = self.tare.apply(raw);
         // During a tare on request, presses are tracked with the old baseline.
         let tared = !matches!(self.tare.aim(), Some(Aim::First { .. }));
-        let change = match tared {
-            true => self.tracker.push(&frame, self.marks(raw, &frame), at),
-            false => None,
+        let threshold_n = self.sensor.thresholds().contact_threshold_n;
+        let full_scale = self.sensor.layout().full_scale();
+        let contact = ContactFrame {
+            saturated: full_scale.is_some_and(|most| self.tare.is_saturated(raw, most)),
+            ..ContactFrame::new(&frame, threshold_n, at)
         };
+        let (contact_area_taxels, force_n) = (contact.contact_area_taxels, contact.force_n);
+        let change = tared.then(|| self.tracker.push(contact)).flatten();
         if self.tracker.is_pressed() {
             self.tare.give_up(RetareError::Pressed);
         }
@@ -393,7 +397,6 @@ impl Pipeline {
             end: End::Timeout, ..
         }) = &change
         {
-            let threshold_n = self.sensor.thresholds().contact_threshold_n;
             self.unreleased = Some(link::in_contact(&frame, threshold_n));
         }
         // Use the seconds of the clock, so that a resumed pipeline keeps the same pace.
@@ -408,12 +411,6 @@ impl Pipeline {
             let track = &self.judge.track;
             track.latest(press.began(), stamp.mono, delay_ms)
         });
-        let threshold_n = self.sensor.thresholds().contact_threshold_n;
-        let contact_area_taxels = frame.contact_area_taxels(threshold_n);
-        let force_n = match contact_area_taxels {
-            0 => 0.0,
-            _ => frame.felt(threshold_n).force_n(),
-        };
         events.push(Event::Frame(FrameEvent {
             sensor: self.sensor.name().to_owned(),
             time: stamp.wall,
@@ -482,25 +479,6 @@ impl Pipeline {
             reason,
             frames,
             context: self.judge.context.clone(),
-        })
-    }
-
-    /// The marks of a frame by the current settings.
-    fn marks(&self, raw: &RawFrame, frame: &Frame) -> Marks {
-        let full_scale = self.sensor.layout().full_scale();
-        Marks {
-            at_edge: self.is_at_edge(frame),
-            saturated: full_scale.is_some_and(|f| self.tare.is_saturated(raw, f)),
-        }
-    }
-
-    fn is_at_edge(&self, frame: &Frame) -> bool {
-        let array = self.sensor.layout().array();
-        let threshold_n = self.sensor.thresholds().contact_threshold_n;
-        frame.newtons.iter().enumerate().any(|(place, &newtons)| {
-            let (row, col) = array.position(place);
-            let is_edge = row == 0 || col == 0 || row + 1 == array.rows || col + 1 == array.cols;
-            is_edge && newtons >= threshold_n
         })
     }
 }

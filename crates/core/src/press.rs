@@ -14,7 +14,7 @@ pub use self::phases::{Phases, thinned};
 pub use self::settings::{Settings, Thresholds};
 use self::settling::Settling;
 pub use self::so_far::SoFar;
-use crate::frame::{Frame, Stamp};
+use crate::frame::{Array, Frame, Stamp};
 
 /// The number of a frame in a press, and when its last byte came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,17 +25,7 @@ pub struct FrameAt {
     pub stamp: Stamp,
 }
 
-/// Marks of a frame. They are decided by the settings at the frame's arrival, because the settings
-/// may have changed when the press is judged.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Marks {
-    /// Whether the contact touches the border of the array.
-    pub at_edge: bool,
-    /// Whether a live taxel reads full scale.
-    pub saturated: bool,
-}
-
-/// A frame of a press, in contact. The best frame has the maximal contact area. Of equal areas the
+/// A frame as presses get it. The best frame of a press has the maximal contact area. Of equal areas the
 /// greater force wins, then the earlier frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContactFrame {
@@ -43,12 +33,35 @@ pub struct ContactFrame {
     pub moment: FrameAt,
     /// The frame as [`Frame::felt`] gives it.
     pub frame: Arc<Frame>,
-    /// The frame's marks.
-    pub marks: Marks,
+    /// Whether the contact touches the border of the array.
+    pub at_edge: bool,
+    /// Whether a live taxel reads full scale.
+    pub saturated: bool,
     /// The contact area of the frame.
     pub contact_area_taxels: u32,
     /// The force of the contact.
     pub force_n: f64,
+}
+
+impl ContactFrame {
+    /// A frame whose taxels are in contact at or above `threshold_n`, and do not read full scale.
+    pub fn new(frame: &Frame, threshold_n: f32, moment: FrameAt) -> Self {
+        let felt = frame.felt(threshold_n);
+        let Array { rows, cols } = frame.array;
+        let is_edge = |place: usize| {
+            let (row, col) = frame.array.position(place);
+            row == 0 || col == 0 || row + 1 == rows || col + 1 == cols
+        };
+        let mut taxels = frame.newtons.iter().enumerate();
+        Self {
+            moment,
+            force_n: felt.force_n(),
+            at_edge: taxels.any(|(place, &n)| n >= threshold_n && is_edge(place)),
+            saturated: false,
+            contact_area_taxels: frame.contact_area_taxels(threshold_n),
+            frame: Arc::new(felt),
+        }
+    }
 }
 
 /// How a press ended. Only one that was released or timed out gets a verdict.
@@ -117,7 +130,7 @@ pub enum Change {
 /// use std::time::Duration;
 ///
 /// use hardnessd_core::frame::{Frame, Stamp};
-/// use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
+/// use hardnessd_core::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 ///
 /// let mut tracker = PressTracker::new(Thresholds::default());
 /// let free = Frame::default();
@@ -131,7 +144,7 @@ pub enum Change {
 ///         wall: jiff::Timestamp::UNIX_EPOCH,
 ///     };
 ///     let at = FrameAt { frame: number, stamp };
-///     changes.extend(tracker.push(frame, Marks::default(), at));
+///     changes.extend(tracker.push(ContactFrame::new(frame, 0.07, at)));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
 /// assert!(matches!(&changes[1], Change::End { press, end: End::Release } if press.frames() == 3));
@@ -198,29 +211,17 @@ impl PressTracker {
     }
 
     /// Takes the next frame in.
-    pub fn push(&mut self, frame: &Frame, marks: Marks, at: FrameAt) -> Option<Change> {
-        let threshold_n = self.thresholds.contact_threshold_n;
-        let area = frame.contact_area_taxels(threshold_n);
+    pub fn push(&mut self, frame: ContactFrame) -> Option<Change> {
+        let (at, area) = (frame.moment, frame.contact_area_taxels);
         let is_touched = area >= self.thresholds.end_area_taxels;
-        let contact = || {
-            let felt = frame.felt(threshold_n);
-            ContactFrame {
-                moment: at,
-                force_n: felt.force_n(),
-                frame: Arc::new(felt),
-                marks,
-                contact_area_taxels: area,
-            }
-        };
         match &mut self.state {
             State::Idle if area < self.thresholds.begin_area_taxels => None,
             State::Idle => {
                 self.presses += 1;
-                let contact = contact();
                 let mut settling = Settling::default();
-                settling.push(&contact, &self.thresholds);
+                settling.push(&frame, &self.thresholds);
                 self.state = State::Pressed {
-                    press: Box::new(SoFar::new(self.presses, contact)),
+                    press: Box::new(SoFar::new(self.presses, frame)),
                     settling,
                     released_frames: 0,
                 };
@@ -239,13 +240,12 @@ impl PressTracker {
                 settling,
                 released_frames,
             } => {
-                let contact = contact();
-                if settling.push(&contact, &self.thresholds) {
+                if settling.push(&frame, &self.thresholds) {
                     press.settled();
                 }
                 *released_frames = if is_touched { 0 } else { *released_frames + 1 };
                 if is_touched {
-                    press.push(contact);
+                    press.push(frame);
                 }
                 let released_frames = *released_frames;
                 let held = at.stamp.mono.saturating_sub(press.began()).as_secs_f64();

@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use hardnessd_core::frame::{Frame, Stamp};
-use hardnessd_core::press::{Change, End, FrameAt, Marks, PressTracker, Thresholds};
+use hardnessd_core::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 
 /// Whether a press tracker of a JX255N begins a press with this frame.
 pub(super) fn begins_press(frame: &Frame) -> bool {
@@ -41,7 +41,9 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        match tracker.push(frame, Marks::default(), at) {
+        let felt = ContactFrame::new(frame, settings.contact_threshold_n, at);
+        let area = felt.contact_area_taxels;
+        match tracker.push(felt) {
             Some(Change::Begin { .. }) if best.is_some() => return None,
             None | Some(Change::Begin { .. }) => {}
             Some(Change::End {
@@ -50,7 +52,6 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
             }) => best = Some(press.peak().moment.frame as usize),
             Some(Change::End { .. }) => return None,
         }
-        let area = frame.contact_area_taxels(settings.contact_threshold_n);
         if tracker.is_pressed() && area >= settings.end_area_taxels {
             contact.push(number as usize);
         }

@@ -20,6 +20,10 @@ fn moment(frame: u64, rate_hz: u64) -> FrameAt {
     }
 }
 
+fn contact(frame: &Frame, at: FrameAt) -> ContactFrame {
+    ContactFrame::new(frame, Thresholds::default().contact_threshold_n, at)
+}
+
 /// Tracks `loads` and writes each change as a letter with its frame: b begin, s settled, e end, t
 /// timeout, x without a verdict.
 fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String {
@@ -27,8 +31,7 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
     let mut text = Vec::new();
     let mut was_settled = false;
     for (number, &(area, force_n)) in (0..).zip(loads) {
-        let (frame, at) = (frame(area, force_n), moment(number, rate_hz));
-        let change = tracker.push(&frame, Marks::default(), at);
+        let change = tracker.push(contact(&frame(area, force_n), moment(number, rate_hz)));
         let settled = tracker.so_far().filter(|press| press.is_settled());
         let peak = settled.map(|press| press.peak().moment.frame);
         text.extend(
@@ -118,7 +121,7 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
         for (newtons, count) in frame.newtons.iter_mut().zip(counts) {
             *newtons = 0.04 * f32::from(count);
         }
-        ended = tracker.push(&frame, Marks::default(), moment(number, 5));
+        ended = tracker.push(contact(&frame, moment(number, 5)));
     }
     let Some(Change::End { press, .. }) = ended else {
         panic!("{ended:?}");
@@ -201,7 +204,7 @@ fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
 #[test]
 fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_timed_out() {
     let push = |tracker: &mut PressTracker, number| {
-        tracker.push(&frame(5, 2.0), Marks::default(), moment(number, 5))
+        tracker.push(contact(&frame(5, 2.0), moment(number, 5)))
     };
     let mut tracker = PressTracker::new(Thresholds {
         max_seconds: 0.2,
@@ -223,11 +226,8 @@ fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_tim
 /// A press whose frames have these contact areas.
 fn of_areas(areas: impl IntoIterator<Item = u32>) -> SoFar {
     let mut frames = (0..).zip(areas).map(|(number, area)| ContactFrame {
-        moment: moment(number, 100),
-        frame: Arc::new(Frame::default()),
-        marks: Marks::default(),
         contact_area_taxels: area,
-        force_n: 1.0,
+        ..contact(&Frame::default(), moment(number, 100))
     });
     let mut press = SoFar::new(1, frames.next().unwrap());
     frames.for_each(|frame| press.push(frame));
