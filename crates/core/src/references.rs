@@ -62,24 +62,23 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
     let known = arrays.read("known", &[], frames..=frames, 0.0..=1.0)?;
     let newtons = arrays.read("frames", &[ROWS, COLS], frames..=frames, -MOST_N..=MOST_N)?;
 
-    let (mut references, mut first) = (Vec::with_capacity(count), 0);
-    for number in 0..count {
-        let length = press[first..]
-            .iter()
-            .take_while(|&&of| of == number as f64)
-            .count();
-        if !(1..=COURSE_FRAMES.1).contains(&length) {
-            let expected = format!("1 to {} of each press, in order", COURSE_FRAMES.1);
-            let found = format!("{length} frames of press {number}");
-            return Err(Error::of("press", found, expected));
-        }
-        let moment = |row: usize| Sample {
-            time_s: time_s[row] as f32,
-            approach_mm: (known[row] == 1.0).then_some(approach_mm[row] as f32),
-            frame: ModelFrame {
-                newtons: std::array::from_fn(|k| newtons[row * TAXELS + k] as f32),
-            },
-        };
+    let of_presses: Vec<&[f64]> = press.chunk_by(f64::eq).collect();
+    let is_one = |(number, rows): (usize, &&[f64])| {
+        rows[0] == number as f64 && rows.len() <= COURSE_FRAMES.1
+    };
+    if of_presses.len() != count || !of_presses.iter().enumerate().all(is_one) {
+        let most = COURSE_FRAMES.1;
+        let expected = format!("1 to {most} of each of {count} presses, in order");
+        return Err(Error::of("press", format!("{frames} frames"), expected));
+    }
+    let mut moments = (0..frames).map(|row| Sample {
+        time_s: time_s[row] as f32,
+        approach_mm: (known[row] == 1.0).then_some(approach_mm[row] as f32),
+        frame: ModelFrame {
+            newtons: std::array::from_fn(|k| newtons[row * TAXELS + k] as f32),
+        },
+    });
+    let reference = |(number, rows): (usize, &&[f64])| {
         let mm = piece_mm[number] as f32;
         let range = [shore[2 * number] as f32, shore[2 * number + 1] as f32];
         let piece = match kinds[number] {
@@ -92,20 +91,13 @@ pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
                 return Err(Error::of("piece", found, expected));
             }
         };
-        references.push(ReferencePress {
-            course: TimeSeries {
-                moments: (first..first + length).map(moment).collect(),
-                arm_n_per_mm: arm_n_per_mm[number] as f32,
-            },
-            piece,
-        });
-        first += length;
-    }
-    if first != frames {
-        let expected = format!("{first}, those of {count} presses");
-        return Err(Error::of("press", format!("{frames} frames"), expected));
-    }
-    Ok(references)
+        let course = TimeSeries {
+            moments: moments.by_ref().take(rows.len()).collect(),
+            arm_n_per_mm: arm_n_per_mm[number] as f32,
+        };
+        Ok(ReferencePress { course, piece })
+    };
+    of_presses.iter().enumerate().map(reference).collect()
 }
 
 /// The arrays of a file.
@@ -167,30 +159,21 @@ pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
                 .map(move |moment| (number, moment))
         })
     };
-    let piece_mm = |press: &ReferencePress| match press.piece {
-        Piece::Flat { width_mm } => width_mm,
-        Piece::Ball { radius_mm } => radius_mm,
-        Piece::Shore { .. } => 0.0,
+    let piece = |press: &ReferencePress| match press.piece {
+        Piece::Flat { width_mm } => (1, width_mm, [0.0; 2]),
+        Piece::Ball { radius_mm } => (2, radius_mm, [0.0; 2]),
+        Piece::Shore { range } => (3, 0.0, range),
     };
-    let shore = |press: &ReferencePress| match press.piece {
-        Piece::Shore { range } => range,
-        Piece::Flat { .. } | Piece::Ball { .. } => [0.0; 2],
-    };
-    let kind = |press: &ReferencePress| match press.piece {
-        Piece::Flat { .. } => 1,
-        Piece::Ball { .. } => 2,
-        Piece::Shore { .. } => 3,
-    };
+    let pieces: Vec<(u8, f32, [f32; 2])> = references.iter().map(piece).collect();
     let mut npz = Writer::compressed(Cursor::new(Vec::new()));
-    let presses = references.iter();
-    let kinds: Vec<u8> = presses.clone().map(kind).collect();
+    let kinds: Vec<u8> = pieces.iter().map(|piece| piece.0).collect();
     npz.add_list("piece", &kinds)?;
-    let piece_mm: Vec<f32> = presses.clone().map(piece_mm).collect();
+    let piece_mm: Vec<f32> = pieces.iter().map(|piece| piece.1).collect();
     npz.add_list("piece_mm", &piece_mm)?;
-    let shore: Vec<f32> = presses.clone().flat_map(shore).collect();
+    let shore: Vec<f32> = pieces.iter().flat_map(|piece| piece.2).collect();
     npz.add("shore", &[references.len(), 2], &shore)?;
-    let arms: Vec<f32> = presses.map(|press| press.course.arm_n_per_mm).collect();
-    npz.add_list("arm_n_per_mm", &arms)?;
+    let arms = references.iter().map(|press| press.course.arm_n_per_mm);
+    npz.add_list("arm_n_per_mm", &arms.collect::<Vec<f32>>())?;
     let numbers: Vec<u32> = moments().map(|(number, _)| number).collect();
     npz.add_list("press", &numbers)?;
     let time_s: Vec<f32> = moments().map(|(_, m)| m.time_s).collect();
@@ -262,7 +245,10 @@ mod tests {
             (bytes[..bytes.len() / 2].to_vec(), "found no .npz file"),
             (of(&[]), "piece: found 0 rows, expected 1 to 64"),
             (of(&vec![press(1, flat); 65]), "piece: found 65 rows"),
-            (of(&[press(49, flat)]), "press: found 49 frames of press 0"),
+            (
+                of(&[press(49, flat)]),
+                "press: found 49 frames, expected 1 to 48 of each of 1 presses",
+            ),
             (of(&[press(4, turned)]), "Shore [70.0, 61.0]"),
             (
                 of(&[press(4, Piece::Flat { width_mm: f32::NAN })]),

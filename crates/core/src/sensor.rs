@@ -158,7 +158,7 @@ impl Sensor {
         ranges.map_err(|error| error.within("model"))?;
         let stale_after = match sensor.stale_after_ms {
             None => LEAST_STALE_AFTER.max(period(sensor.frame_rate_hz).mul_f64(STALE_PERIODS)),
-            Some(ms) => of_ms(ms),
+            Some(ms) => Duration::from_nanos((ms * 1e6).round() as u64),
         };
         Ok(Self {
             layout,
@@ -241,10 +241,6 @@ impl Sensor {
 
 fn period(frame_rate_hz: f64) -> Duration {
     Duration::from_secs_f64(1.0 / frame_rate_hz)
-}
-
-fn of_ms(ms: f64) -> Duration {
-    Duration::from_nanos((ms * 1e6).round() as u64)
 }
 
 #[cfg(test)]

@@ -30,55 +30,39 @@ fn settings(dead_taxels: &[[usize; 2]]) -> Settings {
     }
 }
 
-#[test]
-fn force_grows_with_a_power_of_the_counts() {
-    let newtons = |exponent, counts: u16| {
-        let settings = Settings {
-            exponent,
-            tare_frames: 1,
-            ..Settings::default()
-        };
-        let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
-        let mut raw = raw(&[]);
-        tare.observe(&raw);
-        raw.counts[7] = counts.into();
-        tare.apply(&raw).newtons[7]
-    };
-    assert_eq!(newtons(1.0, 27), 1.0);
-    assert!((newtons(2.0, 27) - 25.0).abs() < 1e-4);
-    assert!((newtons(0.5, 27) - 0.2).abs() < 1e-6);
-    assert_eq!(newtons(0.5, 2), 0.0);
-    // Two counts below the baseline.
-    assert!((newtons(0.5, 0) + 0.04 * 2.0_f32.sqrt()).abs() < 1e-6);
-    assert_eq!(newtons(1.0, 0), -0.08);
-}
-
 fn gains(rows: usize, cols: usize, gain: impl Fn(usize, usize) -> f32) -> Option<Gains> {
     let row = |row| (0..cols).map(|col| gain(row, col)).collect();
     Some(Gains::Taxels((0..rows).map(row).collect()))
 }
 
 #[test]
-fn a_gain_multiplies_the_newtons_of_its_own_taxel() {
+fn force_grows_with_a_power_of_the_counts_and_with_the_gain_of_its_taxel() {
     let array = Array { rows: 5, cols: 4 };
     let gain = |row, col| 1.0 + 0.1 * (4 * row + col) as f32;
-    let settings = Settings {
-        gains: gains(5, 4, gain),
-        tare_frames: 1,
-        ..Settings::default()
-    };
-    settings.check(array).unwrap();
-    let mut tare = Tare::new(&settings, array, CONTACT);
-    tare.observe(&raw_of(array, &[]));
-    for place in 0..array.taxels() {
-        let (row, col) = array.position(place);
-        let newtons = tare.apply(&raw_of(array, &[(place, 27)])).newtons;
-        assert_eq!(
-            newtons[place],
-            gain(row, col),
-            "25 counts are 1 N, times the gain"
-        );
-        assert_eq!(newtons.iter().filter(|&&n| n > 0.0).count(), 1);
+    for (exponent, counts, newtons) in [
+        (1.0, 27, 1.0),
+        (2.0, 27, 25.0),
+        (0.5, 27, 0.2),
+        (0.5, 2, 0.0),
+        // Two counts below the baseline.
+        (0.5, 0, -0.04 * 2.0_f32.sqrt()),
+        (1.0, 0, -0.08),
+    ] {
+        let settings = Settings {
+            exponent,
+            gains: gains(5, 4, gain),
+            tare_frames: 1,
+            ..Settings::default()
+        };
+        let mut tare = Tare::new(&settings, array, CONTACT);
+        tare.observe(&raw_of(array, &[]));
+        for place in 0..array.taxels() {
+            let (row, col) = array.position(place);
+            let found = tare.apply(&raw_of(array, &[(place, counts)])).newtons;
+            let off = found[place] - newtons * gain(row, col);
+            assert!(off.abs() < 1e-4, "{counts} at {place}, {exponent}");
+            assert!(found.iter().filter(|&&n| n != 0.0).count() <= 1);
+        }
     }
 }
 

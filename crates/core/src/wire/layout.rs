@@ -4,7 +4,7 @@ use super::cells::Cells;
 use super::fixed::Fixed;
 use super::scan::{Context, Scan};
 use super::settings::Settings;
-use super::text::{self, Lines, Text};
+use super::text::{self, Lines};
 use crate::frame::{Array, RawFrame};
 use crate::range::{OutOfRange, check, within};
 
@@ -12,7 +12,8 @@ use crate::range::{OutOfRange, check, within};
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Form {
     Fixed(Box<Fixed>),
-    Text(Text),
+    /// What comes before each frame. Empty if nothing does.
+    Text(Vec<u8>),
 }
 
 /// A checked layout.
@@ -79,7 +80,7 @@ impl Layout {
                 heading.len() <= MOST_HEADING_BYTES && !heading.contains(&b'\n'),
                 "at most 64 bytes on one line",
             )?;
-            (Form::Text(Text { heading }), None)
+            (Form::Text(heading), None)
         } else {
             let fixed = Box::new(Fixed::new(&keys, array)?);
             (Form::Fixed(fixed), keys.cell.unwrap_or_default().range())
@@ -153,7 +154,7 @@ impl Layout {
         let cells = self.cells.of(frame);
         match &self.form {
             Form::Fixed(fixed) => fixed.encode(cells, out),
-            Form::Text(text) => text::encode(text, cells, out),
+            Form::Text(heading) => text::encode(heading, cells, out),
         }
     }
 
@@ -161,7 +162,7 @@ impl Layout {
     pub(super) fn scan(&self, bytes: &[u8], context: Context, lines: &mut Lines) -> Scan {
         match &self.form {
             Form::Fixed(fixed) => fixed.scan(&self.cells, bytes, context),
-            Form::Text(text) => text::scan(text, &self.cells, bytes, context, lines),
+            Form::Text(heading) => text::scan(heading, &self.cells, bytes, context, lines),
         }
     }
 

@@ -27,13 +27,6 @@ const NUMBER_BYTES: usize = 32;
 /// The most bytes of a word that a message shows.
 const SHOWN_BYTES: usize = 20;
 
-/// How frames of text are found.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Text {
-    /// What comes before each frame. Empty if nothing does.
-    pub(super) heading: Vec<u8>,
-}
-
 /// The lines of which a frame may be made, and how far the pending bytes were read.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Lines {
@@ -117,9 +110,9 @@ pub(super) fn usual_bytes(cells: &Cells) -> (usize, usize) {
 }
 
 /// Writes a frame on one line.
-pub(super) fn encode(text: &Text, cells: impl Iterator<Item = f32>, out: &mut Vec<u8>) {
-    out.extend(&text.heading);
-    if !text.heading.is_empty() {
+pub(super) fn encode(heading: &[u8], cells: impl Iterator<Item = f32>, out: &mut Vec<u8>) {
+    out.extend(heading);
+    if !heading.is_empty() {
         out.push(b' ');
     }
     for cell in cells {
@@ -131,14 +124,14 @@ pub(super) fn encode(text: &Text, cells: impl Iterator<Item = f32>, out: &mut Ve
     }
 }
 
+/// Looks for a frame that comes after `heading`, which is empty if nothing is before a frame.
 pub(super) fn scan(
-    text: &Text,
+    heading: &[u8],
     cells: &Cells,
     bytes: &[u8],
     context: Context,
     lines: &mut Lines,
 ) -> Scan {
-    let heading = text.heading.as_slice();
     // Whether the first `end` bytes are most of a frame that was damaged.
     let damage = |end: usize| {
         let is_of_frame = context.in_sync && bytes.starts_with(heading);
