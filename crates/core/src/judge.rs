@@ -54,12 +54,14 @@ pub struct Unjudged {
 #[derive(Debug)]
 pub struct Judge {
     sensor: Arc<Sensor>,
-    hrn: Arc<Hrn>,
+    /// The model.
+    pub(crate) hrn: Arc<Hrn>,
     /// The positions of the arm.
     pub(crate) track: Track,
     /// The controller's context.
     pub(crate) context: Option<Value>,
-    kept: Kept,
+    /// What a later judge needs of this one between two presses.
+    pub(crate) kept: Kept,
     /// The speed of the approach when the press under way began.
     speed_mm_s: Option<f64>,
     /// The number of frames in contact at which the press under way may be judged next. `None` once its
@@ -117,20 +119,10 @@ impl Judge {
         judge
     }
 
-    /// The model.
-    pub(crate) fn hrn(&self) -> &Arc<Hrn> {
-        &self.hrn
-    }
-
     /// Takes over own presses of the sensor that an earlier judge collected. Those of another model are
     /// left out.
     pub(crate) fn take_own(&mut self, own: OwnPresses) {
         self.kept.own = own.of_model(&self.hrn);
-    }
-
-    /// What a later judge needs of this one between two presses.
-    pub(crate) fn kept(&self) -> &Kept {
-        &self.kept
     }
 
     /// What a judge with `hrn` can take over from this one.
@@ -156,13 +148,13 @@ impl Judge {
     pub(crate) fn early(&mut self, press: &SoFar, now: Moment) -> Option<Hardness> {
         let next_look = self.next_look?;
         match self.hrn.format() {
-            Format::Frame if press.is_settled() => {
+            Format::Frame if press.is_settled => {
                 self.next_look = None;
                 let known = self.known(press, Phase::Early);
                 self.judge(press, Phase::Early, &known, now)
             }
-            Format::Course { .. } if press.frames() >= next_look => {
-                let frames = press.frames();
+            Format::Course { .. } if press.frames >= next_look => {
+                let frames = press.frames;
                 self.next_look = Some(frames + (frames / LOOK_SHARE).max(1));
                 let known = self.known(press, Phase::Early);
                 let described = self.sensor.description();
@@ -186,7 +178,7 @@ impl Judge {
     pub(crate) fn end(&mut self, press: &SoFar, now: Moment) -> Option<Hardness> {
         let known = self.known(press, Phase::Final);
         if let Some(ended) = &mut self.ended {
-            ended.push(known.ended(press.press(), COURSE_FRAMES.1, &self.sensor));
+            ended.push(known.ended(press.press, COURSE_FRAMES.1, &self.sensor));
         }
         let verdict = self.judge(press, Phase::Final, &known, now);
         let delay_ms = self.sensor.arm().delay_ms;
@@ -208,7 +200,7 @@ impl Judge {
         known: &PressWithApproach<'_>,
         now: Moment,
     ) -> Option<Hardness> {
-        let (press, peak) = (press.press(), press.peak());
+        let (press, peak) = (press.press, &press.peak);
         match self.try_judge(press, phase, known, peak, now) {
             Ok(verdict) => Some(verdict),
             // A model that fails on its own check frames was refused at loading.

@@ -169,7 +169,7 @@ impl Pipeline {
 
     /// The own presses of the sensor.
     pub fn own_presses(&self) -> &OwnPresses {
-        &self.judge.kept().own
+        &self.judge.kept.own
     }
 
     /// Takes over own presses of the sensor that an earlier pipeline collected.
@@ -184,7 +184,7 @@ impl Pipeline {
 
     /// The current model.
     pub fn hrn(&self) -> &Arc<Hrn> {
-        self.judge.hrn()
+        &self.judge.hrn
     }
 
     /// The arrival time of the last whole frame.
@@ -212,7 +212,7 @@ impl Pipeline {
         self.decoder.restart();
         self.chunks.clear();
         self.link.opened(at.mono);
-        match self.link.was_lost() {
+        match self.link.was_lost {
             true => None,
             false => self.status_if_changed(at),
         }
@@ -409,7 +409,7 @@ impl Pipeline {
         let approach_mm = self.tracker.so_far().and_then(|press| {
             let delay_ms = self.sensor.arm().delay_ms;
             let track = &self.judge.track;
-            track.latest(press.began(), stamp.mono, delay_ms)
+            track.latest(press.began, stamp.mono, delay_ms)
         });
         events.push(Event::Frame(FrameEvent {
             sensor: self.sensor.name().to_owned(),
@@ -454,8 +454,8 @@ impl Pipeline {
                     true => (PressState::End, self.judge.end(&press, now)),
                     false => (PressState::Aborted, None),
                 };
-                let (last, frames) = (press.last(), press.frames());
-                events.push(self.press(press.press(), state, last, frames, end.reason()));
+                let (last, frames) = (press.last(), press.frames);
+                events.push(self.press(press.press, state, last, frames, end.reason()));
                 events.extend(verdict.map(Event::Hardness));
             }
         }

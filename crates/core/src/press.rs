@@ -147,14 +147,15 @@ pub enum Change {
 ///     changes.extend(tracker.push(ContactFrame::new(frame, 0.07, at)));
 /// }
 /// assert!(matches!(changes[0], Change::Begin { press: 1, .. }));
-/// assert!(matches!(&changes[1], Change::End { press, end: End::Release } if press.frames() == 3));
+/// assert!(matches!(&changes[1], Change::End { press, end: End::Release } if press.frames == 3));
 /// assert!(matches!(changes[3], Change::End { end: End::Short, .. }));
 /// ```
 #[derive(Debug)]
 pub struct PressTracker {
     thresholds: Thresholds,
     state: State,
-    presses: u64,
+    /// The number of presses so far.
+    pub(crate) presses: u64,
 }
 
 #[derive(Debug)]
@@ -180,16 +181,6 @@ impl PressTracker {
             state: State::Idle,
             presses: 0,
         }
-    }
-
-    /// The number of presses so far.
-    pub fn presses(&self) -> u64 {
-        self.presses
-    }
-
-    /// Continues after this number of presses.
-    pub fn resume(&mut self, presses: u64) {
-        self.presses = presses;
     }
 
     /// Whether a press is under way.
@@ -241,14 +232,14 @@ impl PressTracker {
                 released_frames,
             } => {
                 if settling.push(&frame, &self.thresholds) {
-                    press.settled();
+                    press.is_settled = true;
                 }
                 *released_frames = if is_touched { 0 } else { *released_frames + 1 };
                 if is_touched {
                     press.push(frame);
                 }
                 let released_frames = *released_frames;
-                let held = at.stamp.mono.saturating_sub(press.began()).as_secs_f64();
+                let held = at.stamp.mono.saturating_sub(press.began).as_secs_f64();
                 if released_frames >= self.thresholds.end_frames {
                     self.end(End::Release, State::Idle)
                 } else if held >= self.thresholds.max_seconds {
@@ -270,7 +261,7 @@ impl PressTracker {
         let State::Pressed { press, .. } = std::mem::replace(&mut self.state, next) else {
             return None;
         };
-        let is_short = end.is_judged() && press.frames() < self.thresholds.min_frames;
+        let is_short = end.is_judged() && press.frames < self.thresholds.min_frames;
         Some(Change::End {
             press,
             end: if is_short { End::Short } else { end },

@@ -49,7 +49,7 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
             Some(Change::End {
                 end: End::Release,
                 press,
-            }) => best = Some(press.peak().moment.frame as usize),
+            }) => best = Some(press.peak.moment.frame as usize),
             Some(Change::End { .. }) => return None,
         }
         if tracker.is_pressed() && area >= settings.end_area_taxels {

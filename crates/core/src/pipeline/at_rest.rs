@@ -69,14 +69,14 @@ impl Pipeline {
             frames: self.frames,
             frames_damaged: self.frames_damaged,
             pace: self.pace.clone(),
-            presses: self.tracker.presses(),
+            presses: self.tracker.presses,
             context: self.judge.context.clone(),
             link: self.link.clone(),
             decoder: self.decoder.place(),
             pending: self.pending(),
             tare: self.tare.at_rest(),
             motion: self.judge.track.since(since.unwrap_or_default()),
-            judge: self.judge.kept().clone(),
+            judge: self.judge.kept.clone(),
         })
     }
 
@@ -106,7 +106,7 @@ impl Pipeline {
             ..self.decoder.place()
         };
         next.decoder = Decoder::at(next.sensor.layout().clone(), place);
-        next.tracker.resume(self.tracker.presses());
+        next.tracker.presses = self.tracker.presses;
         next.judge = next.judge.after(kept, self.judge.track, self.judge.context);
         (next.frames, next.frames_damaged) = (self.frames, self.frames_damaged);
         next.pace = self.pace;
@@ -121,7 +121,7 @@ impl Pipeline {
             pipeline.hold(&bytes, at);
         }
         pipeline.tare.resume(state.tare);
-        pipeline.tracker.resume(state.presses);
+        pipeline.tracker.presses = state.presses;
         let track = state.motion.into();
         pipeline.judge = pipeline.judge.after(state.judge, track, state.context);
         pipeline.link = state.link;

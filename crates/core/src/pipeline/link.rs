@@ -26,7 +26,7 @@ pub(super) const RATE_FRAMES: usize = 32;
 pub(super) struct Link {
     port: Port,
     /// Whether the port was lost, and no frame has come since.
-    was_lost: bool,
+    pub(super) was_lost: bool,
     /// The arrival times of the latest frames.
     recent: VecDeque<Duration>,
     /// When the last bytes came that are not settled.
@@ -62,10 +62,6 @@ impl Link {
             last_frame: None,
             published: (LinkState::Connecting, None, None),
         }
-    }
-
-    pub(super) fn was_lost(&self) -> bool {
-        self.was_lost
     }
 
     pub(super) fn is_live(&self) -> bool {

@@ -12,14 +12,19 @@ const MOST_HELD: usize = 512;
 /// The frames in contact of a press up to now.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SoFar {
-    press: u64,
-    peak: ContactFrame,
-    began: Duration,
-    is_settled: bool,
+    /// The press's number.
+    pub press: u64,
+    /// When its first frame came.
+    pub began: Duration,
+    /// The number of frames in contact.
+    pub frames: u64,
+    /// The best frame.
+    pub peak: ContactFrame,
+    /// Whether the contact has settled.
+    pub is_settled: bool,
     /// Frames 0, `stride`, 2 `stride`, ... of the frames in contact, and the last one.
     held: Vec<ContactFrame>,
     stride: u64,
-    frames: u64,
 }
 
 impl SoFar {
@@ -55,38 +60,9 @@ impl SoFar {
         }
     }
 
-    pub(super) fn settled(&mut self) {
-        self.is_settled = true;
-    }
-
-    /// The press's number.
-    pub fn press(&self) -> u64 {
-        self.press
-    }
-
-    /// The number of frames in contact.
-    pub fn frames(&self) -> u64 {
-        self.frames
-    }
-
-    /// When its first frame came.
-    pub fn began(&self) -> Duration {
-        self.began
-    }
-
     /// Its last frame in contact.
     pub fn last(&self) -> FrameAt {
         self.held[self.held.len() - 1].moment
-    }
-
-    /// The best frame.
-    pub fn peak(&self) -> &ContactFrame {
-        &self.peak
-    }
-
-    /// Whether the contact has settled.
-    pub fn is_settled(&self) -> bool {
-        self.is_settled
     }
 
     /// Its frames, evenly spread over the press, some hundred at most. A short press has all its frames.

@@ -32,8 +32,8 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
     let mut was_settled = false;
     for (number, &(area, force_n)) in (0..).zip(loads) {
         let change = tracker.push(contact(&frame(area, force_n), moment(number, rate_hz)));
-        let settled = tracker.so_far().filter(|press| press.is_settled());
-        let peak = settled.map(|press| press.peak().moment.frame);
+        let settled = tracker.so_far().filter(|press| press.is_settled);
+        let peak = settled.map(|press| press.peak.moment.frame);
         text.extend(
             peak.filter(|_| !was_settled)
                 .map(|peak| format!("s@{number}:{peak}")),
@@ -47,8 +47,8 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
                     End::Timeout => 't',
                     _ => 'x',
                 };
-                let (last, frames) = (press.last().frame, press.frames());
-                let peak = press.peak().moment.frame;
+                let (last, frames) = (press.last().frame, press.frames);
+                let peak = press.peak.moment.frame;
                 format!("{letter}@{number}:last{last} n{frames} peak{peak}")
             }
         }));
@@ -126,7 +126,7 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
     let Some(Change::End { press, .. }) = ended else {
         panic!("{ended:?}");
     };
-    assert_eq!(press.peak().moment.frame, 0);
+    assert_eq!(press.peak.moment.frame, 0);
 }
 
 #[test]
@@ -215,7 +215,7 @@ fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_tim
     let Some(Change::End { press, end }) = tracker.abort(End::Lost) else {
         panic!("the press goes on");
     };
-    assert_eq!((press.press(), press.frames(), end), (1, 1, End::Lost));
+    assert_eq!((press.press, press.frames, end), (1, 1, End::Lost));
     assert!(!tracker.is_pressed());
     push(&mut tracker, 1);
     push(&mut tracker, 2);
@@ -243,7 +243,7 @@ fn first_best_and_last_are_held_and_the_rest_is_even() {
         let numbers: Vec<u64> = frames.iter().map(|frame| frame.moment.frame).collect();
         assert_eq!(numbers[press.best_of(&frames)], best, "{count}");
         assert_eq!((numbers[0], numbers.last()), (0, Some(&(count - 1))));
-        assert_eq!((press.last().frame, press.frames()), (count - 1, count));
+        assert_eq!((press.last().frame, press.frames), (count - 1, count));
         assert!(numbers.is_sorted_by(|one, next| one < next));
         assert!(numbers.len() >= 256.min(count as usize) && numbers.len() <= 514);
         let widest = numbers.windows(2).map(|pair| pair[1] - pair[0]).max();
