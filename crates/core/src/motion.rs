@@ -60,6 +60,8 @@ const LONGEST_GAP_NS: i64 = LONGEST_GAP.as_nanos() as i64;
      for the press it falls in"
 )]
 pub struct StepBack {
+    /// The index of the point.
+    pub index: usize,
     /// How far the point goes back in time.
     pub back_ms: f64,
 }
@@ -133,7 +135,7 @@ impl Track {
     /// the earlier ones are forgotten.
     pub fn push(&mut self, points: &[Point]) -> Result<(), StepBack> {
         let mut first_back = None;
-        for &point in points {
+        for (index, &point) in points.iter().enumerate() {
             self.received += 1;
             self.late += u64::from(self.judged_ns.is_some_and(|judged| point.at_ns <= judged));
             if let Some(latest) = self.points.back().map(|point| point.at_ns)
@@ -142,6 +144,7 @@ impl Track {
                 // Nobody knows which of both moments is right.
                 self.points.clear();
                 first_back.get_or_insert(StepBack {
+                    index,
                     back_ms: (latest.saturating_sub(point.at_ns)) as f64 / 1e6,
                 });
             }

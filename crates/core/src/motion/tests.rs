@@ -98,7 +98,7 @@ fn a_step_back_is_told_and_time_goes_on_from_there() {
     let mut track = track(&steady(0, 5000, 50));
     let again = steady(2000, 9000, 50);
     let back = track.push(&again).unwrap_err();
-    assert_eq!(back.back_ms, 3000.0);
+    assert_eq!((back.index, back.back_ms), (0, 3000.0));
     assert_eq!(approach(&track, 1900, &[2500]), None);
     assert_eq!(approach(&track, 6000, &[6500]), Some(vec![Some(500.0)]));
 }
