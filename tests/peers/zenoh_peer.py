@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
 """Events on zenoh, read by Eclipse's own implementation.
 
-    python -m venv venv && venv/bin/pip install eclipse-zenoh mcap mcap-ros2-support
+    python -m venv venv && venv/bin/pip install eclipse-zenoh
     cargo build --features zenoh && venv/bin/python tests/peers/zenoh_peer.py target/debug/hardnessd
 
-Claims: positions of an arm that a peer puts at the configured key reach the press and the recording; a peer gets,
-under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
+Claims: a peer gets, under the keys of docs/protocol.md, the very lines of the Unix socket; a late peer
 asks for the last verdict and status, beside 100 frames/s too; the liveliness token goes when the daemon is killed; a router
 that comes later is found; a frozen peer costs no other subscriber an event, nor the stop its second;
 and nothing listens that was not named.
