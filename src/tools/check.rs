@@ -59,7 +59,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let idle = setup.without_effect().into_iter();
     warnings
         .extend(idle.map(|key| format!("{key}: changes no verdict, because the model {needs}")));
-    warnings.extend(stranger_warnings(&setup));
     for warning in warnings {
         stderr_line!("warning: {}: {warning}", path.display());
     }
@@ -109,30 +108,6 @@ fn scale_warning(sensor: &Settings, layout: &Layout) -> Option<String> {
          `hardnessd calibrate force`",
         sensor.name
     ))
-}
-
-/// Warns of each address that others can reach.
-fn stranger_warnings(setup: &Setup) -> impl Iterator<Item = String> {
-    let publish = &setup.config.publish;
-    let (tcp, foxglove) = (publish.tcp.as_ref(), publish.foxglove.as_ref());
-    let addresses = [
-        ("publish.tcp.listen", tcp.map(|tcp| tcp.listen)),
-        (
-            "publish.foxglove.listen",
-            foxglove.map(|foxglove| foxglove.listen),
-        ),
-        (
-            "http.listen",
-            setup.config.http.as_ref().map(|http| http.listen),
-        ),
-    ];
-    addresses.into_iter().filter_map(|(key, address)| {
-        let address = address.filter(|address| !address.ip().is_loopback())?;
-        Some(format!(
-            "{key}: {address} is open to anyone who can reach this machine; a loopback address, such as 127.0.0.1, \
-             is not"
-        ))
-    })
 }
 
 /// Pitches closer than this count as equal, because datasheets give two digits.

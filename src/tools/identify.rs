@@ -214,12 +214,12 @@ fn of_file(
     hrn: &Arc<Hrn>,
 ) -> Result<Vec<ReferencePress>, Failure> {
     let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
-    played.keep_courses();
+    played.playback.keep_courses();
     let mut courses = Vec::new();
-    played.play(|played, _, _| courses.extend(played.courses(sensor.name())))?;
+    played.play(|played, _, _| courses.extend(played.playback.courses(sensor.name())))?;
     let what = match args.what {
         Some(what) => what,
-        None => labelled(&played.labels(), path)?,
+        None => labelled(&played.playback.labels(), path)?,
     };
     let piece = piece(what, &hrn.card().levels)?;
     if courses.is_empty() {

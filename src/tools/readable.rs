@@ -13,36 +13,28 @@ use hardnessd_core::wording;
 /// How events are printed on stdout.
 #[derive(Debug)]
 pub(super) struct Printer {
-    form: Form,
+    is_json: bool,
+    is_terminal: bool,
     /// The labels of the model's levels.
     labels: Vec<String>,
-}
-
-#[derive(Debug)]
-enum Form {
-    Json,
-    /// JSON without characters that move the cursor.
-    JsonOnTerminal,
-    Readable,
 }
 
 impl Printer {
     /// A printer for stdout as it is.
     pub(super) fn new(is_json: bool, labels: Vec<String>) -> Self {
-        let form = match (is_json, io::stdout().is_terminal()) {
-            (false, _) => Form::Readable,
-            (true, false) => Form::Json,
-            (true, true) => Form::JsonOnTerminal,
-        };
-        Self { form, labels }
+        Self {
+            is_json,
+            is_terminal: io::stdout().is_terminal(),
+            labels,
+        }
     }
 
     /// The line of an event, newline included. `json` is its line on the wire, and `event` reads it.
     pub(super) fn line(&self, json: String, event: impl FnOnce() -> Value) -> String {
-        let text = match self.form {
-            Form::Json => json,
-            Form::JsonOnTerminal => json_escaped(&json),
-            Form::Readable => line(&event(), &self.labels),
+        let text = match (self.is_json, self.is_terminal) {
+            (false, _) => line(&event(), &self.labels),
+            (true, false) => json,
+            (true, true) => json_escaped(&json),
         };
         text + "\n"
     }

@@ -15,7 +15,7 @@ use clap::Args as ClapArgs;
 
 use super::configuration::ModelFile;
 use super::exit::Failure;
-use super::played::{Played, Step};
+use super::played::Played;
 use super::readable::Printer;
 use super::simulate::positive;
 use crate::daemon::config::{Config, Setup};
@@ -85,14 +85,14 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
     }
     let mut pace = Pace {
         speed: args.speed,
-        start: None,
+        first: None,
         stopped,
     };
     let mut seq = 0;
     let outcome = loop {
         match played.next() {
-            Ok(Some(Step { events, since, .. })) => {
-                if !pace.wait(since) || !print(events, &mut seq, &printer)? {
+            Ok(Some((events, at))) => {
+                if !pace.wait(at.mono) || !print(events, &mut seq, &printer)? {
                     return Ok(());
                 }
             }
@@ -100,7 +100,7 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
             Err(failure) => break Err(failure),
         }
     };
-    if let Some(model) = played.other_model() {
+    if let Some(model) = played.playback.other_model() {
         stderr_line!(
             "warning: {}: recorded with model {}, played with another",
             path.display(),
@@ -118,16 +118,16 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
 /// The timing of a replay.
 struct Pace<'a> {
     speed: Option<f64>,
-    /// When the first part was played.
-    start: Option<Instant>,
+    /// When the first part was played, and its moment.
+    first: Option<(Instant, Duration)>,
     stopped: &'a Receiver<()>,
 }
 
 impl Pace<'_> {
-    /// Waits until the part is due that came `since` after the first one. Returns `false` if the
-    /// replay was stopped.
-    fn wait(&mut self, since: Duration) -> bool {
-        let start = *self.start.get_or_insert_with(Instant::now);
+    /// Waits until the part of this moment is due. Returns `false` if the replay was stopped.
+    fn wait(&mut self, moment: Duration) -> bool {
+        let (start, first) = *self.first.get_or_insert_with(|| (Instant::now(), moment));
+        let since = moment.saturating_sub(first);
         let left = self.speed.map_or(Duration::ZERO, |speed| {
             let due = Duration::try_from_secs_f64(since.as_secs_f64() / speed);
             // A moment that is too far away to count never comes.

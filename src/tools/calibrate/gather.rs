@@ -65,7 +65,7 @@ pub(super) fn presses(
     let mut gathered = Gathered::default();
     Played::open(path, file, sensor, hrn, None)?.play(|played, mut events, at| {
         events.retain(|event| event.sensor() == sensor.name());
-        if let Some(pipeline) = played.pipeline(sensor.name()) {
+        if let Some(pipeline) = played.playback.pipeline(sensor.name()) {
             gathered.take(events, at, pipeline);
         }
     })?;

@@ -122,6 +122,14 @@ fn shown(view: &View, ms: u64, size: (u16, u16), look: Look) -> String {
     rows(&picture(view, ms, size, look)).join("\n")
 }
 
+/// Asserts that all `parts` are shown without colours on 24 rows.
+fn assert_shown(view: &View, ms: u64, width: u16, parts: &[&str]) {
+    let text = shown(view, ms, (width, 24), PLAIN);
+    for part in parts {
+        assert!(text.contains(part), "{part:?} not in\n{text}");
+    }
+}
+
 #[test]
 fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
     let mut view = live_sensor();
@@ -130,22 +138,19 @@ fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
     take_event(&mut view, 3_500, late);
     let frame = view.sensor().unwrap().frame.as_ref().unwrap();
     assert_eq!(frame.at, at(1_000).mono);
-    let text = shown(&view, 3_600, (80, 24), PLAIN);
-    assert!(text.contains("frame 2.6 s old"), "{text}");
+    assert_shown(&view, 3_600, 80, &["frame 2.6 s old"]);
 }
 
 #[test]
 fn what_is_not_live_is_not_shown_as_present() {
-    let live = shown(&pressed_sensor(), 300, (80, 24), PLAIN);
-    for part in [
+    let live = [
         "LIVE",
         "force 12.00 N on 8 taxels",
         "model built in (simulated data only)",
         "3 in contact",
         "frame 0.2 s old",
-    ] {
-        assert!(live.contains(part), "{part:?} not in\n{live}");
-    }
+    ];
+    assert_shown(&pressed_sensor(), 300, 80, &live);
     let lost = |state: &str, word: &str| {
         let mut view = pressed_sensor();
         take_event(&mut view, 2_000, status("forearm", state));
@@ -195,14 +200,9 @@ fn a_sensor_without_a_zero_shows_no_force_and_says_why() {
     let mut raw = frame("forearm", 1.2, 500);
     raw["force_n"] = json!(null);
     let view = view_of(&[(0, hello("a", &["forearm"])), (0, status), (100, raw)]);
+    let said = "(tare: contact: 512 taxels varied by 0.07 N or more)";
+    assert_shown(&view, 200, 140, &[" NO ZERO YET ", said, "force not known"]);
     let text = shown(&view, 200, (140, 24), PLAIN);
-    for part in [
-        " NO ZERO YET ",
-        "(tare: contact: 512 taxels varied by 0.07 N or more)",
-        "force not known",
-    ] {
-        assert!(text.contains(part), "{part:?} not in\n{text}");
-    }
     assert!(!text.contains("LIVE") && !text.contains("600"), "{text}");
 }
 
@@ -212,30 +212,21 @@ fn verdicts_stand_with_their_probabilities_newest_first() {
     take_event(&mut view, 9_000, verdict(4, None, Some("low_force")));
     take_event(&mut view, 9_100, status("forearm", "live"));
     let text = shown(&view, 10_200, (80, 24), PLAIN);
-    let lines: Vec<&str> = text
+    let lines = text
         .lines()
-        .map(|line| line.get(32..).unwrap_or("").trim_end())
+        .map(|line| line.get(32..).unwrap_or("").trim_end());
+    let lines: Vec<&str> = lines
+        .skip_while(|line| !line.starts_with("verdicts"))
         .collect();
-    let first = lines
-        .iter()
-        .position(|line| line.starts_with("verdicts"))
-        .unwrap();
-    assert_eq!(
-        lines[first],
-        "verdicts Shore OO, level, age; % of hard, firm"
-    );
-    assert_eq!(
-        lines[first + 1],
-        "  4 65 +- 6 OO, low force        1.2 s   12.3 N"
-    );
-    assert_eq!(
-        lines[first + 2],
-        "  3 65 +- 6 OO, firm              10 s   12.3 N"
-    );
-    assert_eq!(lines[first + 3], "");
-    let text = shown(&view, 10_200, (120, 24), PLAIN);
+    let expected = [
+        "verdicts Shore OO, level, age; % of hard, firm",
+        "  4 65 +- 6 OO, low force        1.2 s   12.3 N",
+        "  3 65 +- 6 OO, firm              10 s   12.3 N",
+        "",
+    ];
+    assert_eq!(lines[..4], expected);
     let whole = "  3 65 +- 6 OO, firm              10 s   12.3 N    7  93";
-    assert!(text.contains(whole), "{text}");
+    assert_shown(&view, 10_200, 120, &[whole]);
 }
 
 #[test]
@@ -247,17 +238,16 @@ fn every_sensor_has_its_link_in_view_and_its_picture_by_a_key() {
         (0, status("palm", "live")),
         (0, frame("palm", 2.0, 3)),
     ]);
-    let text = shown(&view, 100, (80, 24), PLAIN);
-    assert!(
-        text.contains(">1 forearm LIVE   2 wrist LOST   3 palm LIVE"),
-        "{text}"
+    assert_shown(
+        &view,
+        100,
+        80,
+        &[">1 forearm LIVE   2 wrist LOST   3 palm LIVE"],
     );
     view.press(KeyCode::BackTab.into());
-    assert_eq!(view.sensor().unwrap().name, "palm");
-    let text = shown(&view, 100, (80, 24), PLAIN);
-    assert!(text.contains("force 6.00 N"), "{text}");
+    assert_shown(&view, 100, 80, &[">3 palm", "force 6.00 N"]);
     // If not all sensors fit, the chosen one must be visible.
-    assert!(shown(&view, 100, (30, 24), PLAIN).contains(">3 palm LIVE"));
+    assert_shown(&view, 100, 30, &[">3 palm LIVE"]);
     view.press(KeyCode::Tab.into());
     assert_eq!(view.sensor().unwrap().name, "forearm");
     view.press(KeyCode::Char('2').into());
@@ -278,8 +268,12 @@ fn each_connection_begins_anew_and_shows_the_chosen_sensor() {
 
 #[test]
 fn without_colours_pressure_is_told_by_characters_and_no_name_turns_the_line() {
-    let text = shown(&pressed_sensor(), 300, (80, 24), PLAIN);
-    assert!(text.contains("@@@@@@@@"), "{text}");
+    let mut view = pressed_sensor();
+    assert_shown(&view, 300, 80, &["@@@@@@@@"]);
+    take_event(&mut view, 200, frame("forearm", 4.6, 3));
+    // A soft touch is seen after a hard one. The force is little more than the usual contact threshold.
+    take_event(&mut view, 300, frame("forearm", 0.08, 12));
+    assert_shown(&view, 400, 80, &["::::::::::::"]);
     let mut turned = hello("a", &["forearm"]);
     turned["robot"] = json!("b\u{202e}\u{e4}r-7");
     let turned = view_of(&[(0, turned)]);
@@ -314,39 +308,24 @@ fn a_person_says_what_is_pressed_and_sees_how_many_verdicts_are_right() {
         .chain([KeyCode::Backspace, KeyCode::Char('m')])
         .collect();
     assert_eq!(press(&mut view, &keys), None);
-    let asked = shown(&view, 300, (80, 24), PLAIN);
-    assert!(
-        asked.contains("pressing (a level, a name, or both; Enter): cup firm_"),
-        "{asked}"
-    );
+    let asked = "pressing (a level, a name, or both; Enter): cup firm_";
+    assert_shown(&view, 300, 80, &[asked]);
     let context = json!({"sensor": "forearm", "object": "cup", "level": 2});
     assert_eq!(
         press(&mut view, &[KeyCode::Enter]),
         Some(Order::Context(context.clone()))
     );
-    let begun = shown(&view, 300, (80, 24), PLAIN);
-    assert!(
-        begun.contains("pressing cup (firm): no verdict yet"),
-        "{begun}"
-    );
+    assert_shown(&view, 300, 80, &["pressing cup (firm): no verdict yet"]);
     for (number, level) in [(4, 2), (5, 1)] {
         let mut event = verdict(number, Some(level), None);
         event["context"] = context.clone();
         take_event(&mut view, 400, event);
     }
-    let counted = shown(&view, 500, (80, 24), PLAIN);
-    assert!(
-        counted.contains("pressing cup (firm): 1 of 2 right, 1 wrong"),
-        "{counted}"
-    );
-    assert_eq!(
-        press(
-            &mut view,
-            &[KeyCode::Char('p'), KeyCode::Char('q'), KeyCode::Esc]
-        ),
-        None
-    );
-    assert_eq!(press(&mut view, &[KeyCode::Char('q')]), Some(Order::Quit));
+    let counted = "pressing cup (firm): 1 of 2 right, 1 wrong";
+    assert_shown(&view, 500, 80, &[counted]);
+    let keys = ['p', 'q'].map(KeyCode::Char);
+    assert_eq!(press(&mut view, &[keys[0], keys[1], KeyCode::Esc]), None);
+    assert_eq!(press(&mut view, &keys[1..]), Some(Order::Quit));
 }
 
 #[test]
@@ -399,16 +378,6 @@ fn a_panic_gives_the_terminal_back() {
             .local_modes
             .contains(LocalModes::ECHO | LocalModes::ICANON)
     );
-}
-
-#[test]
-fn a_soft_touch_is_seen_after_a_hard_one() {
-    let mut view = pressed_sensor();
-    take_event(&mut view, 200, frame("forearm", 4.6, 3));
-    // The force is little more than the usual contact threshold.
-    take_event(&mut view, 300, frame("forearm", 0.08, 12));
-    let text = shown(&view, 400, (80, 24), PLAIN);
-    assert!(text.contains("::::::::::::"), "{text}");
 }
 
 #[test]

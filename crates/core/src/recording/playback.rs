@@ -8,8 +8,9 @@ use crate::event::Event;
 use crate::frame::Stamp;
 use crate::judge::{EndedPress, Unjudged};
 use crate::motion::Track;
-use crate::pipeline::Pipeline;
+use crate::pipeline::{Clock, Pipeline};
 use crate::press::End;
+use crate::sensor::Sensor;
 use crate::verdict::{Hrn, ModelError, TimeSeries};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
@@ -46,7 +47,8 @@ pub struct Playback {
 #[derive(Debug)]
 struct Player {
     pipeline: Pipeline,
-    last: Stamp,
+    /// The moment of the last entry. `None` for raw bytes, whose times come from the frame rate.
+    last: Option<Stamp>,
     labels: Labels,
     /// The SHA-256 of the model during recording.
     model: String,
@@ -85,9 +87,25 @@ impl Playback {
         }
     }
 
+    /// A playback of the raw bytes of a sensor. The moments of entries do not count: the frames get theirs from
+    /// the frame rate.
+    pub fn of_bytes(sensor: Sensor, hrn: Arc<Hrn>) -> Self {
+        let mut playback = Self::new(hrn.clone());
+        playback.players.push(Player {
+            model: hrn.sha256().to_owned(),
+            pipeline: Pipeline::new(sensor, hrn, Clock::FrameRate),
+            last: None,
+            labels: Labels::new(),
+        });
+        playback
+    }
+
     /// Keeps each press that ends, until [`Self::ended`] or [`Self::courses`] returns it.
     pub fn keep_courses(&mut self) {
         self.keeps_courses = true;
+        for player in &mut self.players {
+            player.pipeline.keep_courses();
+        }
     }
 
     /// The kept presses that were not returned yet. A state of a sensor forgets its own.
@@ -158,7 +176,7 @@ impl Playback {
                 }
                 let player = Player {
                     pipeline,
-                    last: at,
+                    last: Some(at),
                     labels: state.labels,
                     model: state.sensor.model_sha256,
                 };
@@ -180,7 +198,7 @@ impl Playback {
                 }
             }
             (Entry::Input(input), Some(known)) => {
-                known.last = at;
+                known.last = known.last.and(Some(at));
                 // What was refused then is refused now.
                 known.pipeline.take(input, at).unwrap_or_default()
             }
@@ -197,7 +215,7 @@ impl Playback {
     pub fn end(&mut self) -> Vec<Event> {
         let players = self.players.iter_mut();
         let mut events: Vec<Event> = players
-            .flat_map(|player| player.pipeline.end_of_recording(Some(player.last)))
+            .flat_map(|player| player.pipeline.end_of_recording(player.last))
             .collect();
         forget_boot(&mut events);
         events
