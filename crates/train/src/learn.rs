@@ -71,7 +71,7 @@ pub trait Learning {
     }
 
     /// The graph of the exported file, up to the logits.
-    fn graph(&self, weights: &[Weights]) -> Recogniser;
+    fn graph(&self, weights: &[Weights]) -> Graph;
 }
 
 /// A stage before its first step, and how it goes on.
@@ -108,15 +108,6 @@ impl Question {
             references: Vec::new(),
         }
     }
-}
-
-/// A graph from a model's inputs to logits.
-#[derive(Debug, Clone)]
-pub struct Recogniser {
-    /// The nodes.
-    pub graph: Graph,
-    /// What the graph takes.
-    pub inputs: Inputs,
 }
 
 /// What logits are of.

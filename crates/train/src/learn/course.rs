@@ -7,10 +7,11 @@ use burn::tensor::{Device, Tensor};
 
 use self::lots::Lots;
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Recogniser, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Taken};
 use crate::data::presses::{Presses, Timed};
 use crate::net::bins::{self, BINS};
 use crate::net::course;
+use crate::net::graph::Graph;
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
@@ -273,14 +274,11 @@ impl Learning for Course<'_> {
     }
 
     /// A network that met no references in training takes none.
-    fn graph(&self, weights: &[Weights]) -> Recogniser {
+    fn graph(&self, weights: &[Weights]) -> Graph {
         let inputs = match self.lots.have_references() {
             true => Inputs::References,
             false => Inputs::Features,
         };
-        Recogniser {
-            graph: course::graph(&weights[0], &self.standard, inputs),
-            inputs,
-        }
+        course::graph(&weights[0], &self.standard, inputs)
     }
 }

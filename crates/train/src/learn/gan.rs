@@ -9,9 +9,10 @@ use burn::tensor::{Device, Tensor};
 
 use super::hrn::{Frames, Hrn};
 use super::learner::Learner;
-use super::{Learning, Outputs, Plan, Question, Recogniser, Taken};
+use super::{Learning, Outputs, Plan, Question, Taken};
 use crate::data::presses::Presses;
 use crate::net::generator;
+use crate::net::graph::Graph;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::losses::{self, Game, Judged};
@@ -196,7 +197,7 @@ impl Learning for Gan<'_> {
         Outputs::Levels
     }
 
-    fn graph(&self, weights: &[Weights]) -> Recogniser {
+    fn graph(&self, weights: &[Weights]) -> Graph {
         let (hrn, weights) = self.recogniser(weights);
         hrn.graph(&weights)
     }

@@ -3,9 +3,10 @@
 use burn::tensor::{Device, Tensor};
 
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Recogniser, Taken};
+use super::{Learning, Outputs, Plan, Question, Taken};
 use crate::data::augment;
 use crate::data::presses::Presses;
+use crate::net::graph::Graph;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::network::{Normalisation, Statistics, Weights, numbers};
@@ -182,11 +183,7 @@ impl Learning for Hrn<'_> {
         Outputs::Levels
     }
 
-    fn graph(&self, weights: &[Weights]) -> Recogniser {
-        let statistics = self.statistics(&weights[0]);
-        Recogniser {
-            graph: hrn::graph(&weights[0], &statistics, self.on.scale),
-            inputs: Inputs::Frame,
-        }
+    fn graph(&self, weights: &[Weights]) -> Graph {
+        hrn::graph(&weights[0], &self.statistics(&weights[0]), self.on.scale)
     }
 }

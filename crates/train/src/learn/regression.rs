@@ -11,7 +11,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use liblbfgs::lbfgs;
 
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Recogniser, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Taken};
 use crate::data::presses::Presses;
 use crate::net::graph::{Graph, RAW};
 use crate::net::network::{Weights, dense, numbers};
@@ -246,22 +246,23 @@ impl Learning for Regression<'_> {
         Outputs::Levels
     }
 
-    fn graph(&self, weights: &[Weights]) -> Recogniser {
-        let mut graph = Graph::of(&weights[0]);
-        let (inputs, seen) = match self.seen {
+    fn graph(&self, weights: &[Weights]) -> Graph {
+        let (inputs, mut columns) = match self.seen {
             Seen::Unloaded(_) => unreachable!("a control is never written"),
             Seen::Features => (Inputs::Features, "features"),
-            Seen::Parts(array, bend_n) => {
-                let flat = format!("flat = Reshape(parts, [1x{}])", self.seen.columns());
-                graph.add(&flat);
-                let log = format!("Log(Add(Div(Abs(flat), {bend_n}), 1))");
-                graph.add(&format!("seen = Mul(Sign(flat), {log})"));
-                (Inputs::Parts(array), "seen")
-            }
+            Seen::Parts(array, _) => (Inputs::Parts(array), "parts"),
         };
-        self.standard.add_to(&mut graph, seen);
+        let mut graph = Graph::of(&weights[0], inputs);
+        if let Seen::Parts(_, bend_n) = self.seen {
+            let width = self.seen.columns();
+            graph.add(&format!("flat = Reshape(parts, [1x{width}])"));
+            let log = format!("Log(Add(Div(Abs(flat), {bend_n}), 1))");
+            graph.add(&format!("seen = Mul(Sign(flat), {log})"));
+            columns = "seen";
+        }
+        self.standard.add_to(&mut graph, columns);
         graph.add(&format!("{RAW} = Dense(standardised, levels)"));
-        Recogniser { graph, inputs }
+        graph
     }
 }
 

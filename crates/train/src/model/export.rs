@@ -15,7 +15,8 @@ use crate::data::presses::{Presses, Timed};
 use crate::data::source::{Kind, Source};
 use crate::judge::evaluated::Evaluated;
 use crate::learn::calibration::Calibration;
-use crate::learn::{Inputs, Learning, Outputs, Question, Recogniser};
+use crate::learn::{Inputs, Learning, Outputs, Question};
+use crate::net::graph::Graph;
 use crate::net::network::Weights;
 use crate::run::{Description, Run};
 use hardnessd_core::press;
@@ -74,11 +75,11 @@ impl Learnt<'_> {
     ///
     /// Fails if the card cannot be written as JSON.
     pub fn bytes(&self, card: &Card) -> anyhow::Result<Vec<u8>> {
-        let recogniser = self.learning.graph(self.weights);
+        let graph = self.learning.graph(self.weights);
         let outputs = self.learning.outputs();
-        let checks = self.checks(&recogniser, &outputs);
+        let checks = self.checks(&graph, &outputs);
         let temperature = self.calibration.temperature;
-        file::bytes(&recogniser, &outputs, temperature, card, &checks)
+        file::bytes(&graph, &outputs, temperature, card, &checks)
     }
 
     /// What the file says of itself before it is measured. `sources` are the files of the data.
@@ -87,11 +88,11 @@ impl Learnt<'_> {
     ///
     /// Fails if the names of the files cannot be written as JSON.
     pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
-        let recogniser = self.learning.graph(self.weights);
+        let graph = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
         let best = self.train.iter().map(|&press| self.presses.frame(press));
         let mut range = range(best);
-        let (format, conformal) = match recogniser.inputs {
+        let (format, conformal) = match graph.inputs {
             Inputs::Frame | Inputs::Parts(_) => ("1", None),
             Inputs::Features | Inputs::References => {
                 if let Some(missing) = self.calibration.missing() {
@@ -116,7 +117,7 @@ impl Learnt<'_> {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
                 ..range
             },
-            grid: match recogniser.inputs {
+            grid: match graph.inputs {
                 Inputs::Parts(array) => Some(array),
                 _ => None,
             },
@@ -126,9 +127,9 @@ impl Learnt<'_> {
 
     /// Two presses of each level, and what the trainer's network says of them. Of a model that takes
     /// references, every second press has some.
-    fn checks(&self, recogniser: &Recogniser, outputs: &Outputs) -> Checks {
+    fn checks(&self, graph: &Graph, outputs: &Outputs) -> Checks {
         let places = self.checked();
-        let references = match recogniser.inputs {
+        let references = match graph.inputs {
             Inputs::References => self.check_references(),
             _ => Vec::new(),
         };
@@ -144,8 +145,8 @@ impl Learnt<'_> {
         let rows = self.learning.judge(self.weights, &questions, None);
         let temperature = self.calibration.temperature;
         let probabilities = |row: &Vec<f32>| outputs.probabilities(row, temperature);
-        if let Inputs::Frame | Inputs::Parts(_) = recogniser.inputs {
-            let newtons = |&press: &usize| match recogniser.inputs {
+        if let Inputs::Frame | Inputs::Parts(_) = graph.inputs {
+            let newtons = |&press: &usize| match graph.inputs {
                 Inputs::Parts(array) => self.presses.parts(press, array),
                 _ => self.presses.frame(press).newtons.to_vec(),
             };

@@ -6,10 +6,10 @@
 use prost::Message as _;
 use tract_onnx::pb;
 
-use crate::learn::{Inputs, Outputs, Recogniser};
+use crate::learn::{Inputs, Outputs};
 use crate::net::bins::{BINS, LIFTS};
 use crate::net::course::{EMBEDDING, REFERENCES};
-use crate::net::graph::{INPUT, RAW, model, value_info};
+use crate::net::graph::{Graph, INPUT, RAW, model, value_info};
 use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::parts::PARTS;
@@ -21,13 +21,13 @@ use hardnessd_core::verdict::{COLS, Card, Checks, PIECE, ROWS};
 ///
 /// Fails if the metadata cannot be written as JSON.
 pub fn bytes(
-    recogniser: &Recogniser,
+    graph: &Graph,
     outputs: &Outputs,
     temperature: f32,
     card: &Card,
     checks: &Checks,
 ) -> anyhow::Result<Vec<u8>> {
-    let mut graph = recogniser.graph.clone();
+    let mut graph = graph.clone();
     let mut given = match outputs {
         Outputs::Levels => {
             graph.add(&format!("logits = Div({RAW}, {temperature})"));
@@ -45,7 +45,7 @@ pub fn bytes(
         }
     };
     let features = value_info("features", &[1, FEATURES]);
-    let taken = match recogniser.inputs {
+    let taken = match graph.inputs {
         Inputs::Frame => vec![value_info(INPUT, &[1, 1, ROWS, COLS])],
         Inputs::Parts(Array { rows, cols }) => vec![value_info("parts", &[1, PARTS, rows, cols])],
         Inputs::Features => vec![features],

@@ -209,7 +209,7 @@ fn reference_formulas() -> String {
 /// The graph from the inputs of format 3 to the logits of the bins, before temperature. The press's embedding
 /// as a reference is in `reference`, if the model takes references.
 pub fn graph(weights: &Weights, standard: &Standard, inputs: Inputs) -> Graph {
-    let mut graph = Graph::of(weights);
+    let mut graph = Graph::of(weights, inputs);
     standard.add_to(&mut graph, "features");
     if inputs == Inputs::References {
         graph.constant("each reference", &[REFERENCES, 1], &[1.0; REFERENCES]);

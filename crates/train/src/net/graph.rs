@@ -32,8 +32,10 @@ pub enum Inputs {
 }
 
 /// The nodes and constants of a graph under construction. A name identifies each value.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Graph {
+    /// What the graph takes.
+    pub inputs: Inputs,
     weights: Weights,
     nodes: Vec<pb::NodeProto>,
     constants: Vec<pb::TensorProto>,
@@ -43,10 +45,13 @@ pub struct Graph {
 
 impl Graph {
     /// A graph of a network with these weights.
-    pub fn of(weights: &Weights) -> Self {
+    pub fn of(weights: &Weights, inputs: Inputs) -> Self {
         Self {
+            inputs,
             weights: weights.clone(),
-            ..Self::default()
+            nodes: Vec::new(),
+            constants: Vec::new(),
+            values: 0,
         }
     }
 

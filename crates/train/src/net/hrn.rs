@@ -5,7 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::net::graph::{Graph, RAW};
+use crate::net::graph::{Graph, Inputs, RAW};
 use crate::net::image::PixelScale;
 use crate::net::layers::STRIDE;
 use crate::net::network::{
@@ -93,7 +93,7 @@ pub fn targets(
 /// The graph from newtons to logits. The inference library fuses batch normalisation with the convolution
 /// before it.
 pub fn graph(weights: &Weights, statistics: &Statistics, scale: PixelScale) -> Graph {
-    let mut graph = Graph::of(weights);
+    let mut graph = Graph::of(weights, Inputs::Frame);
     // `network::trunk` raises the image by 1, too.
     graph.add(&scale.formula());
     let (mut x, mut size) = ("image".to_owned(), 0);
