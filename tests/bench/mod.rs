@@ -1,26 +1,32 @@
-//! The real binary on a real pty, with sockets and configurations: shared by the tests of the
-//! daemon.
+//! The real binary on a real pty, with sockets and configurations, in a directory of its own.
 #![allow(
     unreachable_pub,
     reason = "the binary of the tests has it as a module of its own"
 )]
 
+mod http;
 #[path = "../../src/tools/pty/pair.rs"]
 pub mod pair;
+mod subscriber;
+mod terminal;
 
 use std::fs::{self, File};
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{SocketAddr, TcpStream};
-use std::os::unix::net::UnixStream;
+use std::io::{BufRead, BufReader, Read};
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use pair::Pair;
+use hardnessd_core::frame::RawFrame;
+use hardnessd_core::recording::{Found, Reader};
+use hardnessd_core::wire::{Layout, Settings};
+pub use http::{Answer, HTTP, answer, ask, get, open};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+pub use subscriber::Subscriber;
+pub use terminal::{Terminal, on_terminal};
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
 
@@ -40,9 +46,57 @@ pub const PATIENCE: Duration = Duration::from_secs(60);
 /// How long a process may take to end by itself.
 const FAREWELL: Duration = Duration::from_secs(2);
 
+/// The program with the words of `line` as its arguments, in the directory of the sources.
+///
+/// SIGHUP is as a terminal has it. Tests may run under `nohup`, whose setting is inherited.
+pub fn command(line: &str) -> Command {
+    let mut command = Command::new("env");
+    command
+        .args(["--default-signal=HUP", BINARY])
+        .args(line.split_whitespace());
+    command
+}
+
+/// Runs a command to its end. Returns exit code, stdout and stderr.
+pub fn ran(command: &mut Command) -> (i32, String, String) {
+    let output = command.output().unwrap();
+    let [stdout, stderr] =
+        [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    (output.status.code().unwrap(), stdout, stderr)
+}
+
+/// Runs the program in the directory of the sources.
+pub fn run(line: &str) -> (i32, String, String) {
+    ran(&mut command(line))
+}
+
+/// An address that nobody has, neither over TCP nor over UDP.
+pub fn free_address() -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    UdpSocket::bind(address).map_or_else(|_| free_address(), |_| address)
+}
+
+/// The bytes of a frame of the JX255N that has these counts on 36 taxels in its middle.
+pub fn frame(counts: f32) -> Vec<u8> {
+    let mut raw = RawFrame::default();
+    for row in 11..17 {
+        raw.counts[row * 28 + 11..row * 28 + 17].fill(counts);
+    }
+    let mut bytes = Vec::new();
+    let layout = Layout::new(&Settings::default()).unwrap();
+    layout.encode(&raw, &mut bytes);
+    bytes
+}
+
 /// A directory with a port, a socket and a configuration.
 pub struct Bench {
     directory: tempfile::TempDir,
+}
+
+/// The table of a sensor. Further keys may follow.
+pub fn sensor(name: &str, port: &str, fps: u32) -> String {
+    format!("[[sensor]]\nname = \"{name}\"\nport = \"{port}\"\nframe_rate_hz = {fps}.0\n")
 }
 
 impl Bench {
@@ -56,6 +110,10 @@ impl Bench {
         self.directory.path().join(name)
     }
 
+    pub fn text_path(&self, name: &str) -> String {
+        self.path(name).to_str().unwrap().to_owned()
+    }
+
     /// Makes a pipe with a name.
     pub fn fifo(&self, name: &str) -> PathBuf {
         let path = self.path(name);
@@ -64,50 +122,115 @@ impl Bench {
         path
     }
 
-    /// Writes a configuration of one sensor at 20 frames/s, with `more` tables.
-    pub fn configure(&self, name: &str, socket: &str, more: &str) -> PathBuf {
-        let path = self.path(name);
-        let text = format!(
-            "robot = \"arm-7\"\n[[sensor]]\nname = \"forearm\"\nport = \"port\"\n\
-             frame_rate_hz = 20.0\n[publish.unix]\npath = \"{socket}\"\n{more}"
-        );
-        fs::write(&path, text).unwrap();
-        path
+    pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        fs::write(self.path(name), content).unwrap();
     }
 
+    pub fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap()
+    }
+
+    /// Writes `hardnessd.toml` with these sensors. `more` begins with keys of `[publish.unix]`.
+    pub fn configure(&self, sensors: &str, more: &str) {
+        let unix = "[publish.unix]\npath = \"events.sock\"\n";
+        self.write(
+            "hardnessd.toml",
+            format!("robot = \"arm-7\"\n{sensors}{unix}{more}"),
+        );
+    }
+
+    /// The same with one sensor at 20 frames/s.
+    pub fn configure_forearm(&self, more: &str) {
+        self.configure(&sensor("forearm", "port", 20), more);
+    }
+
+    /// The program in this directory.
+    pub fn command(&self, line: &str) -> Command {
+        let mut command = command(line);
+        command.current_dir(self.directory.path());
+        command
+    }
+
+    /// Starts the program in this directory. Nothing is read of what it writes.
+    pub fn start(&self, line: &str) -> Process {
+        let mut command = self.command(line);
+        command.stdout(Stdio::null()).stderr(Stdio::null());
+        Process::start(&mut command)
+    }
+
+    /// Runs the program in this directory. Returns exit code, stdout and stderr.
+    pub fn run(&self, line: &str) -> (i32, String, String) {
+        ran(&mut self.command(line))
+    }
+
+    /// The output of the program, which does what it is asked.
+    pub fn succeeds(&self, line: &str) -> String {
+        let (code, stdout, stderr) = self.run(line);
+        assert_eq!(code, 0, "{line}: {stderr}");
+        stdout
+    }
+
+    /// The program must fail with this exit code and one line that has all these parts.
+    pub fn fails(&self, line: &str, code: i32, parts: &[&str]) {
+        let (found, _, stderr) = self.run(line);
+        assert_eq!(
+            (found, stderr.lines().count()),
+            (code, 1),
+            "{line}: {stderr}"
+        );
+        for part in parts {
+            assert!(stderr.contains(part), "{line}: {part:?} not in {stderr:?}");
+        }
+    }
+
+    /// The final verdicts of a replay.
+    pub fn finals(&self, arguments: &str) -> Vec<Value> {
+        let mut events = events(&self.succeeds(&format!("replay --json {arguments}")));
+        events.retain(|event| event["phase"] == "final");
+        events
+    }
+
+    /// A daemon of one sensor at 20 frames/s.
     pub fn daemon(&self) -> Daemon {
         self.daemon_with("")
     }
 
-    /// A daemon of one sensor, with `more` tables.
+    /// The same with more tables.
     pub fn daemon_with(&self, more: &str) -> Daemon {
-        Daemon::start(&self.configure("hardnessd.toml", "events.sock", more))
+        self.configure_forearm(more);
+        self.daemon_as_configured()
+    }
+
+    /// A daemon of these sensors, with more tables.
+    pub fn daemon_of(&self, sensors: &str, more: &str) -> Daemon {
+        self.configure(sensors, more);
+        self.daemon_as_configured()
+    }
+
+    pub fn daemon_as_configured(&self) -> Daemon {
+        Daemon::start(self.command("run --config hardnessd.toml"))
     }
 
     pub fn subscriber(&self) -> Subscriber {
         Subscriber::connect(&self.path("events.sock"))
     }
 
+    pub fn control(&self) -> Subscriber {
+        Subscriber::connect(&self.path("control.sock"))
+    }
+
     /// A sensor at the port, with enough force that every contact counts as a press.
-    pub fn sensor(&self, more: &[&str]) -> Process {
-        self.sensor_at("port", 20, more)
+    pub fn sensor(&self, options: &str) -> Process {
+        self.sensor_at("port", 20, options)
     }
 
     /// A sensor at another port and rate.
-    pub fn sensor_at(&self, port: &str, fps: u32, more: &[&str]) -> Process {
+    pub fn sensor_at(&self, port: &str, fps: u32, options: &str) -> Process {
         let link = self.path(port);
         // A killed sensor leaves its link, which must not be taken for that of the new sensor.
         let _ = fs::remove_file(&link);
-        let mut command = by_terminal();
-        command.args(["simulate", "--force", "15", "--material", "hard-plastic"]);
-        command
-            .args(["--fps", &fps.to_string()])
-            .arg("--link")
-            .arg(&link)
-            .args(more)
-            .stdout(Stdio::null())
-            .stderr(Stdio::null());
-        let sensor = Process(command.spawn().unwrap());
+        let usual = format!("--force 15 --material hard-plastic --fps {fps} --link {port}");
+        let sensor = self.start(&format!("simulate {usual} {options}"));
         wait_for("the port", || {
             fs::read_link(&link).is_ok_and(|pty| pty.exists())
         });
@@ -122,34 +245,60 @@ impl Bench {
         fs::remove_file(self.path("port")).unwrap();
         sensor.0.kill().unwrap();
     }
-}
 
-/// The program with SIGHUP as a terminal starts it. Tests may run under `nohup`, whose setting is
-/// inherited.
-pub fn by_terminal() -> Command {
-    let mut command = Command::new("env");
-    command.args(["--default-signal=HUP", BINARY]);
-    command
+    /// All entries of a recording.
+    pub fn entries(&self, recording: &str) -> Vec<Found> {
+        let file = BufReader::new(File::open(self.path(recording)).unwrap());
+        Reader::new(file).map(Result::unwrap).collect()
+    }
+
+    /// The names of the files in the directory `rec` that begin with `what`, with `rec/`, sorted.
+    pub fn recordings(&self, what: &str) -> Vec<String> {
+        let found = fs::read_dir(self.path("rec")).into_iter().flatten();
+        let names = found.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.filter(|name| name.starts_with(what)).collect();
+        names.sort();
+        names.iter().map(|name| format!("rec/{name}")).collect()
+    }
 }
 
 /// A process that does not outlive its test.
 pub struct Process(pub Child);
 
 impl Process {
+    pub fn start(command: &mut Command) -> Self {
+        Self(command.spawn().unwrap())
+    }
+
     pub fn signal(&self, signal: Signal) {
         let pid = Pid::from_raw(i32::try_from(self.0.id()).unwrap()).unwrap();
         kill_process(pid, signal).unwrap();
     }
 
     pub fn exit_code(&mut self) -> Option<i32> {
+        let mut status = None;
+        wait_for("the end of the process", || {
+            status = self.0.try_wait().unwrap();
+            status.is_some()
+        });
+        status.unwrap().code()
+    }
+
+    /// What it wrote to stderr, until its end.
+    pub fn errors(&mut self) -> String {
+        let mut text = String::new();
+        let mut stderr = self.0.stderr.take().unwrap();
+        stderr.read_to_string(&mut text).unwrap();
+        text
+    }
+
+    /// It must end soon after this signal, with this exit code.
+    pub fn ends_at(&mut self, signal: Signal, code: i32) {
         let start = Instant::now();
-        loop {
-            if let Some(status) = self.0.try_wait().unwrap() {
-                return status.code();
-            }
-            assert!(start.elapsed() < PATIENCE, "the process does not end");
-            std::thread::sleep(Duration::from_millis(2));
-        }
+        self.signal(signal);
+        assert_eq!(self.exit_code(), Some(code), "{signal:?}");
+        let took = start.elapsed();
+        assert!(took < Duration::from_secs(5), "{signal:?}: {took:?}");
     }
 }
 
@@ -167,48 +316,6 @@ impl Drop for Process {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
-}
-
-/// Starts a command on a terminal. Returns its process, and what it writes.
-///
-/// The command must be run by `setsid`, which keeps it from using the terminal that the test was
-/// started from.
-pub fn start_on(pair: &Pair, mut command: Command) -> (Process, mpsc::Receiver<Vec<u8>>) {
-    let end = || Stdio::from(pair.device.try_clone().unwrap());
-    command.stdin(end()).stdout(end()).stderr(end());
-    let process = Process(command.spawn().unwrap());
-    let mut output = File::from(pair.master.try_clone().unwrap());
-    let (sender, bytes) = mpsc::channel();
-    std::thread::spawn(move || {
-        let mut read = [0; 4096];
-        while let Ok(length @ 1..) = output.read(&mut read) {
-            if sender.send(read[..length].to_vec()).is_err() {
-                return;
-            }
-        }
-    });
-    (process, bytes)
-}
-
-/// The output of a program on a terminal until the program ends, and its exit code.
-pub fn on_a_terminal(mut command: Command, stop_after: Option<&str>) -> (String, Option<i32>) {
-    let Pair { master, device, .. } = Pair::open().unwrap();
-    command.stdout(Stdio::from(device)).stderr(Stdio::null());
-    let mut process = Process(command.spawn().unwrap());
-    // `command` holds the last descriptor of the device.
-    drop(command);
-    let text = |written: &[u8]| String::from_utf8(written.to_vec()).unwrap();
-    let mut written = Vec::new();
-    let mut master = File::from(master);
-    let mut read = [0; 4096];
-    while let Ok(length @ 1..) = master.read(&mut read) {
-        written.extend(&read[..length]);
-        if stop_after.is_some_and(|part| text(&written).contains(part)) {
-            process.signal(Signal::INT);
-        }
-    }
-    let written = text(&written).replace("\r\n", "\n");
-    (written, process.exit_code())
 }
 
 /// The lines that a process writes.
@@ -254,19 +361,10 @@ pub struct Daemon {
 
 impl Daemon {
     /// Starts a daemon and waits until it serves.
-    pub fn start(config: &Path) -> Self {
-        let mut process = Process(
-            Command::new(BINARY)
-                .args(["run", "--config"])
-                .arg(config)
-                .env("RUST_LOG", "info")
-                // Own presses of one test are none of another.
-                .env_remove("XDG_STATE_HOME")
-                .env_remove("HOME")
-                .stderr(Stdio::piped())
-                .spawn()
-                .unwrap(),
-        );
+    fn start(mut command: Command) -> Self {
+        // Own presses of one test are none of another.
+        command.env_remove("XDG_STATE_HOME").env_remove("HOME");
+        let mut process = Process::start(command.env("RUST_LOG", "info").stderr(Stdio::piped()));
         let log = Lines::of(process.0.stderr.take().unwrap());
         let mut daemon = Self { process, log };
         daemon.logged("started");
@@ -274,7 +372,7 @@ impl Daemon {
     }
 
     /// The address of `way`, including the port.
-    pub fn address(&mut self, way: &str) -> SocketAddr {
+    pub fn address(&self, way: &str) -> SocketAddr {
         let part = format!("way=\"{way}\"");
         // All addresses are logged before "started".
         let line = self.log.seen.iter().find(|line| line.contains(&part));
@@ -283,14 +381,16 @@ impl Daemon {
         address.trim().parse().unwrap()
     }
 
-    /// Asks it to end, which it does without an error.
-    pub fn end(&mut self) {
-        self.process.signal(Signal::TERM);
-        assert_eq!(self.process.exit_code(), Some(0));
+    /// Reads the configuration again. Returns the line that says what came of it.
+    pub fn reload(&mut self, answer: &str) -> String {
+        self.process.signal(Signal::HUP);
+        self.logged(answer)
     }
 
-    /// The whole log, once the daemon has ended.
-    pub fn whole_log(&mut self) -> String {
+    /// Asks it to end, which it does without an error. Returns the whole log.
+    pub fn end(&mut self) -> String {
+        self.process.signal(Signal::TERM);
+        assert_eq!(self.process.exit_code(), Some(0));
         self.log.seen.extend(self.log.lines.iter());
         self.log.seen.join("\n")
     }
@@ -301,95 +401,12 @@ impl Daemon {
     }
 }
 
-/// The stream of a connection.
-pub trait Stream: Read + Write + Send {}
-impl<S: Read + Write + Send> Stream for S {}
-
-/// A connection to a socket.
-pub struct Subscriber {
-    pub lines: BufReader<Box<dyn Stream>>,
-}
-
-impl Subscriber {
-    /// Connects to a socket of a daemon that may still be starting.
-    pub fn connect(socket: &Path) -> Self {
-        let mut stream = UnixStream::connect(socket);
-        wait_for("the socket", || {
-            if stream.is_err() {
-                stream = UnixStream::connect(socket);
-            }
-            stream.is_ok()
-        });
-        let stream = stream.unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        Self {
-            lines: BufReader::new(Box::new(stream)),
-        }
-    }
-
-    pub fn over_tcp(address: SocketAddr) -> Self {
-        let stream = TcpStream::connect(address).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        Self {
-            lines: BufReader::new(Box::new(stream)),
-        }
-    }
-
-    /// Sends a line and waits for the answer.
-    pub fn ask(&mut self, line: &str) -> Value {
-        self.send_line(line);
-        loop {
-            let answer = self.next().unwrap();
-            if ["ok", "error"].contains(&answer["type"].as_str().unwrap()) {
-                return answer;
-            }
-        }
-    }
-
-    pub fn send_line(&mut self, line: &str) {
-        self.lines
-            .get_mut()
-            .write_all(format!("{line}\n").as_bytes())
-            .unwrap();
-    }
-
-    /// The next line. `None` if the connection is closed.
-    pub fn next(&mut self) -> Option<Value> {
-        let mut line = String::new();
-        (self.lines.read_line(&mut line).unwrap() > 0).then(|| serde_json::from_str(&line).unwrap())
-    }
-
-    /// Reads until a line has all of `fields`.
-    pub fn until(&mut self, fields: &Value) -> Value {
-        let fields = fields.as_object().unwrap();
-        loop {
-            let line = self
-                .next()
-                .unwrap_or_else(|| panic!("closed before {fields:?}"));
-            if fields.iter().all(|(key, value)| &line[key] == value) {
-                return line;
-            }
-        }
-    }
-}
-
 pub fn wait_for(what: &str, mut there: impl FnMut() -> bool) {
     let start = Instant::now();
     while !there() {
         assert!(start.elapsed() < PATIENCE, "{what} does not come");
         std::thread::sleep(Duration::from_millis(2));
     }
-}
-
-/// What the web server at `address` answers, with its head.
-pub fn get(address: &str, path: &str) -> String {
-    let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
-    stream.write_all(request.as_bytes()).unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    answer
 }
 
 /// The events in lines of JSON.
@@ -407,48 +424,4 @@ pub fn timeless(mut event: Value) -> Value {
         }
     }
     event
-}
-
-/// The files in a directory whose names begin with `what`, sorted.
-pub fn recordings_in(directory: &Path, what: &str) -> Vec<PathBuf> {
-    let Ok(found) = fs::read_dir(directory) else {
-        return Vec::new();
-    };
-    let mut found: Vec<PathBuf> = found.map(|entry| entry.unwrap().path()).collect();
-    found.retain(|path| {
-        path.file_name()
-            .unwrap()
-            .to_str()
-            .unwrap()
-            .starts_with(what)
-    });
-    found.sort();
-    found
-}
-
-pub fn hardnessd(arguments: &[&str]) -> Output {
-    Command::new(BINARY).args(arguments).output().unwrap()
-}
-
-/// Runs the binary to its end. Returns exit code, stdout and stderr.
-pub fn run(arguments: &[&str]) -> (i32, String, String) {
-    ran(Command::new(BINARY).args(arguments))
-}
-
-/// Runs a command to its end. Returns exit code, stdout and stderr.
-pub fn ran(command: &mut Command) -> (i32, String, String) {
-    let output = command.output().unwrap();
-    let [stdout, stderr] =
-        [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
-    (output.status.code().unwrap(), stdout, stderr)
-}
-
-/// The binary must fail with this exit code and one line that has all these parts.
-pub fn fails(arguments: &[&str], code: i32, parts: &[&str]) {
-    let (found, _, stderr) = run(arguments);
-    assert_eq!(found, code, "{arguments:?}: {stderr}");
-    assert_eq!(stderr.lines().count(), 1, "{stderr}");
-    for part in parts {
-        assert!(stderr.contains(part), "{part:?} not in {stderr:?}");
-    }
 }

@@ -3,9 +3,8 @@
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
-use std::process::Stdio;
 
-use crate::bench::{Bench, PATIENCE, Process, by_terminal, fails, wait_for};
+use crate::bench::{Bench, PATIENCE, wait_for};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -20,48 +19,30 @@ impl Controller {
     }
 
     fn order(&mut self, line: &str) -> Value {
-        self.0
-            .get_mut()
-            .write_all(format!("{line}\n").as_bytes())
-            .unwrap();
+        writeln!(self.0.get_mut(), "{line}").unwrap();
         let mut answer = String::new();
         self.0.read_line(&mut answer).unwrap();
         serde_json::from_str(&answer).unwrap()
     }
 
-    /// Waits until the arm is where it should go. Returns the state then.
+    /// Waits until the arm is where it should go. Returns what is true then.
     fn arrive(&mut self) -> Value {
         let mut state = Value::Null;
         wait_for("the arm", || {
             state = self.order("{}");
             state["at_mm"] == state["to_mm"]
         });
-        state
+        state["truth"].clone()
     }
-}
-
-fn simulator(bench: &Bench) -> Process {
-    let mut command = by_terminal();
-    let options = "simulate --fps 20 --material wood --material foam";
-    command
-        .args(options.split(' '))
-        .arg("--link")
-        .arg(bench.path("port"))
-        .arg("--arm")
-        .arg(bench.path("arm.sock"))
-        .stdout(Stdio::null())
-        .stderr(Stdio::null());
-    let simulator = Process(command.spawn().unwrap());
-    wait_for("the arm's socket", || {
-        UnixStream::connect(bench.path("arm.sock")).is_ok()
-    });
-    simulator
 }
 
 #[test]
 fn an_arm_stops_without_its_controller_and_at_a_force_and_refuses_what_it_cannot_do() {
     let bench = Bench::new();
-    let mut simulator = simulator(&bench);
+    let options = "--fps 20 --material wood --material foam --link port --arm arm.sock";
+    let mut simulator = bench.start(&format!("simulate {options}"));
+    let arm = bench.path("arm.sock");
+    wait_for("the arm's socket", || UnixStream::connect(&arm).is_ok());
     let mut controller = Controller::connect(&bench);
     for (line, expected) in [
         (r#"{"to_mm": 31}"#, "to_mm: found 31"),
@@ -86,25 +67,25 @@ fn an_arm_stops_without_its_controller_and_at_a_force_and_refuses_what_it_cannot
     assert_eq!(state["at_mm"], state["to_mm"], "the arm waits: {state}");
     // 30 mm would be 250 N on wood.
     controller.order(r#"{"to_mm": 30, "speed_mm_s": 20}"#);
-    let state = controller.arrive();
-    let truth = &state["truth"];
+    let truth = controller.arrive();
     let force_n = truth["greatest_n"].as_f64().unwrap();
-    assert!((50.0..80.0).contains(&force_n), "{state}");
+    assert!((50.0..80.0).contains(&force_n), "{truth}");
     assert_eq!(
         (&truth["material"], &truth["level"]),
         (&json!("wood"), &json!(1))
     );
     controller.order(r#"{"to_mm": 0, "speed_mm_s": 20}"#);
-    assert_eq!(controller.arrive()["truth"]["force_n"], 0.0);
+    assert_eq!(controller.arrive()["force_n"], 0.0);
     let truth = controller.order(r#"{"object": 2}"#)["truth"].clone();
     assert_eq!(
         (&truth["material"], &truth["greatest_n"]),
         (&json!("foam"), &json!(0.0))
     );
-    let arm = bench.path("arm.sock");
-    let again = ["simulate", "--arm", arm.to_str().unwrap()];
-    fails(&again, 74, &["a daemon serves ", "stop it"]);
-    simulator.signal(Signal::TERM);
-    assert_eq!(simulator.exit_code(), Some(0));
+    bench.fails(
+        "simulate --arm arm.sock",
+        74,
+        &["a daemon serves ", "stop it"],
+    );
+    simulator.ends_at(Signal::TERM, 0);
     assert!(!arm.exists());
 }

@@ -8,43 +8,25 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, wait_for};
-use hardnessd_core::frame::RawFrame;
-use hardnessd_core::wire::{Layout, Settings};
+use crate::bench::{Bench, Daemon, Subscriber, frame, sensor, wait_for};
 use rustix::fs::{FlockOperation, flock};
 use serde_json::{Value, json};
 
 /// The time between two frames.
 const PERIOD: Duration = Duration::from_millis(10);
 
-fn rest() -> RawFrame {
-    RawFrame::default()
-}
-
-/// A frame with 36 loaded taxels in the middle of the array.
-fn pressed() -> RawFrame {
-    let mut raw = rest();
-    for row in 11..17 {
-        raw.counts[row * 28 + 11..row * 28 + 17].fill(20.0);
-    }
-    raw
-}
+/// The counts of a press.
+const PRESSED: f32 = 20.0;
 
 /// The sensor's end of a cable. The test writes every byte on it.
 struct Cable {
     pair: Option<Pair>,
     link: PathBuf,
-    layout: Layout,
 }
 
 impl Cable {
     fn plug(link: PathBuf) -> Self {
-        let layout = Layout::new(&Settings::default()).unwrap();
-        let mut cable = Self {
-            pair: None,
-            link,
-            layout,
-        };
+        let mut cable = Self { pair: None, link };
         cable.replug();
         cable
     }
@@ -70,12 +52,6 @@ impl Cable {
         now
     }
 
-    fn bytes(&self, raw: &RawFrame) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        self.layout.encode(raw, &mut bytes);
-        bytes
-    }
-
     fn write(&self, mut bytes: &[u8]) {
         let master = &self.pair.as_ref().unwrap().master;
         while !bytes.is_empty() {
@@ -84,9 +60,9 @@ impl Cable {
     }
 
     /// Writes frames at their pace.
-    fn play(&self, raw: &RawFrame, frames: usize) {
+    fn play(&self, counts: f32, frames: usize) {
         for _ in 0..frames {
-            self.write(&self.bytes(raw));
+            self.write(&frame(counts));
             std::thread::sleep(PERIOD);
         }
     }
@@ -108,11 +84,17 @@ impl Cable {
     fn wake(&self, bench: &Bench, sensor: &str) {
         let mut subscriber = bench.subscriber();
         wait_for("a live sensor", || {
-            self.write(&self.bytes(&rest()));
+            self.write(&frame(0.0));
             self.drain();
-            status(&mut subscriber, sensor)["state"] == "live"
+            subscriber.status(sensor)["state"] == "live"
         });
     }
+}
+
+/// The table of a sensor whose cable a test holds.
+fn cabled(name: &str, port: &str, stale_after_ms: u32) -> String {
+    let keys = format!("baud = 1000000\nstale_after_ms = {stale_after_ms}\n");
+    sensor(name, port, 100) + &keys
 }
 
 /// A daemon with a sensor on a cable, which is live and tared.
@@ -124,13 +106,17 @@ struct Rig {
 }
 
 impl Rig {
-    /// A rig whose configuration has `tables`.
-    fn start(tables: &str) -> Self {
+    fn start() -> Self {
+        Self::beside("")
+    }
+
+    /// A rig whose configuration has other sensors too.
+    fn beside(sensors: &str) -> Self {
         let bench = Bench::new();
         let cable = Cable::plug(bench.path("port"));
-        let daemon = Daemon::start(&configure(&bench, tables));
+        let daemon = bench.daemon_of(&(cabled("forearm", "port", 300) + sensors), "");
         let mut subscriber = bench.subscriber();
-        subscriber.until(&json!({"state": "stale"}));
+        subscriber.state("stale");
         let mut rig = Self {
             bench,
             _daemon: daemon,
@@ -138,7 +124,7 @@ impl Rig {
             subscriber,
         };
         rig.wake();
-        rig.cable.play(&rest(), 8);
+        rig.cable.play(0.0, 8);
         rig.sees(&json!({"state": "live", "reason": null}));
         rig
     }
@@ -152,64 +138,38 @@ impl Rig {
     }
 
     fn status(&mut self) -> Value {
-        status(&mut self.subscriber, "forearm")
+        self.subscriber.status("forearm")
     }
 
     /// The status once no frame comes any more, which says that all were read.
     fn at_rest(&mut self) -> Value {
-        self.sees(&json!({"type": "status", "state": "stale"}));
+        self.subscriber.state("stale");
         self.status()
     }
 
     /// Ends the press under way, and checks that it is number `press` and has a verdict.
     fn release(&mut self, press: u64) -> Value {
-        self.cable.play(&rest(), 4);
-        released(&mut self.subscriber, press)
+        self.cable.play(0.0, 4);
+        let end = self.subscriber.press("end");
+        assert_eq!(
+            (&end["press"], &end["reason"]),
+            (&json!(press), &Value::Null)
+        );
+        assert_eq!(self.subscriber.verdict()["press"], press);
+        end
     }
 
     /// Makes a press, and checks that it is number `press`.
-    fn press(&mut self, press: u64) -> Value {
-        self.cable.play(&pressed(), 10);
-        let begin = self.sees(&json!({"type": "press", "state": "begin"}));
-        assert_eq!(begin["press"], press);
-        self.release(press)
+    fn press(&mut self, press: u64) {
+        self.cable.play(PRESSED, 10);
+        assert_eq!(self.subscriber.press("begin")["press"], press);
+        self.release(press);
     }
-}
-
-/// The status as an answer.
-fn status(subscriber: &mut Subscriber, sensor: &str) -> Value {
-    subscriber.send_line(r#"{"get":"status"}"#);
-    // Only the status of an event has a number, and this one is an answer.
-    subscriber.until(&json!({"type": "status", "seq": null, "sensor": sensor}))
-}
-
-/// Waits for the end of a press, and checks that it is number `press`, ends by its release and has
-/// a verdict.
-fn released(subscriber: &mut Subscriber, press: u64) -> Value {
-    let end = subscriber.until(&json!({"type": "press", "state": "end"}));
-    assert_eq!(
-        (&end["press"], &end["reason"]),
-        (&json!(press), &json!(null))
-    );
-    let verdict = subscriber.until(&json!({"phase": "final"}));
-    assert_eq!(verdict["press"], press);
-    end
 }
 
 /// How much `key` grew from one status to another.
 fn growth(before: &Value, after: &Value, key: &str) -> u64 {
     after[key].as_u64().unwrap() - before[key].as_u64().unwrap()
-}
-
-fn configure(bench: &Bench, tables: &str) -> PathBuf {
-    let path = bench.path("hardnessd.toml");
-    let text = format!(
-        "robot = \"arm-7\"\n[[sensor]]\nname = \"forearm\"\nport = \"port\"\nbaud = 1000000\n\
-         frame_rate_hz = 100.0\nstale_after_ms = 300.0\n{tables}\n\
-         [publish.unix]\npath = \"events.sock\"\n"
-    );
-    fs::write(&path, text).unwrap();
-    path
 }
 
 fn since(moment: SystemTime, event: &Value) -> Duration {
@@ -221,17 +181,17 @@ fn since(moment: SystemTime, event: &Value) -> Duration {
 
 #[test]
 fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_up() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     let mut shortest = Duration::MAX;
     let mut skipped = 0;
     for (press, byte) in (1..).zip([0, 1, 2, 4, 395, 788, 789]) {
         let frames = rig.at_rest()["frames"].as_u64().unwrap();
-        rig.cable.play(&pressed(), 5);
+        rig.cable.play(PRESSED, 5);
         wait_for("five frames", || rig.status()["frames"] == frames + 5);
-        rig.cable.write(&rig.cable.bytes(&pressed())[..byte]);
+        rig.cable.write(&frame(PRESSED)[..byte]);
         let unplugged = rig.cable.unplug();
-        let lost = rig.sees(&json!({"type": "status", "state": "lost"}));
-        let aborted = rig.sees(&json!({"type": "press", "state": "aborted"}));
+        let lost = rig.subscriber.state("lost");
+        let aborted = rig.subscriber.press("aborted");
         assert_eq!(
             (&aborted["press"], &aborted["reason"], &aborted["frames"]),
             (&json!(press), &json!("lost"), &json!(5))
@@ -255,7 +215,7 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
 
 #[test]
 fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     rig.press(1);
     let mut shortest = Duration::MAX;
     for press in 2..5 {
@@ -263,9 +223,9 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
         let replugged = SystemTime::now();
         rig.cable.replug();
         assert_ne!(fs::read_link(&rig.cable.link).unwrap(), before);
-        rig.sees(&json!({"type": "status", "state": "lost"}));
+        rig.subscriber.state("lost");
         rig.wake();
-        let live = rig.sees(&json!({"type": "status", "state": "live"}));
+        let live = rig.subscriber.state("live");
         shortest = shortest.min(since(replugged, &live));
         rig.press(press);
     }
@@ -277,7 +237,7 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
     let replugged = SystemTime::now();
     rig.cable.replug();
     rig.wake();
-    let live = rig.sees(&json!({"type": "status", "state": "live"}));
+    let live = rig.subscriber.state("live");
     let away = since(replugged, &live);
     assert!(away < Duration::from_millis(2500), "{away:?}");
     rig.press(5);
@@ -285,7 +245,7 @@ fn plugged_in_elsewhere_behind_its_link_a_sensor_is_read_on_within_its_pause() {
 
 #[test]
 fn a_lost_sensor_says_what_keeps_it_from_being_live_now() {
-    let mut rig = Rig::start("");
+    let mut rig = Rig::start();
     let lost = |reason: &str| json!({"type": "status", "state": "lost", "reason": reason});
     rig.cable.unplug();
     rig.sees(&lost("no such device"));
@@ -297,23 +257,23 @@ fn a_lost_sensor_says_what_keeps_it_from_being_live_now() {
     flock(&device, FlockOperation::Unlock).unwrap();
     rig.sees(&lost("no frame for 25 ms"));
     rig.wake();
-    rig.sees(&json!({"type": "status", "state": "live"}));
+    rig.subscriber.state("live");
 }
 
 #[test]
 fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
-    let mut rig = Rig::start("");
-    let whole = rig.cable.bytes(&pressed());
+    let mut rig = Rig::start();
+    let whole = frame(PRESSED);
     let (head, tail) = whole.split_at(395);
     let mut before = rig.at_rest();
     rig.cable.write(&whole.repeat(5));
     // Without its other half, the half frame is skipped.
     for (rest, frames, skipped) in [(tail, 6, 0), (&whole, 1, 395)] {
         rig.cable.write(head);
-        let stale = rig.sees(&json!({"type": "status", "state": "stale"}));
+        let stale = rig.subscriber.state("stale");
         assert_eq!(stale["reason"], "no frame for 300 ms");
         rig.cable.write(rest);
-        rig.sees(&json!({"type": "status", "state": "live"}));
+        rig.subscriber.state("live");
         let after = rig.status();
         let more = |key| growth(&before, &after, key);
         assert_eq!((more("frames"), more("bytes_skipped")), (frames, skipped));
@@ -324,24 +284,21 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
 
 #[test]
 fn a_lost_sensor_disturbs_no_other() {
-    let more = "[[sensor]]\nname = \"wrist\"\nport = \"port-2\"\nbaud = 1000000\n\
-                frame_rate_hz = 100.0\nstale_after_ms = 60000.0\n";
-    let mut rig = Rig::start(more);
+    let mut rig = Rig::beside(&cabled("wrist", "port-2", 60_000));
     let wrist = Cable::plug(rig.bench.path("port-2"));
     wrist.wake(&rig.bench, "wrist");
-    wrist.play(&rest(), 8);
-    let live = |sensor: &str| json!({"type": "status", "state": "live", "sensor": sensor});
-    rig.sees(&live("wrist"));
+    wrist.play(0.0, 8);
+    rig.sees(&json!({"type": "status", "state": "live", "sensor": "wrist"}));
     let types = r#"{"subscribe":["status","press","hardness","frame"]}"#;
     assert_eq!(rig.subscriber.ask(types)["type"], "ok");
-    rig.cable.play(&pressed(), 5);
-    rig.sees(&json!({"type": "press", "sensor": "forearm", "state": "begin"}));
+    rig.cable.play(PRESSED, 5);
+    rig.subscriber.press("begin");
     rig.cable.unplug();
     for _ in 0..2 {
-        wrist.play(&pressed(), 10);
-        wrist.play(&rest(), 4);
+        wrist.play(PRESSED, 10);
+        wrist.play(0.0, 4);
     }
-    let (mut frame, mut finals) = (None, 0);
+    let (mut latest, mut finals) = (None, 0);
     while finals < 2 {
         let event = rig.subscriber.next().unwrap();
         if event["sensor"] == "forearm" {
@@ -355,8 +312,8 @@ fn a_lost_sensor_disturbs_no_other() {
         match event["type"].as_str().unwrap() {
             "frame" => {
                 let number = event["frame"].as_u64().unwrap();
-                assert!(frame.is_none_or(|last| number == last + 1), "{event}");
-                frame = Some(number);
+                assert!(latest.is_none_or(|last| number == last + 1), "{event}");
+                latest = Some(number);
             }
             "hardness" => finals += u32::from(event["phase"] == "final"),
             "press" => {}

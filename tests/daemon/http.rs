@@ -1,61 +1,16 @@
 //! The real binary over HTTP: events that resume, metrics, health, and refused requests.
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Write};
 use std::net::{SocketAddr, TcpStream};
 
-use crate::bench::{Bench, Daemon, PATIENCE, wait_for};
-use serde_json::{Value, json};
-
-const HTTP: &str = "[http]\nlisten = \"127.0.0.1:0\"\n";
+use crate::bench::{Answer, Bench, Daemon, HTTP, answer, ask, get, open, wait_for};
+use serde_json::Value;
 
 /// A daemon with a page, and the page's address.
 fn serving(bench: &Bench) -> (Daemon, SocketAddr) {
-    let mut daemon = bench.daemon_with(HTTP);
+    let daemon = bench.daemon_with(HTTP);
     let address = daemon.address("http");
     (daemon, address)
-}
-
-struct Answer {
-    code: u16,
-    head: String,
-    body: String,
-}
-
-/// Sends a request unchanged. Without a `Host` among `headers`, the right one is added.
-fn ask(address: SocketAddr, request: &str, headers: &[&str]) -> Answer {
-    answer(open(address, request, headers))
-}
-
-fn answer(mut stream: TcpStream) -> Answer {
-    let mut text = String::new();
-    stream.read_to_string(&mut text).unwrap();
-    let (head, body) = text.split_once("\r\n\r\n").unwrap();
-    let head = head.to_ascii_lowercase();
-    // hyper panics while it writes a date before 1970.
-    assert!(!head.contains("\r\ndate:"), "{head}");
-    Answer {
-        code: head.split(' ').nth(1).unwrap().parse().unwrap(),
-        head,
-        body: body.to_owned(),
-    }
-}
-
-fn open(address: SocketAddr, request: &str, headers: &[&str]) -> TcpStream {
-    let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let mut text = format!("{request} HTTP/1.1\r\nConnection: close\r\n");
-    if !headers.iter().any(|header| header.starts_with("Host:")) {
-        text += &format!("Host: {address}\r\n");
-    }
-    for header in headers {
-        text += &format!("{header}\r\n");
-    }
-    stream.write_all((text + "\r\n").as_bytes()).unwrap();
-    stream
-}
-
-fn get(address: SocketAddr, path: &str) -> Answer {
-    ask(address, &format!("GET {path}"), &[])
 }
 
 /// Server-sent events, as a browser reads them.
@@ -118,8 +73,7 @@ fn set_context(address: SocketAddr, content_type: &str, body: &str) -> Answer {
 #[test]
 fn the_page_may_say_what_is_pressed_and_no_page_from_elsewhere_may() {
     let bench = Bench::new();
-    let http = "[http]\nlisten = \"127.0.0.1:0\"\nset_context = true\n";
-    let mut daemon = bench.daemon_with(http);
+    let daemon = bench.daemon_with(&format!("{HTTP}set_context = true\n"));
     let address = daemon.address("http");
     let body = r#"{"sensor":"forearm","level":2,"object":"cup"}"#;
     let json = "Content-Type: application/json";
@@ -137,14 +91,8 @@ fn the_page_may_say_what_is_pressed_and_no_page_from_elsewhere_may() {
         ask(address, "OPTIONS /api/context", &["Origin: null"]).code,
         405
     );
-    let _sensor = bench.sensor(&["--presses", "1"]);
-    let mut subscriber = bench.subscriber();
-    let press = loop {
-        let event = subscriber.next().unwrap();
-        if event["type"] == "press" {
-            break event;
-        }
-    };
+    let _sensor = bench.sensor("--presses 1");
+    let press = bench.subscriber().press("begin");
     let expected: Value = serde_json::from_str(body).unwrap();
     assert_eq!(press["context"], expected);
 }
@@ -161,14 +109,14 @@ fn events_broken_off_and_resumed_come_once_each() {
     // A client that disconnects before the first event misses no event either.
     let mut next = hello["seq"].as_u64().unwrap() + 1;
     assert_eq!(events.last_id, format!("{run}:{}", next - 1));
-    let _sensor = bench.sensor(&[]);
+    let _sensor = bench.sensor("");
     for had in [0, 1, 2, 5] {
         for _ in 0..had {
             assert_eq!(events.next_seq(), next);
             next += 1;
         }
         // More events come while nobody reads.
-        witness.until(&json!({"type": "press", "state": "end"}));
+        witness.press("end");
         let last_id = events.last_id.clone();
         assert_eq!(last_id, format!("{run}:{}", next - 1));
         events = Events::open(address, "/events", Some(&last_id));
@@ -230,21 +178,18 @@ fn metrics_say_what_was_published() {
     let bench = Bench::new();
     let (_daemon, address) = serving(&bench);
     let mut subscriber = bench.subscriber();
-    let mut sensor = bench.sensor(&["--presses", "2"]);
-    let mut last = Value::Null;
-    for _ in 0..2 {
-        last = subscriber.until(&json!({"phase": "final"}));
-    }
+    let mut sensor = bench.sensor("--presses 2");
+    subscriber.verdict();
+    let last = subscriber.verdict();
     bench.unplug(&mut sensor);
-    let lost = subscriber.until(&json!({"type": "status", "state": "lost"}));
-    let answer = get(address, "/metrics");
-    assert!(answer.head.contains("application/openmetrics-text"));
-    assert!(answer.body.ends_with("# EOF\n"), "{}", answer.body);
+    let lost = subscriber.state("lost");
+    let Answer { head, body, .. } = get(address, "/metrics");
+    assert!(head.contains("application/openmetrics-text"));
+    assert!(body.ends_with("# EOF\n"), "{body}");
     let value = |name: &str, more: &str| -> f64 {
         let labels = format!("robot=\"arm-7\",sensor=\"forearm\"{more}");
         let series = format!("hardnessd_{name}{{{labels}}} ");
-        let mut lines = answer.body.lines();
-        let value = lines.find_map(|line| line.strip_prefix(&series));
+        let value = body.lines().find_map(|line| line.strip_prefix(&series));
         value.expect(&series).parse().unwrap()
     };
     assert_eq!(Some(value("frames_total", "")), lost["frames"].as_f64());
@@ -258,7 +203,7 @@ fn metrics_say_what_was_published() {
     assert_eq!(value("link_state", ",state=\"live\""), 0.0);
     assert!((0.0..60.0).contains(&value("last_frame_age_seconds", "")));
     let model = format!("model=\"{}", last["model"].as_str().unwrap());
-    assert!(answer.body.contains(&model), "{}", answer.body);
+    assert!(body.contains(&model), "{body}");
 }
 
 #[test]
@@ -267,15 +212,15 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     let (_daemon, address) = serving(&bench);
     let codes = || (get(address, "/livez").code, get(address, "/readyz").code);
     assert_eq!(codes(), (200, 503), "no sensor yet");
-    let mut sensor = bench.sensor(&[]);
+    let mut sensor = bench.sensor("");
     wait_for("readiness", || get(address, "/readyz").code == 200);
-    bench.subscriber().until(&json!({"phase": "final"}));
+    bench.subscriber().verdict();
     bench.unplug(&mut sensor);
     wait_for("the loss", || get(address, "/readyz").code == 503);
     assert_eq!(codes(), (200, 503), "absent hardware is healthy");
     assert_eq!(get(address, "/readyz").body, "forearm lost\n");
 
-    let status: Value = serde_json::from_str(&get(address, "/api/status").body).unwrap();
+    let status = get(address, "/api/status").json();
     assert_eq!(status["hello"]["robot"], "arm-7");
     let forearm = &status["sensors"][0];
     assert_eq!(forearm["status"]["state"], "lost");
@@ -284,8 +229,7 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     assert!(forearm["last_frame_age_s"].as_f64().unwrap() > 0.0);
 
     // A page that opens now has the curve of the press that is over.
-    let history = get(address, "/api/history?sensor=forearm");
-    let history: Value = serde_json::from_str(&history.body).unwrap();
+    let history = get(address, "/api/history?sensor=forearm").json();
     let forces = history["points"].as_array().unwrap().iter();
     let forces = forces.map(|point| point[1].as_f64().unwrap());
     assert!(forces.fold(0.0, f64::max) > 5.0, "{history}");
@@ -298,8 +242,7 @@ fn an_open_page_does_not_keep_the_daemon() {
     let (mut daemon, address) = serving(&bench);
     let mut events = Events::open(address, "/events?types=status,frame", None);
     events.next();
-    daemon.end();
-    let log = daemon.whole_log();
+    let log = daemon.end();
     assert!(
         log.contains("stopping") && !log.contains("did not fetch"),
         "{log}"

@@ -19,6 +19,5 @@ mod shipped;
 mod soak;
 mod stdout;
 mod subscribe;
-#[cfg(feature = "watch")]
 mod watch;
 mod properties;

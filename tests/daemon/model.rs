@@ -1,15 +1,12 @@
 //! A bad model file, with the real binary: `check` and a start refuse it in one line, and a running
 //! daemon keeps its model. The unit tests of the core have every kind of bad file.
 
-use std::fs;
-
-use hardnessd_core::verdict::BUILT_IN_HRN;
+use hardnessd_core::verdict::{BUILT_IN, BUILT_IN_HRN};
 use prost::Message as _;
-use rustix::process::Signal;
 use tract_onnx::pb;
 use tract_onnx::pb::tensor_proto::DataType;
 
-use crate::bench::{Bench, Daemon, fails, run};
+use crate::bench::Bench;
 
 /// The paper's network, with a constant larger than any memory added to its frame.
 fn bad_file() -> Vec<u8> {
@@ -45,31 +42,23 @@ fn bad_file() -> Vec<u8> {
 #[test]
 fn a_bad_file_is_refused_in_one_line_and_a_running_daemon_keeps_its_model() {
     let bench = Bench::new();
-    let table = "[model]\npath = \"hrn.onnx\"\n";
-    let config = bench.configure("hardnessd.toml", "events.sock", table);
-    let file = bench.path("hrn.onnx");
-    fs::write(&file, BUILT_IN_HRN).unwrap();
-    let mut daemon = Daemon::start(&config);
+    bench.write("hrn.onnx", BUILT_IN_HRN);
+    let mut daemon = bench.daemon_with("[model]\npath = \"hrn.onnx\"\n");
     let model = || bench.subscriber().next().unwrap()["model"]["sha256"].clone();
     let old = model();
-    fs::write(&file, bad_file()).unwrap();
-    let config = config.to_str().unwrap();
+    bench.write("hrn.onnx", bad_file());
     let expected = "the inference library failed on it";
     for command in ["check", "run"] {
-        fails(&[command, "--config", config], 78, &[expected]);
+        let line = format!("{command} --config hardnessd.toml");
+        bench.fails(&line, 78, &[expected]);
     }
-    daemon.process.signal(Signal::HUP);
-    let line = daemon.logged("refused");
+    let line = daemon.reload("refused");
     // On a busy machine, the trial may take longer than a reload allows.
-    assert!(
-        line.contains(expected) || line.contains("given up"),
-        "{line}"
-    );
+    let is_said = line.contains(expected) || line.contains("given up");
+    assert!(is_said, "{line}");
     assert_eq!(model(), old);
-    let good = concat!(env!("CARGO_MANIFEST_DIR"), "/models/course.onnx");
-    fs::copy(good, &file).unwrap();
-    assert_eq!(run(&["check", "--config", config]).0, 0);
-    daemon.process.signal(Signal::HUP);
-    daemon.logged("reloaded");
+    bench.write("hrn.onnx", BUILT_IN);
+    bench.succeeds("check --config hardnessd.toml");
+    daemon.reload("reloaded");
     assert_ne!(model(), old);
 }

@@ -12,17 +12,15 @@ fn it_tells_verdicts_that_it_knows_nothing_without_a_daemon_and_goes_on_with_the
     let example = Path::new(BINARY).with_file_name("examples/subscribe");
     assert!(example.exists(), "first: cargo build --example subscribe");
     let bench = Bench::new();
-    let mut subscribe = Process(
-        Command::new(example)
-            .arg(bench.path("events.sock"))
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap(),
-    );
+    let mut command = Command::new(example);
+    command
+        .arg(bench.path("events.sock"))
+        .stdout(Stdio::piped());
+    let mut subscribe = Process::start(&mut command);
     let mut lines = Lines::of(subscribe.0.stdout.take().unwrap());
     lines.until(&["nothing is known until it is back"]);
     let daemon = bench.daemon();
-    let _sensor = bench.sensor(&[]);
+    let _sensor = bench.sensor("");
     lines.until(&["\"forearm\" is \"live\""]);
     let verdict = lines.until(&["\"forearm\" press 1 (\"final\"): \"", "\" at ", " %"]);
     assert!(!verdict.contains("null"), "{verdict}");

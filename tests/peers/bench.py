@@ -72,6 +72,18 @@ def same(found, expected, key):
     return found == expected
 
 
+def same_messages(kind, messages, events):
+    """The ROS messages of a kind are the events that have their numbers, field by field. Says how many there are."""
+    found = {message.seq: message for message in messages}
+    told = [event for event in events if event["type"] == kind and event.get("seq") in found]
+    for event in told:
+        message = found[event["seq"]]
+        for key, value in event.items():
+            assert key == "type" or same(getattr(message, key), value, key), (kind, key, message, value)
+        assert message.header.frame_id == event["sensor"]
+    return len(told)
+
+
 class Arm:
     """A stand-in for a control socket, at `path`: `simulate --motion PATH` tells it where the simulated arm is, and
     `tell` is called with each list of [MONO_NS, MM]. What was told is in `told`."""

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Every board of docs/boards.md, emulated over a real pty or a network, with the configuration that the page gives.
+"""Every board of docs/boards.md, emulated over a network, with the configuration that the page gives.
 
     venv/bin/python tests/peers/boards.py target/debug/hardnessd
 
@@ -7,7 +7,7 @@ Claims: the daemon reads the counts that each emulator sends, at their places; i
 areas of a hand are all read at one port.
 """
 
-import argparse
+import contextlib
 import os
 import re
 import socket
@@ -17,7 +17,6 @@ import sys
 import threading
 import time
 import tomllib
-import tty
 
 from bench import Bench, free_port, wait_for
 
@@ -108,66 +107,50 @@ BOARDS = {
 }
 
 
-class Serial:
-    """A board on a pty. With `asked`, it sends a frame whenever it has read these bytes."""
+def serve(board):
+    """A board at an address of this machine. What waits for bytes sends its frame whenever it has read them, or from
+    then on if it waits once. The others send at their rate."""
+    frame, asked, rate = board
+    is_once = isinstance(asked, str)
+    wanted = bytes.fromhex(asked.split()[1]) if is_once else asked
 
-    def __init__(self, path, frame, asked, rate):
-        self.ours, self.theirs = os.openpty()
-        tty.setraw(self.theirs)
-        os.symlink(os.ttyname(self.theirs), path)
-        os.set_blocking(self.ours, False)
-        self.frame, self.asked, self.rate = frame, asked, rate
-        self.ended = threading.Event()
-        self.thread = threading.Thread(target=self._serve)
-        self.thread.start()
+    def talk(connection):
+        heard = b""
+        while True:
+            while wanted and wanted not in heard:
+                heard += connection.recv(4096)
+            heard = b"" if not is_once else heard
+            connection.sendall(frame)
+            if is_once or not wanted:
+                time.sleep(1 / rate)
 
-    def _serve(self):
-        is_once = isinstance(self.asked, str)
-        wanted = bytes.fromhex(self.asked.split()[1]) if is_once else self.asked
-        heard, sends = b"", wanted is None
-        while not self.ended.wait(1 / self.rate if sends else 0.001):
-            try:
-                if wanted is not None:
-                    heard += os.read(self.ours, 4096)
-            except BlockingIOError:
-                pass
-            if wanted is not None and wanted in heard:
-                heard = b""
-                sends |= is_once
-                if not is_once:
-                    os.write(self.ours, self.frame)
-            try:
-                if sends:
-                    os.write(self.ours, self.frame)
-            except BlockingIOError:
-                pass  # Nobody reads yet.
-
-    def end(self):
-        self.ended.set()
-        self.thread.join()
-        os.close(self.ours)
-        os.close(self.theirs)
+    return listening(talk)
 
 
-def hand(listener):
-    """Answers Modbus TCP. A register holds its own number, modulo 97, and a high bit that is no count."""
+def listening(talk):
+    """A server that talks to each connection until it ends, and its address as a port of the daemon."""
 
-    def serve(connection):
-        stream = connection.makefile("rb")
-        try:
-            while len(request := stream.read(12)) == 12:
-                number, first, cells = struct.unpack(">H6xHH", request)
-                head = struct.pack(">HHHBBB", number, 0, 3 + 2 * cells, 1, 3, 2 * cells)
-                connection.sendall(head + struct.pack(">H", 0x8000 | first % 97) * cells)
-        except ConnectionError:
-            pass  # The daemon has ended.
-
-    while True:
-        try:
+    def accept():
+        while True:
             connection, _ = listener.accept()
-        except OSError:
-            return
-        threading.Thread(target=serve, args=(connection,), daemon=True).start()
+            threading.Thread(target=talk_until_its_end, args=(connection,), daemon=True).start()
+
+    def talk_until_its_end(connection):
+        with contextlib.suppress(ConnectionError):
+            talk(connection)
+
+    listener = socket.create_server(("127.0.0.1", 0))
+    threading.Thread(target=accept, daemon=True).start()
+    return f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+
+
+def hand(connection):
+    """Answers Modbus TCP. A register holds its own number, modulo 97, and a high bit that is no count."""
+    stream = connection.makefile("rb")
+    while len(request := stream.read(12)) == 12:
+        number, first, cells = struct.unpack(">H6xHH", request)
+        head = struct.pack(">HHHBBB", number, 0, 3 + 2 * cells, 1, 3, 2 * cells)
+        connection.sendall(head + struct.pack(">H", 0x8000 | first % 97) * cells)
 
 
 def presets():
@@ -187,79 +170,58 @@ def newtons_are_counts(config):
     return "".join(tables)
 
 
-def check(binary, config, wanted, start=lambda bench: []):
+def check(binary, config, wanted):
     """The daemon reads `wanted`, the counts by the sensors' names."""
     with Bench(binary, sensors=()) as bench:
         with open(bench.path("hardnessd.toml"), "w") as out:
             out.write('[publish.unix]\npath = "events.sock"\n' + newtons_are_counts(config))
-        started = start(bench)
-        try:
-            bench.daemon()
-            tail = bench.events("--types", "frame,status")
-            found = lambda name: [
-                event for event in tail.events if event["type"] == "frame" and event["sensor"] == name
-            ]
-            for name, expected in wanted.items():
-                frames = wait_for(f"a frame of {name}", lambda name=name: found(name)[3:])
-                assert expected is None or all(frame["newtons"] == expected for frame in frames), (name, frames[0])
-            tail.kill()
-            tail.thread.join()
-        finally:
-            for one in started:
-                one.end()
+        bench.daemon()
+        tail = bench.events("--types", "frame,status")
+        frames = lambda name: [event for event in tail.events if event["type"] == "frame" and event["sensor"] == name]
+        for name, expected in wanted.items():
+            found = wait_for(f"a frame of {name}", lambda name=name: frames(name)[3:])
+            assert expected is None or all(frame["newtons"] == expected for frame in found), (name, found[0])
+        tail.kill()
+        tail.thread.join()
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("binary")
-    binary = parser.parse_args().binary
+def main(binary):
     with open(PAGE) as page:
         page = page.read()
     blocks = re.findall(r"(?ms)^```toml\n(.*?)^```", page)
     programs = dict(re.findall(r"(?ms)^```python\n# (\S+)\n(.*?)^```", page))
-    tried = set()
-    for block in [*blocks, *presets()]:
+    boards = {tomllib.loads(block)["sensor"][0]["name"]: block for block in [*blocks, *presets()]}
+    bridge = boards.pop("bridge")
+    assert boards.keys() == BOARDS.keys(), boards.keys() ^ BOARDS.keys()
+    for name, block in boards.items():
         sensors = tomllib.loads(block)["sensor"]
-        name = sensors[0]["name"]
-        if name == "bridge":
-            continue
         frame, asked, expected = BOARDS[name]
-        config = re.sub(r'(?m)^port = ".*"', 'port = "port"', block)
+        port = serve((frame, asked, sensors[0]["frame_rate_hz"]))
+        config = re.sub(r'(?m)^port = ".*"', f'port = "{port}"', block)
         wanted = dict(zip([sensor["name"] for sensor in sensors], expected, strict=True))
-        rate = sensors[0]["frame_rate_hz"]
-        check(binary, config, wanted, lambda bench: [Serial(bench.path("port"), frame, asked, rate)])  # noqa: B023
-        tried.add(name)
-        print(f"{name}: {', '.join(wanted)}")
-    assert tried == BOARDS.keys(), tried ^ BOARDS.keys()
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=hand, args=(listener,), daemon=True).start()
-        port = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
-        write = [sys.executable, "-c", programs["inspire.py"], port]
-        config = subprocess.run(write, capture_output=True, text=True, check=True).stdout
-        areas = tomllib.loads(config)["sensor"]
-        assert len(areas) == 17
-        wanted = {}
-        for area in areas:
-            cells = area["frame"]["rows"] * area["frame"]["cols"]
-            wanted[area["name"]] = [int(area["name"][5:]) % 97] * cells
         check(binary, config, wanted)
-        print(f"inspire: {len(areas)} areas at one port")
+        print(f"{name}: {', '.join(wanted)}")
 
-    class Bridge:
-        def __init__(self, port):
-            self.process = subprocess.Popen([sys.executable, "-c", programs["bridge.py"], port])
-
-        def end(self):
-            self.process.kill()
-            self.process.wait()
+    write = [sys.executable, "-c", programs["inspire.py"], listening(hand)]
+    config = subprocess.run(write, capture_output=True, text=True, check=True).stdout
+    areas = tomllib.loads(config)["sensor"]
+    assert len(areas) == 17
+    wanted = {}
+    for area in areas:
+        cells = area["frame"]["rows"] * area["frame"]["cols"]
+        wanted[area["name"]] = [int(area["name"][5:]) % 97] * cells
+    check(binary, config, wanted)
+    print(f"inspire: {len(areas)} areas at one port")
 
     port = str(free_port())
-    (block,) = [block for block in blocks if 'name = "bridge"' in block]
-    expected = [row + col / 10 for row in range(4) for col in range(4)]
-    check(binary, block.replace("8300", port), {"bridge": expected}, lambda bench: [Bridge(port)])
+    process = subprocess.Popen([sys.executable, "-c", programs["bridge.py"], port])
+    try:
+        check(binary, bridge.replace("8300", port), {"bridge": [row + col / 10 for row in range(4) for col in range(4)]})
+    finally:
+        process.kill()
+        process.wait()
     print("bridge: UDP")
 
 
 if __name__ == "__main__":
-    main()
+    main(os.path.abspath(sys.argv[1]))

@@ -23,17 +23,9 @@ import hardnessd
 
 HELLO = {"type": "hello", "protocol": 1, "server": "hardnessd", "run": "ab", "seq": 7}
 STATUS = {
-    "type": "status",
-    "sensor": "a",
-    "time": "2026-11-21T10:00:00.000000Z",
-    "state": "live",
-    "reason": None,
-    "detail": None,
-    "frames": 5,
-    "frames_damaged": 0,
-    "frames_dropped": 0,
-    "bytes_skipped": 0,
-    "frame_rate_hz": None,
+    **{"type": "status", "sensor": "a", "time": "2026-11-21T10:00:00.000000Z", "state": "live"},
+    **dict.fromkeys(("reason", "detail", "frame_rate_hz")),
+    **dict.fromkeys(("frames", "frames_damaged", "frames_dropped", "bytes_skipped"), 5),
 }
 
 
@@ -42,9 +34,8 @@ def line(message):
 
 
 class Server:
-    """Sends the same to each connection. Counts the bytes that one took, and the connections.
-
-    `slowly` is the time between two bytes of the endless part."""
+    """Sends the same to each connection, and then `endless`, a byte each `slowly` seconds or all that the other end
+    takes. Counts the bytes that one took, and the connections. With `stays` none is closed."""
 
     def __init__(self, sent, endless=b"", stays=False, slowly=0.0):
         self.directory = tempfile.TemporaryDirectory()
@@ -52,37 +43,32 @@ class Server:
         self.listener = socket.socket(socket.AF_UNIX)
         self.listener.bind(self.path)
         self.listener.listen()
-        self.sent, self.endless, self.stays, self.slowly = sent, endless, stays, slowly
-        self.connections = 0
-        self.most_bytes = 0
+        self.sent, self.stays, self.slowly = sent, stays, slowly
+        self.parts = [endless[at : at + 1] for at in range(len(endless))] if slowly else [endless]
+        self.connections, self.most_bytes, self.open = 0, 0, []
         threading.Thread(target=self.serve, daemon=True).start()
 
     def serve(self):
-        open_ones = []
         while True:
             try:
                 connection, _ = self.listener.accept()
             except OSError:
                 return
             self.connections += 1
+            self.open = [*self.open, connection] if self.stays else [connection]
             taken = 0
             try:
                 connection.sendall(self.sent)
-                while self.slowly and taken < 1000:
-                    taken += connection.send(self.endless[taken % len(self.endless) :][:1])
-                    time.sleep(self.slowly)
-                while self.endless and taken < 50_000_000:
-                    taken += connection.send(self.endless)
+                while self.parts[0] and taken < (1000 if self.slowly else 50_000_000):
+                    for part in self.parts:
+                        taken += connection.send(part)
+                        time.sleep(self.slowly)
                 if not self.stays:
                     connection.shutdown(socket.SHUT_WR)
                     connection.recv(4096)
             except OSError:
                 pass
             self.most_bytes = max(self.most_bytes, taken)
-            if self.stays:
-                open_ones.append(connection)
-            else:
-                connection.close()
 
     def __enter__(self):
         return self

@@ -10,6 +10,7 @@ presses.
 """
 
 import argparse
+import binascii
 import collections
 import json
 import pathlib
@@ -35,35 +36,12 @@ FRAMINGS = ["marked"] * 5 + ["slip", "cobs", "text"]
 RIGHT, WRONG = 0.85, 0.02
 
 
-def crc(data, bits, polynomial, value, is_reflected):
-    """A CRC of 8 or 16 bits, bit by bit."""
-    top, mask = 1 << (bits - 1), (1 << bits) - 1
-    for byte in data:
-        value ^= byte if is_reflected else byte << (bits - 8)
-        for _ in range(8):
-            if is_reflected:
-                value = value >> 1 ^ (polynomial if value & 1 else 0)
-            else:
-                value = (value << 1 ^ (polynomial if value & top else 0)) & mask
-    return value
-
-
-def xor(data):
-    value = 0
-    for byte in data:
-        value ^= byte
-    return value
-
-
 CHECKSUMS = {
     "none": lambda data: b"",
     "sum8": lambda data: bytes([sum(data) & 0xFF]),
-    "xor8": lambda data: bytes([xor(data)]),
     "lrc8": lambda data: bytes([-sum(data) & 0xFF]),
     "sum16": lambda data: struct.pack("<H", sum(data) & 0xFFFF),
-    "crc8": lambda data: bytes([crc(data, 8, 0x07, 0, False)]),
-    "crc16-modbus": lambda data: struct.pack("<H", crc(data, 16, 0xA001, 0xFFFF, True)),
-    "crc16-ccitt": lambda data: struct.pack("<H", crc(data, 16, 0x1021, 0xFFFF, False)),
+    "crc16-ccitt": lambda data: struct.pack("<H", binascii.crc_hqx(data, 0xFFFF)),
     "crc32": lambda data: struct.pack("<I", zlib.crc32(data)),
 }
 

@@ -149,15 +149,7 @@ def readme(directory):
     subprocess.run([sys.executable, "-c", block], cwd=directory, check=True, stdout=subprocess.DEVNULL)
 
 
-def version():
-    """The versions of the packages are the daemon's."""
-    files = (CLIENT / "pyproject.toml", ROOT / "clients/lerobot/pyproject.toml", ROOT / "Cargo.toml")
-    found = {re.search(r'^version = "(.*)"$', file.read_text(), re.M)[1] for file in files}
-    assert len(found) == 1, found
-
-
 def main(binaries):
-    version()
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
         print("a data set of", data_sets(binaries, directory), "presses")

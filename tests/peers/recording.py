@@ -12,14 +12,13 @@ value.
 import json
 import os
 import pathlib
-import shutil
-import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 
-from bench import Bench, same, wait_for
+from bench import Bench, same_messages, taken, wait_for
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
@@ -70,19 +69,7 @@ def check(path, live):
         assert counts[topic] == len(ros2[topic]) == len(bags[topic]), (topic, counts)
     for messages in (ros2, bags):
         for kind in ("hardness", "press", "status"):
-            found = {message.seq: message for message in messages[kind]}
-            compared = 0
-            for event in live:
-                if event["type"] != kind or event.get("seq") not in found:
-                    continue
-                message = found[event["seq"]]
-                for key, value in event.items():
-                    if key != "type":
-                        got = getattr(message, key)
-                        assert same(got, value, key), (kind, key, got, value)
-                assert message.header.frame_id == event["sensor"]
-                compared += 1
-            assert compared or not live, f"no {kind} to compare"
+            assert same_messages(kind, messages[kind], live) or not live, f"no {kind} to compare"
         image = messages["frame"][-1]
         assert (image.height, image.width, image.encoding) == (28, 28, "32FC1")
         newtons = struct.unpack("<784f", bytes(image.data))
@@ -112,31 +99,23 @@ def bag(out, recordings, counts):
     assert again.returncode == 1 and b"bag.py: " in again.stderr, again
 
 
-def daemon(binary):
+def recorded(binary):
     """The daemon's own recording beside what a subscriber read."""
-    more = '[record]\ndir = "rec"\nkeep_free_mb = 0\n'
-    with Bench(binary, more=more) as bench:
-        running = bench.daemon()
-        tail = subprocess.Popen(
-            [binary, "tail", "--json", "--socket", bench.path("events.sock")],
-            stdout=subprocess.PIPE,
-        )
-        sensor = bench.sensor("forearm", "--presses", "3", "--force", "15", "--seed", "3")
-        sensor.wait(timeout=60)
-        running.send_signal(signal.SIGTERM)
-        running.wait(timeout=10)
-        live = [json.loads(line) for line in tail.communicate(timeout=10)[0].splitlines()]
-        (recording,) = pathlib.Path(bench.path("rec")).glob("hardnessd-*.mcap")
+    with tempfile.TemporaryDirectory() as name:
+        directory = pathlib.Path(name)
+        recording = directory / "take.mcap"
+        live = taken(binary, recording)
         counts, metadata = check(recording, live)
-        bag(pathlib.Path(bench.path("take")), [recording], counts)
+        bag(directory / "one", [recording], counts)
         # Two files become one bag.
-        second = pathlib.Path(shutil.copy(recording, bench.path("second.mcap")))
-        bag(pathlib.Path(bench.path("both")), [recording, second], {kind: 2 * n for kind, n in counts.items()})
-        assert metadata["hardnessd.recording"]["robot"] == "arm-7"
-        assert json.loads(metadata["hardnessd.sensor"]["settings"])["name"] == "forearm"
-        finals = [event for event in live if event.get("phase") == "final"]
-        assert counts["hardness"] >= len(finals) >= 2, counts
-        return counts
+        second = directory / "second.mcap"
+        second.write_bytes(recording.read_bytes())
+        bag(directory / "both", [recording, second], {kind: 2 * n for kind, n in counts.items()})
+    assert metadata["hardnessd.recording"]["robot"] == "arm-7"
+    assert json.loads(metadata["hardnessd.sensor"]["settings"])["name"] == "forearm"
+    finals = [event for event in live if event.get("phase") == "final"]
+    assert counts["hardness"] >= len(finals) >= 2, counts
+    return counts
 
 
 def killed(binary):
@@ -163,5 +142,5 @@ def killed(binary):
 
 if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
-    print("recorded:", daemon(binary))
+    print("recorded:", recorded(binary))
     print("recovered:", killed(binary))

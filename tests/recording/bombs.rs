@@ -9,11 +9,15 @@ use mcap::records::MessageHeader;
 
 use crate::bench::{BINARY, Bench, ran};
 
-/// Runs the program with so many MiB of memory. Returns exit code, stdout and stderr.
-fn within(mib: u64, arguments: &[&str]) -> (i32, String, String) {
+/// Runs the program with so many MiB of memory. Returns exit code and stderr.
+fn within(mib: u64, bench: &Bench, arguments: &str) -> (i32, String) {
     let mut command = Command::new("sh");
-    let line = format!("ulimit -d {} && exec \"$0\" \"$@\"", mib << 10);
-    ran(command.args(["-c", &line, BINARY]).args(arguments))
+    let line = format!("ulimit -d {} && exec \"$0\" {arguments}", mib << 10);
+    command
+        .args(["-c", &line, BINARY])
+        .current_dir(bench.path(""));
+    let (code, _, stderr) = ran(&mut command);
+    (code, stderr)
 }
 
 /// Writes a recording of one chunk of almost 64 MiB.
@@ -47,13 +51,11 @@ fn a_chunk_of_tiny_records_is_read_one_by_one() {
         }
     });
     assert!(fs::metadata(&path).unwrap().len() < 64 << 20);
-    let path = path.to_str().unwrap();
     // The chunk is held packed and unpacked.
-    let (code, _, stderr) = within(280, &["replay", path]);
+    let (code, stderr) = within(280, &bench, "replay tiny.mcap");
     assert_eq!(code, 1, "{stderr}");
     assert!(stderr.contains("found no state of a sensor"), "{stderr}");
-    let good = bench.path("good.mcap");
-    let (code, _, stderr) = within(280, &["recover", path, "--out", good.to_str().unwrap()]);
+    let (code, stderr) = within(280, &bench, "recover tiny.mcap --out good.mcap");
     assert!(stderr.contains("2000000 messages"), "{code}: {stderr}");
 }
 
@@ -71,9 +73,7 @@ fn descriptions_without_end_are_left_out() {
         }
     });
     assert!(fs::metadata(&path).unwrap().len() < 1 << 20);
-    let good = bench.path("good.mcap");
-    let paths = [&path, &good].map(|path| path.to_str().unwrap());
-    let (code, _, stderr) = within(120, &["recover", paths[0], "--out", paths[1]]);
+    let (code, stderr) = within(120, &bench, "recover described.mcap --out good.mcap");
     assert_eq!(code, 1, "{stderr}");
     assert!(!stderr.contains("memory"), "{stderr}");
 }

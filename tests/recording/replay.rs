@@ -1,117 +1,83 @@
 //! Recorded bytes give exactly the expected events, at any pace.
 
-use std::path::{Path, PathBuf};
+use std::fs;
+use std::path::Path;
 
-use crate::bench::{events, hardnessd, run};
+use crate::bench::{Bench, events, run};
 use serde_json::Value;
 
-fn fixtures() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures")
-}
-
-/// Every recording, with the configuration for its rate and its golden events.
-fn recordings() -> Vec<(PathBuf, PathBuf, PathBuf)> {
-    let mut found: Vec<_> = std::fs::read_dir(fixtures())
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.extension().is_some_and(|extension| extension == "bin"))
-        .map(|path| {
-            let rate = Path::new(path.file_stem().unwrap()).extension().unwrap();
-            let config = fixtures().join(rate).with_extension("toml");
-            let golden = path.with_extension("jsonl");
-            (path, config, golden)
-        })
-        .collect();
-    found.sort();
-    found
-}
-
-fn replay(recording: &Path, more: &[&str]) -> String {
-    let output = hardnessd(&[&["replay", recording.to_str().unwrap()], more].concat());
-    assert!(output.status.success(), "{recording:?}: {output:?}");
-    String::from_utf8(output.stdout).unwrap()
+/// Takes the probabilities out of an event.
+fn probabilities(event: &mut Value) -> Vec<f64> {
+    let event = event.as_object_mut().unwrap();
+    let taken = ["probabilities", "confidence"].map(|key| event.remove(key).unwrap_or_default());
+    let [Value::Array(numbers), confidence] = taken else {
+        return Vec::new();
+    };
+    let numbers = numbers.iter().chain([&confidence]);
+    numbers.map(|number| number.as_f64().unwrap()).collect()
 }
 
 /// Asserts that events are equal, except for probabilities, which may differ by 1e-4 between
 /// machines.
-fn assert_same(found: &str, golden: &str, recording: &Path) {
-    let (mut found, mut golden) = (events(found), events(golden));
-    assert_eq!(found.len(), golden.len(), "{recording:?}");
-    for (found, golden) in found.iter_mut().zip(&mut golden) {
-        for key in ["probabilities", "confidence"] {
-            let numbers = |event: &mut Value| -> Vec<f64> {
-                match event.as_object_mut().unwrap().remove(key) {
-                    Some(Value::Array(numbers)) => numbers
-                        .iter()
-                        .map(|number| number.as_f64().unwrap())
-                        .collect(),
-                    Some(number) => vec![number.as_f64().unwrap()],
-                    None => vec![],
-                }
-            };
-            let (found, golden) = (numbers(found), numbers(golden));
-            assert_eq!(found.len(), golden.len());
-            for (found, golden) in found.iter().zip(golden) {
-                assert!(
-                    (found - golden).abs() <= 1e-4,
-                    "{recording:?}: {found} for {golden}"
-                );
-            }
-        }
-        assert_eq!(found, golden, "{recording:?}");
+fn assert_same(found: &str, golden: &str, recording: &str) {
+    let (found, golden) = (events(found), events(golden));
+    assert_eq!(found.len(), golden.len(), "{recording}");
+    for (mut found, mut golden) in found.into_iter().zip(golden) {
+        let numbers = [&mut found, &mut golden].map(probabilities);
+        let [here, there] = &numbers;
+        let is_near = here.iter().zip(there).all(|(a, b)| (a - b).abs() <= 1e-4);
+        assert!(
+            is_near && here.len() == there.len(),
+            "{recording}: {numbers:?}"
+        );
+        assert_eq!(found, golden, "{recording}");
     }
 }
 
 #[test]
-fn recordings_give_their_golden_events_twice_the_same() {
-    let recordings = recordings();
-    assert!(
-        recordings.len() >= 11,
-        "found {} recordings",
-        recordings.len()
-    );
-    for (recording, config, golden) in recordings {
-        let config = config.to_str().unwrap();
-        let events = replay(&recording, &["--config", config]);
+fn recordings_give_their_golden_events_whatever_the_speed() {
+    let mut count = 0;
+    for entry in fs::read_dir("fixtures").unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_none_or(|extension| extension != "bin") {
+            continue;
+        }
+        count += 1;
+        let recording = path.to_str().unwrap();
+        let rate = Path::new(path.file_stem().unwrap()).extension().unwrap();
+        let line = format!(
+            "replay {recording} --config fixtures/{}.toml",
+            rate.display()
+        );
+        let (code, events, errors) = run(&line);
+        assert_eq!(code, 0, "{errors}");
         assert_eq!(
             events,
-            replay(&recording, &["--config", config]),
-            "{recording:?}"
+            run(&format!("{line} --speed 1000")).1,
+            "{recording}"
         );
-        assert_same(
-            &events,
-            &std::fs::read_to_string(golden).unwrap(),
-            &recording,
-        );
+        let golden = fs::read_to_string(path.with_extension("jsonl")).unwrap();
+        assert_same(&events, &golden, recording);
     }
+    assert!(count >= 11, "found {count} recordings");
 }
 
 #[test]
 fn bytes_without_a_whole_frame_are_said_to_have_none() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("other.bin");
-    let mut frame = std::fs::read(fixtures().join("foam.5hz.bin")).unwrap();
+    let bench = Bench::new();
     // One frame has a damaged byte.
-    frame.truncate(790);
+    let mut frame = crate::bench::frame(0.0);
     frame[400] ^= 1;
-    std::fs::write(&path, frame).unwrap();
-    let (code, events, message) = run(&["replay", path.to_str().unwrap()]);
+    bench.write("other.bin", frame);
+    let (code, events, message) = bench.run("replay other.bin");
     assert_eq!((code, message.lines().count()), (1, 1), "{message}");
-    let found = "other.bin: no whole frame in 790 bytes (1 damaged)";
-    assert!(
-        message.contains(found) && message.contains("hardnessd sniff"),
-        "{message}"
-    );
+    for part in [
+        "other.bin: no whole frame in 790 bytes (1 damaged)",
+        "hardnessd sniff",
+    ] {
+        assert!(message.contains(part), "{message}");
+    }
     // The last status with the totals comes nevertheless.
     let end = "\"reason\":\"end of recording\"";
     assert!(events.contains(end), "{events}");
-}
-
-#[test]
-fn the_pace_of_a_replay_does_not_show() {
-    let recording = fixtures().join("flip.5hz.bin");
-    assert_eq!(
-        replay(&recording, &[]),
-        replay(&recording, &["--speed", "50"])
-    );
 }

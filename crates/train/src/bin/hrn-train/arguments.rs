@@ -233,18 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_command_of_the_trainer_in_the_pages_is_a_valid_one() {
-        let calls = pages::calls_of("hrn-train");
-        assert!(calls.len() > 25, "found {} commands", calls.len());
-        let wrong = pages::wrong_calls::<Arguments>(&calls);
-        assert!(wrong.is_empty(), "{wrong:#?}");
-    }
-
-    #[test]
-    fn every_option_of_the_trainer_in_a_sentence_exists() {
-        let names = pages::names_of("hrn-train");
-        assert!(names.len() > 15, "found {} commands", names.len());
-        let wrong = pages::unknown_names::<Arguments>(&names);
-        assert!(wrong.is_empty(), "{wrong:#?}");
+    fn every_command_and_option_of_the_trainer_in_the_pages_exists() {
+        pages::assert_known::<Arguments>("hrn-train", 40);
     }
 }
