@@ -15,15 +15,24 @@ import time
 PATIENCE_S = 60
 
 
-def wait_for(what, there):
+def wait_for(what, there, patience_s=PATIENCE_S):
     """The first true value of `there()`."""
     start = time.monotonic()
-    while time.monotonic() - start < PATIENCE_S:
-        found = there()
-        if found:
+    while time.monotonic() - start < patience_s:
+        if found := there():
             return found
         time.sleep(0.01)
     raise AssertionError(f"{what} does not come")
+
+
+def run(*command, code=0, path=None, env=None, **more):
+    """Runs a program to its end, which must have this exit code. It is looked for in `path` first."""
+    env = {**(env or os.environ)}
+    if path:
+        env["PATH"] = f"{os.path.abspath(path)}:{env['PATH']}"
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=900, env=env, **more)
+    assert done.returncode == code, (command, done.returncode, done.stdout[-2000:], done.stderr[-2000:])
+    return done
 
 
 def free_port():

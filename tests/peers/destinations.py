@@ -18,7 +18,7 @@ import time
 
 import duckdb
 import pyarrow.parquet as pq
-from bench import Bench
+from bench import Bench, run
 from rerun.chunk import RrdReader
 from rosbags.rosbag2 import Reader
 
@@ -40,13 +40,9 @@ def shell(bench, command, **replaced):
     for found, put in {**replaced, **ours}.items():
         command = command.replace(found, put)
     # This program's `hardnessd`, and the bench's daemon.
-    path = f"{os.path.dirname(bench.binary)}:{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "RUNTIME_DIRECTORY": bench.directory.name}
-    done = subprocess.run(
-        ["bash", "-euc", command], cwd=bench.directory.name, env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, (command, done)
-    return done.stdout
+    environment = {**os.environ, "RUNTIME_DIRECTORY": bench.directory.name}
+    path = os.path.dirname(bench.binary)
+    return run("bash", "-euc", command, cwd=bench.directory.name, env=environment, path=path).stdout
 
 
 def recorded(bench, commands):

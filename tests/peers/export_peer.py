@@ -13,10 +13,10 @@ import datetime
 import json
 import os
 import pathlib
-import subprocess
 import sys
 import tempfile
 
+import bench
 import duckdb
 import hardnessd
 import numpy as np
@@ -31,11 +31,9 @@ UTC = datetime.timezone.utc
 
 
 def run(*arguments, code=0, lines=1):
-    command = [sys.executable, "-m", "hardnessd.export", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == code, done
-    assert len(done.stderr.splitlines()) == lines or code == 2, done.stderr
-    return done.stderr.strip()
+    said = bench.run(sys.executable, "-m", "hardnessd.export", *arguments, code=code).stderr.strip()
+    assert len(said.splitlines()) == lines or code == 2, said
+    return said
 
 
 def moment(text):
@@ -198,12 +196,12 @@ def keys(path, directory):
 
 def two_sensors(binary, directory):
     """A recording of two sensors has both in its tables. A data set is of one."""
-    with Bench(binary, sensors=("forearm", "palm")) as bench:
+    with Bench(binary, sensors=("forearm", "palm")) as two:
         for seed, name in enumerate(("forearm", "palm")):
-            bench.sensor(name, "--force", "15", "--seed", str(seed))
+            two.sensor(name, "--force", "15", "--seed", str(seed))
         path = directory / "two.mcap"
-        command = [binary, "record", "--config", bench.path("hardnessd.toml"), "--out", path, "--seconds", "8"]
-        subprocess.run(command, check=True, capture_output=True)
+        command = [binary, "record", "--config", two.path("hardnessd.toml"), "--out", path, "--seconds", "8"]
+        bench.run(*command)
     run(path, "--to", "parquet", "--out", directory / "two")
     frames = pq.read_table(directory / "two/frames.parquet").to_pandas()
     contact = pq.read_table(directory / "two/contact.parquet").to_pandas()

@@ -13,10 +13,10 @@ import os
 import pathlib
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 
+import bench
 import numpy as np
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -25,12 +25,7 @@ CARD = ROOT / "models/README.md"
 
 
 def run(command, directory, path):
-    done = subprocess.run(
-        command, cwd=directory, env={**os.environ, "PATH": path}, capture_output=True, text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, (command, done)
-    return done.stdout
+    return bench.run(*command, cwd=directory, env={**os.environ, "PATH": path}).stdout
 
 
 def console(block, directory, path):
@@ -81,10 +76,9 @@ def simulated(directory, path):
 def card():
     """The example of the model's card."""
     (example,) = re.findall(r"```python\n(.*?)```", CARD.read_text(), re.S)
-    done = subprocess.run([sys.executable, "-c", example], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done
-    print(done.stdout)
-    shore, *levels = done.stdout.splitlines()
+    printed = bench.run(sys.executable, "-c", example, cwd=ROOT).stdout
+    print(printed)
+    shore, *levels = printed.splitlines()
     low, value, high = (float(re.fullmatch(r"Shore (\d+) \((\d+) to (\d+)\)", shore)[n]) for n in (2, 1, 3))
     assert 0 <= low <= value <= high <= 100, shore
     shares = [float(line.split()[1]) for line in levels]

@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
 """examples/gentle_press.py on a simulated arm, with the real daemon, the course model and real time.
 
-    PYTHON tests/peers/gentle_press.py target/debug/hardnessd [--presses N] [--seed S]
+    PYTHON tests/peers/gentle_press.py target/debug/hardnessd [PRESSES]
 
 Claims: after eight presses, which serve the sensor as references, most presses have the right level, and those of hard
 and of very soft materials end at an early verdict, below half of the 15 N at which the others end.
 """
 
-import argparse
 import importlib.util
 import json
 import pathlib
 import statistics
+import sys
 import time
 
 import hardnessd
@@ -29,31 +29,26 @@ def example():
     return module
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binary")
-    parser.add_argument("--presses", type=int, default=12)
-    parser.add_argument("--seed", default="63")
-    args = parser.parse_args()
+def main(binary, presses=12, seed="63"):
     gentle_press = example()
     # 790 bytes take 8.6 ms at 921,600 baud, the scan 10 ms.
     more = (
         f'[press]\nearly_min_force_n = 3.0\n[model]\npath = "{ROOT}/models/course.onnx"\nearly_confidence = 0.9\n'
     )
-    with Bench(args.binary, frame_rate_hz=100, more=more) as bench:
+    with Bench(binary, frame_rate_hz=100, more=more) as bench:
         config = pathlib.Path(bench.path("hardnessd.toml"))
         arm = "baud = 921600\narm = { stiffness_n_per_mm = 10.0, delay_ms = 18.6 }\n[publish.unix]"
         config.write_text(config.read_text().replace("[publish.unix]", arm, 1))
         materials = [word for material in MATERIALS for word in ("--material", material)]
         bench.sensor(
             "forearm", "--baud", "921600", "--arm", bench.path("arm.sock"), "--motion", bench.path("control.sock"),
-            "--seed", args.seed, *materials,
+            "--seed", seed, *materials,
         )
         bench.daemon()
         events = iter(hardnessd.Client(bench.path("events.sock"), ["frame", "hardness", "press", "status"]))
         arm = gentle_press.Arm(bench.path("arm.sock"))
         right, forces_n, early = 0, {material: [] for material in MATERIALS}, dict.fromkeys(MATERIALS, 0)
-        for number in range(1, OWN + args.presses + 1):
+        for number in range(1, OWN + presses + 1):
             while arm.order(to_mm=0.0)["at_mm"] > 0:
                 time.sleep(0.02)
             arm.order(object=number)
@@ -65,13 +60,14 @@ def main():
             forces_n[truth["material"]].append(truth["greatest_n"])
             early[truth["material"]] += first is not None
     median_n = statistics.median(sum(forces_n.values(), []))
-    found = {"presses": args.presses, "right": right, "median_n": median_n, "early": early}
+    found = {"presses": presses, "right": right, "median_n": median_n, "early": early}
     print(json.dumps(found))
-    assert right >= 0.8 * args.presses, found
+    assert right >= 0.8 * presses, found
     for material in ("hard-plastic", "yoga-mat"):
         assert early[material] >= 0.9 * len(forces_n[material]), found
         assert statistics.median(forces_n[material]) < 7.5, (found, forces_n)
 
 
 if __name__ == "__main__":
-    main()
+    binary, *presses = sys.argv[1:]
+    main(binary, *map(int, presses))

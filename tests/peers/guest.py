@@ -14,6 +14,8 @@ import threading
 import time
 import tty
 
+import bench
+
 CACHE = os.path.join(
     os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "hardnessd", "machine"
 )
@@ -57,9 +59,11 @@ KVM_PATIENCE_S = 60
 
 
 def run(*command, **more):
-    done = subprocess.run(command, capture_output=True, text=True, **more)
-    assert done.returncode == 0, (command, done.returncode, done.stdout[-2000:], done.stderr[-2000:])
-    return done.stdout
+    return bench.run(*command, **more).stdout
+
+
+def wait_for(what, there):
+    return bench.wait_for(what, there, PATIENCE_S)
 
 
 def image(architecture):
@@ -304,13 +308,3 @@ class Machine:
             self.qemu.kill()
             self.qemu.wait()
         shutil.rmtree(self.folder)
-
-
-def wait_for(what, there, patience_s=PATIENCE_S):
-    """The first true value of `there()`."""
-    start = time.monotonic()
-    while time.monotonic() - start < patience_s:
-        if found := there():
-            return found
-        time.sleep(0.02)
-    raise AssertionError(f"{what} does not come")

@@ -12,7 +12,7 @@ refused in one line that says what to change.
 
 import csv
 import os
-import subprocess
+import pathlib
 import sys
 import tempfile
 import warnings
@@ -20,6 +20,7 @@ import warnings
 import numpy as np
 import onnx
 import onnxruntime
+from bench import run
 from onnx import TensorProto, helper, numpy_helper
 
 try:
@@ -61,34 +62,22 @@ def kinds():
     }
 
 
-def hrn_train(*arguments):
-    return subprocess.run(["hrn-train", *arguments], capture_output=True, text=True, timeout=120)
-
-
-def adopt(*arguments):
-    command = [sys.executable, "-m", "hardnessd.adopt", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
-
-
-def without(path):
-    """Removes the file of an earlier call."""
-    if os.path.exists(path):
-        os.remove(path)
+def adopt(path, data, out, code=0):
+    """Adopts a file anew. Gives what was said."""
+    pathlib.Path(out).unlink(missing_ok=True)
+    command = [sys.executable, "-m", "hardnessd.adopt", path, "--data", data, "--out", out]
+    return run(*command, code=code).stderr
 
 
 def adopted(path, data):
     """What `adopt` makes of the file: for each frame of the data set its probabilities."""
-    without("adopted.onnx")
-    done = adopt(path, "--data", data, "--out", "adopted.onnx")
-    assert done.returncode == 0, done.stderr
-    done = hrn_train("check-model", "adopted.onnx")
-    assert done.returncode == 0, done.stdout
+    adopt(path, data, "adopted.onnx")
+    run("hrn-train", "check-model", "adopted.onnx")
     found = []
     for split in ("train", "test"):
+        pathlib.Path("verdicts.csv").unlink(missing_ok=True)
         options = ["--model", "adopted.onnx", "--data", data, "--split", split, "--verdicts", "verdicts.csv"]
-        without("verdicts.csv")
-        done = hrn_train("evaluate", *options)
-        assert done.returncode == 0, done.stderr
+        run("hrn-train", "evaluate", *options)
         with open("verdicts.csv") as lines:
             rows = csv.DictReader(lines)
             found += [[float(value) for key, value in row.items() if key.startswith("prob")] for row in rows]
@@ -121,11 +110,10 @@ def compare(name, path, data, order=None):
     assert difference < TOLERANCE, (name, difference)
 
 
-def refuse(path, data, wanted):
-    done = adopt(path, "--data", data, "--out", "refused.onnx")
-    assert done.returncode != 0 and wanted in done.stderr, (wanted, done)
-    assert done.stderr.count("\n") == 1 and not os.path.exists("refused.onnx"), done.stderr
-    print(f"refused: {done.stderr.strip()}")
+def refuse(path, data, wanted, code=1):
+    said = adopt(path, data, "refused.onnx", code)
+    assert wanted in said and said.count("\n") == 1 and not os.path.exists("refused.onnx"), (wanted, said)
+    print(f"refused: {said.strip()}")
 
 
 def export(classifier, inputs, classes, options=None, **more):
@@ -159,10 +147,9 @@ def classifiers(data):
     refused("`target_opset=17`", MLPClassifier((8,), max_iter=20), target_opset=12)
     refused("with `predict_proba`", LinearSVC())
     # What has operators that the daemon does not run, `check-model` names.
-    without("adopted.onnx")
-    adopt(export(KNeighborsClassifier(), inputs, level), "--data", data, "--out", "adopted.onnx")
-    done = hrn_train("check-model", "adopted.onnx")
-    assert done.returncode == 78 and "integers that depend on an input" in done.stderr, done
+    adopt(export(KNeighborsClassifier(), inputs, level), data, "adopted.onnx")
+    said = run("hrn-train", "check-model", "adopted.onnx", code=78)
+    assert "integers that depend on an input" in said.stdout + said.stderr, said
 
 
 def networks(data):
@@ -229,7 +216,7 @@ def main(binaries):
     with tempfile.TemporaryDirectory() as directory:
         os.chdir(directory)
         few = "--objects 4 --test-objects 2 --presses 12".split()
-        assert hrn_train("simulate", "--out", "data.npz", *few).returncode == 0
+        run("hrn-train", "simulate", "--out", "data.npz", *few)
         classifiers("data.npz")
         networks("data.npz")
         os.chdir("/")

@@ -11,7 +11,6 @@ LeRobotDataset then reads is what the socket said; and a sensor that is stale or
 no frame.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -21,7 +20,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from dataclasses import dataclass, field
 
@@ -29,7 +27,6 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 # LeRobot keeps calibrations there, and asks nobody.
 os.environ.setdefault("HF_HOME", tempfile.mkdtemp())
 
-import hardnessd
 import lerobot
 import numpy as np
 from bench import Bench, taken
@@ -143,10 +140,7 @@ def an_export(path, directory, episodes):
 def a_recorded_episode(bench, directory, pictures):
     """`lerobot-record` with the simulated robot, beside a client of the socket."""
     address = bench.path("events.sock")
-    client = hardnessd.Client(address, types=hardnessd.TYPES)
-    live = []
-    reader = threading.Thread(target=lambda: live.extend(client), daemon=True)
-    reader.start()
+    lines = bench.events("--types", "frame,hardness")
     out = directory / "recorded"
     cameras = json.dumps({"forearm": {"type": "hardnessd", "address": address, "sensor": "forearm"}})
     sys.argv = [
@@ -165,8 +159,9 @@ def a_recorded_episode(bench, directory, pictures):
         "--play_sounds=false",
     ]
     lerobot_record.record()
-    client.close()
-    reader.join()
+    lines.kill()
+    lines.thread.join()
+    live = lines.events
     data = LeRobotDataset("hardnessd/recorded", root=out)
     names = data.features["observation.state"]["names"]
     assert names == ["joint.pos", "force_n", "level"] and data.num_frames > 0.8 * 8 * FPS, (names, data.num_frames)
@@ -186,7 +181,7 @@ def a_recorded_episode(bench, directory, pictures):
     if pictures:
         strongest = max(data, key=lambda item: float(item["observation.state"][1]))
         picture = (strongest["observation.images.forearm"].numpy().transpose(1, 2, 0) * 255).astype(np.uint8)
-        Image.fromarray(picture).save(pictures / "lerobot.png")
+        Image.fromarray(picture).save(os.path.join(pictures, "lerobot.png"))
     return data.num_frames, pressed
 
 
@@ -194,10 +189,7 @@ def the_array(bench, directory, video):
     """A program of its own with the 2-D feature: every frame of the data set is one of the socket, with what was known
     then."""
     address = bench.path("events.sock")
-    client = hardnessd.Client(address, types=hardnessd.TYPES)
-    live = []
-    reader = threading.Thread(target=lambda: live.extend(client), daemon=True)
-    reader.start()
+    lines = bench.events("--types", "frame,hardness")
     config = HardnessdCameraConfig(address=address, image_key="observation.images.forearm")
     with HardnessdCamera(config) as camera:
         data = LeRobotDataset.create(
@@ -208,8 +200,9 @@ def the_array(bench, directory, video):
             data.add_frame({**camera.observation(), "task": "press an object"})
         data.save_episode()
         data.finalize()
-    client.close()
-    reader.join()
+    lines.kill()
+    lines.thread.join()
+    live = lines.events
     data = LeRobotDataset("hardnessd/array", root=directory / "array")
     names = data.features[STATE]["names"]
     frames = {np.float32(event["newtons"]).tobytes(): event for event in live if event["type"] == "frame"}
@@ -313,14 +306,9 @@ def nothing_stale(binary):
     return reasons
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binary", type=pathlib.Path)
-    parser.add_argument("--pictures", type=pathlib.Path)
-    options = parser.parse_args()
-    binary = str(options.binary.resolve())
-    if options.pictures:
-        options.pictures.mkdir(parents=True, exist_ok=True)
+def main(binary, pictures):
+    if pictures:
+        os.makedirs(pictures, exist_ok=True)
     register_third_party_plugins()
     assert "hardnessd" in CameraConfig.get_known_choices()
     print("LeRobot", lerobot.__version__)
@@ -333,7 +321,7 @@ def main():
         with Bench(binary, frame_rate_hz=FPS) as bench:
             bench.daemon()
             bench.sensor("forearm", "--force", "15", "--seed", "3", "--motion", bench.path("control.sock"))
-            print("lerobot-record: %d frames, %d of them pressed" % a_recorded_episode(bench, directory, options.pictures))
+            print("lerobot-record: %d frames, %d of them pressed" % a_recorded_episode(bench, directory, pictures))
             print("the array, in a data set: %d frames, %d of them pressed" % the_array(bench, directory, True))
             print("the program of the README: %d frames" % the_readme(bench, directory))
         for reason in nothing_stale(binary):
@@ -341,4 +329,5 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    binary, *pictures = sys.argv[1:]
+    main(os.path.abspath(binary), pictures[-1] if pictures else None)

@@ -9,7 +9,6 @@ asserts that); and the daemon judged with the models that the example made, and 
 did not learn from.
 """
 
-import argparse
 import importlib.util
 import json
 import os
@@ -26,12 +25,8 @@ from hardnessd import recording
 EXAMPLE = pathlib.Path(__file__).parents[2] / "examples/own_model.py"
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binaries")
-    parser.add_argument("--pictures", help="where to put the picture that the example draws")
-    args = parser.parse_args()
-    environment = {**os.environ, "PATH": f"{os.path.abspath(args.binaries)}:{os.environ['PATH']}"}
+def main(binaries, pictures):
+    environment = {**os.environ, "PATH": f"{os.path.abspath(binaries)}:{os.environ['PATH']}"}
     expected = ["scikit-learn", *(["PyTorch"] if importlib.util.find_spec("torch") else [])]
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name, "own")
@@ -43,7 +38,7 @@ def main():
         took_s = time.monotonic() - start
         print(done.stdout)
         assert done.returncode == 0, done.returncode
-        picture(directory / "presses.png", args.pictures)
+        picture(directory / "presses.png", pictures)
         labels = set()
         for path in directory.glob("*.mcap"):
             with recording.open(path) as take:
@@ -75,4 +70,5 @@ def picture(path, folder):
 
 
 if __name__ == "__main__":
-    main()
+    binaries, *pictures = sys.argv[1:]
+    main(binaries, pictures[-1] if pictures else None)

@@ -8,12 +8,12 @@ judges an object that was not recorded with what it wrote.
 """
 
 import json
-import os
 import pathlib
 import re
-import subprocess
 import sys
 import tempfile
+
+import bench
 
 PAGE = pathlib.Path(__file__).parents[2] / "docs/own-objects.md"
 RECORD = """
@@ -44,32 +44,23 @@ wait
 
 
 def run(script, directory, path):
-    done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", script],
-        cwd=directory,
-        env={**os.environ, "PATH": path},
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done
-    print(done.stdout)
-    return done.stdout
+    printed = bench.run("bash", "-euo", "pipefail", "-c", script, cwd=directory, path=path).stdout
+    print(printed)
+    return printed
 
 
 def main(binaries):
-    path = f"{os.path.abspath(binaries)}:{os.environ['PATH']}"
     fit = re.search(r"^hrn-train fit .*$", PAGE.read_text(), re.M)[0]
     with tempfile.TemporaryDirectory() as directory:
-        run(RECORD, directory, path)
-        lines = run(fit, directory, path).split("configuration:\n\n")[1]
+        run(RECORD, directory, binaries)
+        lines = run(fit, directory, binaries).split("configuration:\n\n")[1]
         config = pathlib.Path(directory, "own.toml")
         if lines.startswith("references"):
             config.write_text(config.read_text().replace("port =", f"{lines.splitlines()[0]}\nport =", 1))
         else:
             config.write_text(config.read_text() + lines)
-        run("hardnessd check --config own.toml", directory, path)
-        printed = run("hardnessd replay wood-12.mcap --config own.toml --json", directory, path)
+        run("hardnessd check --config own.toml", directory, binaries)
+        printed = run("hardnessd replay wood-12.mcap --config own.toml --json", directory, binaries)
     events = [event for event in map(json.loads, printed.splitlines()) if event.get("phase") == "final"]
     right = sum(event["level"] == 1 for event in events)
     print(f"{right} of {len(events)} presses of unknown wood said to be of level 1")

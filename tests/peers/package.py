@@ -10,25 +10,22 @@ command; the units name what is installed; every link and picture of a page is t
 machine.py installs it.
 """
 
-import argparse
 import json
 import os
 import pathlib
 import re
 import subprocess
+import sys
 import tempfile
+
+import bench
 
 
 def run(*command, **more):
-    done = subprocess.run(command, capture_output=True, text=True, **more)
-    assert done.returncode == 0, (command, done.returncode, done.stdout[-2000:], done.stderr[-2000:])
-    return done.stdout
+    return bench.run(*command, **more).stdout
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("package")
-    package = parser.parse_args().package
+def main(package):
     with tempfile.TemporaryDirectory() as place:
         root, control = os.path.join(place, "root"), os.path.join(place, "control")
         run("dpkg-deb", "-x", package, root)
@@ -159,4 +156,4 @@ def units(root, files):
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -15,13 +15,13 @@ policy; what a person says that they press is told to the daemon and counted; wo
 one of each state, light, dark and narrow.
 """
 
-import argparse
 import datetime
 import json
 import os
 import re
 import shutil
 import signal
+import sys
 import time
 import urllib.request
 
@@ -351,7 +351,5 @@ def main(binary, pictures):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binary")
-    parser.add_argument("--pictures")
-    main(**vars(parser.parse_args()))
+    binary, *pictures = sys.argv[1:]
+    main(binary, pictures[-1] if pictures else None)

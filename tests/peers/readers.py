@@ -12,12 +12,11 @@ line. The type hints are strict, and a program that installs the package is chec
 import json
 import pathlib
 import re
-import subprocess
 import sys
 import tempfile
 
 import numpy as np
-from bench import taken
+from bench import run, taken
 from hardnessd import dataset, recording
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -36,7 +35,7 @@ def refused(read, path, said):
 def data_sets(binaries, directory):
     path = directory / "data.npz"
     sizes = ["--objects", "2", "--test-objects", "1", "--presses", "4", "--seed", "1"]
-    subprocess.run([binaries / "hrn-train", "simulate", "--out", path, *sizes], check=True, capture_output=True)
+    run(binaries / "hrn-train", "simulate", "--out", path, *sizes)
     presses = dataset.load(path)
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
@@ -118,18 +117,17 @@ def damaged(directory):
 
 def types(directory):
     """The hints are strict, and reach whoever installs the package."""
-    mypy = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(directory / "mypy")]
+    def mypy(*options, code=0):
+        command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", directory / "mypy", *options]
+        return run(*command, code=code, cwd=directory).stdout.replace("builtins.", "")
+
     sources = [CLIENT / "hardnessd.py", *sorted((CLIENT / "package").glob("*.py"))]
     for source in sources:
-        options = ["--config-file", CLIENT / "pyproject.toml"]
-        checked = subprocess.run([*mypy, *options, source], capture_output=True, text=True, cwd=directory)
-        assert checked.returncode == 0, checked.stdout
+        mypy("--config-file", CLIENT / "pyproject.toml", source)
     program = directory / "program.py"
-    text = (CLIENT / "README.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (CLIENT / "README.md").read_text(), re.S)
     program.write_text("\n\n".join(blocks).replace("async def main():", "async def main() -> None:"))
-    checked = subprocess.run([*mypy, program], capture_output=True, text=True, cwd=directory)
-    assert checked.returncode == 0, checked.stdout
+    mypy(program)
     program.write_text(
         "import hardnessd\n"
         "for event in hardnessd.Client():\n"
@@ -137,16 +135,15 @@ def types(directory):
         "        reveal_type(event['force_n'])\n"
         "        print(event['forse_n'])\n"
     )
-    checked = subprocess.run([*mypy, program], capture_output=True, text=True, cwd=directory)
-    assert 'Revealed type is "float"' in checked.stdout.replace("builtins.", ""), checked.stdout
-    assert '"Hardness" has no key "forse_n"' in checked.stdout, checked.stdout
+    said = mypy(program, code=1)
+    assert 'Revealed type is "float"' in said and '"Hardness" has no key "forse_n"' in said, said
     return len(sources)
 
 
 def readme(directory):
     blocks = re.findall(r"```python\n(.*?)```", (CLIENT / "README.md").read_text(), re.S)
     (block,) = [block for block in blocks if "recording.open" in block]
-    subprocess.run([sys.executable, "-c", block], cwd=directory, check=True, stdout=subprocess.DEVNULL)
+    run(sys.executable, "-c", block, cwd=directory)
 
 
 def main(binaries):

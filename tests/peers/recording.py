@@ -13,12 +13,11 @@ import json
 import os
 import pathlib
 import struct
-import subprocess
 import sys
 import tempfile
 import time
 
-from bench import Bench, same_messages, taken, wait_for
+from bench import Bench, run, same_messages, taken, wait_for
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
@@ -82,7 +81,7 @@ def check(path, live):
 
 def bag(out, recordings, counts):
     """A bag of these recordings in the new directory `out` says what is in them, and opens by its metadata."""
-    subprocess.run([sys.executable, str(BAG), "--out", str(out), *map(str, recordings)], check=True)
+    run(sys.executable, BAG, "--out", out, *recordings)
     with Reader(out) as reader:
         assert "storage_identifier: mcap" in (out / "metadata.yaml").read_text()
         assert reader.message_count == sum(counts.values())
@@ -95,8 +94,7 @@ def bag(out, recordings, counts):
             assert reader.start_time <= time_ns <= reader.end_time
             read[connection.topic.rsplit("/", 1)[1]] += 1
         assert read == counts, (read, counts)
-    again = subprocess.run([sys.executable, str(BAG), "--out", str(out), *map(str, recordings)], capture_output=True)
-    assert again.returncode == 1 and b"bag.py: " in again.stderr, again
+    assert "bag.py: " in run(sys.executable, BAG, "--out", out, *recordings, code=1).stderr
 
 
 def recorded(binary):
@@ -132,8 +130,7 @@ def killed(binary):
         recorder.kill()
         recorder.wait()
         sensor.kill()
-        saved = subprocess.run([binary, "recover", out, "--out", good], capture_output=True, text=True)
-        assert saved.returncode == 0, saved
+        saved = run(binary, "recover", out, "--out", good)
         assert "the end was missing" in saved.stderr, saved.stderr
         counts, metadata = check(good, [])
         assert metadata["hardnessd.labels"] == {"level": "2", "simulated": "true"}

@@ -9,7 +9,6 @@ Rerun plots; so has what the live bridge writes; every view of the layout shows 
 or the daemon is gone, nothing is shown any more. With `--pictures` and a display (xvfb-run) the viewer itself shows it.
 """
 
-import argparse
 import os
 import pathlib
 import re
@@ -21,7 +20,7 @@ import time
 
 import numpy as np
 import rerun
-from bench import Bench, taken, wait_for
+from bench import Bench, run, taken, wait_for
 from export_peer import moment
 from rerun.chunk import RrdReader
 
@@ -95,20 +94,17 @@ def nothing_after(entities, kind):
 
 def a_recording(path, live, directory):
     out = directory / "take.rrd"
-    subprocess.run([*VIEWER, path, "--save", out], check=True)
+    run(*VIEWER, path, "--save", out)
     entities = read(out)
     origins = blueprint(out)
     assert {f"/forearm/{name}" for name in ("frame", "force_n", "probability")} <= origins, origins
     assert all(any(entity.startswith(origin) for entity in entities) for origin in origins), (origins, list(entities))
     nothing_after(entities, "the end of a recording")
-    again = subprocess.run([*VIEWER, path, "--save", out], capture_output=True, text=True)
-    assert again.returncode == 74 and len(again.stderr.splitlines()) == 1, again
-    broken = directory / "broken.mcap"
+    broken, nothing = directory / "broken.mcap", directory / "no.rrd"
     broken.write_bytes(path.read_bytes()[:-100])
-    for source, code in ((broken, 1), (directory / "missing.mcap", 66)):
-        refused = subprocess.run([*VIEWER, source, "--save", directory / "no.rrd"], capture_output=True, text=True)
-        assert refused.returncode == code and len(refused.stderr.splitlines()) == 1, refused
-        assert not (directory / "no.rrd").exists()
+    for source, to, code in ((path, out, 74), (broken, nothing, 1), (directory / "missing.mcap", nothing, 66)):
+        assert len(run(*VIEWER, source, "--save", to, code=code).stderr.splitlines()) == 1, source
+    assert not nothing.exists()
     return compare(entities, live)
 
 
@@ -153,17 +149,12 @@ def a_picture(rrd, out):
     """What the viewer draws."""
     out.unlink(missing_ok=True)
     command = [shutil.which("rerun", path=os.path.dirname(sys.executable)), str(rrd), "--renderer", "vulkan"]
-    run = ["xvfb-run", "-a", "-s", "-screen 0 1400x900x24", *command, "--window-size", "1400x900", "--screenshot-to", str(out)]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=240)
+    shown = ["xvfb-run", "-a", "-s", "-screen 0 1400x900x24", *command, "--window-size", "1400x900", "--screenshot-to", str(out)]
+    done = subprocess.run(shown, capture_output=True, text=True, timeout=240)
     assert out.exists(), re.sub(r"\x1b\[[0-9;]*m", "", done.stderr)[-600:]
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binary", type=pathlib.Path)
-    parser.add_argument("--pictures", type=pathlib.Path)
-    options = parser.parse_args()
-    binary = str(options.binary.resolve())
+def main(binary, pictures):
     print("Rerun", rerun.__version__)
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
@@ -171,10 +162,11 @@ def main():
         live = taken(binary, path, "--motion", "{control}")
         print("a recording: %d frames and %d verdicts" % a_recording(path, live, directory))
         print("the live bridge: %d frames and %d verdicts" % the_bridge(binary, directory))
-        if options.pictures:
-            options.pictures.mkdir(parents=True, exist_ok=True)
-            a_picture(directory / "take.rrd", options.pictures / "rerun.png")
+        if pictures:
+            os.makedirs(pictures, exist_ok=True)
+            a_picture(directory / "take.rrd", pathlib.Path(pictures, "rerun.png"))
 
 
 if __name__ == "__main__":
-    main()
+    binary, *pictures = sys.argv[1:]
+    main(os.path.abspath(binary), pictures[-1] if pictures else None)

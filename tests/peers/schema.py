@@ -11,10 +11,9 @@ valid. The schema names every field there is, and so do docs/protocol.md and the
 import json
 import pathlib
 import re
-import subprocess
 import sys
 
-from bench import Bench
+from bench import Bench, run
 from jsonschema import Draft202012Validator
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -86,8 +85,7 @@ def live(binary):
 def replayed(binary):
     lines = 0
     for recording in sorted((ROOT / "fixtures").glob("*.5hz.bin")):
-        output = subprocess.run([binary, "replay", recording], check=True, capture_output=True)
-        for line in output.stdout.decode().splitlines():
+        for line in run(binary, "replay", recording).stdout.splitlines():
             check(line)
             lines += 1
     assert lines

@@ -11,10 +11,10 @@ in `systemd-analyze security`; under the unit's scheduling the daemon's main thr
 real time, every thread it starts is an ordinary one, and its memory is locked.
 """
 
-import argparse
 import os
 import socket
 import subprocess
+import sys
 
 from bench import Bench, wait_for
 
@@ -23,10 +23,7 @@ UNITS = os.path.join(HERE, "..", "..", "systemd")
 MOST_EXPOSED = 2.0
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("binary")
-    binary = os.path.abspath(parser.parse_args().binary)
+def main(binary):
     subprocess.run(["mount", "-t", "tmpfs", "none", "/run"], check=True)
     exposure()
     if subprocess.run(["chrt", "--reset-on-fork", "--rr", "10", "true"], stderr=subprocess.DEVNULL).returncode == 0:
@@ -76,4 +73,4 @@ def real_time(binary):
 
 
 if __name__ == "__main__":
-    main()
+    main(os.path.abspath(sys.argv[1]))

@@ -9,11 +9,12 @@ the binary in it; what is unpacked runs a demonstration from there, without anyt
 
 import os
 import pathlib
-import subprocess
 import sys
 import tarfile
 import tempfile
 import tomllib
+
+from bench import run
 
 ROOT = pathlib.Path(__file__).parents[2]
 TARGET = "x86_64-unknown-linux-gnu"
@@ -21,8 +22,7 @@ TARGET = "x86_64-unknown-linux-gnu"
 
 def packed(binary, directory):
     os.makedirs(directory)
-    run = subprocess.run([ROOT / ".ci/tarball", binary, TARGET, directory], capture_output=True, text=True, check=True)
-    return pathlib.Path(run.stdout.strip())
+    return pathlib.Path(run(ROOT / ".ci/tarball", binary, TARGET, directory).stdout.strip())
 
 
 def main(binary):
@@ -46,11 +46,9 @@ def main(binary):
         with tarfile.open(first) as tar:
             tar.extractall(place, filter="data")
         unpacked = os.path.join(place, filled(table["bin-dir"]))
-        demo = subprocess.run(
-            [unpacked, "demo", "--presses", "1", "--speed", "10"],
-            capture_output=True, text=True, timeout=60, cwd=place, env={"PATH": "/nowhere", "XDG_RUNTIME_DIR": place},
-        )
-        assert demo.returncode == 0 and '"phase":"final"' in demo.stdout, demo
+        alone = {"PATH": "/nowhere", "XDG_RUNTIME_DIR": place}
+        demo = run(unpacked, "demo", "--presses", "1", "--speed", "10", cwd=place, env=alone)
+        assert '"phase":"final"' in demo.stdout, demo
         print(f"{first.name}: twice the same, {first.stat().st_size >> 20} MiB, and it runs")
 
 
