@@ -8,8 +8,7 @@
 //! have its verdict, or must be lost with the link, by its number. Memory, descriptors and threads must
 //! not have grown.
 
-use std::fmt::Write as _;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{Read, Write};
 use std::os::unix::fs::symlink;
 use std::os::unix::net::UnixStream;
@@ -20,8 +19,7 @@ use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, recordings_in, wait_for};
-use hardnessd_core::recording::Reader;
+use crate::bench::{Bench, Daemon, Subscriber, sensor, wait_for};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
@@ -302,21 +300,15 @@ fn check_growth(samples: &[(Duration, [u64; 3])]) {
 }
 
 fn configure(bench: &Bench, min_confidence: f64) {
-    let mut text = String::from("robot = \"soak\"\n");
-    for sensor in 0..SENSORS {
-        let _ = write!(
-            text,
-            "[[sensor]]\nname = \"s{sensor}\"\nport = \"s{sensor}\"\nbaud = 3000000\n\
-             frame_rate_hz = {FRAMES_PER_S:.1}\n"
-        );
-    }
-    let _ = write!(
-        text,
-        "[publish.unix]\npath = \"events.sock\"\n[model]\nmin_confidence = {min_confidence}\n\
+    let tables = (0..SENSORS).map(|number| {
+        let name = format!("s{number}");
+        sensor(&name, &name, 100) + "baud = 3000000\n"
+    });
+    let more = format!(
+        "[model]\nmin_confidence = {min_confidence}\n\
          [record]\ndir = \"rec\"\nrotate_s = 20\nkeep_free_mb = 0\n"
     );
-    fs::write(bench.path("new.toml"), text).unwrap();
-    fs::rename(bench.path("new.toml"), bench.path("soak.toml")).unwrap();
+    bench.configure(&tables.collect::<String>(), &more);
 }
 
 #[test]
@@ -342,7 +334,7 @@ fn soak() {
     });
     let players: Vec<Player> = players.collect();
     configure(&bench, 0.0);
-    let mut daemon = Daemon::start(&bench.path("soak.toml"));
+    let mut daemon = bench.daemon_as_configured();
 
     // Subscribers that read everything until the daemon ends. The first one's links tell the players
     // about their sensors.
@@ -372,14 +364,13 @@ fn soak() {
         .map(|player| thread::spawn(move || player.play(start + length)))
         .collect();
     let (mut usages, mut reloads) = (Vec::new(), 0);
-    let recordings = || recordings_in(&bench.path("rec"), "");
     while playing.iter().any(|player| !player.is_finished()) {
         if start.elapsed().as_secs() / 10 > reloads {
             reloads += 1;
             configure(&bench, 0.001 * (reloads % 2) as f64);
             daemon.process.signal(Signal::HUP);
-            for old in recordings().iter().rev().skip(KEPT) {
-                fs::remove_file(old).unwrap();
+            for old in bench.recordings("").iter().rev().skip(KEPT) {
+                fs::remove_file(bench.path(old)).unwrap();
             }
         }
         usages.push((start.elapsed(), usage(&daemon)));
@@ -393,7 +384,7 @@ fn soak() {
     guests.into_iter().for_each(|guest| guest.join().unwrap());
     // Let the subscribers read the events so far.
     sleep(Duration::from_secs(1));
-    daemon.end();
+    let log = daemon.end();
 
     let expected: Vec<Vec<&str>> = sent
         .iter()
@@ -417,12 +408,10 @@ fn soak() {
         println!("{count} {name}");
     }
     // Errors are above all those of refused reloads.
-    let log = daemon.whole_log();
     let errors: Vec<&str> = log.lines().filter(|line| line.contains("ERROR")).collect();
     assert!(errors.is_empty(), "{errors:?}");
-    for path in recordings() {
-        let whole = Reader::new(File::open(&path).unwrap());
-        whole.for_each(|entry| drop(entry.unwrap()));
+    for recording in bench.recordings("") {
+        assert!(!bench.entries(&recording).is_empty(), "{recording}");
     }
     check_growth(&usages);
 }

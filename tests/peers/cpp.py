@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 
-from bench import Bench
+from bench import Bench, run
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
@@ -18,7 +18,7 @@ def main(binary):
     with Bench(binary) as bench:
         program = bench.path("subscribe")
         source = os.path.join(ROOT, "examples/cpp/subscribe.cpp")
-        subprocess.run(["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", source, "-o", program], check=True)
+        run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", source, "-o", program)
         bench.daemon()
         reader = subprocess.Popen([program, bench.path("events.sock")], stdout=subprocess.PIPE, text=True)
         ours = bench.tail("--types", "hardness", "--timeout", "60")

@@ -16,6 +16,8 @@ import tempfile
 import time
 import zipfile
 
+from bench import run
+
 
 def first_verdict(program, environment):
     """How long the demonstration takes to its first verdict, in s."""
@@ -35,9 +37,9 @@ def main(wheel):
     size = os.path.getsize(wheel) / 1e6
     with tempfile.TemporaryDirectory() as place:
         venv = pathlib.Path(place, "venv")
-        subprocess.run([sys.executable, "-m", "venv", venv], check=True)
+        run(sys.executable, "-m", "venv", venv)
         start = time.monotonic()
-        subprocess.run([venv / "bin/pip", "install", "--quiet", "--no-index", wheel], check=True)
+        run(venv / "bin/pip", "install", "--quiet", "--no-index", wheel)
         installed_s = time.monotonic() - start
         program = venv / "bin/hardnessd"
         # Neither the sources nor another installation is in reach.
@@ -45,18 +47,16 @@ def main(wheel):
         demo, verdict_s = first_verdict(program, environment)
         try:
             read = [venv / "bin/python", "-m", "hardnessd", "--types", "frame", "--count", "1", "--timeout", "10"]
-            said = subprocess.run(read, capture_output=True, text=True, env=environment, cwd=place)
-            assert said.returncode == 0 and "demo" in said.stdout, said
+            assert "demo" in run(*read, env=environment, cwd=place).stdout
         finally:
             demo.terminate()
             demo.wait(10)
         tables = "[publish.zenoh]\n[publish.ros2]\n[publish.foxglove]\n"
         config = pathlib.Path(place, "hardnessd.toml")
         config.write_text(f'[[sensor]]\nname = "palm"\nport = "palm"\n{tables}')
-        checked = subprocess.run([program, "check", "--config", config], capture_output=True, text=True, env=environment)
-        assert checked.returncode == 0, checked
+        run(program, "check", "--config", config, env=environment)
         start = time.monotonic()
-        subprocess.run([program, "--version"], check=True, stdout=subprocess.DEVNULL, env=environment)
+        run(program, "--version", env=environment)
         started_s = time.monotonic() - start
     assert verdict_s < 3, f"the first verdict came after {verdict_s:.1f} s"
     print(
