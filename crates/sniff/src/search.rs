@@ -43,6 +43,8 @@ const MOST_ARRAYS: usize = 40;
 /// numbers, and one number for each takes so many bits more.
 const INTERLEAVED: f64 = 0.7;
 const INTERLEAVED_BITS: f64 = 60.0;
+/// Where it is a little more like it, nothing is sure.
+const MAYBE_INTERLEAVED: f64 = 0.9;
 /// The number of frames that a checksum is tried on.
 const CHECKED: usize = 40;
 /// The bytes on each side of a mark that may be a checksum, and the most marks that are tried.
@@ -66,6 +68,28 @@ impl Format {
     fn name_bits(self) -> f64 {
         numbers::name_bits(self.cell) + CHANNEL_BITS * (self.channels - 1) as f64
     }
+}
+
+/// The number of cells after which a cell is more like the one before it than like its neighbour, if their
+/// difference is less than such a `share`.
+fn interleaved(pictures: &Pictures, array: Array, share: f64) -> Option<usize> {
+    let differs = |by: usize| model::difference(pictures, array.cols, by);
+    (2..=MOST_CHANNELS).find(|by| {
+        array.cols.is_multiple_of(*by) && array.cols >= 3 * by && differs(*by) < share * differs(1)
+    })
+}
+
+/// The doubt that what looks like several columns is several numbers of a taxel.
+fn several_numbers(pictures: &Pictures, array: Array, format: Format) -> Option<String> {
+    // A few columns of many rows may be the axes of as many taxels.
+    let of_taxel = (array.cols < MOST_CHANNELS && array.rows > array.cols).then_some(array.cols);
+    let numbers = of_taxel.or_else(|| interleaved(pictures, array, MAYBE_INTERLEAVED))?;
+    (format.channels == 1).then(|| {
+        format!(
+            "each taxel may have {numbers} numbers, such as the axes of a force: say --rows, --cols and --cell if it \
+             has one"
+        )
+    })
 }
 
 /// An array at a place.
@@ -305,13 +329,7 @@ impl Search<'_> {
                 &later(&pictures),
             );
             *score = self.score(place, *format, *array, &pictures, &bits);
-            let differs = |by: usize| model::difference(&pictures, array.cols, by);
-            let is_interleaved = |by: &usize| {
-                array.cols.is_multiple_of(*by)
-                    && array.cols >= 3 * by
-                    && differs(*by) < INTERLEAVED * differs(1)
-            };
-            if format.channels == 1 && (2..=MOST_CHANNELS).any(|by| is_interleaved(&by)) {
+            if format.channels == 1 && interleaved(&pictures, *array, INTERLEAVED).is_some() {
                 score.once += INTERLEAVED_BITS;
             }
         }
@@ -388,7 +406,8 @@ impl Search<'_> {
                 let mark = parts.mark().map_or(0, |mark| mark.len());
                 score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
             } else if !known.is_complete() {
-                cells = self.other_cells(candidate, candidates());
+                let others = || self.other_cells(candidate, candidates());
+                cells = several_numbers(&pictures, array, format).or_else(others);
             }
             let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
             let alone = self.score(&candidate.place, format, array, &pictures, &alone);
