@@ -3,10 +3,10 @@
 
     PYTHON tests/peers/layouts.py target/debug/hardnessd [--streams N] [--seed S]
 
-A generator that shares no code with the product: arrays, cells, marks, counters, lengths, checksums, SLIP, COBS and
-text by chance, with rests and noise, pressed at a few places. Claims: the share that is right, and that hardly any is
-sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames, tares at once and has
-presses.
+A generator that shares no code with the product: arrays, cells, axes, marks, counters, lengths, checksums, SLIP,
+COBS and text by chance, with rests and noise, pressed at a few places. Claims: the share that is right, and that
+hardly any is sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames, tares at
+once and has presses.
 """
 
 import argparse
@@ -76,6 +76,12 @@ def pressed(rng, rows, cols, frames, rate_hz, full):
     return load
 
 
+def axes(rng, load, value, full):
+    """[rows, cols, 3]: shear by the slope of the load, and the force down."""
+    shear = [0.7 * slope + rng.normal(0, 0.003 * full, load.shape) for slope in np.gradient(load)]
+    return np.stack([*shear, value], axis=-1)
+
+
 def stream(seed):
     """What was sent in words, and the bytes."""
     rng = np.random.default_rng(seed)
@@ -88,6 +94,7 @@ def stream(seed):
     header, length, tail = (int(rng.integers(n)) for n in (5, 4, 3))
     checksum = str(rng.choice(list(CHECKSUMS)))
     is_signed = not cell.startswith("u")
+    has_axes = is_signed and framing != "text" and seed % 4 == 0
     rest = rng.uniform(0, 0.12) if not is_signed or rng.random() < 0.5 else rng.uniform(-0.02, 0.02)
     rest = full * (rest + rng.normal(0, 0.01, (rows, cols)) * (rng.random() < 0.6))
     noise = full * rng.uniform(0, 0.006)
@@ -99,6 +106,8 @@ def stream(seed):
             counts = np.clip(np.round(value * min(10, 4095 / full)), 0, 4095).astype(int)
             out += ("\n".join(separator.join(map(str, row)) for row in counts) + "\n\n").encode()
             continue
+        if has_axes:
+            value = axes(rng, load[frame], value, full)
         if not cell.startswith("f"):
             value = np.clip(np.round(value), -full if is_signed else 0, full)
         clock_ms = began + frame * 1000 // rate_hz
@@ -111,6 +120,7 @@ def stream(seed):
         else:
             out += {"slip": slip, "cobs": cobs}[framing](body + CHECKSUMS[checksum](body))
     sent = {"rows": rows, "cols": cols, "cell": cell, "framing": framing, "checksum": checksum, "frames": frames}
+    sent["stride"] = 3 * np.dtype(numbers).itemsize if has_axes else None
     return sent, out[int(rng.integers(40)) :]
 
 
@@ -131,6 +141,8 @@ def judged(binary, directory, sent, data):
     events = [json.loads(line) for line in played.stdout.splitlines()]
     frames = events[-1]["frames"] if events else 0
     is_array = (found["rows"], found["cols"]) == (sent["rows"], sent["cols"])
+    if found.get("stride_bytes") != sent["stride"]:
+        return "wrong", json.dumps(found)
     if not (is_array and is_cell and frames >= 0.95 * sent["frames"] - 2):
         return "wrong", json.dumps(found)
     untared = [event["reason"] for event in events if (event.get("reason") or "").startswith("tare")]
