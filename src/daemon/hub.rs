@@ -14,7 +14,7 @@ mod log;
 mod subscriber;
 mod tally;
 
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 #[cfg(feature = "zenoh")]
 use std::{sync::mpsc, time::Duration};
 
@@ -22,65 +22,15 @@ use tokio::runtime::Handle;
 
 pub(crate) use self::history::History;
 use self::log::Log;
-pub(crate) use self::log::{SensorSnapshot, Snapshot};
+pub(crate) use self::log::{Line, SensorSnapshot, Snapshot};
 pub(crate) use self::subscriber::Subscriber;
 use super::now;
 use super::request::Subscription;
-use hardnessd_core::event::{Event, Hello, Reply, Status};
+use hardnessd_core::event::{Event, Hello};
 
 /// How long a thread without a runtime waits for an answer.
 #[cfg(feature = "zenoh")]
 const PATIENCE: Duration = Duration::from_secs(1);
-
-/// A line to send.
-#[derive(Debug)]
-pub(crate) struct Line {
-    /// The event that the line was made from. A reply has none.
-    pub(crate) event: Option<Box<Event>>,
-    /// The JSON with its newline, once somebody needs it.
-    text: OnceLock<Box<str>>,
-}
-
-impl Line {
-    /// The number of the event, if it has one.
-    pub(crate) fn seq(&self) -> Option<u64> {
-        self.event.as_ref()?.seq()
-    }
-
-    /// The JSON of the line, with its newline.
-    pub(crate) fn json(&self) -> &str {
-        self.text.get_or_init(|| {
-            let event = self.event.as_ref();
-            event
-                .expect("a line without an event has its text")
-                .to_line()
-                .into()
-        })
-    }
-
-    fn of_event(event: Event) -> Arc<Self> {
-        Arc::new(Self {
-            event: Some(Box::new(event)),
-            text: OnceLock::new(),
-        })
-    }
-
-    /// The line of a reply.
-    pub(crate) fn reply(reply: &Reply) -> Arc<Self> {
-        Arc::new(Self {
-            event: None,
-            text: OnceLock::from(reply.to_line().into_boxed_str()),
-        })
-    }
-
-    /// The line of a status that is not an event: it has no number.
-    pub(crate) fn status(status: Status) -> Arc<Self> {
-        let line = Self::of_event(Event::Status(status));
-        // Whoever makes it also formats it, because the sensors' thread has no time for it.
-        line.json();
-        line
-    }
-}
 
 /// The error that the daemon is stopping, and its sensors' thread answers no more.
 #[derive(Debug, thiserror::Error)]

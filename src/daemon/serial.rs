@@ -21,7 +21,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
-use self::network::{Datagram, Udp};
+use self::network::{Received, Udp};
 use self::tty::LineSettings;
 use self::turns::Turns;
 use super::baud::BITS_A_BYTE;
@@ -309,13 +309,13 @@ impl Task {
                 }
             };
             let bytes = match read {
-                Ok(Datagram::Bytes(0)) => return line.end().to_owned(),
-                Ok(Datagram::Bytes(bytes)) => bytes,
-                Ok(Datagram::OfAnother(bytes)) => {
+                Ok(Received::Bytes(0)) => return line.end().to_owned(),
+                Ok(Received::Bytes(bytes)) => bytes,
+                Ok(Received::OfAnother(bytes)) => {
                     self.begin(&line).await;
                     bytes
                 }
-                Ok(Datagram::Ignored) => continue,
+                Ok(Received::Ignored) => continue,
                 Err(error) => return error.to_string(),
             };
             if std::mem::take(&mut is_new) && is_telnet(&self.buffer[..bytes]) {
@@ -386,10 +386,10 @@ impl Line {
         })
     }
 
-    async fn read(&mut self, buffer: &mut [u8], stale_after: Duration) -> io::Result<Datagram> {
+    async fn read(&mut self, buffer: &mut [u8], stale_after: Duration) -> io::Result<Received> {
         match self {
-            Self::Tty(port, _) => AsyncReadExt::read(port, buffer).await.map(Datagram::Bytes),
-            Self::Tcp(stream) => stream.read(buffer).await.map(Datagram::Bytes),
+            Self::Tty(port, _) => AsyncReadExt::read(port, buffer).await.map(Received::Bytes),
+            Self::Tcp(stream) => stream.read(buffer).await.map(Received::Bytes),
             Self::Udp(udp) => udp.read(buffer, stale_after).await,
         }
     }

@@ -2,11 +2,10 @@
 //! sensor. It has no clock and no channel.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::task::Waker;
 use std::time::Duration;
 
-use super::Line;
 use super::cursor::{Cursor, Place, QUEUE};
 use super::history::History;
 use super::tally::Counts;
@@ -14,7 +13,7 @@ use crate::daemon::record::EventRecorder;
 use crate::daemon::request::{Since, Subscription};
 use crate::daemon::sensor::SensorState;
 use crate::daemon::{log, now};
-use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply};
+use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply, Status};
 
 /// The number of numbered events that are held for `since` (`docs/controller.md`).
 pub(super) const HELD: usize = 4096;
@@ -22,6 +21,56 @@ pub(super) const HELD: usize = 4096;
 /// A read ends with the line that reaches this many bytes. So one write carries many events, and a
 /// subscriber that has stopped reading holds little beside the log.
 const BATCH_BYTES: usize = 32 * 1024;
+
+/// A line to send.
+#[derive(Debug)]
+pub(crate) struct Line {
+    /// The event that the line was made from. A reply has none.
+    pub(crate) event: Option<Box<Event>>,
+    /// The JSON with its newline, once somebody needs it.
+    text: OnceLock<Box<str>>,
+}
+
+impl Line {
+    /// The number of the event, if it has one.
+    pub(crate) fn seq(&self) -> Option<u64> {
+        self.event.as_ref()?.seq()
+    }
+
+    /// The JSON of the line, with its newline.
+    pub(crate) fn json(&self) -> &str {
+        self.text.get_or_init(|| {
+            let event = self.event.as_ref();
+            event
+                .expect("a line without an event has its text")
+                .to_line()
+                .into()
+        })
+    }
+
+    fn of_event(event: Event) -> Arc<Self> {
+        Arc::new(Self {
+            event: Some(Box::new(event)),
+            text: OnceLock::new(),
+        })
+    }
+
+    /// The line of a reply.
+    pub(crate) fn reply(reply: &Reply) -> Arc<Self> {
+        Arc::new(Self {
+            event: None,
+            text: OnceLock::from(reply.to_line().into_boxed_str()),
+        })
+    }
+
+    /// The line of a status that is not an event: it has no number.
+    pub(crate) fn status(status: Status) -> Arc<Self> {
+        let line = Self::of_event(Event::Status(status));
+        // Whoever makes it also formats it, because the sensors' thread has no time for it.
+        line.json();
+        line
+    }
+}
 
 /// An event in the log.
 #[derive(Debug, Clone)]

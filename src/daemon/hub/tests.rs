@@ -7,7 +7,9 @@ use super::log::HELD;
 use super::*;
 use crate::daemon::request::{Policy, Since};
 use crate::daemon::sensor::SensorState;
-use hardnessd_core::event::{FrameEvent, Kind, LinkState, ModelCard, PressState, SensorCard};
+use hardnessd_core::event::{
+    FrameEvent, Kind, LinkState, ModelCard, PressState, SensorCard, Status,
+};
 
 const RUN: &str = "5eed";
 

@@ -61,7 +61,7 @@ pub(super) fn is_telnet(mut stream: &TcpStream) -> bool {
 
 /// What came from a line.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Datagram {
+pub(super) enum Received {
     /// This many bytes.
     Bytes(usize),
     /// This many bytes of the first sender, or of another one that has taken its place.
@@ -110,7 +110,7 @@ impl Udp {
         &mut self,
         buffer: &mut [u8],
         stale_after: Duration,
-    ) -> io::Result<Datagram> {
+    ) -> io::Result<Received> {
         let (bytes, address) = self.socket.recv_from(buffer).await?;
         Ok(match &mut self.sender {
             Some(sender)
@@ -119,15 +119,15 @@ impl Udp {
             {
                 // An empty datagram is no end.
                 match bytes {
-                    0 => Datagram::Ignored,
-                    bytes => Datagram::Bytes(bytes),
+                    0 => Received::Ignored,
+                    bytes => Received::Bytes(bytes),
                 }
             }
             Some(sender) if sender.address != address && sender.is_new(stale_after) => {
                 if !std::mem::replace(&mut sender.reported, true) {
                     log::other_sender(sender.address, address);
                 }
-                Datagram::Ignored
+                Received::Ignored
             }
             sender => {
                 *sender = Some(Sender {
@@ -136,7 +136,7 @@ impl Udp {
                     sends_frames: false,
                     reported: false,
                 });
-                Datagram::OfAnother(bytes)
+                Received::OfAnother(bytes)
             }
         })
     }
