@@ -271,7 +271,7 @@ fn of_taxels(
     for &[row, col] in &dead {
         is_dead[array.place(row, col)] = true;
     }
-    let plain = presses.iter().map(|press| press.without_gains());
+    let plain = presses.iter().map(gather::Press::without_gains);
     let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead).exit(FAILED)?;
     let gains: Vec<f32> = fit.gains.iter().map(|gain| gain.unwrap_or(1.0)).collect();
     let bytes = npy::to_bytes(&gains, array.rows, array.cols);

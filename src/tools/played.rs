@@ -157,7 +157,7 @@ impl<'a> Played<'a> {
                 let count = motion.iter().position(is_later).unwrap_or(motion.len());
                 let points = Input::Motion(motion.drain(..count).collect());
                 let mut events = Vec::new();
-                for input in [points, Input::Bytes(bytes.into())] {
+                for input in [points, Input::Bytes(bytes)] {
                     let found = Found {
                         sensor: sensor.name().to_owned(),
                         at: START,

@@ -48,9 +48,11 @@ fn six_floods_take_nothing_from_a_good_sensor() {
     let (mut stale, mut next) = (0, 0);
     let longest = thread::scope(|scope| {
         for flood in floods {
-            scope.spawn(
-                || while !done.load(Ordering::Relaxed) && flood.write_all(&short).is_ok() {},
-            );
+            scope.spawn(|| {
+                while !done.load(Ordering::Relaxed) && flood.write_all(&short).is_ok() {
+                    std::hint::spin_loop();
+                }
+            });
         }
         let playing = scope.spawn(|| play(good));
         let begin = Instant::now();

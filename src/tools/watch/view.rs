@@ -221,7 +221,7 @@ impl View {
                 }
             }
             KeyCode::Tab | KeyCode::Right | KeyCode::Down => {
-                self.chosen = (self.chosen + 1) % count
+                self.chosen = (self.chosen + 1) % count;
             }
             KeyCode::BackTab | KeyCode::Left | KeyCode::Up => {
                 self.chosen = (self.chosen + count - 1) % count;

@@ -217,10 +217,10 @@ impl Statistics {
         sums.clone().map(|sum| sum.div_scalar(*batches as f32))
     }
 
-    fn collect(&mut self, name: &str, batch: [Tensor<1>; 2]) {
+    fn collect(&mut self, name: &str, batch: &[Tensor<1>; 2]) {
         let none = || (batch.each_ref().map(Tensor::zeros_like), 0);
         let (sums, batches) = self.0.entry(name.to_owned()).or_insert_with(none);
-        for (sum, of_batch) in sums.iter_mut().zip(&batch) {
+        for (sum, of_batch) in sums.iter_mut().zip(batch) {
             *sum = sum.clone().add(of_batch.clone());
         }
         *batches += 1;
@@ -302,7 +302,7 @@ pub(super) fn batch_norm(
     if let Normalisation::Collect(statistics) = normalisation {
         let (variance, mean) = x.clone().inner().var_mean_bias(1);
         let batch = [mean, variance].map(|values| values.reshape([along[0]]));
-        statistics.collect(name, batch);
+        statistics.collect(name, &batch);
     }
     normalised(x, gamma, beta, epsilon, slope)
 }
