@@ -93,7 +93,7 @@ class Arm:
 
     def _serve(self):
         connection, _ = self.listener.accept()
-        connection.sendall(b'{"type":"hello","sensors":[{"name":"forearm"}]}\n')
+        connection.sendall(b'{"type":"hello","protocol":1,"sensors":[{"name":"forearm"}]}\n')
         for line in connection.makefile():
             request = json.loads(line)
             if "motion" in request:

@@ -1,6 +1,6 @@
 //! A press becomes the event of its verdict.
 //!
-//! In: the presses of one sensor, the positions of the arm, and the [`Moment`] of each verdict.
+//! In: the presses of one sensor, the positions of the arm, and what is so at each verdict.
 //! Out: [`Hardness`] events. A judge decides when a press is judged early, what the model is given of
 //! it, and what is said beside the model's own words. It knows nothing of bytes and ports.
 
