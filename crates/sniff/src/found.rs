@@ -185,6 +185,13 @@ impl Ranked {
         }
     }
 
+    /// Whether it is what the user knows.
+    pub(crate) fn is_as(&self, known: Known) -> bool {
+        known.rows.is_none_or(|rows| rows == self.array.rows)
+            && known.cols.is_none_or(|cols| cols == self.array.cols)
+            && known.cell.is_none_or(|cell| Some(cell) == self.cell)
+    }
+
     fn doubt(&self, next: Option<&Self>, is_given: bool) -> Option<String> {
         let Proposal {
             frames,

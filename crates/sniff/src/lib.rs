@@ -93,7 +93,7 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
     if text::is_text(bytes) {
         return text::find(bytes, known);
     }
-    if let Some(found) = glove(bytes) {
+    if let Some(found) = board(bytes).filter(|found| found.best.is_as(known)) {
         return Ok(found);
     }
     in_periods(capture, known)
@@ -116,13 +116,23 @@ fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
     open.ok_or(failure)
 }
 
-/// The glove of Weihai JQ, whose packets have two lengths.
-fn glove(bytes: &[u8]) -> Option<Found> {
-    let settings = Settings {
-        preset: Some(Preset::JqGlove),
-        ..Settings::default()
+/// A board that is known without a picture: one whose checksum holds, or the glove of Weihai JQ, whose packets
+/// have two lengths.
+fn board(bytes: &[u8]) -> Option<Found> {
+    let of_preset = |(preset, cell)| {
+        let settings = Settings {
+            preset: Some(preset),
+            ..Settings::default()
+        };
+        let array = Layout::new(&settings).ok()?.array();
+        let proposal = Proposal::decoded(settings, true, bytes)?;
+        Some(Found::stated(array, Some(cell), proposal))
     };
-    let array = Layout::new(&settings).ok()?.array();
-    let proposal = Proposal::decoded(settings, true, bytes)?;
-    Some(Found::stated(array, Some(Cell::U8), proposal))
+    [
+        (Preset::Jx255n, Cell::U8),
+        (Preset::Jx255nU16, Cell::U16le),
+        (Preset::JqGlove, Cell::U8),
+    ]
+    .into_iter()
+    .find_map(of_preset)
 }

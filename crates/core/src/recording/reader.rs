@@ -7,7 +7,7 @@ use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use super::message::{self, INPUT, MOTION};
-use super::{Entry, Error};
+use super::{Entry, Error, MAGIC};
 use crate::frame::Stamp;
 
 /// An entry of a sensor, and its moment.
@@ -33,6 +33,8 @@ const CHUNK_HEADER_BYTES: usize = 8 + 8 + 8 + 4 + 4 + 8;
 pub(super) struct Records<R> {
     source: R,
     linear: LinearReader,
+    /// The bytes of the file's magic that are still to be read.
+    magic: usize,
 }
 
 impl<R: Read> Records<R> {
@@ -44,6 +46,7 @@ impl<R: Read> Records<R> {
         Self {
             source,
             linear: LinearReader::new_with_options(options),
+            magic: MAGIC.len(),
         }
     }
 
@@ -57,6 +60,13 @@ impl<R: Read> Records<R> {
                             read => break read?,
                         }
                     };
+                    self.magic = self.magic.saturating_sub(read);
+                    if read == 0 && self.magic > 0 {
+                        // Such a short file holds nothing that could be saved.
+                        let found = MAGIC.len() - self.magic;
+                        let words = format!("found {found} bytes, expected a recording");
+                        return Err(Error::Content(words));
+                    }
                     self.linear.notify_read(read);
                 }
                 LinearReadEvent::Record { opcode, data } => {
@@ -98,6 +108,7 @@ impl Records<Cursor<Vec<u8>>> {
         Ok(Self {
             source: Cursor::new(body),
             linear: LinearReader::new_with_options(options),
+            magic: 0,
         })
     }
 }

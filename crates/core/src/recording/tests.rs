@@ -324,8 +324,11 @@ fn what_is_no_recording_is_refused_in_words() {
         errors.next().map(|error| error.to_string())
     };
     assert!(error(b"no recording at all").unwrap().contains("no MCAP"));
-    for file in [&b""[..], b"\x89MCAP"] {
-        assert!(error(file).unwrap().contains("damaged"));
+    for (file, found) in [(&b""[..], "found 0 bytes"), (b"\x89MCAP", "found 5 bytes")] {
+        assert_eq!(
+            error(file).unwrap(),
+            format!("{found}, expected a recording")
+        );
     }
     let (file, _) = recorded(10, 7);
     assert_eq!(error(&file), None);
