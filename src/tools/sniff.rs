@@ -351,6 +351,9 @@ fn toml(path: &Path, bytes: usize, found: &Found, proposal: &Proposal) -> String
             lead.exp2().min(1e6).round(),
             array_in_words(next)
         ),
+        _ if best.picture.is_empty() => {
+            format!("{}: its frames themselves say so", array_in_words(best))
+        }
         _ => format!("{}: no other array makes a picture", array_in_words(best)),
     });
     for words in &proposal.remarks {
