@@ -93,10 +93,23 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
     if text::is_text(bytes) {
         return text::find(bytes, known);
     }
-    if let Some(found) = board(bytes).filter(|found| found.best.is_as(known)) {
+    let of_board = |preset, cell| {
+        let found = board(bytes, preset, cell);
+        found.filter(|found| found.best.is_as(known))
+    };
+    // Its packets have two lengths.
+    if let Some(found) = of_board(Preset::JqGlove, Cell::U8) {
         return Ok(found);
     }
-    in_periods(capture, known)
+    let found = in_periods(capture, known);
+    let is_certain = |found: &Found| found.doubt.is_none() && found.best.proposal.is_checked();
+    if found.as_ref().is_ok_and(is_certain) {
+        return found;
+    }
+    // A checksum that holds in all frames says more than a picture of a few.
+    of_board(Preset::Jx255n, Cell::U8)
+        .or_else(|| of_board(Preset::Jx255nU16, Cell::U16le))
+        .map_or(found, Ok)
 }
 
 /// The layouts of frames of one length.
@@ -116,23 +129,13 @@ fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
     open.ok_or(failure)
 }
 
-/// A board that is known without a picture: one whose checksum holds, or the glove of Weihai JQ, whose packets
-/// have two lengths.
-fn board(bytes: &[u8]) -> Option<Found> {
-    let of_preset = |(preset, cell)| {
-        let settings = Settings {
-            preset: Some(preset),
-            ..Settings::default()
-        };
-        let array = Layout::new(&settings).ok()?.array();
-        let proposal = Proposal::decoded(settings, true, bytes)?;
-        Some(Found::stated(array, Some(cell), proposal))
+/// A known board, if its layout explains the bytes. It needs no picture.
+fn board(bytes: &[u8], preset: Preset, cell: Cell) -> Option<Found> {
+    let settings = Settings {
+        preset: Some(preset),
+        ..Settings::default()
     };
-    [
-        (Preset::Jx255n, Cell::U8),
-        (Preset::Jx255nU16, Cell::U16le),
-        (Preset::JqGlove, Cell::U8),
-    ]
-    .into_iter()
-    .find_map(of_preset)
+    let array = Layout::new(&settings).ok()?.array();
+    let proposal = Proposal::decoded(settings, true, bytes)?;
+    Some(Found::stated(array, Some(cell), proposal))
 }
