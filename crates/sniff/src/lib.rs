@@ -102,14 +102,22 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
         return Ok(found);
     }
     let found = in_periods(capture, known);
-    let is_certain = |found: &Found| found.doubt.is_none() && found.best.proposal.is_checked();
-    if found.as_ref().is_ok_and(is_certain) {
+    let board = of_board(Preset::Jx255n, Cell::U8)
+        .or_else(|| of_board(Preset::Jx255nU16, Cell::U16le))
+        .filter(|board| board.best.proposal.explains_nearly_all());
+    let Some(board) = board else {
+        return found;
+    };
+    // Its checksum holds. A picture can only show that the array has another shape.
+    let is_right = |found: &Found| {
+        let has_shape = found.best.array == board.best.array && found.best.cell == board.best.cell;
+        let is_board = found.best.proposal.is_board;
+        found.doubt.is_none() && found.best.proposal.is_checked() && (is_board || !has_shape)
+    };
+    if found.as_ref().is_ok_and(is_right) {
         return found;
     }
-    // A checksum that holds in all frames says more than a picture of a few.
-    of_board(Preset::Jx255n, Cell::U8)
-        .or_else(|| of_board(Preset::Jx255nU16, Cell::U16le))
-        .map_or(found, Ok)
+    Ok(board)
 }
 
 /// The layouts of frames of one length.
