@@ -1,6 +1,6 @@
 //! A subscriber's place in the log, and which events it gets from there on.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::task::Waker;
 
 use super::log::Entry;
@@ -167,11 +167,19 @@ impl Cursor {
         self.policy = wanted.policy;
     }
 
-    /// Forgets what the subscriber had before `oldest`, because nothing can give it again.
-    pub(super) fn forget_had(&mut self, oldest: Place) {
-        while self.had.first().is_some_and(|&seq| seq <= oldest.seq()) {
-            self.had.pop_first();
+    /// Forgets what the subscriber had and is no longer `held`, because nothing can give it again. The work is
+    /// in proportion to what it had meanwhile.
+    pub(super) fn forget_had(&mut self, held: &VecDeque<Entry>) {
+        if self.had.len() > 2 * held.len() {
+            let place = |seq| held.binary_search_by_key(&Some(seq), |entry| entry.line.seq());
+            self.had.retain(|&seq| place(seq).is_ok());
         }
+    }
+
+    /// How many events it remembers that it had.
+    #[cfg(test)]
+    pub(super) fn remembered(&self) -> usize {
+        self.had.len()
     }
 
     /// Goes back to `place`, for numbered events. Frames go on where they are.

@@ -159,7 +159,7 @@ pub(crate) struct Log {
     /// The place after the newest event. Frames that nobody wanted do not count.
     end: Place,
     sensors: BTreeMap<Arc<str>, OfSensor>,
-    subscribers: BTreeMap<u64, Cursor>,
+    pub(super) subscribers: BTreeMap<u64, Cursor>,
     joined: u64,
     gaps: u64,
     dropped: u64,
@@ -441,7 +441,7 @@ impl Log {
         if cursor.has_all(end) {
             return Vec::new();
         }
-        cursor.forget_had(self.events.front().map_or(end, |entry| entry.before));
+        cursor.forget_had(&self.events);
         let held = [&self.events, &self.frames].into_iter();
         let ahead = held.flat_map(|held| {
             let first = held.partition_point(|entry| cursor.has_passed(entry));

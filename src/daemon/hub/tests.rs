@@ -396,6 +396,20 @@ fn frames_are_held_only_for_those_who_read_them() {
     assert_eq!(log.frames.len(), 0);
 }
 
+#[test]
+fn a_subscriber_remembers_no_more_than_is_held_beside_a_quiet_sensor() {
+    let mut log = log();
+    let id = log.joins(&wanting(&[Kind::Status, Kind::Press], Policy::Queue, None));
+    // It is held as long as its sensor says no more.
+    log.publish_now(status("quiet"));
+    for _ in 0..20 {
+        log.presses(1000);
+        log.drain(id);
+    }
+    let remembered = log.subscribers[&id].remembered();
+    assert!(remembered < 3 * HELD, "{remembered}");
+}
+
 #[tokio::test]
 async fn a_subscriber_that_waits_gets_a_line_without_asking_again() {
     let hub = Hub::new(hello());
