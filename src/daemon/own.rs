@@ -4,9 +4,11 @@
 //! service, one for each sensor, each whole or not there; and at the next start what they hold, if the
 //! owner is still the same. One thread writes, so no sensor waits for a disk.
 
+use std::collections::BTreeMap;
 use std::env;
 use std::ffi::OsString;
 use std::fs;
+use std::iter;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 
@@ -129,19 +131,22 @@ fn read(path: &Path) -> anyhow::Result<Option<Kept>> {
     Ok(Some(serde_json::from_slice(&fs::read(path)?)?))
 }
 
-/// Writes what comes, until all senders are gone.
+/// Writes what comes, until all senders are gone. Of the changes of a sensor that wait, the last one counts.
 fn write_all(directory: &Path, changed: &Receiver<(String, Kept)>) {
-    for (sensor, kept) in changed {
-        let path = file_of(directory, &sensor);
-        let written = fs::create_dir_all(directory).and_then(|()| {
-            let text = serde_json::to_vec(&kept)?;
-            Part::over(&path)?.write(&text)
-        });
-        if let Err(error) = written {
-            let path = path.display();
-            log::limited("own presses", || {
-                warn!(%path, %error, "own presses are not written");
+    while let Ok(first) = changed.recv() {
+        let waiting: BTreeMap<_, _> = iter::once(first).chain(changed.try_iter()).collect();
+        for (sensor, kept) in waiting {
+            let path = file_of(directory, &sensor);
+            let written = fs::create_dir_all(directory).and_then(|()| {
+                let text = serde_json::to_vec(&kept)?;
+                Part::over(&path)?.write(&text)
             });
+            if let Err(error) = written {
+                let path = path.display();
+                log::limited("own presses", || {
+                    warn!(%path, %error, "own presses are not written");
+                });
+            }
         }
     }
 }
