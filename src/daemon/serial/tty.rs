@@ -9,7 +9,7 @@ use std::path::Path;
 
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
-use rustix::termios::{OptionalActions, Termios, tcgetattr, tcsetattr};
+use rustix::termios::{OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcsetattr};
 use rustix::thread::{CapabilitySet, CapabilitySets, capabilities, set_capabilities};
 use serialport::{ClearBuffer, ErrorKind, SerialPort, TTYPort};
 
@@ -77,10 +77,34 @@ impl LineSettings {
         Ok(())
     }
 
-    /// Sets the settings again: another program may have changed them.
+    /// Sets the settings again if another program has changed them. Some drivers send them to the adapter even
+    /// if nothing changes, and the sensors wait for that.
     pub(super) fn restore(&self) -> Result<(), Errno> {
-        tcsetattr(&self.file, OptionalActions::Now, &self.settings)
+        if !are_same(&tcgetattr(&self.file)?, &self.settings) {
+            tcsetattr(&self.file, OptionalActions::Now, &self.settings)?;
+        }
+        Ok(())
     }
+}
+
+/// Whether two settings read and write bytes alike.
+fn are_same(one: &Termios, other: &Termios) -> bool {
+    let modes = |settings: &Termios| {
+        let Termios {
+            input_modes,
+            output_modes,
+            local_modes,
+            control_modes,
+            ..
+        } = *settings;
+        (input_modes, output_modes, local_modes, control_modes)
+    };
+    let speeds = |settings: &Termios| (settings.input_speed(), settings.output_speed());
+    let codes = |settings: &Termios| {
+        let code = |index| settings.special_codes[index];
+        (code(SpecialCodeIndex::VMIN), code(SpecialCodeIndex::VTIME))
+    };
+    modes(one) == modes(other) && speeds(one) == speeds(other) && codes(one) == codes(other)
 }
 
 #[cfg(test)]
@@ -103,10 +127,8 @@ mod tests {
         cooked.set_speed(9_600).unwrap();
         tcsetattr(&line.file, OptionalActions::Now, &cooked).unwrap();
         line.restore().unwrap();
-        let restored = tcgetattr(&line.file).unwrap();
-        assert_eq!(restored.local_modes, line.settings.local_modes);
-        assert_eq!(restored.input_modes, line.settings.input_modes);
-        assert_eq!(restored.input_speed(), 57_600);
+        assert!(are_same(&tcgetattr(&line.file).unwrap(), &line.settings));
+        assert!(!are_same(&cooked, &line.settings));
     }
 
     #[test]
