@@ -9,13 +9,13 @@ use std::thread;
 use tokio::runtime::{Builder, Handle};
 use tokio::sync::oneshot;
 
-/// The thread. When this is dropped, its tasks are dropped, and the thread ends.
+/// The thread. Dropping this waits until its tasks are dropped, with their sockets, and the thread has ended.
 #[derive(Debug)]
 pub(crate) struct Clients {
     pub(super) runtime: Handle,
     /// Ends the thread when it is dropped.
-    ending: oneshot::Sender<()>,
-    thread: thread::JoinHandle<()>,
+    ending: Option<oneshot::Sender<()>>,
+    thread: Option<thread::JoinHandle<()>>,
 }
 
 impl Clients {
@@ -36,15 +36,16 @@ impl Clients {
             })?;
         Ok(Self {
             runtime: handle,
-            ending,
-            thread,
+            ending: Some(ending),
+            thread: Some(thread),
         })
     }
+}
 
-    /// Ends the thread, and waits for that.
-    pub(super) fn end(self) {
-        drop(self.ending);
+impl Drop for Clients {
+    fn drop(&mut self) {
+        drop(self.ending.take());
         // A panic on that thread has been reported by itself.
-        let _ = self.thread.join();
+        let _ = self.thread.take().map(thread::JoinHandle::join);
     }
 }

@@ -139,7 +139,7 @@ impl Daemon {
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
-        self.clients.end();
+        drop(self.clients);
         match self.recorder {
             // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,
