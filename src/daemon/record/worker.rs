@@ -13,7 +13,7 @@ use tracing::{info, warn};
 
 use super::file::{MB, Open, create, has_room};
 use super::{Job, Load, Progress, Target};
-use crate::daemon::{Error, config};
+use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::Input;
@@ -150,6 +150,7 @@ impl Worker {
     }
 
     fn end(mut self) -> Result<(), Error> {
+        self.report_dropped();
         let gone = self.gone.take().map_or(Ok(()), Err);
         let Some(Open {
             path, file, writer, ..
@@ -290,18 +291,26 @@ impl Worker {
             Ok(path)
         };
         let path = written().map_err(|error| error.to_string())?;
-        info!(sensor = name, path = %path.display(), "black box");
+        log::limited(
+            name,
+            || info!(sensor = name, path = %path.display(), "black box"),
+        );
         Ok(path)
+    }
+
+    /// Says how many entries had no room, if there are any.
+    fn report_dropped(&self) -> bool {
+        let count = self.load.dropped.swap(0, Ordering::Relaxed);
+        if count > 0 {
+            warn!(count, "no room in the recorder's queue: entries dropped");
+        }
+        count > 0
     }
 
     /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), recording::Error> {
-        if Instant::now() >= self.report_at {
+        if Instant::now() >= self.report_at && self.report_dropped() {
             self.report_at = Instant::now() + REPORT_EVERY;
-            let count = self.load.dropped.swap(0, Ordering::Relaxed);
-            if count > 0 {
-                warn!(count, "no room in the recorder's queue: entries dropped");
-            }
         }
         if let Some(open) = &mut self.open {
             open.writer.flush()?;
