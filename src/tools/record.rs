@@ -122,8 +122,9 @@ pub async fn run(
         presses,
         ..
     } = *counted.borrow();
-    if recorded.is_err() && frames == 0 {
-        // The path must be free for the next try.
+    let is_unusable = |failure: &Failure| frames == 0 || failure.code() == UNAVAILABLE;
+    if recorded.as_ref().is_err_and(is_unusable) {
+        // The path must be free for the next try. Where a sensor is missing, nothing is worth keeping.
         part::remove(&path, &own);
         return recorded;
     }
