@@ -119,9 +119,9 @@ impl Gathered {
                 _ => {}
             }
         }
-        if let Some(press) = self.presses.last_mut()
-            && at.mono < press.end.saturating_add(AFTER)
-        {
+        // Positions may come late, and another press may have ended meanwhile.
+        let is_recent = |press: &&mut Press| at.mono < press.end.saturating_add(AFTER);
+        for press in self.presses.iter_mut().rev().take_while(is_recent) {
             press.track = pipeline.track().clone();
         }
     }
