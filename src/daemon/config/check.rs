@@ -135,13 +135,36 @@ fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> 
         Ok(id) => range::check(key, id, id <= LAST_DOMAIN_ID, expected)?,
         Err(found) => return Err(Problem::found(key, found, expected)),
     }
-    // The library checks the names, when it makes the topics.
-    for sensor in ros2.motion.keys() {
+    let token = |token: &str| {
+        token.starts_with(|first: char| first.is_ascii_alphabetic())
+            && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+            && !token.contains("__")
+    };
+    let is_topic = |name: &str| {
+        let tokens = name.strip_prefix('/');
+        tokens.is_some_and(|tokens| tokens.split('/').all(token))
+    };
+    let namespace = &ros2.namespace;
+    let fits = namespace == "/" || is_topic(namespace);
+    let expected = "a namespace of ROS such as \"/arm_7\"";
+    range::check("publish.ros2.namespace", namespace, fits, expected)?;
+    for (sensor, topic) in &ros2.motion {
         let is_known = sensors.iter().any(|known| known.name == *sensor);
         let expected = "the name of a [[sensor]] before each topic";
         range::check("publish.ros2.motion", sensor, is_known, expected)?;
+        let key = format!("publish.ros2.motion.{sensor}");
+        let expected = "a topic of ROS such as \"/arm_7/approach\"";
+        range::check(&key, topic, is_topic(topic), expected)?;
     }
-    Ok(())
+    let fits = |sensor: &&sensor::Settings| token(&sensor.name);
+    match sensors.iter().find(|sensor| !fits(sensor)) {
+        Some(sensor) => Err(Problem::found(
+            "sensor.name",
+            &sensor.name,
+            "a name without two _ in a row, for publish.ros2",
+        )),
+        None => Ok(()),
+    }
 }
 
 /// The most characters of a robot's name, as many as in the longest host name.

@@ -247,6 +247,14 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
             "ros2]\nmotion = { foot = \"/approach\" }",
             "ros2.motion: found \"foot\"",
         ),
+        (
+            "ros2]\nmotion = { sensor = \"approach\" }",
+            "ros2.motion.sensor: found \"approach\"",
+        ),
+        (
+            "ros2]\nnamespace = \"arm_7\"",
+            "ros2.namespace: found \"arm_7\"",
+        ),
         ("ros2]\ndomain_id = 233", "found 233, expected 0 to 232"),
         ("ros2]\nnetworks = [\"eth0\"]", "IP address"),
     ] {
@@ -259,6 +267,9 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
         error.contains("zenoh.site") && error.contains("arm #7"),
         "{error}"
     );
+    let named = LEAST.replace("port", "name = \"a__b\"\nport");
+    let error = load(&format!("{named}[publish.ros2]\n")).unwrap_err();
+    assert!(error.contains("a__b"), "{error}");
     let good = format!("{robot}{LEAST}[publish.zenoh]\nsite = \"hall/3\"\n[publish.ros2]\n");
     let publish = load(&good).unwrap().publish;
     assert_eq!(publish.zenoh.unwrap().site("arm #7"), "hall/3");
