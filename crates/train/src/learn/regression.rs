@@ -8,7 +8,6 @@ use std::collections::BTreeMap;
 use std::slice;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use liblbfgs::lbfgs;
 
 use super::learner::Learner;
 use super::{Inputs, Learning, Outputs, Plan, Question, Taken};
@@ -221,7 +220,7 @@ impl Learning for Regression<'_> {
         let right = right.filter(|(logits, level)| argmax(logits).0 == **level);
         sides[0].weights = weights;
         Taken {
-            loss: samples.loss(&fitted, &mut vec![0.0; fitted.len()]),
+            loss: samples.loss(&fitted).0,
             accuracy: Some(right.count() as f64 / judged.len() as f64),
             ..Taken::default()
         }
@@ -280,29 +279,64 @@ struct Samples {
     ridge: f64,
 }
 
+/// The pairs of steps that L-BFGS remembers.
+const REMEMBERED: usize = 10;
 /// The most steps of a fit.
 const MOST_STEPS: usize = 1000;
-/// A fit ends when the gradient's length is no more than this share of that of the coefficients.
-const LEAST_GRADIENT: f64 = 1e-7;
+/// A fit ends when no element of the gradient is larger.
+const LEAST_GRADIENT: f64 = 1e-6;
 
 impl Samples {
-    /// The coefficients of least loss, level by level: by L-BFGS, because with many taxels a matrix of second
-    /// derivatives would be too large.
+    /// The coefficients of least loss, level by level: by L-BFGS (Nocedal and Wright, "Numerical
+    /// optimization", algorithm 7.4), because with many taxels a matrix of second derivatives would be too
+    /// large.
     fn fit(&self) -> Vec<f64> {
         let width = self.rows.first().map_or(0, Vec::len);
-        let mut coefficients = vec![0.0; width * self.levels];
-        let search = lbfgs()
-            .with_max_iterations(MOST_STEPS)
-            .with_epsilon(LEAST_GRADIENT);
-        // A search that finds no better place ends with an error, at the best one.
-        let _ = search.minimize(&mut coefficients, |at, of| Ok(self.loss(at, of)), |_| false);
-        coefficients
+        let mut x = vec![0.0; width * self.levels];
+        let (mut loss, mut gradient) = self.loss(&x);
+        let mut pairs: Vec<[Vec<f64>; 2]> = Vec::new();
+        for _ in 0..MOST_STEPS {
+            if gradient.iter().all(|g| g.abs() <= LEAST_GRADIENT) {
+                break;
+            }
+            let direction = downhill(&gradient, &pairs);
+            let slope = dot(&direction, &gradient);
+            // Halve the step until the loss falls enough (Armijo).
+            let mut share = if pairs.is_empty() {
+                1.0 / gradient.iter().map(|g| g.abs()).sum::<f64>().max(1.0)
+            } else {
+                1.0
+            };
+            let taken = (0..40).find_map(|_| {
+                let next: Vec<f64> = x
+                    .iter()
+                    .zip(&direction)
+                    .map(|(x, d)| x + share * d)
+                    .collect();
+                let (found, of_next) = self.loss(&next);
+                let is_enough = found <= loss + 1e-4 * share * slope;
+                share /= 2.0;
+                is_enough.then_some((next, found, of_next))
+            });
+            let Some((next, found, of_next)) = taken else {
+                break;
+            };
+            let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect();
+            let pair: [Vec<f64>; 2] = [difference(&next, &x), difference(&of_next, &gradient)];
+            if dot(&pair[0], &pair[1]) > 0.0 {
+                pairs.push(pair);
+            }
+            if pairs.len() > REMEMBERED {
+                pairs.remove(0);
+            }
+            (x, loss, gradient) = (next, found, of_next);
+        }
+        x
     }
 
     /// The weighted mean of the cross-entropy plus the ridge, and its gradient.
-    fn loss(&self, coefficients: &[f64], gradient: &mut [f64]) -> f64 {
-        let of_ridge = gradient.iter_mut().zip(coefficients);
-        of_ridge.for_each(|(g, c)| *g = self.ridge * c);
+    fn loss(&self, coefficients: &[f64]) -> (f64, Vec<f64>) {
+        let mut gradient: Vec<f64> = coefficients.iter().map(|c| self.ridge * c).collect();
         let mut loss = 0.5 * self.ridge * dot(coefficients, coefficients);
         let samples = self.rows.iter().zip(&self.shares).zip(&self.of_level);
         for ((row, share), &level) in samples {
@@ -318,8 +352,32 @@ impl Samples {
                 of.iter_mut().zip(row).for_each(|(g, x)| *g += residual * x);
             }
         }
-        loss
+        (loss, gradient)
     }
+}
+
+/// The direction of the next step: the gradient by the inverse second derivatives that the remembered pairs
+/// of steps and changes of the gradient show.
+fn downhill(gradient: &[f64], pairs: &[[Vec<f64>; 2]]) -> Vec<f64> {
+    let mut direction: Vec<f64> = gradient.iter().map(|g| -g).collect();
+    let add = |to: &mut [f64], times: f64, of: &[f64]| {
+        to.iter_mut().zip(of).for_each(|(to, of)| *to += times * of);
+    };
+    let mut shares = Vec::new();
+    for [step, change] in pairs.iter().rev() {
+        let share = dot(step, &direction) / dot(step, change);
+        add(&mut direction, -share, change);
+        shares.push(share);
+    }
+    if let Some([step, change]) = pairs.last() {
+        let scale = dot(step, change) / dot(change, change);
+        direction.iter_mut().for_each(|d| *d *= scale);
+    }
+    for ([step, change], share) in pairs.iter().zip(shares.into_iter().rev()) {
+        let back = dot(change, &direction) / dot(step, change);
+        add(&mut direction, share - back, step);
+    }
+    direction
 }
 
 #[cfg(test)]
@@ -355,8 +413,7 @@ mod tests {
             levels: 3,
             ridge: 1.0 / 40.0,
         };
-        let mut gradient = vec![0.0; 600];
-        samples.loss(&samples.fit(), &mut gradient);
-        assert!(gradient.iter().all(|g| g.abs() <= 10.0 * LEAST_GRADIENT));
+        let (_, gradient) = samples.loss(&samples.fit());
+        assert!(gradient.iter().all(|g| g.abs() <= LEAST_GRADIENT));
     }
 }
