@@ -107,6 +107,9 @@ impl Subscriber {
     /// The status of a sensor as an answer: that of an event has a number.
     pub fn status(&mut self, sensor: &str) -> Value {
         self.send_line(r#"{"get":"status"}"#);
-        self.until(&json!({"type": "status", "seq": null, "sensor": sensor}))
+        let status = self.until(&json!({"type": "status", "seq": null, "sensor": sensor}));
+        // Those of the other sensors are read too, so that none is left for the next question.
+        self.until(&json!({"type": "ok"}));
+        status
     }
 }

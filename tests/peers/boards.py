@@ -118,7 +118,9 @@ def serve(board):
         heard = b""
         while True:
             while wanted and wanted not in heard:
-                heard += connection.recv(4096)
+                if not (more := connection.recv(4096)):
+                    return
+                heard += more
             heard = b"" if not is_once else heard
             connection.sendall(frame)
             if is_once or not wanted:

@@ -250,9 +250,10 @@ fn a_recording_that_is_deleted_begins_anew() {
     let _sensor = bench.sensor("");
     let mut subscriber = bench.subscriber();
     subscriber.verdict();
-    daemon.logged("recording path=");
+    let is_there = || !bench.recordings("hardnessd-").is_empty();
+    wait_for("the recording", is_there);
     fs::remove_dir_all(bench.path("rec")).unwrap();
-    daemon.logged("recording path=");
+    wait_for("the next recording", is_there);
     subscriber.verdict();
     daemon.end();
     let recordings = bench.recordings("hardnessd-");
