@@ -122,11 +122,11 @@ pub async fn run(
         presses,
         ..
     } = *counted.borrow();
-    let is_unusable = |failure: &Failure| frames == 0 || failure.code() == UNAVAILABLE;
+    let is_unusable = |failed: &Failed| failed.is_missing || frames == 0;
     if recorded.as_ref().is_err_and(is_unusable) {
-        // The path must be free for the next try. Where a sensor is missing, nothing is worth keeping.
+        // The path must be free for the next try.
         part::remove(&path, &own);
-        return recorded;
+        return Ok(recorded?);
     }
     let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
     if io::stderr().is_terminal() {
@@ -141,7 +141,20 @@ pub async fn run(
         };
         stderr_line!("warning: {shown}: no press in {seen}{why}");
     }
-    recorded
+    Ok(recorded?)
+}
+
+/// A recording that could not begin, or ended by an error.
+pub(super) struct Failed {
+    failure: Failure,
+    /// Whether a sensor was missing at the start, so that nothing is worth keeping.
+    is_missing: bool,
+}
+
+impl From<Failed> for Failure {
+    fn from(failed: Failed) -> Self {
+        failed.failure
+    }
 }
 
 /// Makes the file of a recording, twice open: to record into, and to know it again. A file that exists is
@@ -163,7 +176,7 @@ pub(super) async fn record(
     labels: Labels,
     progress: watch::Sender<Progress>,
     end: impl Future<Output = ()>,
-) -> Result<(), Failure> {
+) -> Result<(), Failed> {
     let sensors = setup.config.sensors.clone();
     let recorded = async {
         let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
@@ -178,9 +191,15 @@ pub(super) async fn record(
             let port = port.expect("a missing sensor is one of the configuration");
             let obstacle = doctor::obstacle(port).unwrap_or(reason);
             let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
-            Failure::new(UNAVAILABLE, problem)
+            Failed {
+                failure: Failure::new(UNAVAILABLE, problem),
+                is_missing: true,
+            }
         }
-        error => error.into(),
+        error => Failed {
+            failure: error.into(),
+            is_missing: false,
+        },
     })
 }
 

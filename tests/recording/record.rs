@@ -112,6 +112,13 @@ fn record_writes_a_new_file_for_as_long_as_there_is_a_sensor() {
     assert_eq!(record(&bench, "a.mcap").exit_code(), Some(74));
     assert_eq!(fs::read(bench.path("a.mcap")).unwrap(), before);
 
+    // Where one of two sensors is missing, nothing is kept, though the other one sends.
+    let both = sensor("forearm", "port", 20) + &sensor("missing", "nowhere", 20);
+    bench.write("both.toml", both);
+    let (code, _, message) = bench.run("record --config both.toml --out b.mcap");
+    assert!(code == 69 && !message.contains("recorded"), "{message}");
+    assert!(!bench.path("b.mcap").exists());
+
     // The loss of its sensor ends it, too, with another exit code.
     let mut sensor = bench.sensor("--presses 1");
     let mut recording = record(&bench, "c.mcap");
