@@ -80,6 +80,13 @@ pub(crate) struct Kept {
     pub(crate) own: OwnPresses,
 }
 
+impl Kept {
+    /// Whether a judge can work with it. A recording may hold anything.
+    pub(crate) fn is_usable(&self) -> bool {
+        self.objects.is_usable()
+    }
+}
+
 /// What a judge must know of the moment of a verdict.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Moment {
@@ -203,18 +210,21 @@ impl Judge {
         let (press, peak) = (press.press, &press.peak);
         match self.try_judge(press, phase, known, peak, now) {
             Ok(verdict) => Some(verdict),
-            // A model that fails on its own check frames was refused at loading.
             Err(error) => {
-                let sensor = self.sensor.name().to_owned();
-                self.unjudged.push(Unjudged {
-                    sensor,
-                    press,
-                    phase,
-                    error,
-                });
+                self.failed(press, phase, error);
                 None
             }
         }
+    }
+
+    /// The model failed on a press. A model that fails on its own check frames was refused at loading.
+    fn failed(&mut self, press: u64, phase: Phase, error: ModelError) {
+        self.unjudged.push(Unjudged {
+            sensor: self.sensor.name().to_owned(),
+            press,
+            phase,
+            error,
+        });
     }
 
     fn try_judge(
@@ -231,33 +241,39 @@ impl Judge {
         let is_of_course = matches!(hrn.format(), Format::Course { .. });
         let peak = if is_of_course { known.best() } else { peak };
         let resampling = resampling(&hrn, peak, &sensor);
-        let mut references = ReferenceKinds::NONE;
-        let mut course = None;
-        let verdict = match hrn.format() {
+        let name = object_of(self.context.as_ref());
+        let pressed = self.kept.own.next(name.clone(), known, &sensor);
+        let in_a_row = pressed.in_a_row;
+        let is_felt = peak.force_n >= described.model.min_force_n;
+        let mut is_trained = true;
+        let (verdict, references) = match hrn.format() {
             Format::Course { most_frames } => {
                 let ended = known.ended(press, most_frames, &sensor);
-                let course = course.insert(ended.course(card.pitch_mm.into()));
+                let course = ended.course(card.pitch_mm.into());
+                is_trained = card.range.holds(&course);
                 let own = self.kept.own.references(&hrn);
-                let (verdict, used) = hrn.judge_course_with(course, &own)?;
-                references = used;
-                verdict
+                let judged = hrn.judge_course_with(&course, &own);
+                // The press is remembered even if its verdict is missing, and its verdict stays if the
+                // press cannot be kept.
+                if phase == Phase::Final && is_felt && !peak.saturated {
+                    let most = described.sensor.own_presses as usize;
+                    if let Err(error) = self.kept.own.add(pressed, &hrn, &course, most) {
+                        self.failed(press, phase, error);
+                    }
+                }
+                judged?
             }
             format => {
                 card.check_array(peak.frame.array)?;
-                hrn.judge_taxels(&match (format, card.grid) {
+                let taxels = match (format, card.grid) {
                     (Format::Parts, _) => known.ended(press, COURSE_FRAMES.1, &sensor).parts(),
                     (_, Some(_)) => peak.frame.newtons.to_vec(),
                     (_, None) => resampling.apply(&peak.frame).newtons.to_vec(),
-                })?
+                };
+                (hrn.judge_taxels(&taxels)?, ReferenceKinds::NONE)
             }
         };
-        let is_trained = course
-            .as_ref()
-            .is_none_or(|course| card.range.holds(course));
         let notes = self.notes(peak, &resampling, references, is_trained);
-
-        let name = object_of(self.context.as_ref());
-        let pressed = self.kept.own.next(name.clone(), known, &sensor);
         let object = name.map(|name| {
             let mut object = self.kept.objects.with(&name, &verdict);
             if phase == Phase::Final {
@@ -268,13 +284,7 @@ impl Judge {
         });
         let presses = object
             .as_ref()
-            .map_or(pressed.in_a_row.into(), |object| object.presses);
-        let is_felt = peak.force_n >= described.model.min_force_n;
-        if let (Some(course), Phase::Final, true, false) = (&course, phase, is_felt, peak.saturated)
-        {
-            let most = described.sensor.own_presses as usize;
-            self.kept.own.add(pressed, &hrn, course, most)?;
-        }
+            .map_or(in_a_row.into(), |object| object.presses);
 
         let advice = self.advice(peak, &verdict, references, presses);
         let rejected = if !is_felt || advice == Some(Advice::PressHarder) {

@@ -4,7 +4,10 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::event::ApproachSource;
-use crate::tests::course_model::{self, course_model};
+use crate::judge::OwnPresses;
+use crate::tests::course_model::{self, course_model, encoded};
+use crate::tests::graph::{node, number};
+use crate::verdict::BUILT_IN;
 
 /// A tared pipeline with an arm of 10 N/mm. Its model returns its own input.
 fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipeline {
@@ -302,4 +305,50 @@ fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
             assert_eq!(verdict.stiffness_n_per_mm, None);
         }
     }
+}
+
+/// Adds a number to an output of a model: a tiny one if `other` is less than `most`, and NaN if it is more.
+fn spoil(proto: &mut pb::ModelProto, output: &str, most: f32, other: &str) {
+    let graph = proto.graph.as_mut().unwrap();
+    let is_of = |node: &&mut pb::NodeProto| node.output[0] == output;
+    let spoilt = graph.node.iter_mut().find(is_of).unwrap();
+    spoilt.name = "unspoilt".to_owned();
+    spoilt.output[0] = "unspoilt".to_owned();
+    let numbers = [number("most", most), number("tiny factor", 1e-30)];
+    graph.initializer.extend(numbers);
+    graph.node.extend([
+        node("Sub", &["most", other], &["left"], &[]),
+        node("Log", &["left"], &["log"], &[]),
+        node("Mul", &["log", "tiny factor"], &["tiny or NaN"], &[]),
+        node("Add", &["unspoilt", "tiny or NaN"], &[output], &[]),
+    ]);
+}
+
+#[test]
+fn a_press_that_cannot_be_kept_has_its_verdict() {
+    // The model fails on presses of objects of which nothing is known, and judges the press.
+    let mut proto = pb::ModelProto::decode(BUILT_IN).unwrap();
+    spoil(&mut proto, "reference", 1.0, "span");
+    let mut pipeline = tared(&[], |_| {});
+    let hrn = Hrn::load(&proto.encode_to_vec()).unwrap();
+    judge_by(&mut pipeline, Arc::new(hrn));
+    let found = judged(&mut pipeline, |_| Vec::new());
+    assert_eq!(found.last().unwrap().phase, Phase::Final);
+    let [error] = &pipeline.unjudged()[..] else {
+        panic!("expected one error")
+    };
+    let expected = "model gave a number that is not finite in `reference`";
+    assert_eq!((error.press, error.phase), (1, Phase::Final));
+    assert_eq!(error.error.to_string(), expected);
+}
+
+#[test]
+fn a_press_without_a_verdict_is_remembered() {
+    // The model fails on an arm of 10 N/mm. That of its checks is at most 6 N/mm.
+    let bytes = encoded(8, &[], |proto| spoil(proto, "second", 7.0, "arm_n_per_mm"));
+    let mut pipeline = tared(&[], |described| described.sensor.arm.speed_mm_s = Some(5.0));
+    judge_by(&mut pipeline, Arc::new(Hrn::load(&bytes).unwrap()));
+    assert_eq!(judged(&mut pipeline, |_| Vec::new()), []);
+    assert!(!pipeline.unjudged().is_empty());
+    assert_ne!(pipeline.judge.kept.own, OwnPresses::default());
 }
