@@ -1,8 +1,8 @@
 //! Copies the whole parts of a damaged recording into a new one.
 //!
-//! One scan goes from front to back and trusts no index. It searches for the bytes that every chunk has
-//! at the same place, and takes each chunk whose checksum fits. Between two chunks it takes records until
-//! one is damaged. It holds one chunk of bounded size.
+//! One scan goes from front to back and trusts no index. It goes from record to record, and takes each
+//! chunk whose checksum fits. Where a record is damaged, the next one's place is unknown, so the scan
+//! searches for the bytes that every chunk has at the same place. It holds one chunk of bounded size.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -75,32 +75,28 @@ pub fn recover<R: Read + Seek, W: Write>(
     // The magic is skipped unread, so damage to it loses nothing.
     let mut place = MAGIC.len() as u64;
     while place < broken.length && !copy.done.complete {
-        let chunk = broken.chunk_from(place).map_err(RecoverError::Read)?;
-        while place < chunk && !copy.done.complete {
-            match broken.record(place, chunk).map_err(RecoverError::Read)? {
-                Some((opcode, body)) if copy.outside(opcode, &body)? => {
-                    place += RECORD_HEAD_BYTES + body.len() as u64;
-                }
-                _ => {
-                    copy.done.lost.push((place, chunk - place));
-                    place = chunk;
-                }
+        let found = broken.record(place).map_err(RecoverError::Read)?;
+        let (end, is_copied) = match found {
+            Some((op::CHUNK, body, end)) => {
+                let is_copied = match body {
+                    Some(body) => copy.chunk(body)?,
+                    None => false,
+                };
+                copy.done.chunks += u64::from(is_copied);
+                (end, is_copied)
             }
-        }
-        if let Some(end) = broken.end_of(chunk).map_err(RecoverError::Read)?
-            && !copy.done.complete
-        {
-            let whole = broken.record(chunk, end).map_err(RecoverError::Read)?;
-            let is_copied = match whole {
-                Some((_, body)) => copy.chunk(body)?,
-                None => false,
-            };
-            match is_copied {
-                true => copy.done.chunks += 1,
-                false => copy.done.lost.push((chunk, end - chunk)),
+            Some((opcode, Some(body), end)) if copy.outside(opcode, &body)? => (end, true),
+            // Only its length is read of an attachment, which is left out.
+            Some((op::ATTACHMENT, None, end)) => (end, true),
+            _ => {
+                let next = broken.chunk_from(place + 1);
+                (next.map_err(RecoverError::Read)?, false)
             }
-            place = end;
+        };
+        if !is_copied {
+            copy.done.lost.push((place, end - place));
         }
+        place = end;
     }
     Ok(copy.finish()?)
 }
@@ -134,20 +130,25 @@ impl<R: Read + Seek> Broken<R> {
         }
     }
 
-    /// The opcode and the bytes of the record at `place`. `None` if it does not end at `end`, or before with
-    /// another record behind it, or is longer than any that is read.
-    fn record(&mut self, place: u64, end: u64) -> io::Result<Option<(u8, Vec<u8>)>> {
-        let own_end = self.end_of(place)?.filter(|&own| own <= end);
-        let Some(own_end) = own_end else {
+    /// The opcode, the bytes and the end of the record at `place`. `None` if there is none: a chunk begins
+    /// with the bytes that every chunk has, and another record is followed by a record or by the end of
+    /// the file. The bytes of an attachment, and of a record longer than any that is read, are `None`.
+    fn record(&mut self, place: u64) -> io::Result<Option<(u8, Option<Vec<u8>>, u64)>> {
+        let Some(end) = self.end_of(place)? else {
             return Ok(None);
         };
-        let is_followed = own_end == end || self.end_of(own_end)?.is_some();
-        if !is_followed || own_end - place > RECORD_HEAD_BYTES + LONGEST_CHUNK_BYTES as u64 {
-            return Ok(None);
-        }
-        let mut bytes = self.bytes(place, own_end)?;
-        let body = bytes.split_off(RECORD_HEAD_BYTES as usize);
-        Ok(Some((bytes[0], body)))
+        let head = self.bytes(place, place + HEAD_BYTES as u64)?;
+        let is_whole = match head[0] {
+            op::CHUNK => is_chunk_head(&head, self.length - place),
+            _ => end == self.length || self.end_of(end)?.is_some(),
+        };
+        let body_at = place + RECORD_HEAD_BYTES;
+        let is_read = head[0] != op::ATTACHMENT && end - body_at <= LONGEST_CHUNK_BYTES as u64;
+        let body = match is_whole && is_read {
+            true => Some(self.bytes(body_at, end)?),
+            false => None,
+        };
+        Ok(is_whole.then_some((head[0], body, end)))
     }
 
     /// The end of the record at `place`, if there can be a record.
@@ -266,7 +267,7 @@ impl<W: Write> Copy<W> {
 
     /// Adds a record of this many bytes.
     fn take(&mut self, record: Record<'_>, bytes: usize) -> Result<(), Error> {
-        if !matches!(record, Record::Message { .. }) {
+        if let Record::Metadata(_) | Record::Schema { .. } | Record::Channel(_) = record {
             self.described_bytes = self.described_bytes.saturating_add(bytes);
             if self.described_bytes > MOST_DESCRIBED_BYTES {
                 self.done.messages_lost += 1;
