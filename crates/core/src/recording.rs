@@ -232,6 +232,12 @@ impl From<mcap::McapError> for Error {
                  chunks that are read",
                 reader::LONGEST_CHUNK_BYTES
             )),
+            mcap::McapError::UnsupportedCompression(name) => {
+                let name: String = name.chars().take(20).collect();
+                Error::Content(format!(
+                    "found a chunk packed with {name:?}, expected zstd, lz4 or none"
+                ))
+            }
             other => Error::Content(format!(
                 "the recording is damaged ({other}): `hardnessd recover` saves what is whole"
             )),

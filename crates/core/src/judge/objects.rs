@@ -20,8 +20,7 @@ const ALIKE: f32 = 0.75;
 /// Below it, the logarithm of a probability is not believed.
 const LEAST_PROBABILITY: f32 = 1e-4;
 
-/// No sum of presses reaches it, and what is computed of a smaller one is finite. A recording may hold
-/// anything.
+/// No sum of presses reaches it, and what is computed of a smaller one is finite.
 const MOST_SUM: f32 = 1e24;
 
 /// The objects that were pressed.
@@ -66,6 +65,16 @@ impl Objects {
         }
         self.known.push(Object::after(known, name, verdict));
     }
+
+    /// Whether the next verdicts on these objects are finite. A recording may hold anything.
+    pub(super) fn is_usable(&self) -> bool {
+        let is_finite = |sum: &f32| sum.abs() <= MOST_SUM;
+        self.known.iter().all(|object| {
+            let mut sums = object.log_sums.iter().chain(&object.shore_sums);
+            let [.., weight] = object.shore_sums;
+            sums.all(is_finite) && weight >= 0.0
+        })
+    }
 }
 
 impl Object {
@@ -87,14 +96,13 @@ impl Object {
     fn add(&mut self, verdict: &Verdict) {
         self.presses = self.presses.saturating_add(1);
         for (sum, &probability) in self.log_sums.iter_mut().zip(&verdict.probabilities) {
-            let more = probability.max(LEAST_PROBABILITY).ln();
-            *sum = (*sum + more).clamp(-MOST_SUM, MOST_SUM);
+            *sum += probability.max(LEAST_PROBABILITY).ln();
         }
         if let Some(Shore { value, low, high }) = verdict.shore {
             // A press with a narrow interval says more.
             let weight = 1.0 / (high - low).max(1.0).powi(2);
             for (sum, term) in self.shore_sums.iter_mut().zip([value, low, high, 1.0]) {
-                *sum = (sum.max(0.0) + weight * term).min(MOST_SUM);
+                *sum += weight * term;
             }
         }
     }
@@ -174,5 +182,28 @@ mod tests {
         assert_eq!(objects.with("99", &other).presses, 1);
         objects.add("99", &other);
         assert_eq!(objects.with("99", &other).presses, 2);
+    }
+
+    #[test]
+    fn a_recorded_object_gives_finite_numbers_or_is_refused() {
+        let press = verdict(&[0.5, 0.5], Some([60.0, 0.0, 100.0]));
+        for (sum, weight, is_usable) in [
+            (1e24, 0.0, true),
+            (60.0, -1.0, false),
+            (3e38, 0.0, false),
+            (-3e38, 0.0, false),
+            (f32::NAN, 0.0, false),
+        ] {
+            let mut objects = Objects::default();
+            objects.add("cup", &press);
+            assert!(objects.is_usable());
+            objects.known[0].shore_sums = [sum, sum, sum, weight];
+            assert_eq!(objects.is_usable(), is_usable, "{sum}, {weight}");
+            if is_usable {
+                let shore = objects.with("cup", &press).shore.unwrap();
+                let all = [shore.value, shore.low, shore.high];
+                assert!(all.iter().all(|x| x.is_finite()), "{shore:?}");
+            }
+        }
     }
 }

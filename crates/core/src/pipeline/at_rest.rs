@@ -44,6 +44,7 @@ impl AtRest {
             && self.decoder.decoded < MOST_BYTES
             && self.tare.is_usable(array)
             && self.motion.is_usable()
+            && self.judge.is_usable()
     }
 
     /// The controller's context.

@@ -61,6 +61,13 @@ struct InputMessage {
     data: Blob,
 }
 
+/// The part of a state that says whether the rest can be read.
+#[derive(Deserialize)]
+struct Version {
+    #[serde(default)]
+    format: u32,
+}
+
 fn from_cdr<M: DeserializeOwned>(bytes: &[u8]) -> Result<M, Error> {
     let foreign =
         |found: &str| Error::Content(format!("found {found}, expected a message of ours"));
@@ -180,15 +187,15 @@ pub(super) fn decode_entry(bytes: &[u8], log_time_ns: u64) -> Result<Found, Erro
         }
         7 => Entry::Input(Input::Shutdown),
         STATE => {
-            let state: Value = serde_json::from_slice(&data).map_err(unreadable)?;
-            let format = &state["format"];
-            if *format != FORMAT {
+            let Version { format } = serde_json::from_slice(&data).map_err(unreadable)?;
+            if format != FORMAT {
                 return Err(Error::Content(format!(
                     "found a recording of format {format}, expected format {FORMAT}: play it with the version \
                      that wrote it"
                 )));
             }
-            let state: State = serde_json::from_value(state).map_err(unreadable)?;
+            // Not by way of a `Value`, which would turn a number out of range into infinity.
+            let state: State = serde_json::from_slice(&data).map_err(unreadable)?;
             check_context(state.at_rest.context())?;
             Entry::State(Box::new(state))
         }

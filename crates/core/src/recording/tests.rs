@@ -258,7 +258,17 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
         ("/at_rest/context", json!("picking"), "context: found"),
         ("/at_rest/decoder/decoded", json!(u64::MAX), no_state),
         ("/at_rest/decoder/skipped", json!(1_u64 << 40), no_state),
-        ("/at_rest/tare/baseline/7", json!(1e39), no_state),
+        ("/at_rest/tare/baseline/7", json!(1e39), "found other JSON"),
+        (
+            "/at_rest/judge/own",
+            json!({"model": "", "presses": [{"reference": {}, "shore": 1e39}]}),
+            "found other JSON",
+        ),
+        (
+            "/at_rest/judge/objects/known",
+            json!([{"name": "cup", "presses": 1, "log_sums": [0, 0, 0, 0], "shore_sums": [9.0, 9.0, 9.0, -1.0]}]),
+            no_state,
+        ),
         ("/at_rest/tare/baseline", json!([0.0]), no_state),
         ("/at_rest/motion/points/0", json!([0, 1e9]), no_state),
         ("/at_rest/frames", json!(u64::MAX), no_state),
@@ -315,6 +325,26 @@ fn one_flipped_bit_costs_its_chunk_and_no_more() {
             play(&good);
         }
     }
+}
+
+#[test]
+fn what_is_saved_without_a_state_is_told() {
+    let (mut file, _) = recorded(1000, 7);
+    // Before the sensor begins anew, the only state is in the first chunk.
+    file.truncate(file.len() / 3);
+    let mut unplayable = 0;
+    for place in (0..file.len()).step_by(97) {
+        let mut file = file.clone();
+        file[place] ^= 1;
+        let (found, good) = recover(Cursor::new(&file), Vec::new()).unwrap();
+        let mut playback = Playback::new(hrn());
+        for found in Reader::new(&good[..]) {
+            playback.feed(found.unwrap()).unwrap();
+        }
+        assert_eq!(found.states, playback.sensors() as u64, "byte {place}");
+        unplayable += usize::from(found.messages > 0 && found.states == 0);
+    }
+    assert!(unplayable > 0, "no byte lies within the first chunk");
 }
 
 #[test]
