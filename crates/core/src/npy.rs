@@ -337,6 +337,29 @@ mod tests {
         }
     }
 
+    /// A reader of endless bytes. It counts the bytes that were asked for.
+    struct Endless(usize);
+
+    impl Read for Endless {
+        fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+            self.0 += into.len();
+            into.fill(0);
+            Ok(into.len())
+        }
+    }
+
+    #[test]
+    fn no_more_is_unpacked_than_the_header_asks_for() {
+        let mut endless = Endless(0);
+        let elements = of("<f4", false, &[10, 100]).elements(&mut endless, Some);
+        assert_eq!(elements.unwrap_err().to_string(), "more than 1000 elements");
+        assert!(endless.0 <= 4_001, "{} bytes were unpacked", endless.0);
+        let header = of("<f4", false, &[1 << 40, 1 << 40]);
+        let error = header.elements(&mut &[0; 7][..], Some).unwrap_err();
+        let expected = "an array of shape [1099511627776, 1099511627776]";
+        assert_eq!(error.to_string(), expected);
+    }
+
     #[test]
     fn numbers_of_every_type_are_read_if_they_fit() {
         let read = |descr: &str, bytes: &[u8]| {

@@ -259,4 +259,36 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
     }
+
+    /// A packed file may hold a thousand times its size.
+    #[test]
+    fn an_array_with_too_many_rows_is_not_unpacked() {
+        let good = write(&presses()[..1]).unwrap();
+        let most = MOST_REFERENCES * COURSE_FRAMES.1;
+        for (array, rows, expected) in [
+            ("piece", 65, "1 to 64"),
+            ("piece_mm", 2, "1"),
+            ("press", most + 1, "1 to 3072"),
+            ("known", 5, "4"),
+        ] {
+            let mut whole = ZipArchive::new(Cursor::new(&good)).unwrap();
+            let mut npz = Writer::compressed(Cursor::new(Vec::new()));
+            for place in 0..whole.len() {
+                let mut entry = whole.by_index(place).unwrap();
+                let name = entry.name().trim_end_matches(".npy").to_owned();
+                let header = Header::read(&mut entry).unwrap();
+                let values = header
+                    .elements(&mut entry, |value| Some(value as f32))
+                    .unwrap();
+                // These elements are out of range, so they would be refused if they were read first.
+                match name == array {
+                    true => npz.add_list(&name, &vec![-1e9_f32; rows]).unwrap(),
+                    false => npz.add(&name, &header.shape, &values).unwrap(),
+                }
+            }
+            let error = read(&npz.finish().unwrap().into_inner()).unwrap_err();
+            let expected = format!("{array}: found {rows} rows, expected {expected}");
+            assert_eq!(error.to_string(), expected);
+        }
+    }
 }

@@ -1,10 +1,11 @@
+use pb::tensor_shape_proto::dimension::Value as Dimension;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
 use crate::tests::course_model::{course_model, encoded, given};
-use crate::tests::graph::{int, node, value};
+use crate::tests::graph::{indices, int, node, value};
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
     proto.graph.as_mut().unwrap()
@@ -28,6 +29,12 @@ fn edit(proto: &mut pb::ModelProto, key: &str, change: impl FnOnce(&mut Value)) 
     let mut json = serde_json::from_str(&entry.value).unwrap();
     change(&mut json);
     entry.value = json.to_string();
+}
+
+fn tensor_type(proto: &mut pb::ModelProto) -> &mut pb::type_proto::Tensor {
+    let input = graph(proto).input[0].r#type.as_mut().unwrap();
+    let pb::type_proto::Value::TensorType(tensor) = input.value.as_mut().unwrap();
+    tensor
 }
 
 /// A change of a model file.
@@ -93,6 +100,16 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             "model inputs: found image f32 [1,1,28,28], expected frame f32 [1,1,28,28]",
             |p| graph(p).input[0].name = "image".into(),
         ),
+        (
+            "found frame of another type or no fixed shape, expected frame",
+            |p| {
+                let shape = tensor_type(p).shape.as_mut().unwrap();
+                shape.dim[0].value = Some(Dimension::DimParam("batch".into()));
+            },
+        ),
+        ("found frame of another type", |p| {
+            tensor_type(p).elem_type = pb::tensor_proto::DataType::Double as i32;
+        }),
         (
             "model outputs: found \"logits, shore\", expected logits, probabilities",
             |p| drop(graph(p).output.remove(1)),
@@ -196,6 +213,55 @@ fn a_model_of_frames_as_they_are_has_one_array() {
     refused_by(&of_grid("[2, 3]"), other);
     for grid in ["[0, 3]", "[2, 65]", "\"2x3\""] {
         refused_by(&of_grid(grid), "expected [rows, columns], each 1 to 64");
+    }
+}
+
+/// A model of two levels on an array of 2x3 taxels. Its logits are the first two newtons of its input.
+fn of_first_taxels(input: &str, frames: usize) -> Vec<u8> {
+    let level = |level: u8| json!({"level": level, "label": "any", "shore": "any"});
+    let check = json!({
+        "frames": vec![vec![0.0; frames * 6]; 4],
+        "probabilities": vec![[0.5; 2]; 4],
+    });
+    let metadata = [
+        ("hrn.format", json!("1")),
+        ("hrn.grid", json!([2, 3])),
+        ("hrn.levels", json!([level(1), level(2)])),
+        ("hrn.check", check),
+    ];
+    let slice = ["taxels", "from", "to", "along"];
+    encoded(3, &metadata, |proto| {
+        proto.graph = Some(pb::GraphProto {
+            name: "first taxels".to_owned(),
+            input: vec![value(input, &[1, frames, 2, 3])],
+            output: vec![value("probabilities", &[1, 2]), value("logits", &[1, 2])],
+            initializer: vec![
+                indices("from", &[0]),
+                indices("to", &[2]),
+                indices("along", &[1]),
+                indices("flat", &[1, 6 * frames as i64]),
+            ],
+            node: vec![
+                node("Reshape", &[input, "flat"], &["taxels"], &[]),
+                node("Slice", &slice, &["logits"], &[]),
+                node("Softmax", &["logits"], &["probabilities"], &[]),
+            ],
+            ..Default::default()
+        });
+    })
+}
+
+#[test]
+fn parts_keep_the_sign_and_a_frame_is_of_0_or_more() {
+    for (input, frames, format, expected) in [
+        ("frame", 1, Format::Frame, [0.5, 0.0]),
+        ("parts", 8, Format::Parts, [0.5, -2.0]),
+    ] {
+        let hrn = Hrn::load(&of_first_taxels(input, frames)).unwrap();
+        assert_eq!(hrn.format(), format);
+        let mut taxels = vec![0.0; 6 * frames];
+        taxels[..2].copy_from_slice(&[0.5, -2.0]);
+        assert_eq!(hrn.judge_taxels(&taxels).unwrap().logits, expected);
     }
 }
 

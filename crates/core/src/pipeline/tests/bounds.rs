@@ -67,6 +67,21 @@ fn a_sensor_at_twice_its_rate_loses_nothing_and_neither_does_one_after_a_stall()
 }
 
 #[test]
+fn a_recording_that_begins_in_a_flood_goes_on_as_the_sensor_did() {
+    let mut first = pipeline(Preset::Jx255n);
+    let frame = bytes(&first, &raw(0, 0));
+    for ms in (0..10_000).step_by(10) {
+        first.push(&frame, at(ms));
+    }
+    let state = first.at_rest().unwrap();
+    let mut second = Pipeline::resumed(first.sensor().clone(), test_support::hrn(), state);
+    for ms in (10_000..20_000).step_by(10) {
+        assert_eq!(second.push(&frame, at(ms)), first.push(&frame, at(ms)));
+    }
+    assert_eq!(second.status(at(0)), first.status(at(0)));
+}
+
+#[test]
 fn bytes_that_are_not_read_are_counted_and_end_the_frame_before_them() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let frame = bytes(&pipeline, &raw(0, 0));

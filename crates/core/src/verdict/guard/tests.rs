@@ -78,6 +78,21 @@ fn integers_that_depend_on_an_input_are_no_indices_or_divisors() {
         let expected = "it takes integers that depend on an input of the model";
         assert!(error.contains(expected), "{error}");
     }
+    // Integers may be compared, and what depends on no input may be anything.
+    let compared = [
+        plain("ArgMax", &["x"], "most"),
+        plain("Equal", &["most", "i4"], "is"),
+        cast("is", DataType::Float, "y"),
+    ];
+    let of_a_shape = [
+        plain("Shape", &["x"], "shape"),
+        plain("Div", &["shape", "i4"], "indices"),
+        plain("Gather", &["x", "i0"], "first"),
+        plain("Reshape", &["first", "shape"], "y"),
+    ];
+    for nodes in [&compared[..], &of_a_shape] {
+        check(graph(nodes)).unwrap();
+    }
 }
 
 #[test]
