@@ -450,6 +450,9 @@ impl Pipeline {
             }
             Change::End { press, end } => {
                 let now = self.moment();
+                // A contact may settle in the frame with which its press ends.
+                let early = self.judge.early(&press, now);
+                events.extend(early.map(Event::Hardness));
                 let (state, verdict) = match end.is_judged() {
                     true => (PressState::End, self.judge.end(&press, now)),
                     false => (PressState::Aborted, None),

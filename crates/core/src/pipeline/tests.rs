@@ -110,6 +110,22 @@ fn a_press_gives_begin_end_and_a_final_verdict() {
 }
 
 #[test]
+fn a_contact_that_settles_when_its_press_times_out_has_an_early_verdict() {
+    for (min_frames, ended) in [
+        (2, &["End 1 (timeout)", "Final of 6"][..]),
+        (9, &["Aborted 1 (short)"]),
+    ] {
+        let mut pipeline = pipeline_of(|described| {
+            described.press.max_seconds = 0.4;
+            described.press.min_frames = min_frames;
+        });
+        play(&mut pipeline, 1, &vec![raw(0, 0); 5]);
+        let expected = [&["Begin 1", "Early of 5"][..], ended].concat();
+        assert_eq!(play(&mut pipeline, 6, &vec![raw(9, 50); 5]), expected);
+    }
+}
+
+#[test]
 fn a_load_during_tare_is_said_and_tracked_as_no_press() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let loaded = vec![raw(9, 50); 5];

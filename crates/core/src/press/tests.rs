@@ -32,7 +32,11 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
     let mut was_settled = false;
     for (number, &(area, force_n)) in (0..).zip(loads) {
         let change = tracker.push(contact(&frame(area, force_n), moment(number, rate_hz)));
-        let settled = tracker.so_far().filter(|press| press.is_settled);
+        let press = match &change {
+            Some(Change::End { press, .. }) => Some(&**press),
+            _ => tracker.so_far(),
+        };
+        let settled = press.filter(|press| press.is_settled);
         let peak = settled.map(|press| press.peak.moment.frame);
         text.extend(
             peak.filter(|_| !was_settled)
@@ -152,7 +156,7 @@ fn a_held_press_times_out_once_and_waits_for_release() {
         min_frames: 9,
         ..Thresholds::default()
     };
-    check(&settings, &[(&[TOUCH; 4], "b1@0 x@2:last2 n3 peak0")]);
+    check(&settings, &[(&[TOUCH; 4], "b1@0 s@2:0 x@2:last2 n3 peak0")]);
 }
 
 #[test]
