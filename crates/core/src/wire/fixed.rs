@@ -363,6 +363,7 @@ impl Packets {
             self.number_at + self.number.bytes() <= header_bytes,
             format_args!("a place in the header (header_bytes: {header_bytes})"),
         )?;
+        range::check("packets.step", self.step, self.step > 0, "at least 1")?;
         let most = self.number.range().map_or(0.0, |(_, most)| most);
         let most = most.min(u16::MAX.into());
         let last = self.value(self.count - 1);

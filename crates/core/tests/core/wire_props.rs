@@ -334,6 +334,10 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
             "packets.number_at: found 0, expected a place",
         ),
         (
+            "header_bytes = 1\npackets = { count = 2, step = 0 }",
+            "packets.step: found 0, expected at least 1",
+        ),
+        (
             "header_bytes = 1\npackets = { count = 2, first = 255 }",
             "packets.first: found 255, and 256 for the last packet, expected at most 255",
         ),
