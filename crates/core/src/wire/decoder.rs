@@ -28,11 +28,17 @@ pub struct Place {
     pub decoded: u64,
     /// The number of bytes that belonged to no whole frame.
     pub skipped: u64,
-    /// The number of bytes up to the end of the last whole frame, or up to the last restart.
-    #[serde(default)]
+    /// The number of bytes up to the end of the last whole frame, or up to the last restart or skip. A
+    /// recording of an earlier version has none: it is then [`Self::decoded`].
+    #[serde(default = "all")]
     pub framed: u64,
     /// Whether the next byte follows the end of a frame.
     pub in_sync: bool,
+}
+
+/// More bytes than any that are decoded.
+fn all() -> u64 {
+    u64::MAX
 }
 
 /// Finds frames in a stream of bytes.
@@ -90,6 +96,10 @@ impl Decoder {
 
     /// A decoder that continues a stream at `place`.
     pub fn at(layout: Layout, place: Place) -> Self {
+        let place = Place {
+            framed: place.framed.min(place.decoded),
+            ..place
+        };
         Self {
             bytes: Vec::with_capacity(4 * layout.max_frame_bytes()),
             start: 0,
@@ -129,18 +139,19 @@ impl Decoder {
     /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
         self.skip(0);
-        self.place.framed = self.place.decoded;
-        self.lines = Lines::default();
-        self.is_telnet = false;
     }
 
-    /// Counts bytes that came and that nobody reads. The next bytes do not continue the pending ones.
+    /// Counts bytes that came and that nobody reads: they are no sign of a wrong layout. The next bytes do
+    /// not continue the pending ones.
     pub(crate) fn skip(&mut self, bytes: u64) {
         self.pass(self.pending().len());
         self.settled = false;
         self.place.in_sync = self.layout.begins_in_sync();
         self.place.decoded = self.place.decoded.saturating_add(bytes);
         self.place.skipped = self.place.skipped.saturating_add(bytes);
+        self.place.framed = self.place.decoded;
+        self.lines = Lines::default();
+        self.is_telnet = false;
     }
 
     /// The next frame or damaged candidate, or `None` when more bytes are needed.
