@@ -384,12 +384,16 @@ impl Pipeline {
         let tared = !matches!(self.tare.aim(), Some(Aim::First { .. }));
         let threshold_n = self.sensor.thresholds().contact_threshold_n;
         let full_scale = self.sensor.layout().full_scale();
-        let contact = ContactFrame {
+        let contact_area_taxels = frame.contact_area_taxels(threshold_n);
+        // Most frames touch nothing: they change nothing while no press is under way.
+        let is_idle = contact_area_taxels == 0 && self.tracker.is_idle();
+        let contact = (!is_idle).then(|| ContactFrame {
             saturated: full_scale.is_some_and(|most| self.tare.is_saturated(raw, most)),
             ..ContactFrame::new(&frame, threshold_n, at)
-        };
-        let (contact_area_taxels, force_n) = (contact.contact_area_taxels, contact.force_n);
-        let change = tared.then(|| self.tracker.push(contact)).flatten();
+        });
+        let force_n = contact.as_ref().map_or(0.0, |contact| contact.force_n);
+        let tracked = contact.filter(|_| tared);
+        let change = tracked.and_then(|contact| self.tracker.push(contact));
         if self.tracker.is_pressed() {
             self.tare.give_up(RetareError::Pressed);
         }
@@ -426,16 +430,16 @@ impl Pipeline {
         if let Some(change) = change {
             self.publish(change, events);
         }
-        let now = self.moment();
-        let press = self.tracker.so_far();
-        let early = press.and_then(|press| self.judge.early(press, now));
-        events.extend(early.map(Event::Hardness));
+        if let Some(press) = self.tracker.so_far() {
+            let early = self.judge.early(press, self.moment());
+            events.extend(early.map(Event::Hardness));
+        }
     }
 
     /// What a verdict must know of this moment.
     fn moment(&self) -> Moment {
         Moment {
-            state: self.state().0,
+            state: self.link_state(),
             is_live: self.clock == Clock::Arrival,
             arrival: self.arrival,
         }

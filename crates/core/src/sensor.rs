@@ -250,7 +250,7 @@ mod tests {
     #[test]
     fn a_value_that_no_sensor_has_is_refused_with_its_key() {
         type Change = fn(&mut Description);
-        let cases: [(Change, &str); 7] = [
+        let cases: [(Change, &str); 8] = [
             (
                 |d| d.sensor.name = "Arm".to_owned(),
                 "sensor.name: found \"Arm\"",
@@ -267,6 +267,10 @@ mod tests {
             (
                 |d| d.sensor.frame.request_ms = Some(5),
                 "sensor.frame.request_ms",
+            ),
+            (
+                |d| d.sensor.calibration.dead_taxels = vec![[28, 0]],
+                "sensor.calibration.dead_taxels: found [28, 0]",
             ),
             (|d| d.press.end_frames = 0, "press.end_frames: found 0"),
             (|d| d.model.min_confidence = 1.5, "model.min_confidence"),

@@ -189,7 +189,7 @@ impl Pipeline {
 
     /// The current state of the link and its counters.
     pub fn status(&self, at: Stamp) -> Status {
-        let (state, reason) = self.state();
+        let (state, reason) = (self.link_state(), self.reason());
         let detail = match self.touch() {
             Some(touch) => Some(touch.to_string()),
             None => self.unreleased().map(str::to_owned),
@@ -209,32 +209,33 @@ impl Pipeline {
         }
     }
 
-    /// The state and its reason.
-    pub(super) fn state(&self) -> (LinkState, Option<String>) {
-        let tare = || self.touch().map(|_| "tare: contact".to_owned());
-        // A port that was lost is lost until a frame comes, whatever happens to it.
-        let or_lost = |state| match self.link.was_lost {
-            true => LinkState::Lost,
-            false => state,
-        };
+    /// The state of the link. A port that was lost is lost until a frame comes, whatever happens to it.
+    pub(super) fn link_state(&self) -> LinkState {
+        match self.link.port {
+            Port::Live { .. } => LinkState::Live,
+            _ if self.link.was_lost => LinkState::Lost,
+            Port::Closed { .. } | Port::Opened { .. } => LinkState::Connecting,
+            Port::Silent | Port::Stale => LinkState::Stale,
+        }
+    }
+
+    /// The reason of the state.
+    fn reason(&self) -> Option<String> {
         match &self.link.port {
-            Port::Closed { reason } => (or_lost(LinkState::Connecting), reason.clone()),
+            Port::Closed { reason } => reason.clone(),
             Port::Opened { .. } => {
                 let was_lost = self.link.was_lost;
-                let again = was_lost.then(|| "open, no frame yet".to_owned());
-                (or_lost(LinkState::Connecting), again)
+                was_lost.then(|| "open, no frame yet".to_owned())
             }
             Port::Live { .. } => {
+                let tare = self.touch().map(|_| "tare: contact".to_owned());
                 let unreleased = || {
                     let seconds = self.sensor.thresholds().max_seconds;
                     let reason = || format!("not released for {seconds} s");
                     self.unreleased().map(|_| reason())
                 };
                 let too_fast = || self.pace.reason(self.sensor.frame_rate_hz());
-                (
-                    LinkState::Live,
-                    tare().or_else(unreleased).or_else(too_fast),
-                )
+                tare.or_else(unreleased).or_else(too_fast)
             }
             Port::Silent | Port::Stale => {
                 let silence = match self.link.port {
@@ -244,8 +245,7 @@ impl Pipeline {
                 let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
                 let bytes = self.decoder.problem();
                 let bytes = bytes.map(|problem| format!(", but bytes come: {problem}"));
-                let reason = format!("no frame for {ms} ms{}", bytes.unwrap_or_default());
-                (or_lost(LinkState::Stale), Some(reason))
+                Some(format!("no frame for {ms} ms{}", bytes.unwrap_or_default()))
             }
         }
     }
@@ -268,7 +268,7 @@ impl Pipeline {
     /// what rests on the sensor after what varied. The numbers of a touch differ with every try, and
     /// what rests varies when it is taken away.
     pub(super) fn status_if_changed(&mut self, at: Stamp) -> Option<Event> {
-        let (state, reason) = self.state();
+        let (state, reason) = (self.link_state(), self.reason());
         let kind = self.touch().map(|touch| touch.kind);
         let (known_state, known_reason, known_kind) = &self.link.published;
         if (*known_state, known_reason) == (state, &reason) && kind <= *known_kind {

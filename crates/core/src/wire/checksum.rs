@@ -234,7 +234,9 @@ static CRC32: Crc = Crc::new(32, 0x04C1_1DB7, u32::MAX, u32::MAX, true);
 pub(super) struct Sums<'a> {
     checksum: Checksum,
     bytes: &'a [u8],
-    /// The state before the first byte and after each one, from 0 on.
+    /// The end of the stretches that did not overlap the ones before them.
+    end: usize,
+    /// The state before the first byte and after each one, from 0 on, once a stretch has overlapped.
     states: Vec<u32>,
     /// What a state is multiplied by in stretches of these lengths.
     powers: BTreeMap<usize, u32>,
@@ -245,6 +247,7 @@ impl<'a> Sums<'a> {
         Self {
             checksum,
             bytes,
+            end: 0,
             states: vec![0],
             powers: BTreeMap::new(),
         }
@@ -252,6 +255,10 @@ impl<'a> Sums<'a> {
 
     /// The checksum of the bytes `stretch`, as it is sent.
     pub(super) fn sent(&mut self, stretch: Range<usize>) -> [u8; 4] {
+        if stretch.start >= self.end {
+            self.end = stretch.end;
+            return self.checksum.sent(&self.bytes[stretch]);
+        }
         let method = self.checksum.method();
         for at in self.states.len() - 1..stretch.end {
             let after = method.after(self.states[at], self.bytes[at]);

@@ -157,8 +157,7 @@ fn jx255n_is_790_bytes_and_its_bytes_are_frozen() {
 #[test]
 fn every_layout_gives_back_what_it_encodes_and_a_damaged_frame_costs_itself_alone() {
     // One byte is lost in the middle frame, at every place.
-    // A frame without marks is found again after a pause alone.
-    for (preset, layout) in layouts().filter(|(text, _)| !text.contains("request")) {
+    for (preset, layout) in layouts() {
         let mut sent = frames(&layout, 5, 3);
         // The tail of jq-u16 ends with 0. If that 0 is lost and the next frame begins with 0, no
         // reader can tell which frame lost it.
@@ -166,6 +165,10 @@ fn every_layout_gives_back_what_it_encodes_and_a_damaged_frame_costs_itself_alon
         let whole = encode(&layout, &sent);
         let found = decode(&layout, [whole.as_slice()]);
         assert_eq!(found, (sent.clone(), 0), "{preset:?}");
+        // A frame without marks is found again after a pause alone.
+        if preset.contains("request") {
+            continue;
+        }
         let first = encode(&layout, &sent[..1]).len();
         let middle = encode(&layout, &sent[1..2]).len();
         let header = mark_bytes(preset);
