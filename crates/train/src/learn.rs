@@ -166,8 +166,8 @@ impl Outputs {
 ///
 /// # Errors
 ///
-/// Fails if the run's directory cannot be read or written, its checkpoint is of another beginning, or a loss is
-/// no longer finite.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another run, or a loss is no
+/// longer finite.
 pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
     let stage = learning.stage();
     let mut plan = learning.plan();
@@ -219,15 +219,15 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
 
 /// The beginning of a stage, or its last checkpoint, whose numbers the sides then have.
 fn begin(stage: &str, sides: &mut [Learner], run: &Run) -> anyhow::Result<Checkpoint> {
-    let first = Checkpoint::first(sides.iter().flat_map(Learner::numbers).collect());
+    let numbers = sides.iter().flat_map(Learner::numbers).collect();
+    let first = Checkpoint::first(&run.settings()?, numbers);
     let path = run.checkpoint(stage);
     let Some(kept) = Checkpoint::read(&path)? else {
         return Ok(first);
     };
     ensure!(
         kept.origin == first.origin && kept.numbers.len() == first.numbers.len(),
-        "{}: the checkpoint is of other starting weights, or of another version of the program: choose another \
-         --out",
+        "{}: the checkpoint is of another run, or of another version of the program: choose another --out",
         path.display()
     );
     let mut numbers = kept.numbers.iter().copied();

@@ -60,12 +60,7 @@ impl Description {
 }
 
 /// Files that a run writes after its `settings.toml`.
-const OF_A_RUN: [&str; 4] = [
-    "hrn.onnx",
-    "metrics.csv",
-    "evaluation.json",
-    "compared.json",
-];
+const OF_A_RUN: [&str; 4] = ["hrn.onnx", "metrics.csv", "evaluation.json", "checkpoints"];
 
 /// A run's directory, locked against other processes while it is open.
 #[derive(Debug)]
@@ -117,11 +112,7 @@ impl Run {
             "{}: has a run already: continue it with --resume, or choose another --out",
             directory.display()
         );
-        for part in ["checkpoints", "samples"] {
-            let part = run.path(part);
-            fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
-        }
-        run.add_revision()?;
+        // First, because a directory with checkpoints and no settings is refused.
         match before {
             None => run.write("settings.toml", toml::to_string(description)?.as_bytes())?,
             Some(before) => {
@@ -134,7 +125,22 @@ impl Run {
                 }
             }
         }
+        for part in ["checkpoints", "samples"] {
+            let part = run.path(part);
+            fs::create_dir_all(&part).with_context(|| part.display().to_string())?;
+        }
+        run.add_revision()?;
         Ok(run)
+    }
+
+    /// The bytes of `settings.toml`, as the run was started.
+    ///
+    /// # Errors
+    ///
+    /// Returns the error of reading the file.
+    pub fn settings(&self) -> anyhow::Result<Vec<u8>> {
+        let path = self.path("settings.toml");
+        fs::read(&path).with_context(|| path.display().to_string())
     }
 
     /// The path of a file in the directory.

@@ -16,8 +16,8 @@ use super::disk::write_whole;
 /// How far a stage is. The default is its beginning.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Checkpoint {
-    /// A hash of the stage's numbers before its first step, which its seed and the stages before it
-    /// determine.
+    /// A hash of what determines the stage: the run's `settings.toml`, which has the settings, the seed and the
+    /// hashes of the data, and the stage's numbers before its first step.
     pub origin: String,
     /// Epochs done.
     pub epoch: u32,
@@ -31,10 +31,12 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// The beginning of a stage with these numbers.
-    pub fn first(numbers: Vec<f32>) -> Self {
+    /// The beginning of a stage with these numbers, in a run with this `settings.toml`.
+    pub fn first(settings: &[u8], numbers: Vec<f32>) -> Self {
+        let origin =
+            Sha256::new_with_prefix(Sha256::digest(settings)).chain_update(bytes(&numbers));
         Self {
-            origin: hex::encode(Sha256::digest(bytes(&numbers))),
+            origin: hex::encode(origin.finalize()),
             numbers,
             ..Self::default()
         }
