@@ -166,8 +166,8 @@ impl Outputs {
 ///
 /// # Errors
 ///
-/// Fails if the run's directory cannot be read or written, its checkpoint is of another run, or a loss is no
-/// longer finite.
+/// Fails if the run's directory cannot be read or written, its checkpoint is of another run, or a loss or
+/// a weight is no longer finite.
 pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
     let stage = learning.stage();
     let mut plan = learning.plan();
@@ -210,6 +210,10 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
         if is_last || kept.elapsed() > CHECKPOINT_EVERY {
             kept = Instant::now();
             done.numbers = sides.iter().flat_map(Learner::numbers).collect();
+            // The loss does not show the last step yet, because a step's loss is that of the weights before it.
+            for &number in &done.numbers {
+                ensure_finite(stage, done.epoch, "weights", number.into())?;
+            }
             done.write(&run.checkpoint(stage))?;
         }
     }

@@ -177,7 +177,15 @@ fn a_training_that_diverges_ends_where_it_does() {
     let one_step = "epochs = 1\nbatch = 1000\n";
     for (method, table, more, rate, expected) in [
         ("sgan", "ustgan", "", 1e30, "sgan: epoch 1: loss: found NaN"),
-        // The weights are too large after the very last step.
+        // The weights become NaN in the very last step.
+        (
+            "hrn100",
+            "training",
+            one_step,
+            1e300,
+            "hrn: epoch 1: weights: found NaN",
+        ),
+        // They are finite after it, but too large.
         (
             "hrn15",
             "training",
@@ -194,6 +202,8 @@ fn a_training_that_diverges_ends_where_it_does() {
         let last = error.lines().last().unwrap();
         assert!(last.contains(expected), "{method}: {error}");
         assert!(last.ends_with(": the training has diverged"), "{error}");
+        let is_kept = trial.checkpoints().contains(&"hrn".to_owned());
+        assert_eq!(is_kept, method == "hrn15", "{method}");
     }
 }
 
