@@ -298,6 +298,12 @@ mod tests {
             ("[training]\nepochs = \"3\"", "invalid type: string \"3\""),
             ("[stgan]\nbeta1 = 1", "`stgan.beta1`: found 1"),
             ("held_out = nan", "`held_out`: found NaN"),
+            (
+                "log_above_n = 1e-4",
+                "`log_above_n`: found 0.0001, expected 0, or 0.001 to 1000",
+            ),
+            ("log_above_n = 1e-40", "expected 0, or 0.001 to 1000"),
+            ("log_above_n = 1e4", "expected 0, or 0.001 to 1000"),
         ] {
             let given = parse(text).and_then(|given| overridden(&Settings::default(), &given));
             let error = given.unwrap_err().to_string();

@@ -3,11 +3,14 @@
 use crate::exit::coded;
 use hardnessd_core::exit::CONFIG;
 
+/// The key whose number may also be 0, for an image without a logarithm.
+const OR_ZERO: &str = "log_above_n";
+
 /// The key of each number, and the least and the greatest that it may be.
 #[rustfmt::skip]
 const BOUNDS: &[(&str, f64, f64)] = &[
     ("full_scale_n", 1e-3, f64::INFINITY),
-    ("log_above_n", 0.0, 1e3),
+    (OR_ZERO, 1e-3, 1e3),
     // Fifty components of 10,000 samples each take 1.6 GB.
     ("generated_a_component", 1.0, 1e4),
     ("held_out", 0.0, 0.5),
@@ -60,10 +63,12 @@ fn check_below(above: &str, table: &toml::Table) -> anyhow::Result<()> {
             continue;
         };
         for number in &found {
-            let is_within = number.is_finite() && (least..=most).contains(number);
+            let is_zero = key == OR_ZERO && *number == 0.0;
+            let is_within = is_zero || number.is_finite() && (least..=most).contains(number);
             if !is_within || !found.is_sorted() {
                 let expected = match most {
                     f64::INFINITY => format!("{least} or more"),
+                    _ if key == OR_ZERO => format!("0, or {least} to {most}"),
                     _ => format!("{least} to {most}"),
                 };
                 let text = format!("`{above}{key}`: found {number}, expected {expected}");

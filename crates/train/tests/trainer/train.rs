@@ -357,6 +357,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
     let at = data().0.path();
     fs::write(at.join("text.toml"), "epoch = 3\n").unwrap();
     fs::write(at.join("zero.toml"), "[training]\nepochs = 0\n").unwrap();
+    fs::write(at.join("log.toml"), "log_above_n = 1e-40\n").unwrap();
     fs::write(at.join("model.onnx"), BUILT_IN_HRN).unwrap();
     let mut presses = read_one(&data().1).unwrap();
     presses.all.retain(|press| press.split == Split::Train);
@@ -377,6 +378,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         66 | train hrn100 tiny.npz --config missing | missing
         78 | train hrn100 tiny.npz --config text.toml | text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`
         78 | train hrn100 tiny.npz --config zero.toml | zero.toml: `training.epochs`: found 0
+        78 | train hrn100 tiny.npz --config log.toml | log.toml: `log_above_n`: found 0.0
         2 | train hrn100 tiny.npz --labels 3 | --labels: found 3, expected at least 4
         2 | train hrn100 tiny.npz --seed 9223372036854775808 | --seed
         78 | train hrn100 tiny.npz --resume --out corrupt | corrupt/settings.toml: line 2
