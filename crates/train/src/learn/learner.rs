@@ -153,4 +153,48 @@ mod tests {
             assert_eq!(learner.weights.numbers(name), [expected], "{name}");
         }
     }
+
+    #[test]
+    fn a_resumed_learner_goes_on_with_the_same_bits() {
+        let settings = Training {
+            rule: Rule::Adam,
+            averaging: 0.9,
+            weight_decay: 0.01,
+            ..Training::default()
+        };
+        let fresh = || {
+            let mut weights = Weights::default();
+            let device = &Device::flex();
+            weights.add("head.matrix", &[2, 2], vec![0.3, -0.2, 0.7, 0.1], device);
+            weights.add("head.bias", &[2], vec![0.5, -0.4], device);
+            Learner::fresh(weights, settings)
+        };
+        let take_three = |learner: &mut Learner| {
+            for _ in 0..3 {
+                let tracked = learner.weights.tracked();
+                let values = tracked.entries.iter().map(|weight| weight.values.clone());
+                let values = Tensor::cat(values.collect(), 0);
+                let loss = values.clone().mul(values.clone()).mul(values).sum();
+                learner.step(&tracked, &mut loss.backward(), 0.01);
+            }
+        };
+        let bits = |numbers: &[f32]| numbers.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+        let mut whole = fresh();
+        take_three(&mut whole);
+        let kept = whole.numbers();
+        // Weights, two moments and the average, of six numbers each.
+        assert_eq!(kept.len(), 4 * 6);
+        let mut resumed = fresh();
+        let mut saved = kept.iter().copied();
+        resumed.resume(3, &mut saved);
+        assert_eq!(saved.next(), None);
+        assert_eq!(bits(&resumed.numbers()), bits(&kept));
+        for learner in [&mut whole, &mut resumed] {
+            take_three(learner);
+        }
+        assert_eq!(bits(&resumed.numbers()), bits(&whole.numbers()));
+        assert_ne!(bits(&whole.numbers()), bits(&kept));
+        let judged = [&whole, &resumed].map(|of| bits(&of.evaluated().numbers("head.matrix")));
+        assert_eq!(judged[0], judged[1]);
+    }
 }

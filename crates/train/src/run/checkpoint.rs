@@ -2,12 +2,12 @@
 //!
 //! Every random choice follows from the run's seed and the step's number through counter-based
 //! streams, so the number of steps done is the position of every stream. The rest of the state is
-//! numbers. The file is a line of JSON, and the numbers after it.
+//! numbers. The file is a line of JSON with how many they are, and the numbers after it.
 
 use std::fs;
 use std::path::Path;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
@@ -48,7 +48,7 @@ impl Checkpoint {
     ///
     /// Returns the errors of writing.
     pub fn write(&self, path: &Path) -> anyhow::Result<()> {
-        let mut file = serde_json::to_vec(self)?;
+        let mut file = serde_json::to_vec(&(self, self.numbers.len()))?;
         file.push(b'\n');
         file.extend(bytes(&self.numbers));
         write_whole(path, &file)
@@ -65,9 +65,15 @@ impl Checkpoint {
             file => file.with_context(|| path.display().to_string())?,
         };
         let head = file.split(|&byte| byte == b'\n').next().unwrap_or_default();
-        let checkpoint: Self =
+        let (checkpoint, expected): (Self, usize) =
             serde_json::from_slice(head).with_context(|| path.display().to_string())?;
-        let (numbers, _) = file[(head.len() + 1).min(file.len())..].as_chunks();
+        let (numbers, rest) = file[(head.len() + 1).min(file.len())..].as_chunks();
+        ensure!(
+            numbers.len() == expected && rest.is_empty(),
+            "{}: found {} numbers, expected {expected}: the checkpoint is damaged",
+            path.display(),
+            numbers.len()
+        );
         Ok(Some(Self {
             numbers: numbers.iter().copied().map(f32::from_le_bytes).collect(),
             ..checkpoint

@@ -63,6 +63,34 @@ fn every_program_that_had_a_part_in_a_run_is_named_once() {
 }
 
 #[test]
+fn a_checkpoint_comes_back_whole_or_not_at_all() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hrn");
+    assert!(Checkpoint::read(&path).unwrap().is_none());
+    // A number may have the byte of the line's end.
+    let line_end = f32::from_le_bytes(*b"\n\n\n\n");
+    let numbers = vec![0.1, -0.0, line_end, f32::MIN_POSITIVE / 2.0];
+    let written = Checkpoint {
+        epoch: 2,
+        step: 7,
+        seconds: 1.5,
+        ..Checkpoint::first(b"seed = 1", numbers)
+    };
+    written.write(&path).unwrap();
+    let read = Checkpoint::read(&path).unwrap().unwrap();
+    let of = |of: &Checkpoint| (of.origin.clone(), of.epoch, of.step, of.seconds);
+    assert_eq!(of(&read), of(&written));
+    let bits = |of: &Checkpoint| of.numbers.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    assert_eq!(bits(&read), bits(&written));
+    let whole = fs::read(&path).unwrap();
+    for length in 0..whole.len() {
+        fs::write(&path, &whole[..length]).unwrap();
+        let error = format!("{:#}", Checkpoint::read(&path).unwrap_err());
+        assert!(error.starts_with(&path.display().to_string()), "{error}");
+    }
+}
+
+#[test]
 fn a_resumed_stage_writes_its_rows_again_and_no_others() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("metrics.csv");
