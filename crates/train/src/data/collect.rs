@@ -237,14 +237,17 @@ impl Collection {
         labelled.with_context(|| shown.to_string())?;
         let labels = &recording.labels;
         let material = labels.get("material").map_or(NO_MATERIAL, String::as_str);
-        let material = number_of(&mut self.materials, material);
+        // The names of a recording that is refused after all do not stay.
+        let (mut materials, mut sensors) = (self.materials.clone(), self.sensors.clone());
+        let material = number_of(&mut materials, material);
         let material = u8::try_from(material).context("a data set has at most 256 materials")?;
         for press in &mut presses.all {
             let sensor = &recording.sensors[press.sensor as usize].sensor;
-            press.sensor = number_of(&mut self.sensors, sensor.name()) as u32;
+            press.sensor = number_of(&mut sensors, sensor.name()) as u32;
             press.material = Some(material);
         }
         self.presses.append(presses)?;
+        (self.materials, self.sensors) = (materials, sensors);
         self.captures.push(json!({
             "name": recording::name_of(&recording.path),
             "sha256": sha256,

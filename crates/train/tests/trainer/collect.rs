@@ -256,7 +256,7 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     let calibration =
         "[[sensor]]\nname = \"a\"\nport = \"b\"\n[sensor.calibration]\npitch_mm = 2.0\n";
     desk.write("narrow.toml", calibration);
-    desk.recording_of("narrow.mcap", "", |described| {
+    desk.recording_of("narrow.mcap", "material=cork", |described| {
         described.sensor.calibration.pitch_mm = Pitch::square(2.0);
     });
     desk.collected("narrow.npz", "--level 1 narrow.mcap");
@@ -271,6 +271,14 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     desk.collected("wide.npz", "--level 1 foam.bin");
     let expected = "narrow.mcap: taxel pitch: found 2 mm, expected 3.5 mm, that of wide.npz";
     desk.assert_refused("wide.npz", "--append --level 1 narrow.mcap", 1, expected);
+    // Nothing of a recording that is left out stays, not even the name of its material.
+    desk.recording("usual.mcap", "level=1 material=oak");
+    let skip = "--append --skip-unusable --level 1 narrow.mcap usual.mcap";
+    desk.collected("wide.npz", skip);
+    assert_eq!(
+        desk.meta("wide.npz")["materials"],
+        json!(["unknown", "oak"])
+    );
 
     // A model can be evaluated on data of another pitch, with a warning.
     for (data, is_warned) in [("narrow.npz", false), ("wide.npz", true)] {
