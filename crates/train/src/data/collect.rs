@@ -184,8 +184,9 @@ impl Collection {
         );
         let meta = presses::meta(path)?;
         let names = |key: &str, last: Option<u32>| -> Vec<String> {
-            let named: Option<Vec<String>> = serde_json::from_value(meta[key].clone()).ok();
-            let mut names = named.unwrap_or_default();
+            let named = meta[key].as_array().into_iter().flatten();
+            let named = named.map(|name| name.as_str().unwrap_or_default().to_owned());
+            let mut names: Vec<String> = named.collect();
             let all = last.map_or(0, |last| last as usize + 1);
             names.resize(all.max(names.len()), String::new());
             names

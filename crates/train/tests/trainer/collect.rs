@@ -305,12 +305,13 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     desk.assert_refused("own.npz", append, 1, "another process is at work here");
     drop(locked);
 
-    // A data set that somebody made, without names of its materials.
+    // A data set that somebody made, with a number in place of a material's name.
     let own = desk.presses("own.npz");
     let write = |change: fn(&mut Press)| {
         let mut presses = own.clone();
         presses.all.iter_mut().for_each(change);
-        write_data(&desk.path("own.npz"), &presses, &json!({}));
+        let meta = json!({"materials": ["oak", 7]});
+        write_data(&desk.path("own.npz"), &presses, &meta);
     };
     write(|press| press.object = None);
     desk.assert_refused("own.npz", append, 1, "own.npz: has no array `object`");
@@ -318,6 +319,8 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     let both = desk.collected("own.npz", &format!("{append} --split test"));
     let last = both.last().unwrap();
     assert_eq!((last.object, last.material), (Some(3), Some(2)));
+    let named = json!(["oak", "", "unknown"]);
+    assert_eq!(desk.meta("own.npz")["materials"], named);
     assert!(last.force_n.is_some() && both[0].force_n.is_none());
     assert_eq!((both[0].kind, last.kind), (Kind::Unknown, Kind::Recorded));
 }
