@@ -87,6 +87,9 @@ pub fn resampled(frame: &Frame) -> ModelFrame {
     Resampling::new(frame, Pitch::JX255N, PITCH_MM).apply(frame)
 }
 
+/// File, level, number and material of an object.
+pub type OfObject = (usize, u8, u64, Option<u8>);
+
 /// Presses of one or several files.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Presses {
@@ -398,15 +401,15 @@ impl Presses {
         trained.iter().find(is_tested).map(|object| object.number)
     }
 
-    /// The presses of each object by its file, level and number. A press whose object is not known is of one of its
-    /// own.
-    pub fn by_object(&self, places: &[usize]) -> BTreeMap<(usize, u8, u64), Vec<usize>> {
+    /// The presses of each object by its file, level, number and material, because numbers may begin anew for each
+    /// material. A press whose object is not known is of one of its own.
+    pub fn by_object(&self, places: &[usize]) -> BTreeMap<OfObject, Vec<usize>> {
         let mut objects = BTreeMap::<_, Vec<usize>>::new();
         for &place in places {
             let press = &self.all[place];
             let object = press.object.map_or(u64::MAX - place as u64, u64::from);
-            let own = objects.entry((press.source, press.level, object));
-            own.or_default().push(place);
+            let key = (press.source, press.level, object, press.material);
+            objects.entry(key).or_default().push(place);
         }
         objects
     }

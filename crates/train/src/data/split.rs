@@ -60,7 +60,7 @@ type Groups = BTreeMap<(usize, u8), Vec<Vec<usize>>>;
 /// The objects of `places` by source and level, in a random order drawn from `stream`.
 fn objects(presses: &Presses, places: &[usize], stream: &Stream) -> Groups {
     let mut groups = Groups::new();
-    for ((source, level, _), own) in presses.by_object(places) {
+    for ((source, level, ..), own) in presses.by_object(places) {
         groups.entry((source, level)).or_default().push(own);
     }
     for (number, objects) in (0..).zip(groups.values_mut()) {

@@ -212,7 +212,7 @@ pub fn references(
     let force_n = |place: &usize| presses.all[*place].force_n.unwrap_or_default();
     let mut turns = BTreeMap::<u8, usize>::new();
     let mut objects: Vec<(usize, u8, Vec<usize>)> = Vec::new();
-    for ((_, level, _), mut own) in presses.by_object(places) {
+    for ((_, level, ..), mut own) in presses.by_object(places) {
         own.sort_by(|one, other| force_n(one).total_cmp(&force_n(other)));
         let turn = turns.entry(level).or_default();
         objects.push((*turn, level, own));

@@ -105,7 +105,7 @@ impl Estimate {
         let places: Vec<usize> = values.iter().map(|(press, _)| *press).collect();
         let objects = presses.by_object(&places);
         let mut counts = BTreeMap::<u8, usize>::new();
-        for (_, level, _) in objects.keys() {
+        for (_, level, ..) in objects.keys() {
             *counts.entry(*level).or_default() += 1;
         }
         let has_several = counts.values().all(|&count| count > 1);
@@ -408,7 +408,7 @@ impl Comparison<'_> {
     fn of_levels(&self) -> Vec<OfLevel> {
         let objects = self.presses.by_object(self.places);
         let levels = self.presses.levels().into_iter().map(|level| {
-            let own = || objects.iter().filter(|((_, of, _), _)| *of == level.level);
+            let own = || objects.iter().filter(|((_, of, ..), _)| *of == level.level);
             OfLevel {
                 presses: own().map(|(_, presses)| presses.len()).sum(),
                 objects: own().count(),

@@ -24,7 +24,7 @@ pub struct Fold {
 /// never judged. `None` if that leaves fewer than two levels to tell apart.
 pub fn by_object(presses: &Presses, places: &[usize], seed: u64) -> Option<Vec<Fold>> {
     let mut of_levels = BTreeMap::<u8, Vec<Vec<usize>>>::new();
-    for ((_, level, _), own) in presses.by_object(places) {
+    for ((_, level, ..), own) in presses.by_object(places) {
         of_levels.entry(level).or_default().push(own);
     }
     of_levels.retain(|_, objects| objects.len() > 1);

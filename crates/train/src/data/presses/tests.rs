@@ -284,6 +284,32 @@ fn a_file_may_have_up_to_sixteen_levels_of_its_own() {
 }
 
 #[test]
+fn objects_of_one_number_and_two_materials_are_two() {
+    let press = |material, object| Press {
+        level: 1,
+        object,
+        material,
+        ..Press::default()
+    };
+    let (oak, pine) = (Some(0), Some(1));
+    let all = [
+        (pine, Some(0)),
+        (oak, Some(0)),
+        (oak, Some(1)),
+        (oak, Some(0)),
+        (oak, None),
+        (oak, None),
+    ];
+    let presses = Presses {
+        all: all.map(|(material, object)| press(material, object)).into(),
+        ..Presses::default()
+    };
+    let objects = presses.by_object(&[0, 1, 2, 3, 4, 5]);
+    let objects: Vec<Vec<usize>> = objects.into_values().collect();
+    assert_eq!(objects, [vec![1, 3], vec![0], vec![2], vec![5], vec![4]]);
+}
+
+#[test]
 fn joined_files_keep_objects_and_sensors_apart_and_have_one_pitch() {
     let part = |last: u32, pitch_mm: f64| {
         let mut presses = frames();
