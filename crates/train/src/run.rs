@@ -9,6 +9,7 @@ pub mod history;
 pub mod progress;
 
 use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
@@ -86,7 +87,7 @@ impl Run {
                 });
                 description.map(Some)
             }
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error).with_context(|| path.display().to_string()),
         }
     }
@@ -162,15 +163,20 @@ impl Run {
         self.path("checkpoints").join(stage)
     }
 
-    /// The steps and the seconds of all stages of the run in a directory, over all restarts.
+    /// The steps and the seconds of all stages of the run in a directory, over all restarts. They are 0 without
+    /// checkpoints, which somebody may have removed to save space.
     ///
     /// # Errors
     ///
-    /// Returns an error if a checkpoint cannot be read.
+    /// Returns an error if the checkpoints are there and cannot be read.
     pub fn cost(directory: &Path) -> anyhow::Result<(u64, f64)> {
         let (mut steps, mut seconds) = (0, 0.0);
         let directory = directory.join("checkpoints");
-        for file in fs::read_dir(&directory).with_context(|| directory.display().to_string())? {
+        let files = match fs::read_dir(&directory) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok((steps, seconds)),
+            files => files.with_context(|| directory.display().to_string())?,
+        };
+        for file in files {
             if let Some(stage) = Checkpoint::read(&file?.path())? {
                 steps += stage.step;
                 seconds += stage.seconds;

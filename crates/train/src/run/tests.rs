@@ -63,6 +63,24 @@ fn every_program_that_had_a_part_in_a_run_is_named_once() {
 }
 
 #[test]
+fn the_cost_of_a_run_is_that_of_its_checkpoints() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path();
+    assert_eq!(Run::cost(path).unwrap(), (0, 0.0));
+    fs::create_dir(path.join("checkpoints")).unwrap();
+    for (stage, step, seconds) in [("ustgan", 3, 1.5), ("hrn", 4, 2.0)] {
+        let stage = path.join("checkpoints").join(stage);
+        let done = Checkpoint {
+            step,
+            seconds,
+            ..Checkpoint::default()
+        };
+        done.write(&stage).unwrap();
+    }
+    assert_eq!(Run::cost(path).unwrap(), (7, 3.5));
+}
+
+#[test]
 fn a_checkpoint_comes_back_whole_or_not_at_all() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("hrn");
