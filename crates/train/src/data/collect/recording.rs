@@ -335,8 +335,8 @@ fn level(label: &str, of: &Settings) -> Option<u8> {
 pub(super) fn object_of(name: &str) -> u32 {
     let hash = sha256_hex(name.as_bytes());
     let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
-    // A half of the numbers is left to people, who count up from 0 or down from the last.
-    number >> 1
+    // The numbers below 2^31 are left to people, who count up from 0.
+    number | 1 << 31
 }
 
 impl Watched {
@@ -397,5 +397,8 @@ mod tests {
         // The label says 2.
         assert_eq!(truth(json!({"level": 99, "object": 7})), (2, Some(5)));
         assert_ne!(object_of("cup"), object_of("mug"));
+        for name in ["cup", "mug", "a", "b", "c", "d", "e", "f"] {
+            assert!(object_of(name) >= 1 << 31, "{name}");
+        }
     }
 }
