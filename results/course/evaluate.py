@@ -127,7 +127,8 @@ def figures(evaluated, verdicts, data):
         counts[covers.index(sensor // ELECTRONICS), level - 1] += [named == level, 1]
     share = counts.sum(axis=1)
     materials = json.loads(data["meta"].tobytes())["materials"]
-    is_layered = data["material"][places] == materials.index("broad-layered")
+    # The named materials have none that is layered.
+    is_layered = numpy.array(materials)[data["material"][places]] == "broad-layered"
     pairs = [(level, named) for _, level, named, _, _ in rows]
     sure = [level == named for _, level, named, shares, _ in rows if max(shares) > SURE]
     return {
