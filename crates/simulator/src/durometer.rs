@@ -103,7 +103,7 @@ impl Durometer {
                 high = shore;
             }
         }
-        0.5 * (low + high)
+        low
     }
 
     /// Force in N on the indenter at `depth_mm`, for E = 1 MPa.
@@ -190,6 +190,12 @@ mod tests {
         assert!((thick - 1.0).abs() < 0.01, "{thick}");
         let thin = thin / (core * force_n(Substance { nu: 0.3, ..solid }));
         assert!((thin - 1.0).abs() < 0.05, "{thin}");
+    }
+
+    #[test]
+    fn an_indenter_that_sinks_in_to_the_end_reads_0() {
+        let candy = Material::SoftCandy.properties().substance;
+        assert_eq!(Durometer::new(&candy).reading(1e-4), 0.0);
     }
 
     #[test]
