@@ -100,7 +100,7 @@ impl Row<'_> {
         // The paper has results on its own test split only.
         let papers = paper::confusion(self.method).filter(|_| set == 0);
         if let Some(papers) = papers.and_then(|papers| figure(&papers)) {
-            cell += &format!(" ({papers:.decimals$})");
+            cell += &format!(" ({})", rounded(papers, decimals));
         }
         cell
     }
@@ -108,7 +108,7 @@ impl Row<'_> {
 
 /// The mean.
 fn mean_alone(values: &[f64], decimals: usize) -> String {
-    format!("{:.decimals$}", mean(values))
+    rounded(mean(values), decimals)
 }
 
 /// The mean, and with several values the standard deviation of the sample.
@@ -118,7 +118,7 @@ fn spread(values: &[f64], decimals: usize) -> String {
     let deviation = (squares / (values.len() as f64 - 1.0)).sqrt();
     match values.len() {
         1 => mean_alone(values, decimals),
-        _ => format!("{mean:.decimals$} ± {deviation:.decimals$}"),
+        _ => format!("{} ± {deviation:.decimals$}", rounded(mean, decimals)),
     }
 }
 
@@ -203,10 +203,36 @@ fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
+/// A number with `decimals` decimals. A number that rounds to zero has no sign.
+fn rounded(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    match text.strip_prefix('-') {
+        Some(zero) if zero.bytes().all(|byte| matches!(byte, b'0' | b'.')) => zero.to_owned(),
+        _ => text,
+    }
+}
+
 /// An integer with commas between thousands.
 fn thousands(value: usize) -> String {
     match value {
         0..1000 => value.to_string(),
         _ => format!("{},{:03}", thousands(value / 1000), value % 1000),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_figure_that_rounds_to_zero_has_no_sign() {
+        for (values, expected) in [
+            (&[-4e-5][..], "0.0000"),
+            (&[-6e-5], "-0.0001"),
+            (&[4e-5], "0.0000"),
+            (&[-1e-5, -1e-5], "0.0000 ± 0.0000"),
+        ] {
+            assert_eq!(spread(values, 4), expected);
+        }
     }
 }
