@@ -32,6 +32,8 @@ use hardnessd_simulator::random::Stream;
 
 /// The fewest objects, and presses of each.
 const LEAST: [usize; 2] = [3, 2];
+/// A press that took less than this share of the median time of its object's presses is a piece of one.
+const LEAST_SHARE: f32 = 1.0 / 3.0;
 /// The seed of everything random.
 const SEED: u64 = 1;
 /// The name of the control.
@@ -60,7 +62,8 @@ pub fn fit(
     levels: Option<Vec<Level>>,
 ) -> anyhow::Result<(Report, Option<Written>)> {
     let presses = read(data, sensor, levels)?;
-    let places: Vec<usize> = presses.labelled(Split::Train).collect();
+    let all: Vec<usize> = presses.labelled(Split::Train).collect();
+    let places = whole(&presses, &all);
     check(&presses, &places)?;
     let candidates = candidate::all(&presses, &places)?;
     let control = candidate::unloaded(&presses, &places);
@@ -106,7 +109,16 @@ pub fn fit(
         candidates: compared,
         control,
     };
-    let (report, chosen) = comparison.report();
+    let (mut report, chosen) = comparison.report();
+    let pieces = all.len() - places.len();
+    if pieces > 0 {
+        let remark = format!(
+            "{pieces} of {} presses are left out, because each took less than a third of the median time of its object's: a \
+             light contact that is lost for a moment makes several presses of one",
+            all.len()
+        );
+        report.remarks.insert(0, remark);
+    }
     let Some(place) = chosen else {
         return Ok((report, None));
     };
@@ -183,6 +195,25 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
     Ok(all)
 }
 
+/// The presses that are no pieces of one. Where the contact is light, it is lost and felt again.
+fn whole(presses: &Presses, places: &[usize]) -> Vec<usize> {
+    let seconds = |place: &usize| {
+        let moments = presses.timed(*place).moments;
+        moments.last().map_or(0.0, |(time_s, _)| *time_s)
+    };
+    let objects = presses.by_object(places).into_values();
+    let whole = objects.flat_map(|mut own| {
+        let mut times: Vec<f32> = own.iter().map(seconds).collect();
+        times.sort_by(f32::total_cmp);
+        let least = LEAST_SHARE * times[times.len() / 2];
+        own.retain(|place| seconds(place) >= least);
+        own
+    });
+    let mut whole: Vec<usize> = whole.collect();
+    whole.sort_unstable();
+    whole
+}
+
 /// Refuses data with too little to learn from.
 fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
     let [least_objects, least_presses] = LEAST;
@@ -208,4 +239,34 @@ fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
         "all presses are of one level: press objects of another level too"
     );
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::presses::Press;
+
+    #[test]
+    fn a_press_much_shorter_than_its_objects_others_is_left_out() {
+        let mut presses = Presses::default();
+        // The objects are pressed in turn.
+        for lengths in [[20, 5, 1], [21, 5, 1], [9, 5, 1], [40, 2, 1]] {
+            for (object, length) in (0..).zip(lengths) {
+                let press = Press {
+                    level: 1,
+                    object: Some(object),
+                    ..Press::default()
+                };
+                let moments = (0..length).map(|moment| (0.2 * moment as f32, None, [0.0; 784]));
+                presses.push(press, moments);
+            }
+        }
+        let all: Vec<usize> = (0..presses.all.len()).collect();
+        let expected: Vec<usize> = all
+            .iter()
+            .copied()
+            .filter(|place| ![6, 10].contains(place))
+            .collect();
+        assert_eq!(whole(&presses, &all), expected);
+    }
 }

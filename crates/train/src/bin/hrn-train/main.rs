@@ -15,6 +15,7 @@ use std::error::Error;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
+use anyhow::Context as _;
 use clap::Parser as _;
 use clap::error::ErrorKind;
 use hardnessd_core::trial;
@@ -43,8 +44,11 @@ fn main() -> ExitCode {
         Command::Compare(_) => signals::again(None),
         _ => None,
     };
-    if let Err(error) = signals::end_at_signals(how_to_continue) {
-        hardnessd_core::stderr_line!("hrn-train: signals: {error}");
+    // Without this, the first work of the pool would panic where the system has no thread left.
+    let pool = || rayon::ThreadPoolBuilder::new().build_global();
+    let prepared = signals::end_at_signals(how_to_continue).context("signals");
+    if let Err(error) = prepared.and_then(|()| pool().context("threads")) {
+        hardnessd_core::stderr_line!("hrn-train: {}", wording::line(error.as_ref()));
         return ExitCode::from(exit::IO);
     }
     let done = match arguments.command {
