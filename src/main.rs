@@ -107,11 +107,11 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             record::run(args, setup, &log, end).await
         }
         Command::Recover(args) => finish_blocking(signals, move || recover::run(&args)).await,
-        Command::Replay(args) => finish(signals, replay::run(args)).await,
+        Command::Replay(args) => finish_blocking(signals, move || replay::run(&args)).await,
         Command::Tail(args) => tail::run(args, signals.received()).await,
         #[cfg(feature = "watch")]
         Command::Watch(args) => watch::run(args, signals.received()).await,
-        Command::Control(command) => finish(signals, control::run(command)).await,
+        Command::Control(command) => finish_blocking(signals, || control::run(command)).await,
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => {
             let path = args.config.path()?;

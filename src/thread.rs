@@ -4,7 +4,8 @@
 //! ends the process.
 
 use std::io;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::mem;
+use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
@@ -40,45 +41,25 @@ pub fn spawn_thread<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<oneshot::Receiver<T>, NoThread> {
     let (done, result) = oneshot::channel();
-    let at_work = AtWork::begin();
     thread::Builder::new()
         .name(name.to_owned())
         .spawn(move || {
             // Perhaps nobody waits for the result any more.
             let _ = done.send(work());
-            drop(at_work);
         })?;
     Ok(result)
 }
 
-/// Blocks until every thread of [`spawn_thread`] has done its work, but no longer than `patience`.
+/// Waits until a write to stdout that is under way has ended, but no longer than `patience`. Nothing is written
+/// after it.
 pub fn finish(patience: Duration) {
-    let _ = IDLE.wait_timeout_while(threads(), patience, |threads| *threads > 0);
-}
-
-/// The number of threads at work.
-static THREADS: Mutex<usize> = Mutex::new(0);
-/// A thread has done its work.
-static IDLE: Condvar = Condvar::new();
-
-fn threads() -> MutexGuard<'static, usize> {
-    // The number is right even if a thread panicked while it changed it.
-    THREADS.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Counts a thread as long as it lives.
-struct AtWork;
-
-impl AtWork {
-    fn begin() -> Self {
-        *threads() += 1;
-        Self
-    }
-}
-
-impl Drop for AtWork {
-    fn drop(&mut self) {
-        *threads() -= 1;
-        IDLE.notify_all();
+    let (free, waiting) = mpsc::channel();
+    let taken = thread::Builder::new().spawn(move || {
+        mem::forget(io::stdout().lock());
+        // Perhaps nobody waits any more.
+        let _ = free.send(());
+    });
+    if taken.is_ok() {
+        let _ = waiting.recv_timeout(patience);
     }
 }

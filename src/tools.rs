@@ -23,7 +23,6 @@ pub mod recover;
 pub mod replay;
 mod readable;
 mod robot;
-#[cfg(feature = "watch")]
 mod score;
 pub mod simulate;
 pub mod sniff;
@@ -37,7 +36,6 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use tokio::sync::{mpsc, oneshot};
 
 use self::exit::{Fail, Failure};
 use crate::thread::spawn_thread;
@@ -131,46 +129,9 @@ pub fn print(lines: &[u8]) -> Result<bool, Failure> {
 }
 
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
-async fn print_apart(lines: Vec<u8>) -> Result<bool, Failure> {
-    let mut stdout = Stdout::open()?;
-    stdout.print(lines).await?;
-    stdout.finish().await
-}
-
-/// A thread that writes to stdout.
-struct Stdout {
-    waiting: mpsc::Sender<Vec<u8>>,
-    ended: oneshot::Receiver<Result<bool, Failure>>,
-}
-
-impl Stdout {
-    fn open() -> Result<Self, Failure> {
-        let (waiting, mut lines) = mpsc::channel::<Vec<u8>>(1);
-        let write = move || {
-            while let Some(lines) = lines.blocking_recv() {
-                if !print(&lines)? {
-                    return Ok(false);
-                }
-            }
-            Ok(true)
-        };
-        let ended = spawn_thread("stdout", write).of("stdout", IO)?;
-        Ok(Self { waiting, ended })
-    }
-
-    /// Waits until there is room for the lines. Returns `Ok(false)` if nobody reads any more.
-    async fn print(&mut self, lines: Vec<u8>) -> Result<bool, Failure> {
-        match self.waiting.send(lines).await {
-            Ok(()) => Ok(true),
-            Err(_) => (&mut self.ended).await.of("stdout", IO)?,
-        }
-    }
-
-    /// Waits until all lines are written. Returns `Ok(false)` if nobody reads any more.
-    async fn finish(self) -> Result<bool, Failure> {
-        drop(self.waiting);
-        self.ended.await.of("stdout", IO)?
-    }
+async fn print_apart(text: String) -> Result<bool, Failure> {
+    let printed = spawn_thread("stdout", move || print(text.as_bytes()))?;
+    printed.await.expect("a text is printed without a panic")
 }
 
 /// An absolute path, or the path as it is if the system does not know the current directory.

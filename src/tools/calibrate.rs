@@ -140,7 +140,7 @@ pub async fn run(
         None => of_force(&args.newtons, &presses, &sensor)?,
         Some(part) => of_taxels(presses, &sensor, part, &path, config)?,
     };
-    super::print_apart(text.into_bytes()).await?;
+    super::print_apart(text).await?;
     Ok(())
 }
 

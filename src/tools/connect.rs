@@ -5,25 +5,23 @@
 //! a limited length.
 
 use std::fmt;
-use std::fs;
-use std::io::{self, ErrorKind};
-use std::net::{SocketAddr, ToSocketAddrs};
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read as _, Write as _};
+use std::net::TcpStream;
+use std::os::fd::OwnedFd;
 use std::os::unix::fs::MetadataExt;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args as ClapArgs;
-use futures_util::StreamExt as _;
+use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use serde_json::Value;
-use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
-use tokio::net::{TcpStream, UnixStream};
 
 use super::exit::Failure;
 use super::{demo, doctor};
 use crate::daemon::config::Unix;
-use crate::daemon::lines::{LineError, Lines, lines};
 use crate::daemon::tcp;
-use crate::thread::spawn_thread;
 use hardnessd_core::event::PROTOCOL;
 use hardnessd_core::exit::UNAVAILABLE;
 
@@ -74,11 +72,12 @@ impl fmt::Display for Address {
 /// takes about 6 kB.
 const LONGEST_LINE_BYTES: usize = 1 << 20;
 
-/// A connection to a daemon.
+/// A connection to a daemon. Its calls block, so it has a thread of its own.
 pub(super) struct Connection {
     address: Address,
-    lines: Lines<Box<dyn AsyncRead + Send + Unpin>>,
-    output: Box<dyn AsyncWrite + Send + Unpin>,
+    input: BufReader<File>,
+    /// What has come of the next line.
+    begun: Vec<u8>,
 }
 
 impl Source {
@@ -88,10 +87,10 @@ impl Source {
     /// # Errors
     ///
     /// Fails if no daemon answers.
-    pub(super) async fn connect(&self) -> Result<Connection, Failure> {
+    pub(super) fn connect(&self) -> Result<Connection, Failure> {
         match self.given() {
-            Some(address) => Connection::open(address).await,
-            None => find("events.sock").await,
+            Some(address) => Connection::open(address),
+            None => find("events.sock"),
         }
     }
 
@@ -108,22 +107,22 @@ impl Source {
 /// # Errors
 ///
 /// Fails if no daemon answers.
-pub(super) async fn control(path: Option<PathBuf>) -> Result<Connection, Failure> {
+pub(super) fn control(path: Option<PathBuf>) -> Result<Connection, Failure> {
     match path {
-        Some(path) => Connection::open(Address::Unix(path)).await,
-        None => find("control.sock").await,
+        Some(path) => Connection::open(Address::Unix(path)),
+        None => find("control.sock"),
     }
 }
 
 /// The first daemon that answers at one of the usual places, at its socket of this name.
-async fn find(name: &str) -> Result<Connection, Failure> {
+fn find(name: &str) -> Result<Connection, Failure> {
     let place = |path: PathBuf| path.with_file_name(name);
     let places: Vec<PathBuf> = Unix::places().into_iter().map(place).collect();
     let demos = demo::sockets().into_iter().map(place);
     let mut denied = None;
     for path in places.iter().cloned().chain(demos) {
         let address = Address::Unix(path);
-        match Connection::try_open(&address).await {
+        match Connection::try_open(&address) {
             Ok(connection) => return Ok(connection),
             Err(error) if error.kind() == ErrorKind::PermissionDenied => {
                 denied = denied.or(Some(refusal(&address, error)));
@@ -143,39 +142,25 @@ async fn find(name: &str) -> Result<Connection, Failure> {
     Err(Failure::new(UNAVAILABLE, problem))
 }
 
-/// Connects to one of the addresses of a name. A lookup may take long.
-async fn connect(name: String) -> io::Result<TcpStream> {
-    let found = spawn_thread("lookup", move || name.to_socket_addrs())?;
-    let addresses: Vec<SocketAddr> = found.await.map_err(io::Error::other)??.collect();
-    TcpStream::connect(&addresses[..]).await
-}
-
 impl Connection {
-    async fn open(address: Address) -> Result<Self, Failure> {
-        let opened = Self::try_open(&address).await;
+    pub(super) fn open(address: Address) -> Result<Self, Failure> {
+        let opened = Self::try_open(&address);
         opened.map_err(|error| refusal(&address, error))
     }
 
-    async fn try_open(address: &Address) -> io::Result<Self> {
-        type Input = Box<dyn AsyncRead + Send + Unpin>;
-        let (input, output): (Input, Box<dyn AsyncWrite + Send + Unpin>) = match address {
-            Address::Unix(path) => {
-                let (input, output) = UnixStream::connect(path).await?.into_split();
-                (Box::new(input), Box::new(output))
-            }
-            Address::Tcp(address) => {
-                let stream = connect(address.clone()).await?;
+    fn try_open(address: &Address) -> io::Result<Self> {
+        let stream: OwnedFd = match address {
+            Address::Unix(path) => UnixStream::connect(path)?.into(),
+            Address::Tcp(name) => {
+                let stream = TcpStream::connect(name)?;
                 tcp::keep_alive(&stream, tcp::PATIENCE)?;
-                let (input, output) = stream.into_split();
-                (Box::new(input), Box::new(output))
+                stream.into()
             }
         };
-        let address = address.clone();
-        let lines = lines(input, LONGEST_LINE_BYTES);
         Ok(Self {
-            address,
-            lines,
-            output,
+            address: address.clone(),
+            input: BufReader::new(stream.into()),
+            begun: Vec::new(),
         })
     }
 
@@ -189,14 +174,13 @@ impl Connection {
     /// # Errors
     ///
     /// Fails if what answers is no daemon of this protocol, or has too many subscribers.
-    pub(super) async fn meet(&mut self) -> Result<Value, Failure> {
-        let Ok(first) = tokio::time::timeout(HELLO, self.next()).await else {
+    pub(super) fn meet(&mut self) -> Result<Value, Failure> {
+        let Some(first) = self.next_within(HELLO)? else {
             return Err(self.failed(format_args!(
                 "no answer for {} s: what listens there is no hardnessd, or it hangs",
                 HELLO.as_secs()
             )));
         };
-        let first = first?;
         let hello: Value = serde_json::from_str(&first).unwrap_or_default();
         let found = match (hello["type"].as_str(), &hello["protocol"]) {
             (Some("hello"), protocol) if *protocol == PROTOCOL => return Ok(hello),
@@ -217,20 +201,43 @@ impl Connection {
         )))
     }
 
-    /// The next line, without its newline. Cancelling the call loses nothing.
+    /// The next line, without its newline.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Self::next_within`].
+    pub(super) fn next(&mut self) -> Result<String, Failure> {
+        loop {
+            if let Some(line) = self.next_within(tcp::PATIENCE)? {
+                return Ok(line);
+            }
+        }
+    }
+
+    /// The next line, without its newline. `None` if nothing comes for `patience`.
     ///
     /// # Errors
     ///
     /// Fails if the connection has ended, or the line is longer than a daemon may send.
-    pub(super) async fn next(&mut self) -> Result<String, Failure> {
-        match self.lines.next().await {
-            Some(Ok(line)) => Ok(String::from_utf8_lossy(&line).into_owned()),
-            Some(Err(LineError::Io(error))) => Err(self.broke(error)),
-            Some(Err(LineError::MaxChunkLengthExceeded)) => Err(self.failed(format_args!(
+    pub(super) fn next_within(&mut self, patience: Duration) -> Result<Option<String>, Failure> {
+        let patience = patience.max(Duration::from_millis(1));
+        let set = set_socket_timeout(self.input.get_ref(), Timeout::Recv, Some(patience));
+        set.map_err(|error| self.broke(error.into()))?;
+        let room = LONGEST_LINE_BYTES - self.begun.len();
+        let mut rest = (&mut self.input).take(room as u64);
+        match rest.read_until(b'\n', &mut self.begun) {
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
+            Err(error) => Err(self.broke(error)),
+            Ok(_) if self.begun.pop_if(|last| *last == b'\n').is_some() => {
+                let line = String::from_utf8_lossy(&self.begun).into_owned();
+                self.begun.clear();
+                Ok(Some(line))
+            }
+            Ok(_) if self.begun.len() == LONGEST_LINE_BYTES => Err(self.failed(format_args!(
                 "closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
                  daemon sends"
             ))),
-            None => Err(self.failed("the daemon closed the connection")),
+            Ok(_) => Err(self.failed("the daemon closed the connection")),
         }
     }
 
@@ -249,9 +256,9 @@ impl Connection {
     /// # Errors
     ///
     /// Fails if the request cannot be sent.
-    pub(super) async fn send(&mut self, request: &str) -> Result<(), Failure> {
+    pub(super) fn send(&mut self, request: &str) -> Result<(), Failure> {
         let line = format!("{request}\n");
-        let sent = self.output.write_all(line.as_bytes()).await;
+        let sent = self.input.get_mut().write_all(line.as_bytes());
         sent.map_err(|error| self.broke(error))
     }
 }
@@ -296,30 +303,24 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn a_server_without_newlines_is_left() {
-        use tokio::io::AsyncWriteExt;
-
+    #[test]
+    fn a_server_without_newlines_is_left() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("hostile.sock");
-        let listener = tokio::net::UnixListener::bind(&path).unwrap();
-        let sender = tokio::spawn(async move {
-            let (mut stream, _) = listener.accept().await.unwrap();
+        let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
+        let sender = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
             let mut sent = 0;
-            while stream.write_all(&[b'x'; 65536]).await.is_ok() {
+            while stream.write_all(&[b'x'; 65536]).is_ok() {
                 sent += 65536;
             }
             sent
         });
-        let source = Source {
-            socket: Some(path),
-            connect: None,
-        };
-        let mut connection = source.connect().await.unwrap();
-        let error = connection.next().await.unwrap_err();
+        let mut connection = control(Some(path)).unwrap();
+        let error = connection.next().unwrap_err();
         assert!(error.line().contains("which no daemon sends"), "{error:?}");
         drop(connection);
         // The sender wrote more than the reader took, because the system's buffers hold the rest.
-        assert!(sender.await.unwrap() < 4 * LONGEST_LINE_BYTES);
+        assert!(sender.join().unwrap() < 4 * LONGEST_LINE_BYTES);
     }
 }

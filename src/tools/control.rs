@@ -2,7 +2,7 @@
 //! and its answer.
 
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::{Args as ClapArgs, Subcommand};
 use serde_json::{Map, Value, json};
@@ -66,40 +66,28 @@ const ANSWER: Duration = Duration::from_secs(60);
 /// # Errors
 ///
 /// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
-pub async fn run(command: Command) -> Result<(), Failure> {
-    let answer = match command {
-        Command::Tare(target) => {
-            let request = json!({"tare": target.sensor, "id": 1});
-            ask(target.socket, &request).await?
-        }
-        Command::Blackbox(target) => {
-            let request = json!({"blackbox": target.sensor, "id": 1});
-            ask(target.socket, &request).await?
-        }
+pub fn run(command: Command) -> Result<(), Failure> {
+    let socket = match &command {
+        Command::Tare(target) | Command::Blackbox(target) => &target.socket,
+        Command::Context(context) => &context.target.socket,
+    };
+    let mut daemon = connect::control(socket.clone())?;
+    let request = match command {
+        Command::Tare(target) => json!({"tare": target.sensor}),
+        Command::Blackbox(target) => json!({"blackbox": target.sensor}),
         Command::Context(Context { target, pairs }) => {
-            let mut daemon = connect::control(target.socket).await?;
-            let hello = daemon.meet().await?;
+            let hello = daemon.meet()?;
             let mut context: Map<String, Value> = pairs.into_iter().collect();
             context.insert("sensor".to_owned(), target.sensor.into());
             if let Some(level) = context.get_mut("level") {
                 name_level(level, &hello["model"]["levels"]);
             }
-            exchange(&mut daemon, &json!({"context": context, "id": 1})).await?
+            json!({"context": context})
         }
     };
-    let line = in_words(&answer) + "\n";
+    let line = in_words(&ask(&mut daemon, request)?) + "\n";
     super::print(line.as_bytes())?;
     Ok(())
-}
-
-/// Sends a command with the `id` 1 to a control socket, by default to that of the first daemon that answers.
-/// Returns the answer.
-///
-/// # Errors
-///
-/// Returns a [`Failure`] if no daemon answers, or the daemon refuses.
-pub(super) async fn ask(socket: Option<PathBuf>, request: &Value) -> Result<Value, Failure> {
-    exchange(&mut connect::control(socket).await?, request).await
 }
 
 /// Replaces the label of one of the `levels` of a `hello` by its number.
@@ -110,28 +98,28 @@ fn name_level(level: &mut Value, levels: &Value) {
     }
 }
 
-async fn exchange(daemon: &mut Connection, request: &Value) -> Result<Value, Failure> {
-    daemon.send(&request.to_string()).await?;
-    let answer = tokio::time::timeout(ANSWER, answer(daemon)).await;
-    let mute = |_| Failure::new(FAILED, format!("no answer within {} s", ANSWER.as_secs()));
-    let answer = answer.map_err(mute)??;
-    if answer["type"] == "error" {
-        let message = answer["message"].as_str().unwrap_or_default();
-        return Err(Failure::new(FAILED, message.to_owned()));
-    }
-    Ok(answer)
-}
-
-/// The answer to the command. Other lines come before it.
-async fn answer(daemon: &mut Connection) -> Result<Value, Failure> {
-    loop {
-        let line = daemon.next().await?;
+/// Sends a command to a control socket, and returns the answer. Other lines come before it.
+///
+/// # Errors
+///
+/// Returns a [`Failure`] if the daemon does not answer, or refuses.
+pub(super) fn ask(daemon: &mut Connection, mut request: Value) -> Result<Value, Failure> {
+    request["id"] = json!(1);
+    daemon.send(&request.to_string())?;
+    let end = Instant::now() + ANSWER;
+    while let Some(line) = daemon.next_within(end.saturating_duration_since(Instant::now()))? {
         let answer: Value = serde_json::from_str(&line).unwrap_or_default();
-        let is_refusal = answer["type"] == "error" && answer["id"].is_null();
-        if answer["id"] == 1 || is_refusal {
+        let is_refusal = answer["type"] == "error";
+        if is_refusal && (answer["id"] == 1 || answer["id"].is_null()) {
+            let message = answer["message"].as_str().unwrap_or_default();
+            return Err(Failure::new(FAILED, message.to_owned()));
+        }
+        if answer["id"] == 1 {
             return Ok(answer);
         }
     }
+    let mute = format!("no answer within {} s", ANSWER.as_secs());
+    Err(Failure::new(FAILED, mute))
 }
 
 /// The answer in plain words.

@@ -9,7 +9,7 @@
 mod account;
 mod place;
 
-use std::future::Future;
+use std::future::{self, Future};
 use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
 use std::path::Path;
@@ -18,25 +18,24 @@ use std::time::Duration;
 use clap::Args as ClapArgs;
 use futures_util::FutureExt as _;
 use serde_json::Value;
-use tokio::io::{AsyncBufReadExt, BufReader};
-use tokio::net::UnixStream;
 use tokio::sync::oneshot;
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 
 use self::account::Account;
 use self::place::Place;
 pub(super) use self::place::sockets;
-use super::Stdout;
 use super::configuration::ModelFile;
+use super::connect::{Address, Connection};
 use super::exit::{Fail, Failure};
 use super::faults::Faults;
 use super::player::{self, Pace, Player};
-use super::robot::Robot;
+use super::robot;
 use super::simulate::within;
 use crate::daemon::Daemon;
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::{Config, Http, Setup};
-use hardnessd_core::exit::{FAILED, IO};
+use crate::thread::spawn_thread;
+use hardnessd_core::exit::IO;
 use hardnessd_core::motion;
 use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
@@ -115,10 +114,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         listen: args.http,
         set_context: true,
     });
-    let robot = Robot {
-        socket: config.publish.unix.control_path(),
-        position: Box::new(player.position()),
-    };
+    let control = config.publish.unix.control_path();
     let (config, path) = (
         config.with_model(args.model.path()?.as_deref()),
         Path::new("demo"),
@@ -129,19 +125,36 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
     stderr_line!("socket: {} ({listen})", socket.display());
-    let subscriber = UnixStream::connect(&socket).await.of("socket", IO)?;
+    let subscriber = Connection::open(Address::Unix(socket))?;
+    let print = move || print_events(subscriber, args.presses, account);
+    let mut printed = spawn_thread("events", print)?;
+    robot::start(control, Box::new(player.position()))?;
+    let frames = player::sequence(sequence)?;
+    // When it is dropped, the daemon stops.
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(stopped.map(drop), None);
-    let printing = async {
-        // When it is dropped, the daemon stops.
+    let play = async {
+        player.play(frames, Instant::now()).await.of("pty", IO)?;
+        // The loss of the port ends what is printed.
+        future::pending::<Result<_, Failure>>().await
+    };
+    let playing = async {
         let _stop = stop;
         tokio::select! {
-            printed = print(subscriber, args.presses, player, sequence, account, shutdown) => printed,
-            () = robot.run() => Ok(()),
+            () = shutdown => Ok(None),
+            printed = &mut printed => Ok(Some(printed)),
+            failed = play => failed,
         }
     };
-    let (served, printed) = tokio::join!(daemon, printing);
-    printed?;
+    let (served, played) = tokio::join!(daemon, playing);
+    let printed = match played? {
+        Some(printed) => Ok(printed),
+        // The daemon has closed the connection. A blocked terminal does not hold the demonstration up.
+        None => timeout(LAST_LINE, printed).await,
+    };
+    if let Ok(printed) = printed {
+        printed.expect("events are printed without a panic")?;
+    }
     Ok(served?)
 }
 
@@ -168,63 +181,34 @@ fn hastened(sensor: sensor::Settings, socket: &Path, speed: f64) -> Config {
 /// How long a terminal may take for the last line.
 const LAST_LINE: Duration = Duration::from_millis(500);
 
-/// Prints what the subscriber receives while the sensor plays, and the count at the end.
-async fn print(
-    subscriber: UnixStream,
+/// Prints events until all presses have their final verdicts, the port goes after the last press, or the daemon ends:
+/// all events as they come, or the lines of an account.
+fn print_events(
+    mut daemon: Connection,
     presses: Option<u32>,
-    player: Player,
-    sequence: SequenceSettings,
     mut account: Option<Account>,
-    shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let frames = player::sequence(sequence)?;
-    let play = async {
-        player.play(frames, Instant::now()).await.of("pty", IO)?;
-        // The loss of the port ends what is printed.
-        std::future::pending().await
-    };
-    let printed = tokio::select! {
-        () = shutdown => Ok(()),
-        printed = print_events(subscriber, presses, account.as_mut()) => printed,
-        failed = play => failed,
-    };
-    if let Some(account) = account {
-        let last = super::print_apart((account.close() + "\n").into_bytes());
-        // A blocked terminal does not hold the demonstration up.
-        let _ = tokio::time::timeout(LAST_LINE, last).await;
-    }
-    printed
-}
-
-/// Prints events until all presses have their final verdicts, or the port goes after the last press: all events as
-/// they come, or the lines of an account.
-async fn print_events(
-    subscriber: UnixStream,
-    presses: Option<u32>,
-    mut account: Option<&mut Account>,
-) -> Result<(), Failure> {
-    let (mut lines, mut stdout) = (BufReader::new(subscriber), Stdout::open()?);
     let mut finals = 0;
-    loop {
-        let mut line = Vec::new();
-        let read = lines.read_until(b'\n', &mut line).await;
-        if read.of("socket", IO)? == 0 {
-            return Err(Failure::new(FAILED, "the daemon closed the connection"));
-        }
-        let event: Value = serde_json::from_slice(&line).unwrap_or_default();
+    // If the daemon has failed, it says so itself.
+    while let Ok(line) = daemon.next() {
+        let event: Value = serde_json::from_str(&line).unwrap_or_default();
         finals += u32::from(event["phase"] == "final");
         let text = match &mut account {
-            Some(account) => account.line(&event).map(|line| (line + "\n").into_bytes()),
+            Some(account) => account.line(&event),
             None => Some(line),
         };
         if let Some(text) = text
-            && !stdout.print(text).await?
+            && !super::print((text + "\n").as_bytes())?
         {
             return Ok(());
         }
         let is_over = event["state"] == "lost" && event["type"] == "status";
         if Some(finals) == presses || is_over {
-            return stdout.finish().await.map(drop);
+            break;
         }
     }
+    if let Some(account) = account {
+        super::print((account.close() + "\n").as_bytes())?;
+    }
+    Ok(())
 }

@@ -158,7 +158,7 @@ pub async fn run(
         Tried::default()
     };
     let text = account(&super::as_in(config, &args.out), &all, tried);
-    print_apart(text.into_bytes()).await?;
+    print_apart(text).await?;
     Ok(())
 }
 

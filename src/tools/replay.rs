@@ -8,7 +8,7 @@ pub mod motion;
 
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
@@ -19,7 +19,6 @@ use super::played::Played;
 use super::readable::Printer;
 use super::simulate::positive;
 use crate::daemon::config::{Config, Setup};
-use crate::thread::spawn_thread;
 use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
@@ -47,22 +46,12 @@ pub struct Args {
     json: bool,
 }
 
-/// Plays to the end, or until nobody reads stdout. Dropping the future stops the replay.
+/// Plays to the end, or until nobody reads stdout. It blocks: a recording may be a pipe.
 ///
 /// # Errors
 ///
 /// Returns a [`Failure`] if the recording or the configuration cannot be used.
-pub async fn run(args: Args) -> Result<(), Failure> {
-    // Dropping this future drops `_stop`, which stops the thread.
-    let (_stop, stopped) = mpsc::channel();
-    // The replay runs on a thread of its own, so that a signal waits neither for a recording that
-    // is a pipe nor for the reader of stdout.
-    let played = spawn_thread("replay", move || play(&args, &stopped))?;
-    played.await.expect("a replay does not panic")
-}
-
-/// Plays to the end, or until the other end of `stopped` is dropped.
-fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
+pub fn run(args: &Args) -> Result<(), Failure> {
     let model = args.model.path()?;
     let setup = match &args.config {
         Some(config) => Setup::load(config, model.as_deref())?,
@@ -83,16 +72,16 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
     if played.is_raw() {
         setup.checked(path)?;
     }
-    let mut pace = Pace {
-        speed: args.speed,
-        first: None,
-        stopped,
-    };
+    let mut first = None;
     let mut seq = 0;
     let outcome = loop {
         match played.next() {
             Ok(Some((events, at))) => {
-                if !pace.wait(at.mono) || !print(events, &mut seq, &printer)? {
+                let (start, first) = *first.get_or_insert((Instant::now(), at.mono));
+                if let Some(speed) = args.speed {
+                    wait(start, at.mono.saturating_sub(first), speed);
+                }
+                if !print(events, &mut seq, &printer)? {
                     return Ok(());
                 }
             }
@@ -115,27 +104,12 @@ fn play(args: &Args, stopped: &Receiver<()>) -> Result<(), Failure> {
     failure.map_or(Ok(()), Err)
 }
 
-/// The timing of a replay.
-struct Pace<'a> {
-    speed: Option<f64>,
-    /// When the first part was played, and its moment.
-    first: Option<(Instant, Duration)>,
-    stopped: &'a Receiver<()>,
-}
-
-impl Pace<'_> {
-    /// Waits until the part of this moment is due. Returns `false` if the replay was stopped.
-    fn wait(&mut self, moment: Duration) -> bool {
-        let (start, first) = *self.first.get_or_insert_with(|| (Instant::now(), moment));
-        let since = moment.saturating_sub(first);
-        let left = self.speed.map_or(Duration::ZERO, |speed| {
-            let due = Duration::try_from_secs_f64(since.as_secs_f64() / speed);
-            // A moment that is too far away to count never comes.
-            let due = due.unwrap_or(Duration::MAX);
-            due.saturating_sub(start.elapsed())
-        });
-        self.stopped.recv_timeout(left) != Err(RecvTimeoutError::Disconnected)
-    }
+/// Waits until what happened `since` the first part is due, which was played at `start`.
+fn wait(start: Instant, since: Duration, speed: f64) {
+    let due = Duration::try_from_secs_f64(since.as_secs_f64() / speed);
+    // A moment that is too far away to count never comes.
+    let due = due.unwrap_or(Duration::MAX);
+    thread::sleep(due.saturating_sub(start.elapsed()));
 }
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody

@@ -6,15 +6,16 @@
 
 use std::convert::Infallible;
 use std::path::PathBuf;
+use std::thread;
 use std::time::Duration;
 
-use serde_json::{Value, json};
-use tokio::time::{Instant, MissedTickBehavior};
+use serde_json::json;
+use tokio::time::Instant;
 
-use super::connect;
 use super::exit::Failure;
+use super::{connect, control};
 use crate::daemon::now;
-use hardnessd_core::exit::FAILED;
+use crate::thread::NoThread;
 use hardnessd_core::stderr_line;
 
 /// The time between two positions.
@@ -24,62 +25,50 @@ const POINTS: usize = 2;
 /// How long the robot waits before it looks for the daemon again.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// The robot.
-pub(crate) struct Robot {
-    /// The daemon's control socket.
-    pub(crate) socket: PathBuf,
-    /// Where the arm is at a moment, in mm. `None` while it does not move yet.
-    pub(crate) position: Box<dyn Fn(Instant) -> Option<f64>>,
-}
+/// Where the arm is at a moment, in mm. `None` while it does not move yet.
+pub(crate) type Position = Box<dyn Fn(Instant) -> Option<f64> + Send>;
 
-impl Robot {
-    /// Sends positions for ever. Prints the first reason on stderr why a daemon does not take them.
-    pub(crate) async fn run(self) {
+/// Sends positions to the daemon at a control socket, for ever, on a thread of its own. Prints the first reason on
+/// stderr why a daemon does not take them.
+///
+/// # Errors
+///
+/// Fails if the system has no thread to spare.
+pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread> {
+    thread::Builder::new().spawn(move || {
         let mut complained = false;
         loop {
-            let Err(failure) = self.send().await;
+            let Err(failure) = send(&socket, &position);
             if !complained {
                 let why = failure.line();
                 stderr_line!("warning: {why} (positions are sent as soon as a daemon takes them)");
                 complained = true;
             }
-            tokio::time::sleep(RETRY).await;
+            thread::sleep(RETRY);
         }
-    }
+    })?;
+    Ok(())
+}
 
-    /// Sends positions to one daemon until the daemon ends or refuses them.
-    async fn send(&self) -> Result<Infallible, Failure> {
-        let mut daemon = connect::control(Some(self.socket.clone())).await?;
-        let hello = daemon.meet().await?;
-        // The arm has the daemon's first sensor.
-        let sensor = &hello["sensors"][0]["name"];
-        // The robot needs no events.
-        daemon.send("{\"subscribe\":[]}").await?;
-        let mut tick = tokio::time::interval(STEP);
-        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut points: Vec<(u64, f64)> = Vec::with_capacity(POINTS);
-        loop {
-            tokio::select! {
-                line = daemon.next() => {
-                    let answer: Value = serde_json::from_str(&line?).unwrap_or_default();
-                    if answer["type"] == "error" {
-                        let refusal = answer["message"].as_str().unwrap_or_default();
-                        return Err(Failure::new(FAILED, refusal.to_owned()));
-                    }
-                }
-                _ = tick.tick() => {
-                    let Some(mm) = (self.position)(Instant::now()) else {
-                        continue;
-                    };
-                    let mono_ns = u64::try_from(now().mono.as_nanos()).unwrap_or(u64::MAX);
-                    points.push((mono_ns, mm));
-                    if points.len() == POINTS {
-                        let motion = json!({"motion": {"sensor": sensor, "at": points}});
-                        daemon.send(&motion.to_string()).await?;
-                        points.clear();
-                    }
-                }
-            }
+/// Sends positions to one daemon until the daemon ends or refuses them.
+fn send(socket: &PathBuf, position: &Position) -> Result<Infallible, Failure> {
+    let mut daemon = connect::control(Some(socket.clone()))?;
+    let hello = daemon.meet()?;
+    // The arm has the daemon's first sensor. It needs no events.
+    let sensor = &hello["sensors"][0]["name"];
+    daemon.send("{\"subscribe\":[]}")?;
+    let mut points: Vec<(u64, f64)> = Vec::with_capacity(POINTS);
+    loop {
+        thread::sleep(STEP);
+        let Some(mm) = position(Instant::now()) else {
+            continue;
+        };
+        let mono_ns = u64::try_from(now().mono.as_nanos()).unwrap_or(u64::MAX);
+        points.push((mono_ns, mm));
+        if points.len() == POINTS {
+            let motion = json!({"motion": {"sensor": sensor, "at": points}});
+            control::ask(&mut daemon, motion)?;
+            points.clear();
         }
     }
 }

@@ -14,7 +14,7 @@ use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
 use super::live;
 use super::player::{self, Pace, Player};
-use super::robot::Robot;
+use super::robot::{self, Position};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::Unix;
 use crate::maybe;
@@ -114,14 +114,14 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let line = format!("{}\n", player.path().display());
     let settings = sequence(&args);
     let arm = args.arm.as_deref().map(Arm::bind).transpose().exit(IO)?;
-    let position: Box<dyn Fn(Instant) -> Option<f64>> = match &arm {
+    let position: Position = match &arm {
         Some(arm) => Box::new(arm.position()),
         None => Box::new(player.position()),
     };
-    let robot = args.motion.map(|socket| Robot {
-        socket: socket.unwrap_or_else(|| Unix::default().control_path()),
-        position,
-    });
+    if let Some(socket) = args.motion {
+        let socket = socket.unwrap_or_else(|| Unix::default().control_path());
+        robot::start(socket, position)?;
+    }
     let start = Instant::now();
     let (frames, start) = match &arm {
         Some(arm) => (arm.frames(settings, start)?, start + arm::SCAN),
@@ -129,13 +129,12 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     };
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
-        let printed = super::print_apart(line.into_bytes());
+        let printed = super::print_apart(line);
         let played = async { player.play(frames, start).await.of(&what, IO) };
         tokio::try_join!(printed, played).map(drop)
     };
     tokio::select! {
         played = play => played,
-        () = maybe::wait(robot.map(Robot::run)) => Ok(()),
         () = maybe::wait(arm.map(Arm::serve)) => Ok(()),
         () = shutdown => Ok(()),
     }

@@ -5,16 +5,19 @@
 //! `hello` is not printed.
 
 use std::future::Future;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use clap::Args as ClapArgs;
 use serde_json::{Value, json};
 
+use super::answer;
 use super::connect::Source;
 use super::exit::Failure;
 use super::readable::Printer;
 use super::simulate::positive;
-use super::{Stdout, answer};
 use crate::maybe;
+use crate::thread::spawn_thread;
 use hardnessd_core::event::Kind;
 use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
@@ -68,25 +71,28 @@ fn kind(name: &str) -> Result<Kind, &'static str> {
 ///
 /// Returns a [`Failure`] if no daemon answers, the daemon ends, or the time limit has passed.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
-    let mut found = 0;
+    let (count, timeout) = (args.count, args.timeout);
+    let counted = Arc::new(AtomicU64::new(0));
+    let found = counted.clone();
+    let printed = spawn_thread("tail", move || print(&args, &counted))?;
     tokio::select! {
-        printed = print(&args, &mut found) => return printed,
+        printed = printed => return printed.expect("events are printed without a panic"),
         () = shutdown => return Ok(()),
-        () = maybe::until(maybe::after(args.timeout)) => {}
+        () = maybe::until(maybe::after(timeout)) => {}
     }
-    let seconds = args.timeout.unwrap_or_default();
-    let events = events(found, args.count);
+    let seconds = timeout.unwrap_or_default();
+    let events = events(found.load(Ordering::Relaxed), count);
     Err(Failure::new(
         FAILED,
         format!("timed out after {seconds} s ({events})"),
     ))
 }
 
-async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
-    let mut daemon = args.source.connect().await?;
+fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
+    let mut daemon = args.source.connect()?;
     let request = json!({"subscribe": args.types}).to_string();
-    daemon.send(&request).await?;
-    let labels = answer::labels(&daemon.meet().await?);
+    daemon.send(&request)?;
+    let labels = answer::labels(&daemon.meet()?);
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {
@@ -96,9 +102,9 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
         );
     }
     let printer = Printer::new(args.json, labels);
-    let mut stdout = Stdout::open()?;
-    loop {
-        let line = daemon.next().await?;
+    let mut found = 0;
+    while args.count != Some(found) {
+        let line = daemon.next()?;
         let event: Value = serde_json::from_str(&line).unwrap_or_default();
         let kind = event["type"].as_str().unwrap_or_default();
         // Events that were queued before the subscription took effect are left out.
@@ -106,13 +112,11 @@ async fn print(args: &Args, found: &mut u64) -> Result<(), Failure> {
         if !counts && kind != "gap" {
             continue;
         }
-        let line = printer.line(line, || event);
-        if !stdout.print(line.into_bytes()).await? {
+        if !super::print(printer.line(line, || event).as_bytes())? {
             return Ok(());
         }
-        *found += u64::from(counts);
-        if args.count == Some(*found) {
-            return stdout.finish().await.map(drop);
-        }
+        found += u64::from(counts);
+        counted.store(found, Ordering::Relaxed);
     }
+    Ok(())
 }

@@ -2,30 +2,39 @@
 //!
 //! It is a subscriber like any other. `follow` connects, asks for the totals once a second, and connects
 //! again when the daemon goes away. `view` keeps what is known, and `draw` draws it. This file connects
-//! them with the keys and the clock.
+//! them with the keys and the clock. Each has a thread of its own, so a terminal that accepts no bytes (Ctrl-S, a
+//! slow ssh) does not delay the end.
 
 mod draw;
+mod pressing;
 mod screen;
 #[cfg(test)]
 mod tests;
 mod view;
 
+use std::convert::Infallible;
 use std::future::Future;
 use std::io::{self, IsTerminal};
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
+use ratatui_crossterm::crossterm::event::{self, Event, KeyEvent};
+use ratatui_crossterm::crossterm::terminal;
 use serde_json::{Value, json};
-use tokio::sync::mpsc;
-use tokio::time::MissedTickBehavior;
+use tokio::time::timeout;
 
 use self::draw::{Look, draw};
-use self::screen::{Screen, keys};
+use self::screen::Screen;
 use self::view::{Order, View};
-use super::connect::{Address, Connection, Source};
+use super::connect::{self, Address, Connection, Source};
 use super::control;
 use super::exit::{Fail, Failure};
 use crate::daemon::now;
+use crate::thread::spawn_thread;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
@@ -55,13 +64,21 @@ const QUESTIONS: Duration = Duration::from_secs(1);
 /// Time between two tries to connect.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// What comes from a daemon.
-enum News {
-    /// Its first line, and where it is.
+/// How long the terminal may take for the last bytes.
+const LAST_BYTES: Duration = Duration::from_millis(200);
+
+/// What a picture shows, or what changes it.
+enum Input {
+    Key(KeyEvent),
+    /// The first line of a daemon, and where it is.
     Hello(Address, Value),
     Event(Value),
-    /// Why there is none.
+    /// Why there is no daemon.
     Absence(String),
+    /// The outcome of a command.
+    Said(String),
+    /// No more keys come.
+    End,
 }
 
 /// Shows the sensors until a key or `shutdown` ends it, or the terminal goes away.
@@ -74,8 +91,24 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         let needs = "`watch` needs a terminal on stdin and stdout: use `hardnessd tail` instead";
         return Err(Failure::new(USAGE, needs));
     }
-    if args.source.given().is_none()
-        && let Ok(connection) = args.source.connect().await
+    let is_over = Arc::new(AtomicBool::new(false));
+    let seen = is_over.clone();
+    let mut shown = spawn_thread("watch", move || show(args.source, &seen))?;
+    tokio::select! {
+        shown = &mut shown => shown.expect("pictures are drawn without a panic"),
+        () = shutdown => {
+            is_over.store(true, Ordering::Relaxed);
+            let _ = timeout(LAST_BYTES, shown).await;
+            let _ = terminal::disable_raw_mode();
+            Ok(())
+        }
+    }
+}
+
+/// Draws pictures until `is_over`, the key for the end, or the end of the terminal.
+fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
+    if source.given().is_none()
+        && let Ok(connection) = source.connect()
     {
         let address = connection.address().to_string();
         stderr_line!("hardnessd: watching {}", escaped(&address));
@@ -84,102 +117,115 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let look = Look::new(&variable("TERM"), &variable("NO_COLOR"));
     let mut view = View::new();
     let mut screen = Screen::open().of("terminal", IO)?;
-    let mut keys = keys().of("terminal", IO)?;
-    let mut pictures = tokio::time::interval(PICTURE);
-    pictures.set_missed_tick_behavior(MissedTickBehavior::Skip);
-    let (sender, mut news) = mpsc::channel(16);
-    tokio::spawn(follow(args.source, sender));
-    let mut shutdown = std::pin::pin!(shutdown);
+    let (sender, inputs) = sync_channel(16);
+    let keys = sender.clone();
+    start("keys", move || read_keys(&keys))?;
+    let news = sender.clone();
+    start("daemon", move || follow(&source, &news))?;
     // The address of the last daemon.
     let mut daemon_at = None;
-    let (told, mut outcomes) = mpsc::channel(4);
-    loop {
-        tokio::select! {
-            // Many lines from the daemon must not delay a key or a picture.
-            biased;
-            () = &mut shutdown => return Ok(()),
-            () = screen.gone() => return Ok(()),
-            key = keys.recv() => match key.map_or(Some(Order::Quit), |key| view.press(key)) {
-                Some(Order::Quit) => return Ok(()),
-                Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
-                Some(Order::Context(context)) => {
-                    tokio::spawn(tell(daemon_at.clone(), context, told.clone()));
-                }
-                None => {}
-            },
-            Some(outcome) = outcomes.recv() => view.said = Some(outcome),
-            _ = pictures.tick() => {
-                let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
-                drawn.of("terminal", IO)?;
-            }
-            Some(news) = news.recv() => match news {
-                News::Hello(address, hello) => {
+    while !is_over.load(Ordering::Relaxed) {
+        let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
+        if drawn.is_err() {
+            // The terminal has gone.
+            break;
+        }
+        let next = Instant::now() + PICTURE;
+        while let left = next.saturating_duration_since(Instant::now())
+            && !left.is_zero()
+            && let Ok(input) = inputs.recv_timeout(left)
+        {
+            match input {
+                Input::Key(key) => match view.press(key) {
+                    Some(Order::Quit) => return Ok(()),
+                    Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
+                    Some(Order::Context(context)) => {
+                        let (daemon_at, told) = (daemon_at.clone(), sender.clone());
+                        start("command", move || tell(daemon_at, context, &told))?;
+                    }
+                    None => {}
+                },
+                Input::Hello(address, hello) => {
                     let is_remote = matches!(address, Address::Tcp(_));
                     view.meet(hello, is_remote, now().mono);
                     daemon_at = Some(address);
                 }
-                News::Event(event) => view.take(event, now()),
-                News::Absence(reason) => view.lose(reason),
-            },
+                Input::Event(event) => view.take(event, now()),
+                Input::Absence(reason) => view.lose(reason),
+                Input::Said(outcome) => view.said = Some(outcome),
+                Input::End => return Ok(()),
+            }
         }
     }
+    Ok(())
 }
 
-/// Reads the lines of one daemon after the other, for as long as somebody takes them.
-async fn follow(source: Source, news: mpsc::Sender<News>) {
-    while !news.is_closed() {
-        let absence = match source.connect().await {
-            Ok(daemon) => read(daemon, &news).await,
-            Err(failure) => failure,
-        };
-        // If `watch` has ended, nobody takes it.
-        let _ = news.send(News::Absence(absence.line())).await;
-        tokio::time::sleep(PAUSE).await;
+/// Starts a thread that ends with the process.
+fn start(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), Failure> {
+    let started = thread::Builder::new().name(name.to_owned()).spawn(work);
+    started.map(drop).of("thread", IO)
+}
+
+/// Sends keys as they are pressed, until the input ends.
+fn read_keys(keys: &SyncSender<Input>) {
+    while let Ok(event) = event::read() {
+        if let Event::Key(key) = event {
+            send(keys, Input::Key(key));
+        }
+    }
+    send(keys, Input::End);
+}
+
+/// Sends what is to be shown. If `watch` has ended, nobody takes it.
+fn send(inputs: &SyncSender<Input>, input: Input) {
+    let _ = inputs.send(input);
+}
+
+/// Reads the lines of one daemon after the other, for ever.
+fn follow(source: &Source, news: &SyncSender<Input>) {
+    loop {
+        let Err(absence) = source.connect().and_then(|daemon| read(daemon, news));
+        send(news, Input::Absence(absence.line()));
+        thread::sleep(PAUSE);
     }
 }
 
 /// Reads the lines of a daemon until it is gone, and returns why. Asks for all events of this run that the
 /// daemon still holds, and those that come.
-async fn read(mut daemon: Connection, news: &mpsc::Sender<News>) -> Failure {
-    let read = async {
-        daemon.send(QUESTION).await?;
-        let hello = daemon.meet().await?;
-        let types = ["hardness", "press", "status", "frame"];
-        let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
-        let request = json!({"subscribe": types, "since": since});
-        let address = daemon.address().clone();
-        let _ = news.send(News::Hello(address, hello)).await;
-        daemon.send(&request.to_string()).await?;
-        let mut questions = tokio::time::interval(QUESTIONS);
-        questions.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        loop {
-            tokio::select! {
-                line = daemon.next() => {
-                    let event = serde_json::from_str(&line?).unwrap_or_default();
-                    let _ = news.send(News::Event(event)).await;
-                }
-                _ = questions.tick() => daemon.send(QUESTION).await?,
-            }
+fn read(mut daemon: Connection, news: &SyncSender<Input>) -> Result<Infallible, Failure> {
+    daemon.send(QUESTION)?;
+    let hello = daemon.meet()?;
+    let types = ["hardness", "press", "status", "frame"];
+    let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
+    let request = json!({"subscribe": types, "since": since});
+    send(news, Input::Hello(daemon.address().clone(), hello));
+    daemon.send(&request.to_string())?;
+    let mut asked = Instant::now();
+    loop {
+        if let Some(line) = daemon.next_within(QUESTIONS)? {
+            let event = serde_json::from_str(&line).unwrap_or_default();
+            send(news, Input::Event(event));
         }
-    };
-    let gone: Result<std::convert::Infallible, Failure> = read.await;
-    let Err(failure) = gone;
-    failure
+        if asked.elapsed() >= QUESTIONS {
+            daemon.send(QUESTION)?;
+            asked = Instant::now();
+        }
+    }
 }
 
 /// Sets a context at the control socket beside the daemon's other one, and sends the outcome in words.
-async fn tell(daemon_at: Option<Address>, context: Value, told: mpsc::Sender<String>) {
+fn tell(daemon_at: Option<Address>, context: Value, told: &SyncSender<Input>) {
     let outcome = match daemon_at {
         Some(Address::Unix(path)) => {
-            let socket = path.with_file_name("control.sock");
-            let request = json!({"context": context, "id": 1});
-            match control::ask(Some(socket), &request).await {
+            let daemon = connect::control(Some(path.with_file_name("control.sock")));
+            let set = daemon
+                .and_then(|mut daemon| control::ask(&mut daemon, json!({"context": context})));
+            match set {
                 Ok(_) => "the daemon repeats it in every verdict from now on".to_owned(),
                 Err(error) => format!("counted here only: {}", error.line()),
             }
         }
         _ => "counted here only: over TCP nothing can be set, use `hardnessd context`".to_owned(),
     };
-    // If `watch` has ended, nobody reads it.
-    let _ = told.send(outcome).await;
+    send(told, Input::Said(outcome));
 }

@@ -5,6 +5,7 @@
 use serde_json::Value;
 
 use crate::tools::answer::{self, Answer, with_shore};
+use crate::tools::score::Score;
 use hardnessd_simulator::{Pressed, SequenceSettings};
 
 /// The counts of the presses so far.
@@ -14,9 +15,7 @@ pub(super) struct Account {
     sequence: SequenceSettings,
     /// The labels of the model's levels.
     labels: Vec<String>,
-    presses: u32,
-    right: u32,
-    wrong: u32,
+    score: Score,
 }
 
 impl Account {
@@ -24,9 +23,7 @@ impl Account {
         Self {
             sequence: sequence.clone(),
             labels: Vec::new(),
-            presses: 0,
-            right: 0,
-            wrong: 0,
+            score: Score::default(),
         }
     }
 
@@ -39,9 +36,10 @@ impl Account {
                 None
             }
             ("hardness", "final", _) => self.verdict(event),
-            ("press", _, "aborted") => {
+            // The end of the demonstration may cut a press off.
+            ("press", _, "aborted") if text("reason") != "shutdown" => {
                 let begin = begin(event, &self.pressed(event)?);
-                self.presses += 1;
+                self.score.take(None, None);
                 Some(format!("{begin}no verdict ({})", text("reason")))
             }
             ("gap", ..) => {
@@ -57,18 +55,8 @@ impl Account {
 
     fn verdict(&mut self, event: &Value) -> Option<String> {
         let pressed = self.pressed(event)?;
-        self.presses += 1;
-        let mark = match event["level"].as_u64() {
-            None => "-",
-            Some(level) if level == u64::from(pressed.level) => {
-                self.right += 1;
-                "ok"
-            }
-            Some(_) => {
-                self.wrong += 1;
-                "wrong"
-            }
-        };
+        let level = event["level"].as_u64();
+        let mark = self.score.take(level, Some(pressed.level.into()));
         let (begin, columns) = (begin(event, &pressed), self.answer_columns());
         let shown = with_shore(&Answer::of(event, &self.labels).text, event);
         let force_n = event["force_n"].as_f64().unwrap_or_default();
@@ -93,19 +81,7 @@ impl Account {
 
     /// The line with the counts.
     pub(super) fn close(&self) -> String {
-        let Self {
-            presses,
-            right,
-            wrong,
-            ..
-        } = self;
-        let plural = if *presses == 1 { "" } else { "es" };
-        let mut line = format!("{right} of {presses} press{plural} right, {wrong} wrong");
-        let without = presses - right - wrong;
-        if without > 0 {
-            line += &format!(", {without} without a level");
-        }
-        line + " (simulated presses)"
+        self.score.in_words() + " (simulated presses)"
     }
 }
 
@@ -163,7 +139,7 @@ mod tests {
         assert_eq!(account.line(&early), None);
         assert_eq!(
             account.close(),
-            "1 of 4 presses right, 1 wrong, 2 without a level (simulated presses)"
+            "1 of 4 right, 1 wrong, 2 without a level (simulated presses)"
         );
     }
 }

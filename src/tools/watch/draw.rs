@@ -158,7 +158,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     }
     let width = usize::from(right.width);
     let mut lines = vec![press_line(sensor, link, now, look)];
-    if let Some(line) = sensor.score.line(&view.labels) {
+    if let Some(line) = sensor.count.line(&view.labels) {
         lines.extend(wrapped(&format!("pressing {line}"), width, Style::new()));
     }
     lines.push(force_line(sensor, link, look));

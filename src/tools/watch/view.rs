@@ -10,9 +10,9 @@ use jiff::SignedDuration;
 use ratatui_crossterm::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 use serde_json::Value;
 
+use super::pressing::{Count, Truth};
 use crate::tools::answer::{items, labels};
 use crate::tools::readable::number;
-use crate::tools::score::{Score, Truth};
 use hardnessd_core::frame::{MOST_SIDE, Stamp};
 
 /// After three questions without an answer, the daemon counts as dead.
@@ -105,7 +105,7 @@ pub(super) struct Sensor {
     /// The verdicts and their moments, the newest first.
     pub(super) verdicts: VecDeque<(Duration, Value)>,
     /// What is being pressed, and how many verdicts are right.
-    pub(super) score: Score,
+    pub(super) count: Count,
     /// The context of the last press.
     context: Value,
 }
@@ -235,7 +235,7 @@ impl View {
     fn pressing(&mut self, text: &str) -> Option<Order> {
         let truth = Truth::read(text, &self.labels);
         let sensor = self.sensors.get_mut(self.chosen)?;
-        sensor.score.begin(truth.clone());
+        sensor.count.begin(truth.clone());
         sensor.context = truth.within(&sensor.context, &sensor.name);
         Some(Order::Context(sensor.context.clone()))
     }
@@ -297,7 +297,7 @@ impl Sensor {
                 self.press = Some((at, event));
             }
             Some("hardness") => {
-                self.score.take(&event);
+                self.count.take(&event);
                 self.verdicts.push_front((at, event));
                 self.verdicts.truncate(VERDICTS);
             }
