@@ -5,16 +5,104 @@
 //! them. Times are in seconds of the sensor since its start. The seed decides which bytes and bits
 //! are hit.
 
-mod script;
-
+use std::io::Read as _;
 use std::path::Path;
 
-pub(crate) use self::script::FORMAT;
-use self::script::{Fault, Kind};
+use serde::Deserialize;
+use toml::Spanned;
+
 use super::exit::Failure;
+use super::{cannot_read, open};
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::Layout;
+use hardnessd_core::wording;
 use hardnessd_simulator::random::Stream;
+
+/// The file format, for `--help`.
+pub(crate) const FORMAT: &str = r#"The faults of --faults FILE, a TOML file; times in the sensor's seconds from the start:
+
+  [[fault]]
+  at_s = 12.0            # from the first frame at or after this
+  kind = "unplug"        # the pty and its link go, and come back
+  for_s = 1.5            # how long; without it to the end
+
+The cable:
+  kind = "silence"       # frames stay unsent; the port stays open
+
+Bytes, of the first frame unless `frames` says of how many:
+  kind = "noise"         # `bytes` random bytes before each
+  kind = "drop-bytes"    # `bytes` of each are not sent
+  kind = "flip"          # `bits` of each are inverted
+
+`bytes` and `bits` are 1 unless given, and at most 65535."#;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Script {
+    #[serde(default, rename = "fault")]
+    faults: Vec<Spanned<Fault>>,
+}
+
+/// A fault.
+#[derive(Debug, Clone, Copy, Deserialize)]
+struct Fault {
+    /// When it begins, in seconds of the sensor.
+    at_s: f64,
+    /// How long it lasts.
+    #[serde(default = "no_end")]
+    for_s: f64,
+    /// The most frames that it strikes.
+    frames: Option<usize>,
+    #[serde(flatten)]
+    kind: Kind,
+    /// The number of frames that it has struck.
+    #[serde(skip)]
+    struck: usize,
+}
+
+/// What happens. [`FORMAT`] says what each kind does. All have braces, because serde refuses an
+/// unknown key only then.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+enum Kind {
+    Unplug {},
+    Silence {},
+    Noise {
+        #[serde(default = "one")]
+        bytes: u16,
+    },
+    DropBytes {
+        #[serde(default = "one")]
+        bytes: u16,
+    },
+    Flip {
+        #[serde(default = "one")]
+        bits: u16,
+    },
+}
+
+fn no_end() -> f64 {
+    f64::INFINITY
+}
+
+fn one() -> u16 {
+    1
+}
+
+impl Fault {
+    /// Whether the fault is at work at a time. One of some frames counts this frame.
+    fn strikes(&mut self, time_s: f64) -> bool {
+        let frames = match self.kind {
+            Kind::Unplug {} | Kind::Silence {} => usize::MAX,
+            Kind::Noise { .. } | Kind::DropBytes { .. } | Kind::Flip { .. } => 1,
+        };
+        let is_now = (self.at_s..self.at_s + self.for_s).contains(&time_s);
+        let strikes = is_now && self.struck < self.frames.unwrap_or(frames);
+        self.struck += usize::from(strikes);
+        strikes
+    }
+}
 
 /// The state of the line at a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,10 +122,20 @@ pub(crate) struct Faults {
     stream: Stream,
 }
 
+/// The longest script: some ten thousand faults.
+const MOST_BYTES: u64 = 1 << 20;
+
 impl Faults {
     /// No faults.
     pub(crate) fn none() -> Self {
-        Self::of(Vec::new(), 0)
+        Self::new(Vec::new(), 0)
+    }
+
+    fn new(faults: Vec<Fault>, seed: u64) -> Self {
+        Self {
+            faults,
+            stream: Stream::new(seed, "faults"),
+        }
     }
 
     /// Reads a script.
@@ -46,14 +144,18 @@ impl Faults {
     ///
     /// Fails if the script cannot be read, or has a key or value that cannot be used.
     pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Failure> {
-        Ok(Self::of(script::load(path)?, seed))
-    }
-
-    fn of(faults: Vec<Fault>, seed: u64) -> Self {
-        Self {
-            faults,
-            stream: Stream::new(seed, "faults"),
-        }
+        let mut text = String::new();
+        let read = open(path)?.take(MOST_BYTES + 1).read_to_string(&mut text);
+        read.map_err(cannot_read(path))?;
+        let faults = match text.len() as u64 > MOST_BYTES {
+            true => Err(format!("more than {MOST_BYTES} bytes")),
+            false => parse(&text),
+        };
+        let faults = faults.map_err(|why| format!("{}: {why}", path.display()));
+        Ok(Self::new(
+            faults.map_err(|why| Failure::new(FAILED, why))?,
+            seed,
+        ))
     }
 
     /// Replaces `bytes` by those of the frame due at `time_s`, damaged as the script says, and
@@ -81,7 +183,7 @@ impl Faults {
                     bytes.splice(0..0, noise.collect::<Vec<u8>>());
                 }
                 Kind::DropBytes { bytes: count } => {
-                    for _ in 0..count.min(bytes.len()) {
+                    for _ in 0..bytes.len().min(count.into()) {
                         bytes.remove(self.stream.below(bytes.len()));
                     }
                 }
@@ -99,9 +201,25 @@ impl Faults {
     }
 }
 
+/// The faults of a script, or what is wrong in which line.
+fn parse(text: &str) -> Result<Vec<Fault>, String> {
+    let script: Script = toml::from_str(text).map_err(|error| wording::of_toml(text, &error))?;
+    for fault in &script.faults {
+        let line = text[..fault.span().start].matches('\n').count() + 1;
+        let Fault { at_s, for_s, .. } = *fault.get_ref();
+        if !(at_s >= 0.0 && for_s > 0.0) {
+            let found = format!("found at_s = {at_s:?} and for_s = {for_s:?}");
+            return Err(format!(
+                "line {line}: {found}, expected at_s from 0 on and for_s above 0"
+            ));
+        }
+    }
+    Ok(script.faults.into_iter().map(Spanned::into_inner).collect())
+}
+
 /// The middle of a frame of the simulated array, as another array has it. Taxels that the simulated
 /// one lacks read 0.
-pub(super) fn middle(raw: &RawFrame, array: Array) -> RawFrame {
+fn middle(raw: &RawFrame, array: Array) -> RawFrame {
     let mut cut = RawFrame::zero(array);
     let place = |own: usize, side: usize, other: usize| {
         (own + other / 2)
@@ -150,7 +268,7 @@ mod tests {
             at_s = 5.0
             kind = "flip"
         "#;
-        let mut faults = Faults::of(script::parse(script).unwrap(), 1);
+        let mut faults = Faults::new(parse(script).unwrap(), 1);
         let layout = Layout::new(&Settings::default()).unwrap();
         let (raw, mut whole) = (RawFrame::default(), Vec::new());
         layout.encode(&raw, &mut whole);
@@ -172,5 +290,45 @@ mod tests {
         assert_eq!(struck(4.4), (Line::Up, 790, 0));
         assert_eq!(struck(5.0), (Line::Up, 790, 1));
         assert_eq!(struck(5.2), (Line::Up, 790, 0));
+    }
+
+    #[test]
+    fn a_script_that_cannot_be_played_says_why() {
+        for (fault, expected) in [
+            ("at_s = 1.0\nkind = \"melt\"", "unknown variant `melt`"),
+            (
+                "at_s = 1.0\nkind = \"flip\"\nbit = 3",
+                "unknown field `bit`",
+            ),
+            (
+                "at_s = 1.0\nkind = \"unplug\"\nbits = 3",
+                "unknown field `bits`",
+            ),
+            (
+                "at_s = -1.0\nkind = \"flip\"",
+                "line 2: found at_s = -1.0 and for_s = inf, expected at_s from 0 on",
+            ),
+            ("kind = \"flip\"", "missing field `at_s`"),
+            (
+                "at_s = \"soon\"\nkind = \"flip\"",
+                "invalid type: string \"soon\"",
+            ),
+            (
+                "at_s = 1.0\nkind = \"flip\"\nbits = 65536",
+                "expected a whole number from 0 to 65535",
+            ),
+            (
+                "at_s = 1.0\nkind = \"silence\"\nfor_s = 0",
+                "for_s = 0.0, expected at_s from 0 on and for_s above 0",
+            ),
+        ] {
+            // Each error names a line of its fault.
+            let problem = parse(&format!("\n[[fault]]\n{fault}")).unwrap_err();
+            let line = problem
+                .strip_prefix("line ")
+                .and_then(|rest| rest[..1].parse().ok());
+            assert!(line.is_some_and(|line: u32| line > 1), "{problem}");
+            assert!(problem.contains(expected), "{problem}");
+        }
     }
 }

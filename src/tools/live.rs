@@ -5,9 +5,8 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{Seek, SeekFrom};
+use std::io::Seek;
 use std::path::{Path, PathBuf};
-use std::pin::pin;
 use std::time::Duration;
 
 use tokio::sync::watch;
@@ -72,38 +71,35 @@ async fn record(
     setup.config.sensors.retain(|one| one.name == sensor);
     let path = std::env::temp_dir();
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
-    let file = tempfile::tempfile().of_file(&path, IO)?;
-    let mut recorded = file.try_clone().of_file(&path, IO)?;
-
-    let (progress, mut counted) = watch::channel(Progress::default());
-    let enough = async {
-        stderr_line!("leave the sensor free until its zero is taken");
-        // The presses at the last prompt.
-        let mut shown = None;
-        while shown < Some(wanted) && counted.changed().await.is_ok() {
-            let Progress { tared, presses, .. } = *counted.borrow_and_update();
-            if tared > 0 && shown != Some(presses) {
-                shown = Some(presses);
-                print_next(presses);
-            }
-        }
-        tokio::time::sleep(LAST_POSITIONS).await;
-    };
+    let mut file = tempfile::tempfile().of_file(&path, IO)?;
     let mut stopped = false;
-    let end = async {
-        let (enough, shutdown) = (pin!(enough), pin!(shutdown));
+    let end = async |mut counted: watch::Receiver<Progress>| {
+        let enough = async {
+            stderr_line!("leave the sensor free until its zero is taken");
+            // The presses at the last prompt.
+            let mut shown = None;
+            while shown < Some(wanted) && counted.changed().await.is_ok() {
+                let Progress { tared, presses, .. } = *counted.borrow_and_update();
+                if tared > 0 && shown != Some(presses) {
+                    shown = Some(presses);
+                    print_next(presses);
+                }
+            }
+            tokio::time::sleep(LAST_POSITIONS).await;
+        };
         tokio::select! {
             () = enough => {}
             () = shutdown => stopped = true,
         }
     };
     let (sockets, labels) = (Sockets::Configured, Labels::new());
-    record::record(setup, sockets, &path, file, labels, progress, end).await?;
+    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, end).await;
+    recorded?;
     if stopped {
         return Ok(None);
     }
-    recorded.seek(SeekFrom::Start(0)).of_file(&path, IO)?;
-    Ok(Some(recorded))
+    file.rewind().of_file(&path, IO)?;
+    Ok(Some(file))
 }
 
 /// Does what may take long on another thread; `None` if `shutdown` comes first.

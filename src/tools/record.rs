@@ -102,31 +102,29 @@ pub async fn run(
             let asked = format!("--label {key}: --session asks for it: leave it out");
             return Err(Failure::new(USAGE, asked));
         }
-        return session::run(directory, &labels, setup, sockets, log, pin!(shutdown)).await;
+        return session::run(directory, &labels, &setup, sockets, log, pin!(shutdown)).await;
     }
     let path = args
         .out
         .expect("clap asks for it where there is no session");
-    let (file, own) = create(&path)?;
-    let (progress, counted) = watch::channel(Progress::default());
-    let end = async {
+    let file = create(&path)?;
+    let end = async |_| {
         tokio::select! {
             () = shutdown => {}
             () = maybe::until(maybe::after(args.seconds)) => {}
         }
     };
-    let recorded = record(setup, sockets, &path, file, labels, progress, end).await;
+    let (recorded, progress) = record(setup, sockets, &path, &file, labels, end).await;
     let Progress {
         frames,
         tared,
         presses,
         ..
-    } = *counted.borrow();
-    let is_unusable = |failed: &Failed| failed.is_missing || frames == 0;
-    if recorded.as_ref().is_err_and(is_unusable) {
+    } = progress;
+    if recorded.is_err() && frames == 0 {
         // The path must be free for the next try.
-        part::remove(&path, &own);
-        return Ok(recorded?);
+        part::remove(&path, &file);
+        return recorded;
     }
     let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
     if io::stderr().is_terminal() {
@@ -141,49 +139,41 @@ pub async fn run(
         };
         stderr_line!("warning: {shown}: no press in {seen}{why}");
     }
-    Ok(recorded?)
+    recorded
 }
 
-/// A recording that could not begin, or ended by an error.
-pub(super) struct Failed {
-    failure: Failure,
-    /// Whether a sensor was missing at the start, so that nothing is worth keeping.
-    is_missing: bool,
-}
-
-impl From<Failed> for Failure {
-    fn from(failed: Failed) -> Self {
-        failed.failure
-    }
-}
-
-/// Makes the file of a recording, twice open: to record into, and to know it again. A file that exists is
-/// left alone.
-fn create(path: &Path) -> Result<(File, File), Failure> {
-    let created = File::create_new(path).and_then(|file| Ok((file.try_clone()?, file)));
+/// Makes the file of a recording. A file that exists is left alone.
+fn create(path: &Path) -> Result<File, Failure> {
+    let created = File::create_new(path);
     created.map_err(|error| {
         let problem = format!("{}: {error}: name a new file", path.display());
         Failure::new(IO, problem)
     })
 }
 
-/// Records into `file`, which is at `path`, until `end` comes or no sensor is left.
+/// Records into `file`, which is at `path`, until `end` is over or no sensor is left. Returns what the file holds too.
+/// Where a sensor is missing at the start, nothing is worth keeping: the file holds nothing then.
 pub(super) async fn record(
     setup: Setup,
     sockets: Sockets,
     path: &Path,
-    file: File,
+    file: &File,
     labels: Labels,
-    progress: watch::Sender<Progress>,
-    end: impl Future<Output = ()>,
-) -> Result<(), Failed> {
+    end: impl AsyncFnOnce(watch::Receiver<Progress>),
+) -> (Result<(), Failure>, Progress) {
+    let (progress, counted) = watch::channel(Progress::default());
     let sensors = setup.config.sensors.clone();
     let recorded = async {
+        let file = file.try_clone();
+        let file =
+            file.map_err(|error| daemon::Error::Io(format!("{}: {error}", path.display())))?;
         let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
-        daemon.run(end, None).await
+        daemon.run(end(counted.clone()), None).await
     };
-    recorded.await.map_err(|error| match error {
-        daemon::Error::Unavailable { sensor, reason } => {
+    let recorded = recorded.await;
+    let progress = *counted.borrow();
+    match recorded {
+        Err(daemon::Error::Unavailable { sensor, reason }) => {
             let mut known = sensors.iter();
             let port = known
                 .find(|known| known.name == sensor)
@@ -191,16 +181,11 @@ pub(super) async fn record(
             let port = port.expect("a missing sensor is one of the configuration");
             let obstacle = doctor::obstacle(port).unwrap_or(reason);
             let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
-            Failed {
-                failure: Failure::new(UNAVAILABLE, problem),
-                is_missing: true,
-            }
+            let failure = Failure::new(UNAVAILABLE, problem);
+            (Err(failure), Progress::default())
         }
-        error => Failed {
-            failure: error.into(),
-            is_missing: false,
-        },
-    })
+        recorded => (recorded.map_err(Failure::from), progress),
+    }
 }
 
 fn shown(path: &Path) -> String {

@@ -4,21 +4,21 @@
 //! press as it comes, keeps the score, and continues with the next object. `hrn-train fit` takes the files as
 //! they are.
 
-use std::fs::{self, File};
+use std::fs;
 use std::future::Future;
 use std::io::{self, IsTerminal, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{counted_in_words, record, shown};
+use super::{counted_in_words, create, record, shown};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
 use crate::thread::NoThread;
-use crate::tools::exit::{Failure, IO, USAGE};
+use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label};
 use hardnessd_core::verdict::{Borders, Level};
@@ -73,12 +73,53 @@ impl User<'_> {
             }
         }
     }
+
+    /// Asks which object comes next. Returns `None` if none does.
+    async fn name_object(
+        &mut self,
+        directory: &Path,
+        number: u32,
+        levels: &[Level],
+    ) -> Option<Object> {
+        let named = |name: &str| {
+            if name.is_empty() {
+                return Err("the name is empty: write what you will press".to_owned());
+            }
+            check_label("name", name).map(|()| name.to_owned())
+        };
+        let question = format!("\nobject {number}: its name");
+        let name = self.ask(&question, named).await?;
+        let labels: Vec<&str> = levels.iter().map(|level| level.label.as_str()).collect();
+        let labels = labels.join(", ");
+        let question =
+            format!("its Shore OO reading, or its level ({labels}), or Enter if unknown");
+        let hardness = |answer: &str| hardness(answer, levels);
+        let (shore, level) = self.ask(&question, hardness).await?;
+        if let (Some(_), Some(level)) = (&shore, level) {
+            print(&format!("level {} ({})\n", level.level, level.label));
+        }
+        let level = level.map_or(0, |level| level.level);
+        let path = directory.join(format!("{number:03}-{}.mcap", slug(&name)));
+        let known = [
+            ("object", Some(number.to_string())),
+            ("name", Some(name)),
+            ("level", Some(level.to_string())),
+            ("shore", shore),
+        ];
+        let known = known.into_iter();
+        let labels = known.filter_map(|(key, value)| Some((key.to_owned(), value?)));
+        Some(Object {
+            path,
+            labels: labels.collect(),
+            level,
+        })
+    }
 }
 
 /// An object to press.
 struct Object {
-    name: String,
-    shore: Option<String>,
+    path: PathBuf,
+    labels: Labels,
     /// 0 if it is unknown.
     level: u8,
 }
@@ -98,7 +139,7 @@ struct Score {
 pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
-    setup: Setup,
+    setup: &Setup,
     sockets: Sockets,
     log: &Log,
     shutdown: Pin<&mut dyn Future<Output = ()>>,
@@ -108,31 +149,18 @@ pub(super) async fn run(
                        --label instead";
         return Err(Failure::new(USAGE, problem));
     }
-    let first = next_number(directory).map_err(failed_at(directory))?;
+    let first = next_number(directory);
+    let first = first.of(format!("--session: {}", directory.display()), IO)?;
     let mut user = User::at_terminal(shutdown)?;
     print("One recording for each object. `q` ends the session.\n");
-    let levels = setup.hrn.card().levels.clone();
-    let (mut number, mut score) = (first, Score::default());
-    while let Some(object) = ask_for_object(&mut user, number, &levels).await {
-        let path = directory.join(format!("{number:03}-{}.mcap", slug(&object.name)));
-        let mut labels = labels.clone();
-        labels.extend([
-            ("object".to_owned(), number.to_string()),
-            ("name".to_owned(), object.name.clone()),
-            ("level".to_owned(), object.level.to_string()),
-        ]);
-        let shore = object.shore.clone();
-        labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
-        let goes_on = record_object(
-            &mut user, &object, &path, labels, &setup, sockets, &mut score,
-        )
-        .await?;
-        number += u32::from(path.exists());
+    let levels = &setup.hrn.card().levels;
+    let (mut number, mut score, mut goes_on) = (first, Score::default(), true);
+    while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
+        object.labels.extend(labels.clone());
+        goes_on = record_object(&mut user, &object, setup, sockets, &mut score).await?;
+        number += u32::from(object.path.exists());
         // A late line would cut through the next question.
         log.flush();
-        if !goes_on {
-            break;
-        }
     }
     let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
@@ -147,30 +175,6 @@ pub(super) async fn run(
         ));
     }
     Ok(())
-}
-
-async fn ask_for_object(user: &mut User<'_>, number: u32, levels: &[Level]) -> Option<Object> {
-    let named = |name: &str| {
-        if name.is_empty() {
-            return Err("the name is empty: write what you will press".to_owned());
-        }
-        check_label("name", name).map(|()| name.to_owned())
-    };
-    let question = format!("\nobject {number}: its name");
-    let name = user.ask(&question, named).await?;
-    let labels: Vec<&str> = levels.iter().map(|level| level.label.as_str()).collect();
-    let labels = labels.join(", ");
-    let question = format!("its Shore OO reading, or its level ({labels}), or Enter if unknown");
-    let hardness = |answer: &str| hardness(answer, levels);
-    let (shore, level) = user.ask(&question, hardness).await?;
-    if let (Some(_), Some(level)) = (&shore, level) {
-        print(&format!("level {} ({})\n", level.level, level.label));
-    }
-    Some(Object {
-        name,
-        shore,
-        level: level.map_or(0, |level| level.level),
-    })
 }
 
 /// The reading and the level that an answer says.
@@ -203,44 +207,33 @@ fn hardness<'a>(
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
-    path: &Path,
-    labels: Labels,
     setup: &Setup,
     sockets: Sockets,
     score: &mut Score,
 ) -> Result<bool, Failure> {
-    let failed = failed_at(path);
-    let own = File::create_new(path).map_err(&failed)?;
-    let file = own.try_clone().map_err(&failed)?;
+    let path = &object.path;
+    let file = create(path)?;
     print("do not touch the sensor until the zero is taken\n");
     let mut goes_on = false;
-    let (progress, mut counted) = watch::channel(Progress::default());
     let levels = &setup.hrn.card().levels;
-    let end = async { goes_on = wait_for_user(user, &mut counted, object, levels).await };
-    let setup = setup.clone();
-    let recorded = record(setup, sockets, path, file, labels, progress, end).await;
-    let Progress {
-        presses,
-        verdicts,
-        right,
-        ..
-    } = *counted.borrow();
-    if presses == 0 {
+    let end = async |counted| goes_on = wait_for_user(user, counted, object, levels).await;
+    let labels = object.labels.clone();
+    let (recorded, progress) = record(setup.clone(), sockets, path, &file, labels, end).await;
+    if progress.presses == 0 {
         // It would stop `hrn-train collect`.
-        part::remove(path, &own);
+        part::remove(path, &file);
         print("no press was recorded\n");
     } else if object.level > 0 {
-        score.verdicts += verdicts;
-        score.right += right;
+        score.verdicts += progress.verdicts;
+        score.right += progress.right;
     }
-    recorded?;
-    Ok(goes_on)
+    recorded.map(|()| goes_on)
 }
 
 /// Shows the verdict on each press, until the user says what to do next. Returns `false` if the user quits.
 async fn wait_for_user(
     user: &mut User<'_>,
-    counted: &mut watch::Receiver<Progress>,
+    mut counted: watch::Receiver<Progress>,
     object: &Object,
     levels: &[Level],
 ) -> bool {
@@ -305,11 +298,6 @@ fn next_number(directory: &Path) -> io::Result<u32> {
         last = last.max(number.and_then(|number| number.parse().ok()).unwrap_or(0));
     }
     Ok(last.saturating_add(1))
-}
-
-fn failed_at(path: &Path) -> impl Fn(io::Error) -> Failure {
-    let what = format!("--session: {}", path.display());
-    move |error| Failure::of(IO, &what, error)
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::mem::ManuallyDrop;
 use std::os::fd::AsFd;
 use std::panic;
 
@@ -20,7 +21,8 @@ const USUAL: (u16, u16) = (80, 24);
 
 /// A terminal that was taken over.
 pub(super) struct Screen {
-    terminal: Terminal<CrosstermBackend<BufWriter<File>>>,
+    /// Its own drop writes to stderr, and panics where the terminal has gone.
+    terminal: ManuallyDrop<Terminal<CrosstermBackend<BufWriter<File>>>>,
     area: Rect,
 }
 
@@ -43,7 +45,10 @@ impl Screen {
         let viewport = Viewport::Fixed(area);
         let backend = CrosstermBackend::new(out);
         let terminal = Terminal::with_options(backend, TerminalOptions { viewport })?;
-        Ok(Self { terminal, area })
+        Ok(Self {
+            terminal: ManuallyDrop::new(terminal),
+            area,
+        })
     }
 
     /// Draws.
@@ -64,8 +69,6 @@ impl Screen {
 
 impl Drop for Screen {
     fn drop(&mut self) {
-        // Otherwise, the terminal would show its cursor once more after all else.
-        let _ = self.terminal.show_cursor();
         let _ = leave(self.terminal.backend_mut());
         let _ = terminal::disable_raw_mode();
     }
