@@ -216,7 +216,10 @@ fn of_file(
     let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
     played.playback.keep_courses();
     let mut courses = Vec::new();
-    played.play(|played, _, _| courses.extend(played.playback.courses(sensor.name())))?;
+    played.play(|played, _, _| {
+        courses.extend(played.playback.courses(sensor.name()));
+        Ok(true)
+    })?;
     let what = match args.what {
         Some(what) => what,
         None => labelled(&played.playback.labels(), path)?,

@@ -4,7 +4,7 @@
 //! bytes are cut.
 
 use std::collections::VecDeque;
-use std::io::{BufReader, ErrorKind, Read};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -112,20 +112,15 @@ impl<'a> Played<'a> {
     }
 
     /// Plays the next part: its events, and a moment on both clocks of the file. `None` at the end.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the file cannot be read or played further.
-    pub(super) fn next(&mut self) -> Result<Option<(Vec<Event>, Stamp)>, Failure> {
-        let step = match &mut self.source {
+    fn next(&mut self) -> Result<Option<(Vec<Event>, Stamp)>, Failure> {
+        let (parts, at) = match &mut self.source {
             Source::Recording(entries) => {
                 let Some(found) = entries.next() else {
                     return Ok(None);
                 };
                 let found = found.map_err(unplayable(&self.path))?;
                 let at = found.at;
-                let events = self.playback.feed(found).map_err(unplayable(&self.path))?;
-                (events, at)
+                (vec![found], at)
             }
             Source::Raw {
                 file,
@@ -134,48 +129,40 @@ impl<'a> Played<'a> {
             } => {
                 // No two frames end within this many bytes, so each frame comes at its own moment, between
                 // its positions.
-                let mut bytes = vec![0; sensor.layout().min_frame_bytes()];
-                let read = loop {
-                    match file.read(&mut bytes) {
-                        Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                        read => break read.map_err(unplayable(&self.path))?,
-                    }
-                };
-                if read == 0 {
+                let mut bytes = Vec::new();
+                let part = sensor.layout().min_frame_bytes() as u64;
+                let read = file.take(part).read_to_end(&mut bytes);
+                if read.map_err(unplayable(&self.path))? == 0 {
                     return Ok(None);
                 }
-                bytes.truncate(read);
-                let time = |playback: &Playback, more: i64| {
-                    let pipeline = playback.pipeline(sensor.name());
-                    let frames = pipeline.map_or(0, |pipeline| pipeline.frame_counts().0);
-                    let frames = frames.saturating_add_signed(more) as f64;
-                    let time = Duration::try_from_secs_f64(frames / sensor.frame_rate_hz());
-                    time.unwrap_or(Duration::MAX)
-                };
-                let until = time(&self.playback, 0).saturating_add(AHEAD).as_nanos() as i128;
+                let pipeline = self.playback.pipeline(sensor.name());
+                let frames = pipeline.map_or(0, |pipeline| pipeline.frame_counts().0);
+                let time = Duration::try_from_secs_f64(frames as f64 / sensor.frame_rate_hz());
+                let mono = time.unwrap_or(Duration::MAX);
+                let until = mono.saturating_add(AHEAD).as_nanos() as i128;
                 let is_later = |point: &Point| i128::from(point.at_ns) > until;
                 let count = motion.iter().position(is_later).unwrap_or(motion.len());
                 let points = Input::Motion(motion.drain(..count).collect());
-                let mut events = Vec::new();
-                for input in [points, Input::Bytes(bytes)] {
-                    let found = Found {
-                        sensor: sensor.name().to_owned(),
-                        at: START,
-                        entry: Entry::Input(input),
-                    };
-                    events.extend(self.playback.feed(found).map_err(unplayable(&self.path))?);
-                }
-                let mono = time(&self.playback, -1);
+                let part = |input| Found {
+                    sensor: sensor.name().to_owned(),
+                    at: START,
+                    entry: Entry::Input(input),
+                };
                 let wall = START.wall.checked_add(mono).unwrap_or(START.wall);
-                (events, Stamp { mono, wall })
+                let parts = [points, Input::Bytes(bytes)].map(part);
+                (parts.into(), Stamp { mono, wall })
             }
         };
+        let mut events = Vec::new();
+        for part in parts {
+            events.extend(self.playback.feed(part).map_err(unplayable(&self.path))?);
+        }
         warn(self.playback.unjudged());
-        Ok(Some(step))
+        Ok(Some((events, at)))
     }
 
     /// The last events, at the end of the file or where it is damaged, and why the file was of no use.
-    pub(super) fn end(&mut self) -> (Vec<Event>, Option<Failure>) {
+    fn end(&mut self) -> (Vec<Event>, Option<Failure>) {
         let is_raw = self.is_raw();
         let (path, playback) = (self.path.display(), &mut self.playback);
         let left_out = playback.left_out();
@@ -210,22 +197,32 @@ impl<'a> Played<'a> {
         (events, Some(failure))
     }
 
-    /// Plays to the end. `each` takes the events of each part, and a moment.
+    /// Plays to the end, or until `each` returns `false`, which takes the events of each part, and a moment.
     ///
     /// # Errors
     ///
-    /// Fails if the file cannot be played to its end, or is of no use.
+    /// Fails as `each` does, or if the file cannot be played to its end, or is of no use. If a recording is cut off or
+    /// damaged, its events end like those of bytes that end there.
     pub(super) fn play(
         &mut self,
-        mut each: impl FnMut(&mut Self, Vec<Event>, Stamp),
+        mut each: impl FnMut(&mut Self, Vec<Event>, Stamp) -> Result<bool, Failure>,
     ) -> Result<(), Failure> {
         let mut last = START;
-        while let Some((events, at)) = self.next()? {
-            last = at;
-            each(self, events, at);
-        }
+        let played = loop {
+            match self.next() {
+                Ok(Some((events, at))) => {
+                    last = at;
+                    if !each(self, events, at)? {
+                        return Ok(());
+                    }
+                }
+                Ok(None) => break Ok(()),
+                Err(failure) => break Err(failure),
+            }
+        };
         let (events, failure) = self.end();
-        each(self, events, last);
+        each(self, events, last)?;
+        played?;
         failure.map_or(Ok(()), Err)
     }
 }

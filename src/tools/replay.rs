@@ -74,21 +74,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let mut first = None;
     let mut seq = 0;
-    let outcome = loop {
-        match played.next() {
-            Ok(Some((events, at))) => {
-                let (start, first) = *first.get_or_insert((Instant::now(), at.mono));
-                if let Some(speed) = args.speed {
-                    wait(start, at.mono.saturating_sub(first), speed);
-                }
-                if !print(events, &mut seq, &printer)? {
-                    return Ok(());
-                }
-            }
-            Ok(None) => break Ok(()),
-            Err(failure) => break Err(failure),
+    let done = played.play(|_, events, at| {
+        let (start, first) = *first.get_or_insert((Instant::now(), at.mono));
+        if let Some(speed) = args.speed {
+            wait(start, at.mono.saturating_sub(first), speed);
         }
-    };
+        print(events, &mut seq, &printer)
+    });
     if let Some(model) = played.playback.other_model() {
         stderr_line!(
             "warning: {}: recorded with model {}, played with another",
@@ -96,12 +88,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             model.get(..12).unwrap_or(model)
         );
     }
-    // If a recording is cut off or damaged, its events end like those of bytes that end there, and the error
-    // follows them.
-    let (end, failure) = played.end();
-    print(end, &mut seq, &printer)?;
-    outcome?;
-    failure.map_or(Ok(()), Err)
+    done
 }
 
 /// Waits until what happened `since` the first part is due, which was played at `start`.

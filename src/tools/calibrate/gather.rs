@@ -68,6 +68,7 @@ pub(super) fn presses(
         if let Some(pipeline) = played.playback.pipeline(sensor.name()) {
             gathered.take(events, at, pipeline);
         }
+        Ok(true)
     })?;
     let taxels = sensor.layout().array().taxels();
     let frames = gathered.presses.iter().flat_map(|press| &press.frames);

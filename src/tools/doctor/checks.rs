@@ -38,8 +38,9 @@ fn access(path: &Path) -> io::Result<()> {
 /// Every USB serial port, by its persistent name if it has one.
 pub(super) fn ports(root: &Path) -> Vec<PathBuf> {
     let of = |folder: &str, is_meant: fn(&Path) -> bool| {
-        let names = names(root, folder).into_iter();
-        let paths = names.map(|name| Path::new("/").join(folder).join(name));
+        let files = fs::read_dir(root.join(folder)).into_iter().flatten();
+        let paths = files.flatten();
+        let paths = paths.map(|file| Path::new("/").join(folder).join(file.file_name()));
         let mut paths: Vec<PathBuf> = paths.filter(|path| is_meant(path)).collect();
         paths.sort();
         paths
@@ -162,28 +163,22 @@ fn allows(mode: u32, shift: u32) -> bool {
 /// other users' processes.
 fn held(root: &Path, device: &Path, own: u32) -> Vec<String> {
     let others = holders(root, device).filter(|&pid| pid != own);
-    let fault = |pid| match subcommand(root, pid).as_deref() {
-        // A simulator made the port and does not keep others from opening it.
-        Some(b"simulate" | b"demo") => None,
-        Some(b"run") => Some(format!(
+    let fault = |pid| match is_daemon(root, pid) {
+        true => format!(
             "held by process {pid}, the daemon (hardnessd run): sudo systemctl stop hardnessd; where it is no \
              service, kill {pid}"
-        )),
-        _ => Some(format!(
-            "held by process {pid} ({}): kill {pid}",
-            command(root, pid)
-        )),
+        ),
+        false => format!("held by process {pid} ({}): kill {pid}", command(root, pid)),
     };
-    others.filter_map(fault).collect()
+    others.map(fault).collect()
 }
 
-/// The subcommand of `hardnessd` that a process runs.
-fn subcommand(root: &Path, pid: u32) -> Option<Vec<u8>> {
-    let line = fs::read(root.join("proc").join(pid.to_string()).join("cmdline")).ok()?;
+/// Whether a process is `hardnessd run`.
+fn is_daemon(root: &Path, pid: u32) -> bool {
+    let line = fs::read(root.join(format!("proc/{pid}/cmdline"))).unwrap_or_default();
     let mut words = line.split(|&byte| byte == 0);
-    let program = Path::new(OsStr::from_bytes(words.next()?));
-    let is_ours = program.file_name() == Some(OsStr::new("hardnessd"));
-    is_ours.then(|| words.next().unwrap_or_default().to_vec())
+    let program = Path::new(OsStr::from_bytes(words.next().unwrap_or_default()));
+    program.file_name() == Some(OsStr::new("hardnessd")) && words.next() == Some(b"run")
 }
 
 /// ModemManager writes to every new USB serial port, unless udev's database says of this one that it
@@ -201,43 +196,25 @@ fn modem_manager(root: &Path, device: &Path) -> Option<String> {
 
 /// An FTDI adapter holds bytes back until its latency timer expires.
 fn latency(root: &Path, device: &Path) -> Option<String> {
-    let timer = Path::new("sys/class/tty")
-        .join(device.file_name()?)
-        .join("device/latency_timer");
-    let ms: u32 = fs::read_to_string(root.join(&timer))
-        .ok()?
-        .trim()
-        .parse()
-        .ok()?;
-    (ms > 1).then(|| {
-        let (timer, rule) = (timer.display(), udev_rule(root, device));
-        format!(
-            "its latency timer holds bytes back for {ms} ms: echo 1 | sudo tee /{timer}; to last: {rule}"
-        )
-    })
+    let name = device.file_name()?.to_string_lossy();
+    let timer = format!("sys/class/tty/{name}/device/latency_timer");
+    let ms = fs::read_to_string(root.join(&timer)).ok()?;
+    let ms = ms.trim().parse::<u32>().ok().filter(|&ms| ms > 1)?;
+    let rule = udev_rule(root, device);
+    Some(format!(
+        "its latency timer holds bytes back for {ms} ms: echo 1 | sudo tee /{timer}; to last: {rule}"
+    ))
 }
 
-/// The number of a serial port, MAJOR:MINOR.
-fn number(root: &Path, device: &Path) -> Option<String> {
+/// What udev's database says of a serial port. Its file has the port's number, MAJOR:MINOR.
+fn property(root: &Path, device: &Path, key: &str) -> Option<String> {
     let entry = Path::new("sys/class/tty").join(device.file_name()?);
     let number = fs::read_to_string(root.join(entry).join("dev")).ok()?;
-    Some(number.trim().to_owned())
-}
-
-/// What udev's database says of a device.
-fn property(root: &Path, device: &Path, key: &str) -> Option<String> {
-    let entry = format!("c{}", number(root, device)?);
-    let entry = root.join("run/udev/data").join(entry);
-    let text = fs::read_to_string(entry).ok()?;
-    let of_key = |line: &str| {
-        Some(
-            line.strip_prefix("E:")?
-                .strip_prefix(key)?
-                .strip_prefix('=')?
-                .to_owned(),
-        )
-    };
-    text.lines().find_map(of_key)
+    let entry = format!("run/udev/data/c{}", number.trim());
+    let text = fs::read_to_string(root.join(entry)).ok()?;
+    let key = format!("E:{key}=");
+    let value = text.lines().find_map(|line| line.strip_prefix(&key))?;
+    Some(value.to_owned())
 }
 
 /// The commands that let the shipped udev rules act on this device.
@@ -263,16 +240,6 @@ fn is_usb(device: &Path) -> bool {
 fn command(root: &Path, pid: u32) -> String {
     let name = fs::read_to_string(root.join("proc").join(pid.to_string()).join("comm"));
     name.map_or("?".to_owned(), |name| name.trim().to_owned())
-}
-
-fn names(root: &Path, folder: &str) -> Vec<String> {
-    let entries = fs::read_dir(root.join(folder))
-        .into_iter()
-        .flatten()
-        .flatten();
-    entries
-        .map(|entry| entry.file_name().to_string_lossy().into_owned())
-        .collect()
 }
 
 /// The line of `etc/passwd` or `etc/group` whose third field is `id`.

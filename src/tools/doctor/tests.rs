@@ -131,7 +131,4 @@ fn who_holds_the_port_is_named_and_the_daemon_is_stopped_as_a_service() {
     // Another subcommand of `hardnessd` is not a service.
     machine.put("proc/88/cmdline", "hardnessd\0record\0--config\0x\0");
     one(&machine.faults(PORT), &["(hardnessd): kill 88"]);
-    // A simulator made the port and does not keep others from opening it.
-    machine.put("proc/88/cmdline", "hardnessd\0simulate\0--link\0port\0");
-    assert_eq!(machine.faults(PORT), Vec::<String>::new());
 }
