@@ -28,8 +28,8 @@ pub struct Place {
     pub decoded: u64,
     /// The number of bytes that belonged to no whole frame.
     pub skipped: u64,
-    /// The number of bytes up to the end of the last whole frame, or up to the last restart or skip. A
-    /// recording of an earlier version has none: it is then [`Self::decoded`].
+    /// The number of bytes up to the end of the last whole frame, or up to the last restart, and of those
+    /// that nobody read since. A recording of an earlier version has none: it is then [`Self::decoded`].
     #[serde(default = "all")]
     pub framed: u64,
     /// Whether the next byte follows the end of a frame.
@@ -139,6 +139,9 @@ impl Decoder {
     /// Drops the pending bytes, for example after a reconnect: the next bytes do not continue them.
     pub fn restart(&mut self) {
         self.skip(0);
+        self.place.framed = self.place.decoded;
+        self.lines = Lines::default();
+        self.is_telnet = false;
     }
 
     /// Counts bytes that came and that nobody reads: they are no sign of a wrong layout. The next bytes do
@@ -149,9 +152,10 @@ impl Decoder {
         self.place.in_sync = self.layout.begins_in_sync();
         self.place.decoded = self.place.decoded.saturating_add(bytes);
         self.place.skipped = self.place.skipped.saturating_add(bytes);
-        self.place.framed = self.place.decoded;
+        self.place.framed = self.place.framed.saturating_add(bytes);
+        let refused = self.lines.refused.take();
         self.lines = Lines::default();
-        self.is_telnet = false;
+        self.lines.refused = refused;
     }
 
     /// The next frame or damaged candidate, or `None` when more bytes are needed.

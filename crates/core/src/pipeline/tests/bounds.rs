@@ -147,6 +147,15 @@ fn a_sensor_whose_bytes_are_skipped_is_live_as_long_as_its_frames_come() {
     skip(&mut pipeline, 55_100);
     let events = pipeline.tick(at(55_700));
     assert_eq!(words(&events), ["Stale (no frame for 600 ms)"]);
+    // A flood of noise, of which a part is read, is said once.
+    let mut events = Vec::new();
+    for ms in (55_800..70_000).step_by(50) {
+        events.extend(pipeline.push(&[7; 1_000], at(ms)));
+        events.extend(skip(&mut pipeline, ms));
+    }
+    let noise =
+        "Stale (no frame for 600 ms, but bytes come: is the baud rate or the layout wrong?)";
+    assert_eq!(words(&events), [noise]);
 }
 
 #[test]
