@@ -60,14 +60,13 @@ use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target};
 pub use self::reload::Reload;
 use self::sensor::{SensorCore, SensorHandle, Sensors};
-use self::serial::Source;
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
 use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
-use hardnessd_core::sensor::Sensor;
+use hardnessd_core::sensor::{Sensor, Settings};
 
 /// The most commands that wait for a sensor.
 const QUESTIONS: usize = 64;
@@ -102,10 +101,9 @@ pub enum Error {
     Stopped(&'static str),
 }
 
-impl Error {
-    /// The error that the system has no thread for `what`.
-    fn no_thread(what: &str) -> impl FnOnce(std::io::Error) -> Self {
-        move |error| Self::Io(format!("cannot start a thread for {what}: {error}"))
+impl From<NoThread> for Error {
+    fn from(error: NoThread) -> Self {
+        Self::Io(error.to_string())
     }
 }
 
@@ -184,14 +182,13 @@ impl Daemon {
         progress: watch::Sender<Progress>,
         sockets: Sockets,
     ) -> Result<Self, Error> {
-        setup.config.http = None;
-        setup.config.publish = match sockets {
-            Sockets::None => Publish::none(),
-            Sockets::Configured => Publish {
-                unix: setup.config.publish.unix,
-                ..Publish::none()
-            },
+        let mut unix = setup.config.publish.unix;
+        unix.enabled &= sockets == Sockets::Configured;
+        setup.config.publish = Publish {
+            unix,
+            ..Publish::default()
         };
+        setup.config.http = None;
         setup.config.record = None;
         let target = Target::File {
             path,
@@ -208,9 +205,8 @@ impl Daemon {
         raise_descriptors();
         realtime::lock_memory();
         let hub = Hub::new(hello.clone());
-        let clients = Clients::start().map_err(Error::no_thread("the clients"))?;
-        let store = Store::of_environment();
-        let store = store.map_err(|NoThread(error)| Error::no_thread("own presses")(error))?;
+        let clients = Clients::start().map_err(NoThread)?;
+        let store = Store::of_environment()?;
         let names = setup.sensors.iter().map(|sensor| sensor.name().to_owned());
         let handles = names.map(|name| {
             let (commands, inbox) = mpsc::channel(QUESTIONS);
@@ -225,33 +221,62 @@ impl Daemon {
         if let Some(recorder) = &recorder {
             hub.log().record(recorder.of_hub());
         }
-        let mut tasks = JoinSet::new();
-        let sources = serial::start(&setup.sensors.iter().collect::<Vec<_>>());
-        let parts = setup.sensors.iter().zip(inboxes).zip(sources);
-        for (index, ((sensor, commands), source)) in parts.enumerate() {
+        let parts = setup.sensors.iter().zip(inboxes).enumerate();
+        let core = |(index, (sensor, commands)): (usize, (&Sensor, _))| {
             let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
-            let core = SensorCore {
-                pipeline: pipeline_of(&setup, sensor, &store),
+            let hrn = setup.hrn_of(sensor.name()).clone();
+            let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
+            store.load(&mut pipeline);
+            SensorCore {
+                pipeline,
                 recorder: recorder.unwrap_or_default(),
                 unjudged: 0,
                 commands,
-            };
-            start_sensor(core, source, (&hub, &store), &mut tasks);
-        }
-        announce(&setup, &run);
-        systemd::ready();
-        Ok(Self {
+            }
+        };
+        let cores = parts.map(core).collect();
+        let mut daemon = Self {
             setup,
             run,
             hub,
             sensors,
-            tasks,
+            tasks: JoinSet::new(),
             publishers,
             clients,
             store,
             recorder,
             listening,
-        })
+        };
+        daemon.start_sensors(cores);
+        daemon.announce();
+        systemd::ready();
+        Ok(daemon)
+    }
+
+    /// Starts a task for each of these sensors.
+    fn start_sensors(&mut self, cores: Vec<SensorCore>) {
+        let sensors: Vec<&Sensor> = cores.iter().map(|core| core.pipeline.sensor()).collect();
+        let sources = serial::start(&sensors);
+        for (core, source) in cores.into_iter().zip(sources) {
+            // Whoever connects before the task runs gets a status too.
+            self.hub.log().report(core.state());
+            let serving = sensor::serve(core, source, self.hub.clone(), self.store.clone());
+            self.tasks.spawn(serving);
+        }
+    }
+
+    fn announce(&self) {
+        info!(
+            version = env!("CARGO_PKG_VERSION"),
+            robot = self.setup.config.robot.as_str(),
+            run = self.run,
+            model = short(&self.setup),
+            validation = self.setup.hrn.card().validation.as_str(),
+            "started"
+        );
+        for sensor in &self.setup.config.sensors {
+            announce_sensor(&self.setup, sensor);
+        }
     }
 
     /// The address of the live page, if there is one.
@@ -293,41 +318,7 @@ fn raise_descriptors() {
     }
 }
 
-/// The pipeline of a sensor, with its own presses of earlier runs.
-fn pipeline_of(setup: &Setup, sensor: &Sensor, store: &Store) -> Pipeline {
-    let hrn = setup.hrn_of(sensor.name()).clone();
-    let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
-    store.load(&mut pipeline);
-    pipeline
-}
-
-/// Starts the task of a sensor.
-fn start_sensor(
-    core: SensorCore,
-    source: Source,
-    (hub, store): (&Hub, &Store),
-    tasks: &mut JoinSet<SensorCore>,
-) {
-    // Whoever connects before the task runs gets a status too.
-    hub.log()
-        .report(sensor::state(&core.pipeline, core.unjudged));
-    tasks.spawn(sensor::serve(core, source, hub.clone(), store.clone()));
-}
-
-fn announce(setup: &Setup, run: &str) {
-    info!(
-        version = env!("CARGO_PKG_VERSION"),
-        robot = setup.config.robot.as_str(),
-        run,
-        model = short(setup),
-        validation = setup.hrn.card().validation.as_str(),
-        "started"
-    );
-    (0..setup.sensors.len()).for_each(|index| announce_sensor(setup, index));
-}
-
-fn announce_sensor(setup: &Setup, index: usize) {
-    let sensor = &setup.config.sensors[index];
+fn announce_sensor(setup: &Setup, sensor: &Settings) {
     let name = sensor.name.as_str();
     info!(sensor = name, port = %sensor.port, "sensor");
     if setup.ignores_references_of(name) {
@@ -346,12 +337,8 @@ fn short(setup: &Setup) -> &str {
 fn about(setup: &Setup, hello: &Hello) -> About {
     let sensors = setup.sensors.iter();
     let mut labels = Labels::new();
-    if setup
-        .config
-        .sensors
-        .iter()
-        .any(|one| port::is_simulated(&one.port))
-    {
+    let mut tables = setup.config.sensors.iter();
+    if tables.any(|one| port::is_simulated(&one.port)) {
         labels.insert("simulated".to_owned(), "true".to_owned());
     }
     About {

@@ -3,7 +3,7 @@
 use std::future::Future;
 use std::io::{self, Write as _};
 use std::panic;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::{Pin, pin};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -23,8 +23,8 @@ use hardnessd::tools::{
 };
 use hardnessd_core::trial;
 use rustix::process;
+use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{Signal, SignalKind, signal};
-use tokio::sync::mpsc;
 
 /// How long a write that is under way may take to finish.
 const LAST_LINES: Duration = Duration::from_millis(200);
@@ -42,26 +42,12 @@ fn main() -> ExitCode {
         };
         std::process::abort();
     }));
-    let runtime = match tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-    {
-        Ok(runtime) => runtime,
-        Err(error) => {
-            hardnessd_core::stderr_line!("hardnessd: no runtime: {error}");
-            return ExitCode::from(exit::IO);
-        }
-    };
     // Signals come before everything else, even the arguments: an early signal must not kill the
     // process.
-    let signals = {
-        let _inside = runtime.enter();
-        Signals::catch()
-    };
-    let signals = match signals {
-        Ok(signals) => signals,
+    let (runtime, signals) = match with_signals() {
+        Ok(started) => started,
         Err(error) => {
-            hardnessd_core::stderr_line!("hardnessd: no signals: {error}");
+            hardnessd_core::stderr_line!("hardnessd: no runtime and signals: {error}");
             return ExitCode::from(exit::IO);
         }
     };
@@ -83,6 +69,15 @@ fn main() -> ExitCode {
             ExitCode::from(error.code())
         }
     }
+}
+
+/// The runtime of the commands, and the signals, which it handles.
+fn with_signals() -> io::Result<(Runtime, Signals)> {
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    let inside = runtime.enter();
+    let signals = Signals::catch()?;
+    drop(inside);
+    Ok((runtime, signals))
 }
 
 async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
@@ -114,18 +109,15 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
         Command::Control(command) => finish_blocking(signals, || control::run(command)).await,
         Command::Check(args) => finish_blocking(signals, move || check::run(&args)).await,
         Command::Calibrate(args) => {
-            let path = args.config.path()?;
-            let named = path.clone();
-            let load = move || Setup::load(&named, None);
-            let command = async |setup, end: End<'_>| calibrate::run(args, setup, &path, end).await;
-            attend(signals, load, command).await
+            let path = &args.config.path()?;
+            let load = |path: &Path| Setup::load(path, None);
+            let command = async |setup, end: End<'_>| calibrate::run(args, setup, path, end).await;
+            attend(signals, path, load, command).await
         }
         Command::Identify(args) => {
-            let path = args.config.path()?;
-            let named = path.clone();
-            let load = move || identify::load(&named);
-            let command = async |setup, end: End<'_>| identify::run(args, setup, &path, end).await;
-            attend(signals, load, command).await
+            let path = &args.config.path()?;
+            let command = async |setup, end: End<'_>| identify::run(args, setup, path, end).await;
+            attend(signals, path, identify::load, command).await
         }
         Command::Doctor(args) => finish_blocking(signals, move || doctor::run(&args)).await,
         Command::Sniff(args) => finish(signals, sniff::run(args)).await,
@@ -135,16 +127,18 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
 /// It is over when a command is to end in order.
 type End<'a> = Pin<&'a mut dyn Future<Output = ()>>;
 
-/// Runs a command that serves a sensor. At a signal, the daemon inside ends in order, and the command
-/// fails.
+/// Runs a command that serves a sensor of the configuration at `path`. At a signal, the daemon inside ends in
+/// order, and the command fails.
 async fn attend(
     signals: Signals,
-    read: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
+    path: &Path,
+    read: impl FnOnce(&Path) -> Result<Setup, config::Error> + Send + 'static,
     command: impl AsyncFnOnce(Setup, End<'_>) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     let mut end = pin!(signals.end());
+    let path = path.to_owned();
     let setup = tokio::select! {
-        setup = load(read) => setup?,
+        setup = load(move || read(&path)) => setup?,
         signal = &mut end => return Err(Failure::interrupted(signal)),
     };
     let _log = Log::start(setup.config.log, "warn")?;
@@ -189,9 +183,17 @@ async fn load(
 }
 
 async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<(), Failure> {
-    let (shutdown, mut hangup) = signals.apart();
+    let Signals {
+        mut interrupt,
+        mut terminate,
+        hangup,
+        ..
+    } = signals;
     let mut shutdown = pin!(async {
-        shutdown.await;
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
     });
     let named = (path.clone(), model.clone());
     let setup = tokio::select! {
@@ -200,24 +202,13 @@ async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<
     };
     let log = Log::start(setup.config.log, "info")?;
     let daemon = Daemon::start(setup)?;
-    let (request, requests) = mpsc::channel(1);
-    tokio::spawn(async move {
-        while hangup.recv().await.is_some() {
-            // If a request waits already, that request will see this change too.
-            let _ = request.try_send(());
-        }
-    });
-    Ok(daemon
-        .run(
-            shutdown,
-            Some(Reload {
-                requests,
-                path,
-                model,
-                log,
-            }),
-        )
-        .await?)
+    let reload = Reload {
+        requests: hangup,
+        path,
+        model,
+        log,
+    };
+    Ok(daemon.run(shutdown, Some(reload)).await?)
 }
 
 /// The signals that this process handles.
@@ -248,35 +239,17 @@ impl Signals {
     }
 
     /// Waits for SIGINT, SIGTERM, or SIGHUP of a terminal that has gone.
-    async fn end(self) -> process::Signal {
-        let outlives_terminal = self.outlives_terminal;
-        let (shutdown, mut hangup) = self.apart();
+    async fn end(mut self) -> process::Signal {
         tokio::select! {
-            signal = shutdown => signal,
-            _ = hangup.recv(), if !outlives_terminal => process::Signal::HUP,
+            _ = self.interrupt.recv() => process::Signal::INT,
+            _ = self.terminate.recv() => process::Signal::TERM,
+            _ = self.hangup.recv(), if !self.outlives_terminal => process::Signal::HUP,
         }
     }
 
     /// Like [`Signals::end`], for a command that runs until a signal ends it.
     async fn received(self) {
         self.end().await;
-    }
-
-    /// A future that waits for SIGINT or SIGTERM, and the signal SIGHUP by itself.
-    fn apart(self) -> (impl Future<Output = process::Signal>, Signal) {
-        let Self {
-            mut interrupt,
-            mut terminate,
-            hangup,
-            ..
-        } = self;
-        let shutdown = async move {
-            tokio::select! {
-                _ = interrupt.recv() => process::Signal::INT,
-                _ = terminate.recv() => process::Signal::TERM,
-            }
-        };
-        (shutdown, hangup)
     }
 }
 

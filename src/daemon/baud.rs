@@ -7,12 +7,6 @@ use hardnessd_core::wire::Layout;
 /// The number of bits that a byte takes on a line: a start bit, eight bits and a stop bit.
 pub(crate) const BITS_A_BYTE: f64 = 10.0;
 
-/// The names of serial ports that follow their baud rate.
-const PACED: [&str; 11] = [
-    "ttyUSB", "ttyS", "ttyAMA", "ttyTHS", "ttymxc", "ttyLP", "ttyPS", "ttyO", "ttyMSM", "ttySTM",
-    "ttyXRUSB",
-];
-
 /// Whether a port is known to follow its baud rate. A pty, USB CDC, Bluetooth and a network ignore it. A device
 /// that does not exist yet is judged by its name.
 fn is_paced(port: &Port) -> bool {
@@ -22,9 +16,9 @@ fn is_paced(port: &Port) -> bool {
     let there = path.canonicalize();
     let device = there.as_deref().unwrap_or(path);
     let name = device.file_name().unwrap_or_default().to_string_lossy();
-    let is_named = |names: &[&str]| names.iter().any(|known| name.starts_with(known));
-    let is_free = device.starts_with("/dev/pts") || is_named(&["ttyACM", "ttyGS", "rfcomm"]);
-    !is_free && (there.is_ok() || is_named(&PACED))
+    let free = ["ttyACM", "ttyGS", "rfcomm"];
+    let is_free = device.starts_with("/dev/pts") || free.iter().any(|free| name.starts_with(free));
+    !is_free && (there.is_ok() || name.starts_with("tty"))
 }
 
 /// Checks that the line of `sensor` can carry its frames, the shortest at least. The error says what it can

@@ -10,7 +10,7 @@
 mod requests;
 
 use std::io::{self, ErrorKind, Write};
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream as StdStream;
 use std::sync::Arc;
 
@@ -18,7 +18,6 @@ use futures_util::StreamExt as _;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::net::unix::pipe::Receiver;
-use tokio::net::{TcpStream, UnixStream};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio::task::coop::consume_budget;
@@ -51,23 +50,10 @@ pub(crate) enum Access {
     Control,
 }
 
-/// A connection that carries lines. Bytes go in and out of every kind of stream socket in the same
-/// way, so from here on each is served as a Unix socket.
-pub(crate) trait Stream: Send + 'static {
-    /// The socket, which no runtime watches.
-    fn into_socket(self) -> io::Result<StdStream>;
-}
-
-impl Stream for UnixStream {
-    fn into_socket(self) -> io::Result<StdStream> {
-        self.into_std()
-    }
-}
-
-impl Stream for TcpStream {
-    fn into_socket(self) -> io::Result<StdStream> {
-        Ok(OwnedFd::from(self.into_std()?).into())
-    }
+/// The socket of a connection, which no runtime watches. Bytes go in and out of every kind of stream
+/// socket in the same way, so from here on each is served as a Unix socket.
+fn socket_of(stream: impl AsFd) -> io::Result<StdStream> {
+    Ok(stream.as_fd().try_clone_to_owned()?.into())
 }
 
 /// Everything that serves the connections of one listener.
@@ -81,7 +67,7 @@ pub(crate) struct Service {
     pub(crate) writers: Handle,
 }
 
-impl<S: Stream> Serve<S> for Service {
+impl<S: AsFd + Send + 'static> Serve<S> for Service {
     fn serve(&self, stream: S) -> impl Future<Output = ()> + Send + 'static {
         let service = self.clone();
         async move {
@@ -98,9 +84,7 @@ impl<S: Stream> Serve<S> for Service {
         );
         let line = requests::end(Err(message), None);
         // If the line cannot be sent, the client still sees the connection end.
-        let _ = stream
-            .into_socket()
-            .and_then(|mut stream| stream.write_all(line.json().as_bytes()));
+        let _ = socket_of(stream).and_then(|mut socket| socket.write_all(line.json().as_bytes()));
     }
 }
 
@@ -114,8 +98,8 @@ enum Asked {
 }
 
 /// Serves a connection until it ends.
-async fn serve(stream: impl Stream, service: Service) -> io::Result<()> {
-    let output = stream.into_socket()?;
+async fn serve(stream: impl AsFd, service: Service) -> io::Result<()> {
+    let output = socket_of(stream)?;
     // The socket is read like a pipe. So the runtime watches it for one direction alone: else each read of the
     // client would wake the clients' thread.
     let input = Receiver::from_owned_fd_unchecked(output.try_clone()?.into())?;

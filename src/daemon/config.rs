@@ -161,31 +161,27 @@ impl Config {
             log: log::Settings::default(),
             ..config.clone()
         };
-        let names = |config: &Self| -> Vec<String> {
-            let sensors = config.sensors.iter();
-            sensors.map(|sensor| sensor.name.clone()).collect()
-        };
-        let renamed = (names(self) != names(other)).then(|| "sensor.name".to_owned());
-        difference(&fixed(self), &fixed(other)).or(renamed)
+        let (ours, theirs) = (fixed(self), fixed(other));
+        if ours == theirs {
+            let [ours, theirs] = [self, other].map(|config| config.sensors.iter());
+            let is_named_alike = ours.map(|one| &one.name).eq(theirs.map(|one| &one.name));
+            return (!is_named_alike).then(|| "sensor.name".to_owned());
+        }
+        // A path that is not UTF-8 has no JSON, so its key cannot be named.
+        let [ours, theirs] =
+            [ours, theirs].map(|one| serde_json::to_value(one).unwrap_or_default());
+        Some(difference(&ours, &theirs).unwrap_or_else(|| "a path".to_owned()))
     }
 }
 
 /// The first key that differs, with the keys of its tables before it.
-fn difference<T: PartialEq + Serialize>(ours: &T, theirs: &T) -> Option<String> {
-    fn first(ours: &Value, theirs: &Value) -> Option<String> {
-        let (Value::Object(ours), Value::Object(theirs)) = (ours, theirs) else {
-            return None;
-        };
-        let mut keys = ours.keys().chain(theirs.keys());
-        let key = keys.find(|key| ours.get(*key) != theirs.get(*key))?;
-        let [ours, theirs] = [ours, theirs].map(|table| table.get(key).unwrap_or(&Value::Null));
-        let below = first(ours, theirs).map(|below| format!(".{below}"));
-        Some(format!("{key}{}", below.unwrap_or_default()))
-    }
-    // A path that is not UTF-8 has no JSON, so its key cannot be named.
-    let json = |table: &T| serde_json::to_value(table).unwrap_or_default();
-    let named = || first(&json(ours), &json(theirs)).unwrap_or_else(|| "a path".to_owned());
-    (ours != theirs).then(named)
+fn difference(ours: &Value, theirs: &Value) -> Option<String> {
+    let (ours, theirs) = (ours.as_object()?, theirs.as_object()?);
+    let mut keys = ours.keys().chain(theirs.keys());
+    let key = keys.find(|key| ours.get(*key) != theirs.get(*key))?;
+    let [ours, theirs] = [ours, theirs].map(|table| table.get(key).unwrap_or(&Value::Null));
+    let below = difference(ours, theirs).map(|below| format!(".{below}"));
+    Some(format!("{key}{}", below.unwrap_or_default()))
 }
 
 /// A configuration whose values have all been checked, with its sensors and its model.
@@ -249,32 +245,31 @@ impl Setup {
 
     /// The keys that are written in the configuration and change no verdict of this model.
     pub fn without_effect(&self) -> Vec<String> {
-        let is_written = |key: &str| self.text.is_written(0, key);
-        let Config { press, model, .. } = &self.config;
-        let (press_default, model_default) =
-            (press::Settings::default(), verdict::Settings::default());
-        let takes_none = self.hrn.most_references() == 0;
-        let sensors = self.config.sensors.iter();
-        let given = sensors.filter(|sensor| takes_none && sensor.references.is_some());
-        let references = given.map(|sensor| format!("sensor.references of {:?}", sensor.name));
-        match self.hrn.format() {
-            Format::Frame | Format::Parts => {
-                let described =
-                    |sensor: &&sensor::Settings| sensor.arm != motion::Settings::default();
-                let arms = self.config.sensors.iter().filter(described);
-                let arms = arms.map(|sensor| format!("sensor.arm of {:?}", sensor.name));
-                let early = model.early_confidence != model_default.early_confidence;
-                let early = early && is_written("model.early_confidence");
-                let early = early.then(|| "model.early_confidence".to_owned());
-                arms.chain(early).chain(references).collect()
+        let Config {
+            press,
+            model,
+            sensors,
+            ..
+        } = &self.config;
+        let of = |key: &str, sensor: &sensor::Settings| format!("{key} of {:?}", sensor.name);
+        let mut idle = Vec::new();
+        if matches!(self.hrn.format(), Format::Course { .. }) {
+            if press.early_settle_s != press::Settings::default().early_settle_s {
+                idle.push("press.early_settle_s".to_owned());
             }
-            Format::Course { .. } => {
-                let settle = press.early_settle_s != press_default.early_settle_s;
-                let settle = settle && is_written("press.early_settle_s");
-                let settle = settle.then(|| "press.early_settle_s".to_owned());
-                settle.into_iter().chain(references).collect()
+        } else {
+            let given = |sensor: &&sensor::Settings| sensor.arm != motion::Settings::default();
+            let arms = sensors.iter().filter(given);
+            idle.extend(arms.map(|sensor| of("sensor.arm", sensor)));
+            if model.early_confidence != verdict::Settings::default().early_confidence {
+                idle.push("model.early_confidence".to_owned());
             }
         }
+        if self.hrn.most_references() == 0 {
+            let given = sensors.iter().filter(|sensor| sensor.references.is_some());
+            idle.extend(given.map(|sensor| of("sensor.references", sensor)));
+        }
+        idle
     }
 
     /// Reads a configuration and its model. `model` replaces the configuration's own.

@@ -19,12 +19,13 @@ use foxglove::{
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
-use tracing::{info, warn};
+use tracing::info;
 
 use super::Error;
 use super::config::{self, Config};
 use super::hub::Line;
-use super::relay::Worker;
+use super::relay::{Worker, each_event};
+use hardnessd_core::event::Event;
 use hardnessd_core::ros;
 
 /// The most messages that wait for a viewer, about 1 MB. When there are more, the oldest are
@@ -131,7 +132,9 @@ impl Foxglove {
             loop {
                 tokio::select! {
                     lines = lines.recv() => match lines {
-                        Some(lines) => lines.iter().for_each(|line| topics.publish(line)),
+                        Some(lines) => {
+                            each_event("foxglove", &lines, |event, _| topics.publish(event));
+                        }
                         None => break,
                     },
                     Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
@@ -175,11 +178,7 @@ impl Topics {
         })
     }
 
-    fn publish(&mut self, line: &Line) {
-        let Some(event) = &line.event else {
-            warn!(gap = line.json().trim_end(), "foxglove is too slow");
-            return;
-        };
+    fn publish(&mut self, event: &Event) {
         for (topic, time, bytes) in ros::encode_all(event) {
             let name = topic.of(event.sensor());
             let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);

@@ -94,14 +94,13 @@ impl Http {
             .route("/", get(async || page))
             .route("/events", get(events::answer))
             .route("/api/status", get(async move |hub| status(hub, sets_context).await))
-            .route("/api/history", get(history))
             .route("/metrics", get(metrics))
             .route("/livez", get(live))
             .route("/readyz", get(ready))
             .fallback(async || {
                 refusal(
                     StatusCode::NOT_FOUND,
-                    "not found: the paths are /, /events, /api/status, /api/history, /metrics, /livez and /readyz",
+                    "not found: the paths are /, /events, /api/status, /metrics, /livez and /readyz",
                 )
             });
         if let Some(sensors) = sensors {
@@ -109,7 +108,7 @@ impl Http {
             routes = routes.route("/api/context", set.layer(DefaultBodyLimit::max(BODY_BYTES)));
         }
         let routes = routes.method_not_allowed_fallback(async || {
-            let message = "method not allowed: this server is read-only: use GET or HEAD";
+            let message = "method not allowed: use GET or HEAD, and POST for /api/context alone";
             refusal(StatusCode::METHOD_NOT_ALLOWED, message)
         });
         Self {
@@ -176,22 +175,6 @@ fn text(content_type: &'static str, text: String) -> Response {
 async fn status(State(hub): State<Hub>, sets_context: bool) -> Result<Response, Closed> {
     let now = hub.snapshot().await?;
     Ok(text("application/json", status::json(&now, sets_context)))
-}
-
-/// The force and contact area of one sensor in the last two minutes. The query names the sensor.
-async fn history(
-    State(hub): State<Hub>,
-    request: axum::extract::Request,
-) -> Result<Response, Closed> {
-    let query = request.uri().query().unwrap_or_default();
-    let mut pairs = form_urlencoded::parse(query.as_bytes());
-    let sensor = pairs.find(|(key, _)| key == "sensor");
-    let sensor = sensor.map_or(String::new(), |(_, sensor)| sensor.into_owned());
-    let Some(history) = hub.history(sensor.clone()).await? else {
-        let why = format!("sensor: found {sensor:?}, expected the name of a sensor");
-        return Ok(refusal(StatusCode::NOT_FOUND, why));
-    };
-    Ok(text("application/json", history.json(&sensor).to_string()))
 }
 
 async fn metrics(State(hub): State<Hub>) -> Result<Response, Closed> {

@@ -9,7 +9,6 @@
 //! no thread with ordinary scheduling holds the log while a sensor needs it.
 
 mod cursor;
-mod history;
 mod log;
 mod subscriber;
 mod tally;
@@ -20,10 +19,10 @@ use std::{sync::mpsc, time::Duration};
 
 use tokio::runtime::Handle;
 
-pub(crate) use self::history::History;
 use self::log::Log;
 pub(crate) use self::log::{Line, SensorSnapshot, Snapshot};
 pub(crate) use self::subscriber::Subscriber;
+pub(crate) use self::tally::Series;
 use super::now;
 use super::request::Subscription;
 use hardnessd_core::event::{Event, Hello};
@@ -78,7 +77,8 @@ impl Hub {
         self.ask(move |log| {
             let now = log.snapshot();
             let id = log.join(&wanted)?;
-            Ok((Subscriber::new(hub, id), now))
+            let changed = log.subscribers[&id].changed.clone();
+            Ok((Subscriber::new(hub, id, changed), now))
         })
         .await
     }
@@ -96,12 +96,6 @@ impl Hub {
         self.thread
             .spawn(async move { answer.send(hub.log().snapshot()) });
         answered.recv_timeout(PATIENCE).map_err(|_| Closed)
-    }
-
-    /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
-    /// sensor. Its JSON is made by the caller, because the sensors' thread has no time for it.
-    pub(crate) async fn history(&self, sensor: String) -> Result<Option<History>, Closed> {
-        self.ask(move |log| log.history(&sensor)).await
     }
 
     /// Has a question answered on the sensors' thread.

@@ -28,9 +28,9 @@ use tracing_subscriber::{Registry, reload};
 use self::lines::Lines;
 use self::quota::LineQuota;
 use super::Error;
+use crate::thread::NoThread;
 use hardnessd_core::event::{Event, LinkState, Phase, PressState, Tared, name, round_3};
 use hardnessd_core::judge::Unjudged;
-use hardnessd_core::motion::StepBack;
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::wording;
@@ -85,7 +85,7 @@ impl Log {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
         // The filter is a layer beside the output: a filter inside the output would be lost when
         // the output is exchanged.
-        let lines = Lines::start().map_err(Error::no_thread("the log"))?;
+        let lines = Lines::start().map_err(NoThread)?;
         let (layer, output) = reload::Layer::new(output(settings, &lines));
         tracing_subscriber::registry()
             .with(layer)
@@ -194,12 +194,13 @@ fn level_of(event: &Event) -> Level {
         Event::Press(press) if press.state != PressState::Aborted => return Level::DEBUG,
         Event::Press(_) => true,
         Event::Hardness(verdict) if verdict.phase == Phase::Early => return Level::DEBUG,
-        Event::Hardness(_) | Event::Frame(_) => false,
+        Event::Hardness(_) => false,
+        Event::Frame(_) => return Level::DEBUG,
     };
     if is_wrong { Level::WARN } else { Level::INFO }
 }
 
-/// Writes one line for a numbered event. Lines that are only for the level `debug` have no limit.
+/// Writes one line for an event, but none for a frame. Lines that are only for the level `debug` have no limit.
 pub(crate) fn event(event: &Event) {
     match level_of(event) {
         Level::DEBUG => line_of(event),
@@ -296,17 +297,17 @@ pub(crate) fn limited(cause: &str, line: impl FnOnce()) {
     let Some(left_out) = allowed else { return };
     if left_out > 0 {
         warn!(
-            sensor = cause,
+            cause,
             lines = left_out,
-            "left out of the log: too many lines of this sensor"
+            "left out of the log: too many lines of this cause"
         );
     }
     line();
 }
 
-/// Logs that positions of an arm step back in time.
-pub(crate) fn motion_refused(sensor: &str, reason: StepBack) {
-    limited(sensor, || warn!(sensor, %reason, "positions refused"));
+/// Logs why what somebody sent is refused.
+pub(crate) fn refused(sensor: &str, reason: &str) {
+    limited(sensor, || warn!(sensor, reason, "refused"));
 }
 
 /// Logs that datagrams of `other` are ignored, because `sender` sends.

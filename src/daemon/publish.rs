@@ -1,6 +1,7 @@
 //! All publishers of the daemon, which are opened together and served together.
 
 use std::net::SocketAddr;
+use std::pin::Pin;
 
 use rustix::process::Gid;
 use tokio::runtime::Handle;
@@ -51,6 +52,9 @@ fn control_group(unix: &Unix) -> Result<Option<Gid>, Error> {
         .ok_or_else(|| Error::Config(format!("{GROUP_KEY}: found {name:?}, {expected}")))
 }
 
+/// What serves a publisher until the order to stop.
+type Serving = Pin<Box<dyn Future<Output = ()> + Send>>;
+
 /// The running publishers.
 pub(super) struct Publishers {
     /// A task for each. It ends after the order to stop, when its subscribers have their last lines.
@@ -70,16 +74,16 @@ impl Publishers {
         stop: &Stop,
     ) -> Result<Self, Error> {
         let (publish, unix) = (&config.publish, &config.publish.unix);
-        let most = unix.max_clients;
+        let (most, ours) = (unix.max_clients, Handle::current());
         let service = |access| Service {
             access,
             max_clients: most,
             hub: hub.clone(),
             sensors: sensors.clone(),
-            writers: Handle::current(),
+            writers: ours.clone(),
         };
-        let (reading, controlling) = (service(Access::ReadOnly), service(Access::Control));
-        let mut tasks = JoinSet::new();
+        // None of them is served before all are open.
+        let mut serving: Vec<(&Handle, Serving)> = Vec::new();
         let (mut paths, mut addresses) = (Vec::new(), Vec::new());
         if unix.enabled {
             let (path, control_path) = (unix.path(), unix.control_path());
@@ -88,16 +92,18 @@ impl Publishers {
             drop(on_their_thread);
             let (mode, group) = (unix.control_mode.0, control_group(unix)?);
             let control = Socket::bind(CONTROL_KEY, &control_path, mode, group)?;
-            let serving = accept(events, most, reading.clone(), stop.clone());
-            tasks.spawn_on(serving, clients);
-            tasks.spawn(accept(control, most, controlling, stop.clone()));
+            let events = accept(events, most, service(Access::ReadOnly), stop.clone());
+            let control = accept(control, most, service(Access::Control), stop.clone());
+            serving.push((clients, Box::pin(events)));
+            serving.push((&ours, Box::pin(control)));
             paths.extend([("events", path), ("control", control_path)]);
         }
         let _on_their_thread = clients.enter();
         if let Some(settings) = &publish.tcp {
             let tcp = Tcp::bind("publish.tcp.listen", settings.listen)?;
             addresses.push(("tcp", tcp.address()));
-            tasks.spawn_on(accept(tcp, most, reading, stop.clone()), clients);
+            let tcp = accept(tcp, most, service(Access::ReadOnly), stop.clone());
+            serving.push((clients, Box::pin(tcp)));
         }
         let mut http = None;
         if let Some(settings) = &config.http {
@@ -106,29 +112,33 @@ impl Publishers {
             addresses.push(("http", address));
             let setter = settings.set_context.then(|| sensors.clone());
             let service = Http::new(address, hub.clone(), setter, stop.clone());
-            let serving = accept(tcp, Http::MOST_CONNECTIONS, service, stop.clone());
-            tasks.spawn_on(serving, clients);
+            let page = accept(tcp, Http::MOST_CONNECTIONS, service, stop.clone());
+            serving.push((clients, Box::pin(page)));
         }
         #[cfg(feature = "foxglove")]
         if let Some(settings) = &publish.foxglove {
             let worker = foxglove::open(settings, config)?;
-            tasks.spawn_on(worker.serve(hub.clone()), clients);
+            serving.push((clients, Box::pin(worker.serve(hub.clone()))));
         }
         #[cfg(feature = "ros2")]
         if let Some(settings) = &publish.ros2 {
             let worker = ros2::open(settings, sensors)?;
-            tasks.spawn_on(worker.serve(hub.clone()), clients);
+            serving.push((clients, Box::pin(worker.serve(hub.clone()))));
         }
         #[cfg(feature = "zenoh")]
         if let Some(settings) = &publish.zenoh {
             let worker = zenoh::open(settings, config, hub, sensors)?;
-            tasks.spawn_on(worker.serve(hub.clone()), clients);
+            serving.push((clients, Box::pin(worker.serve(hub.clone()))));
         }
         for (way, path) in paths {
             info!(way, path = %path.display(), "listening");
         }
         for (way, address) in addresses {
             info!(way, %address, "listening");
+        }
+        let mut tasks = JoinSet::new();
+        for (thread, serving) in serving {
+            tasks.spawn_on(serving, thread);
         }
         Ok(Self { tasks, http })
     }

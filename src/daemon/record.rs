@@ -11,15 +11,16 @@ mod worker;
 use std::fs::File;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use tracing::info;
 
 use self::worker::Worker;
 use super::{Error, config};
+use crate::thread::spawn_thread;
 use hardnessd_core::event::Event;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Input, Pipeline};
@@ -100,34 +101,37 @@ impl Job {
 /// More memory than a numbered event takes: a context has up to 1 KiB of text.
 const EVENT_BYTES: usize = 4 << 10;
 
+/// A job, and a permit for each byte of its memory. The room is free again when the permit is dropped.
+type Queued = (Job, OwnedSemaphorePermit);
+
 /// The queue to the thread.
 #[derive(Debug, Clone)]
 struct Jobs {
-    sender: Sender<Job>,
-    load: Arc<Load>,
-}
-
-/// How full the queue is, and what had no room in it.
-#[derive(Debug, Default)]
-struct Load {
-    /// The bytes of memory that wait.
-    bytes: AtomicUsize,
-    /// The number of jobs that were dropped.
-    dropped: AtomicU64,
+    sender: Sender<Queued>,
+    /// A permit for each byte of memory that is left.
+    room: Arc<Semaphore>,
+    /// The number of jobs that had no room.
+    dropped: Arc<AtomicU64>,
 }
 
 impl Jobs {
+    fn new(sender: Sender<Queued>, bytes: usize) -> Self {
+        Self {
+            sender,
+            room: Arc::new(Semaphore::new(bytes)),
+            dropped: Arc::default(),
+        }
+    }
+
     /// Sends a job. Returns `false` if there was no room for it.
     fn send(&self, job: Job) -> bool {
-        let bytes = job.weight();
-        let queued = self.load.bytes.fetch_add(bytes, Ordering::Relaxed);
-        if queued.saturating_add(bytes) > QUEUED_BYTES {
-            self.load.bytes.fetch_sub(bytes, Ordering::Relaxed);
-            self.load.dropped.fetch_add(1, Ordering::Relaxed);
+        let bytes = u32::try_from(job.weight()).unwrap_or(u32::MAX);
+        let Ok(taken) = self.room.clone().try_acquire_many_owned(bytes) else {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
             return false;
-        }
+        };
         // The recording may have ended, which is reported elsewhere.
-        let _ = self.sender.send(job);
+        let _ = self.sender.send((job, taken));
         true
     }
 }
@@ -150,19 +154,12 @@ impl Recorder {
         }
         let labels = about.labels.clone();
         let (sender, inbox) = channel();
-        let load = Arc::new(Load::default());
+        let jobs = Jobs::new(sender, QUEUED_BYTES);
         let (stopping, stop) = oneshot::channel();
-        let worker = Worker::new(target, about, load.clone(), stopping);
-        let (end, ended) = oneshot::channel();
-        std::thread::Builder::new()
-            .name("recorder".to_owned())
-            .spawn(move || {
-                // The daemon may no longer wait for the result.
-                let _ = end.send(worker.run(&inbox));
-            })
-            .map_err(Error::no_thread("the recording"))?;
+        let worker = Worker::new(target, about, jobs.dropped.clone(), stopping);
+        let ended = spawn_thread("recorder", move || worker.run(&inbox))?;
         Ok(Self {
-            jobs: Jobs { sender, load },
+            jobs,
             labels,
             stop,
             ended,

@@ -9,7 +9,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::thread;
+use std::sync::mpsc::channel;
 
 use tokio::sync::{mpsc, oneshot};
 use tracing::warn;
@@ -21,7 +21,8 @@ use super::log;
 use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
 use super::sensor::Sensors;
-use hardnessd_core::event::Kind;
+use crate::thread::spawn_thread;
+use hardnessd_core::event::{Event, Kind};
 
 /// The most batches of lines that wait for the thread.
 const BATCHES: usize = 8;
@@ -35,6 +36,20 @@ pub(super) fn pass_on(way: &'static str, sensors: &Sensors, positions: &Position
     if let Err(refused) = client::try_move_arm(sensors, positions) {
         let sensor = positions.sensor.as_str();
         log::limited(way, || warn!(way, sensor, %refused, "positions refused"));
+    }
+}
+
+/// Passes the events of a batch to `publish`, with their lines. A gap is logged.
+pub(super) fn each_event(
+    way: &'static str,
+    lines: &[Arc<Line>],
+    mut publish: impl FnMut(&Event, &Line),
+) {
+    for line in lines {
+        match &line.event {
+            Some(event) => publish(event, line),
+            None => warn!(way, gap = line.json().trim_end(), "too slow"),
+        }
     }
 }
 
@@ -54,24 +69,18 @@ impl Worker {
         work: impl FnOnce(O, mpsc::Receiver<Vec<Arc<Line>>>) + Send + 'static,
     ) -> Result<Self, Error> {
         let (lines, inbox) = mpsc::channel(BATCHES);
-        let (end, ended) = oneshot::channel();
-        let (opened, outcome) = std::sync::mpsc::channel();
-        let started = thread::Builder::new().name(way.to_owned()).spawn(move || {
-            match open() {
-                Ok(open) => {
-                    let _ = opened.send(Ok(()));
-                    work(open, inbox);
-                }
-                Err(error) => {
-                    let _ = opened.send(Err(error));
-                }
+        let (opened, outcome) = channel();
+        let ended = spawn_thread(way, move || match open() {
+            Ok(open) => {
+                let _ = opened.send(Ok(()));
+                work(open, inbox);
             }
-            drop(end);
-        });
-        started.map_err(|error| Error::Io(format!("no thread for publish.{way}: {error}")))?;
-        outcome
-            .recv()
-            .expect("a thread that panics ends the process")?;
+            Err(error) => {
+                let _ = opened.send(Err(error));
+            }
+        })?;
+        let outcome = outcome.recv();
+        outcome.expect("a thread that panics ends the process")?;
         Ok(Self { lines, ended })
     }
 
@@ -88,8 +97,6 @@ impl Worker {
             let _ = self.lines.send(now.statuses().collect()).await;
             subscriber.feed(self.lines);
         }
-        // The wait always ends with an error, because the thread sends nothing and only drops its
-        // end.
         let _ = self.ended.await;
     }
 }

@@ -7,6 +7,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use tokio::signal::unix::Signal;
 use tokio::sync::mpsc;
 
 use super::config::Setup;
@@ -20,8 +21,8 @@ const PATIENCE: Duration = Duration::from_secs(10);
 
 /// The requests to a running daemon to read its configuration again.
 pub struct Reload {
-    /// One item for each request.
-    pub requests: mpsc::Receiver<()>,
+    /// SIGHUP. A request while another one waits is the same one: what is read then has all changes.
+    pub requests: Signal,
     /// The path of the configuration.
     pub path: PathBuf,
     /// The model that replaces the configuration's own, if there is one.

@@ -42,20 +42,6 @@ pub(crate) enum Query {
     Last,
 }
 
-impl Request {
-    /// The key that names the request.
-    pub(crate) fn key(&self) -> &'static str {
-        match self {
-            Request::Subscribe(_) => "subscribe",
-            Request::Get(_) => "get",
-            Request::Tare(_) => "tare",
-            Request::Context(_) => "context",
-            Request::Motion(_) => "motion",
-            Request::Blackbox(_) => "blackbox",
-        }
-    }
-}
-
 /// The events that a subscriber wants, and the policy if it is slow.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -19,12 +19,11 @@ use tracing::{info, warn};
 
 use super::Error;
 use super::config;
-use super::hub::Line;
 use super::log;
-use super::relay::{Worker, pass_on};
-use super::request::motion::{Positions, ReportedPoint};
+use super::relay::{Worker, each_event, pass_on};
+use super::request::motion::{Positions, ReportedTime};
 use super::sensor::{SensorHandle, Sensors};
-use hardnessd_core::event::Kind;
+use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::ros::position::{POSITION, PointStamped};
 use hardnessd_core::ros::{self, Topic};
 
@@ -61,7 +60,7 @@ pub(super) fn open(settings: &config::Ros2, sensors: &Sensors) -> Result<Worker,
             // Meanwhile the runtime reads positions.
             runtime.block_on(async {
                 while let Some(lines) = lines.recv().await {
-                    lines.iter().for_each(|line| ros2.publish(line));
+                    each_event("ros2", &lines, |event, _| ros2.publish(event));
                 }
             });
             // The tasks that read positions must end before their node.
@@ -123,11 +122,7 @@ impl Ros2 {
         Ok((runtime, ros2))
     }
 
-    fn publish(&self, line: &Line) {
-        let Some(event) = &line.event else {
-            warn!(gap = line.json().trim_end(), "ros2 is too slow");
-            return;
-        };
+    fn publish(&self, event: &Event) {
         for (topic, _, bytes) in ros::encode_all(event) {
             let sensor = event.sensor();
             let Some(publisher) = self.topics.get(&(sensor.to_owned(), topic.name)) else {
@@ -156,16 +151,13 @@ async fn take_positions(sensor: String, positions: Subscription<PointStamped>, s
                 continue;
             }
         };
-        match taken.and_then(|(at, mm)| ReportedPoint::at_time(at, mm)) {
-            Some(point) => {
-                let (sensor, points) = (sensor.clone(), vec![point]);
+        match taken {
+            Some((at, mm)) => {
+                let (sensor, points) = (sensor.clone(), vec![(ReportedTime::Wall(at), mm)]);
                 pass_on("ros2", &sensors, &Positions { sensor, points });
             }
             None => log::limited("ros2", || {
-                warn!(
-                    sensor,
-                    "found a position on ros2 that is no number or no time"
-                );
+                warn!(sensor, "found a position on ros2 without a valid time");
             }),
         }
     }

@@ -13,8 +13,7 @@ use super::log::Log;
 use super::record::Recorder;
 use super::reload::Refusal;
 use super::sensor::{Command, SensorCore};
-use super::serial;
-use super::{Daemon, Error, announce_sensor, hello, now, short, start_sensor, systemd};
+use super::{Daemon, Error, announce_sensor, hello, now, short, systemd};
 use crate::maybe;
 
 /// How long subscribers may take to fetch their last lines. This is short, because the daemon must
@@ -82,11 +81,7 @@ impl Daemon {
         self.hub
             .log()
             .describe(hello(&self.setup, self.run.clone()));
-        let all = self.setup.sensors.iter();
-        let anew: Vec<_> = all
-            .filter(|sensor| stopped.contains_key(sensor.name()))
-            .collect();
-        let mut sources = serial::start(&anew).into_iter();
+        let mut anew = Vec::new();
         for (index, sensor) in self.setup.sensors.iter().enumerate() {
             let hrn = self.setup.hrn_of(sensor.name()).clone();
             let Some(mut core) = stopped.remove(sensor.name()) else {
@@ -95,12 +90,13 @@ impl Daemon {
                 let _ = self.sensors[index].commands.send(model).await;
                 continue;
             };
-            announce_sensor(&self.setup, index);
+            info!(sensor = sensor.name(), "stopped");
+            announce_sensor(&self.setup, &self.setup.config.sensors[index]);
             core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
             core.recorder.begin_anew(&core.pipeline, now());
-            let source = sources.next().expect("each that starts has one");
-            start_sensor(core, source, (&self.hub, &self.store), &mut self.tasks);
+            anew.push(core);
         }
+        self.start_sensors(anew);
         info!(model = short(&self.setup), "reloaded");
         Ok(())
     }
@@ -116,9 +112,7 @@ impl Daemon {
             let Some(Ok(core)) = self.tasks.join_next().await else {
                 return Err(Error::Stopped("a sensor"));
             };
-            let name = core.pipeline.sensor().name().to_owned();
-            info!(sensor = name, "stopped");
-            ended.insert(name, core);
+            ended.insert(core.name().to_owned(), core);
         }
         Ok(ended)
     }
@@ -128,11 +122,8 @@ impl Daemon {
     pub(super) async fn finish(mut self) -> Result<(), Error> {
         systemd::stopping();
         info!("stopping");
-        for sensor in self.sensors.iter() {
-            // The task may have ended by itself.
-            let _ = sensor.commands.send(Command::Finish).await;
-        }
-        while self.tasks.join_next().await.is_some() {}
+        // A task that ended by itself is reported already.
+        let _ = self.stop((0..self.sensors.len()).collect()).await;
         self.hub.log().close();
         drop(self.listening);
         let farewell = async { while self.publishers.tasks.join_next().await.is_some() {} };

@@ -8,7 +8,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
@@ -20,8 +19,6 @@ use super::serial::Source;
 use super::{log, request};
 use crate::maybe;
 use hardnessd_core::event::{Event, Phase, Status, Tared};
-use hardnessd_core::frame::Stamp;
-use hardnessd_core::motion::{Point, StepBack};
 use hardnessd_core::pipeline::{Input, Pipeline, Refused};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
@@ -32,11 +29,9 @@ use hardnessd_core::verdict::Hrn;
 pub(crate) enum Command {
     /// Take another tare. The answer comes when the tare is taken, refused or abandoned.
     Tare(oneshot::Sender<Result<Tared, RetareError>>),
-    /// Repeat the controller's context in events. The answer comes when the pipeline has the
-    /// context.
-    Context(Option<Value>, oneshot::Sender<Result<(), String>>),
-    /// Take positions of the arm that the robot reports. The answer comes when they are taken.
-    Motion(Vec<Point>, oneshot::Sender<Result<(), StepBack>>),
+    /// Take a context of the controller, or positions of the arm. The answer comes when the pipeline has it, or
+    /// says why it is refused.
+    Take(Input, oneshot::Sender<Result<(), String>>),
     /// Write the last minute to a file. The answer is the path of the file.
     Blackbox(oneshot::Sender<Result<PathBuf, String>>),
     /// Judge with another model from the next rest on. Of the sensor's tables, only `[model]` may differ.
@@ -81,72 +76,51 @@ pub(crate) type Sensors = Arc<[SensorHandle]>;
 
 /// Serves one sensor until [`Command::Finish`]. Returns what is left of it.
 pub(crate) async fn serve(
-    core: SensorCore,
+    mut core: SensorCore,
     mut source: Source,
     hub: Hub,
     store: Store,
 ) -> SensorCore {
     // The client that waits for the outcome of a tare.
-    let mut taring = None;
-    let SensorCore {
-        mut pipeline,
-        mut recorder,
-        mut unjudged,
-        mut commands,
-    } = core;
-    let mut frames = pipeline.frame_counts().0;
+    let mut taring: Option<oneshot::Sender<_>> = None;
+    let mut frames = core.pipeline.frame_counts().0;
     // The model that judges from the next rest on.
     let mut next_model = None;
     loop {
-        if pipeline.is_at_rest()
+        if core.pipeline.is_at_rest()
             && let Some((sensor, hrn)) = next_model.take()
-            && let Some(judging) = pipeline.with_model(sensor, hrn)
+            && let Some(judging) = core.pipeline.with_model(sensor, hrn)
         {
-            pipeline = judging;
-            recorder.begin_anew(&pipeline, super::now());
+            core.pipeline = judging;
+            core.recorder.begin_anew(&core.pipeline, super::now());
         }
-        hub.log().report(state(&pipeline, unjudged));
+        hub.log().report(core.state());
         // A sensor that never pauses leaves the others their turns.
         tokio::task::yield_now().await;
-        let deadline = pipeline.deadline();
+        let deadline = core.pipeline.deadline();
         let events = tokio::select! {
             // The selection is not biased: the task must still obey `Finish` if the sensor never
             // pauses, and still read its port if commands never pause.
-            command = commands.recv() => match command {
+            command = core.commands.recv() => match command {
                 Some(Command::Tare(reply)) => {
-                    match take(&mut pipeline, &mut recorder, Input::Tare, super::now()) {
+                    match core.take(Input::Tare) {
                         Err(Refused::Tare(refusal)) => {
-                            log::tare(pipeline.sensor().name(), &Err(refusal));
+                            log::tare(core.name(), &Err(refusal));
                             let _ = reply.send(Err(refusal));
                         }
                         _ => taring = Some(reply),
                     }
                     continue;
                 }
-                Some(Command::Context(context, reply)) => {
-                    let checked = check_truth(context.as_ref(), pipeline.hrn().card().levels.len());
-                    if checked.is_ok() {
-                        log::context(pipeline.sensor().name(), context.as_ref());
-                        let input = Input::Context(context);
-                        taken(&mut pipeline, &mut recorder, input, super::now());
-                    }
-                    let _ = reply.send(checked);
-                    continue;
-                }
-                Some(Command::Motion(points, reply)) => {
-                    let input = Input::Motion(points);
-                    let taken = match take(&mut pipeline, &mut recorder, input, super::now()) {
-                        Err(Refused::Motion(step_back)) => Err(step_back),
-                        _ => Ok(()),
-                    };
-                    // Whoever sent them may not wait for the answer.
-                    if let Err(Err(refused)) = reply.send(taken) {
-                        log::motion_refused(pipeline.sensor().name(), refused);
+                Some(Command::Take(input, reply)) => {
+                    // Whoever sent it may not wait for the answer.
+                    if let Err(Err(reason)) = reply.send(core.take_asked(input)) {
+                        log::refused(core.name(), &reason);
                     }
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
-                    recorder.blackbox(reply);
+                    core.recorder.blackbox(reply);
                     continue;
                 }
                 Some(Command::Model(sensor, hrn)) => {
@@ -154,74 +128,76 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    let events = taken(&mut pipeline, &mut recorder, Input::Shutdown, super::now());
-                    hub.publish(events);
+                    hub.publish(core.taken(Input::Shutdown));
                     source.close().await;
-                    return SensorCore {
-                        pipeline,
-                        recorder,
-                        unjudged,
-                        commands,
-                    };
+                    return core;
                 }
             },
-            input = source.next() => {
-                taken(&mut pipeline, &mut recorder, input, super::now())
-            }
-            () = maybe::until(deadline.map(moment)) => {
-                taken(&mut pipeline, &mut recorder, Input::Tick, super::now())
-            }
+            input = source.next() => core.taken(input),
+            () = maybe::until(deadline.map(moment)) => core.taken(Input::Tick),
         };
-        if std::mem::replace(&mut frames, pipeline.frame_counts().0) < frames {
+        if std::mem::replace(&mut frames, core.pipeline.frame_counts().0) < frames {
             source.proven();
         }
-        answer(&mut pipeline, &mut taring);
-        for failed in pipeline.unjudged() {
+        if let Some(outcome) = core.pipeline.retared() {
+            log::tare(core.name(), &outcome);
+            // The client may have gone.
+            let _ = taring.take().map(|reply| reply.send(outcome));
+        }
+        for failed in core.pipeline.unjudged() {
             log::unjudged(&failed);
-            unjudged += 1;
+            core.unjudged += 1;
         }
         let is_final =
             |event: &Event| matches!(event, Event::Hardness(one) if one.phase == Phase::Final);
         let is_judged = events.iter().any(is_final);
         hub.publish(events);
         if is_judged {
-            store.save(&pipeline);
+            store.save(&core.pipeline);
         }
     }
 }
 
-/// Records an input, then passes it on to the pipeline.
-fn take(
-    pipeline: &mut Pipeline,
-    recorder: &mut SensorRecorder,
-    input: Input,
-    at: Stamp,
-) -> Result<Vec<Event>, Refused> {
-    recorder.note(pipeline, &input, at);
-    pipeline.take(input, at)
-}
+impl SensorCore {
+    pub(super) fn name(&self) -> &str {
+        self.pipeline.sensor().name()
+    }
 
-/// The same for an input that is never refused.
-fn taken(
-    pipeline: &mut Pipeline,
-    recorder: &mut SensorRecorder,
-    input: Input,
-    at: Stamp,
-) -> Vec<Event> {
-    let taken = take(pipeline, recorder, input, at);
-    taken.expect("only a tare and positions of the arm can be refused")
-}
+    /// Records an input, then passes it on to the pipeline.
+    fn take(&mut self, input: Input) -> Result<Vec<Event>, Refused> {
+        let now = super::now();
+        self.recorder.note(&self.pipeline, &input, now);
+        self.pipeline.take(input, now)
+    }
 
-/// Answers the client that requested a tare, when the outcome is known.
-fn answer(
-    pipeline: &mut Pipeline,
-    taring: &mut Option<oneshot::Sender<Result<Tared, RetareError>>>,
-) {
-    if let Some(outcome) = pipeline.retared() {
-        log::tare(pipeline.sensor().name(), &outcome);
-        if let Some(reply) = taring.take() {
-            // The client may have gone.
-            let _ = reply.send(outcome);
+    /// The same for an input that is never refused.
+    fn taken(&mut self, input: Input) -> Vec<Event> {
+        let taken = self.take(input);
+        taken.expect("only a tare and positions of the arm can be refused")
+    }
+
+    /// The same for an input that a client sent.
+    fn take_asked(&mut self, input: Input) -> Result<(), String> {
+        if let Input::Context(context) = &input {
+            let levels = self.pipeline.hrn().card().levels.len();
+            check_truth(context.as_ref(), levels)?;
+            log::context(self.name(), context.as_ref());
+        }
+        match self.take(input) {
+            Err(Refused::Motion(back)) => Err(format!("motion.at[{}]: {back}", back.index)),
+            _ => Ok(()),
+        }
+    }
+
+    /// The state of the sensor, which the hub has for everybody who asks.
+    pub(super) fn state(&self) -> SensorState {
+        let pipeline = &self.pipeline;
+        SensorState {
+            status: pipeline.status(super::now()),
+            last_frame: pipeline.last_frame().map(|frame| frame.mono),
+            contact_threshold_n: pipeline.sensor().thresholds().contact_threshold_n,
+            unjudged: self.unjudged,
+            motion: pipeline.motion_counts(),
         }
     }
 }
@@ -245,22 +221,6 @@ fn check_truth(context: Option<&Value>, levels: usize) -> Result<(), String> {
             Err(request::unusable("context.level", found, &expected))
         }
         None => Ok(()),
-    }
-}
-
-/// The state of the sensor, which the hub has for everybody who asks.
-pub(super) fn state(pipeline: &Pipeline, unjudged: u64) -> SensorState {
-    // The hub sets the time of the status when somebody asks.
-    let at = Stamp {
-        mono: Duration::ZERO,
-        wall: Timestamp::UNIX_EPOCH,
-    };
-    SensorState {
-        status: pipeline.status(at),
-        last_frame: pipeline.last_frame().map(|frame| frame.mono),
-        contact_threshold_n: pipeline.sensor().thresholds().contact_threshold_n,
-        unjudged,
-        motion: pipeline.motion_counts(),
     }
 }
 

@@ -17,7 +17,7 @@ use rustix::io::Errno;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
 
@@ -43,8 +43,10 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// that fails as soon as it is opened, or after a frame, never gets so far.
 const HELD: Duration = LONGEST_PAUSE;
 
-/// The most bytes read at once: the longest datagram.
-const BUFFER_BYTES: usize = 64 * 1024;
+/// The most bytes read at once from a line: more wait in the system.
+const BUFFER_BYTES: usize = 8 * 1024;
+/// The most bytes of a datagram. What is not read of it is lost.
+const DATAGRAM_BYTES: usize = 64 * 1024;
 /// The most inputs that wait for a sensor. When the queue is full, the port is not read.
 const INPUTS: usize = 16;
 
@@ -62,7 +64,7 @@ const OVERFLOW_PAUSE: Duration = Duration::from_millis(1);
 /// also at most a third of the stale time.
 const REPORT_EVERY: Duration = Duration::from_millis(25);
 
-/// How often the settings of a serial line are set again while its sensor is stale.
+/// How often the settings of a serial line are set again, if they are other ones.
 const RESTORE_EVERY: Duration = Duration::from_secs(1);
 
 /// What a port must know of a sensor.
@@ -114,8 +116,6 @@ pub(crate) struct Source {
     inputs: mpsc::Receiver<Input>,
     /// Tells the port that a frame of this sensor came.
     frames: mpsc::Sender<usize>,
-    /// Ends when the port is closed.
-    closed: watch::Receiver<()>,
 }
 
 impl Source {
@@ -137,9 +137,8 @@ impl Source {
 
     /// Gives the port up. It is closed when all its sensors have done so, and then this returns.
     pub(crate) async fn close(self) {
-        let mut closed = self.closed;
         drop(self.inputs);
-        let _ = closed.changed().await;
+        self.frames.closed().await;
     }
 }
 
@@ -163,13 +162,16 @@ pub(crate) fn start(sensors: &[&Sensor]) -> Vec<Source> {
 /// Starts the task of a port of sensors with these settings. Returns the source of each.
 pub(crate) fn open(port: &Port, baud: u32, sensors: &[Settings]) -> Vec<Source> {
     let (frames, frames_in) = mpsc::channel(INPUTS);
-    let (closing, closed) = watch::channel(());
     let (members, inputs): (Vec<_>, Vec<_>) = sensors.iter().map(|_| mpsc::channel(INPUTS)).unzip();
     let mut starts: Vec<&[u8]> = sensors.iter().map(|one| one.start.as_slice()).collect();
     starts.dedup();
     let stale_after = sensors.iter().map(|one| one.stale_after).max();
     let bytes_at_once = sensors.iter().map(|one| one.bytes_at_once).min();
     let bytes_per_s: f64 = sensors.iter().map(|one| one.bytes_per_s).sum();
+    let buffer_bytes = match port {
+        Port::Device(_) | Port::Tcp(_) => BUFFER_BYTES,
+        Port::Udp(_) => DATAGRAM_BYTES,
+    };
     let task = Task {
         port: port.clone(),
         baud,
@@ -182,7 +184,7 @@ pub(crate) fn open(port: &Port, baud: u32, sensors: &[Settings]) -> Vec<Source> 
         frames: frames_in,
         turns: Turns::new(sensors, Instant::now()),
         pause: FIRST_PAUSE,
-        buffer: vec![0; BUFFER_BYTES].into(),
+        buffer: vec![0; buffer_bytes].into(),
         allowance: Allowance::default(),
         skipped: 0,
         report_at: Instant::now(),
@@ -197,7 +199,6 @@ pub(crate) fn open(port: &Port, baud: u32, sensors: &[Settings]) -> Vec<Source> 
             () = task.serve() => {}
             () = given_up => {}
         }
-        drop(closing);
     });
     let sources = inputs
         .into_iter()
@@ -206,7 +207,6 @@ pub(crate) fn open(port: &Port, baud: u32, sensors: &[Settings]) -> Vec<Source> 
             index,
             inputs,
             frames: frames.clone(),
-            closed: closed.clone(),
         });
     sources.collect()
 }
@@ -275,7 +275,7 @@ impl Task {
         let is_tty = matches!(line, Line::Tty(..));
         // A telnet server at the other end would begin with its options.
         let mut is_new = !is_tty;
-        let mut restore_at = is_tty.then_some(since + RESTORE_EVERY);
+        let mut restore = tokio::time::interval(RESTORE_EVERY);
         // Frames of an earlier opening prove nothing.
         while self.frames.try_recv().is_ok() {}
         self.begin(&line).await;
@@ -289,7 +289,6 @@ impl Task {
                     if now.duration_since(since) >= HELD {
                         self.pause = FIRST_PAUSE;
                     }
-                    restore_at = restore_at.map(|_| now + self.stale_after);
                     if let Line::Udp(udp) = &mut line {
                         udp.proven();
                     }
@@ -302,9 +301,8 @@ impl Task {
                     }
                     continue;
                 }
-                () = maybe::until(restore_at) => {
+                _ = restore.tick(), if is_tty => {
                     line.restore();
-                    restore_at = Some(Instant::now() + RESTORE_EVERY);
                     continue;
                 }
             };
@@ -350,11 +348,11 @@ impl Task {
         }
         self.report_skipped().await;
         for piece in self.buffer[..bytes].chunks(self.bytes_at_once) {
-            for member in self.turns.audience() {
-                // A sensor that has ended takes nothing.
-                let _ = self.members[member]
-                    .send(Input::Bytes(piece.to_vec()))
-                    .await;
+            for (index, member) in self.members.iter().enumerate() {
+                if self.turns.hears(index) {
+                    // A sensor that has ended takes nothing.
+                    let _ = member.send(Input::Bytes(piece.to_vec())).await;
+                }
             }
         }
     }

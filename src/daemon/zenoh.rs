@@ -22,9 +22,9 @@ use zenoh::{Session, Wait};
 use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
-use super::relay::Worker;
+use super::relay::{Worker, each_event};
 use super::sensor::Sensors;
-use hardnessd_core::event::{self, Kind, Reply};
+use hardnessd_core::event::{self, Event, Kind, Reply};
 
 /// Opens a session as `settings` say, with keys below `tactile/SITE`.
 ///
@@ -125,15 +125,11 @@ impl Zenoh {
 
     fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>) {
         while let Some(lines) = lines.blocking_recv() {
-            lines.iter().for_each(|line| self.publish(line));
+            each_event("zenoh", &lines, |event, line| self.publish(event, line));
         }
     }
 
-    fn publish(&self, line: &Line) {
-        let Some(event) = &line.event else {
-            warn!(gap = text(line), "zenoh is too slow");
-            return;
-        };
+    fn publish(&self, event: &Event, line: &Line) {
         let key = key(&self.site, event.sensor(), event.kind());
         let Some(publisher) = self.publishers.get(&key) else {
             return;

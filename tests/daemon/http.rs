@@ -227,13 +227,6 @@ fn readiness_follows_the_sensors_and_liveness_does_not() {
     assert_eq!(forearm["last"]["phase"], "final");
     assert_eq!(forearm["contact_threshold_n"], 0.07);
     assert!(forearm["last_frame_age_s"].as_f64().unwrap() > 0.0);
-
-    // A page that opens now has the curve of the press that is over.
-    let history = get(address, "/api/history?sensor=forearm").json();
-    let forces = history["points"].as_array().unwrap().iter();
-    let forces = forces.map(|point| point[1].as_f64().unwrap());
-    assert!(forces.fold(0.0, f64::max) > 5.0, "{history}");
-    assert_eq!(get(address, "/api/history?sensor=palm").code, 404);
 }
 
 #[test]

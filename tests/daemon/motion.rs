@@ -35,7 +35,7 @@ fn positions_are_checked_counted_and_recorded() {
         message.starts_with("motion.at[1]: found a step of"),
         "{back}"
     );
-    let expected = "motion: this socket changes nothing: send it to the control socket";
+    let expected = "this socket changes nothing: send it to the control socket";
     let point = json!({"motion": {"sensor": "forearm", "at": [[now, 1]]}});
     bench.subscriber().is_refused(&point.to_string(), expected);
 

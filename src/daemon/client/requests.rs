@@ -15,6 +15,7 @@ use crate::daemon::request::motion::{self, Positions};
 use crate::daemon::request::{self, Context, Query, Request};
 use crate::daemon::sensor::{Command, SensorHandle, Sensors};
 use hardnessd_core::event::{Reply, Tared};
+use hardnessd_core::pipeline::Input;
 
 /// The reason a request is answered with an `error`, in words: nobody tells reasons apart.
 pub(in crate::daemon) type Refused = String;
@@ -65,29 +66,27 @@ pub(super) fn end(done: Result<Done, Refused>, id: Option<Value>) -> Arc<Line> {
 
 /// Carries out a request that changes something. Of all sockets, only the control socket may.
 async fn change(service: &Service, request: Request) -> Result<Done, Refused> {
-    let key = request.key();
     if service.access == Access::ReadOnly {
-        return Err(format!(
-            "{key}: this socket changes nothing: send it to the control socket"
-        ));
+        return Err("this socket changes nothing: send it to the control socket".to_owned());
     }
     let sensors = &service.sensors;
     let mut done = Done::default();
     match request {
         Request::Tare(sensor) => {
-            let tared = ask(sensors, key, &sensor, Command::Tare).await?;
+            let tared = ask(sensors, "tare", &sensor, Command::Tare).await?;
             done.tare = Some(tared.map_err(|error| format!("tare: {error}"))?);
         }
         Request::Context(context) => set_context(sensors, context).await?,
         Request::Motion(Positions { sensor, points }) => {
             // Read the clocks now, because the sensor's task may have other work to do first.
-            let placed = motion::placed(&points, now())?;
-            let command = |reply| Command::Motion(placed, reply);
-            let taken = ask(sensors, MOTION_KEY, &sensor, command).await?;
-            taken.map_err(|error| format!("motion.at[{}]: {error}", error.index))?;
+            let input = Input::Motion(motion::placed(&points, now())?);
+            ask(sensors, MOTION_KEY, &sensor, |reply| {
+                Command::Take(input, reply)
+            })
+            .await??;
         }
         Request::Blackbox(sensor) => {
-            let written = ask(sensors, key, &sensor, Command::Blackbox).await?;
+            let written = ask(sensors, "blackbox", &sensor, Command::Blackbox).await?;
             done.blackbox = Some(written.map_err(|error| format!("blackbox: {error}"))?);
         }
         // They change nothing.
@@ -101,7 +100,7 @@ pub(in crate::daemon) async fn set_context(
     sensors: &Sensors,
     Context { sensor, context }: Context,
 ) -> Result<(), Refused> {
-    let command = |reply| Command::Context(context, reply);
+    let command = |reply| Command::Take(Input::Context(context), reply);
     ask(sensors, "context.sensor", &sensor, command).await?
 }
 
@@ -113,7 +112,7 @@ pub(in crate::daemon) fn try_move_arm(
 ) -> Result<(), Refused> {
     let found = find(sensors, MOTION_KEY, sensor)?;
     let (reply, _) = oneshot::channel();
-    let command = Command::Motion(motion::placed(points, now())?, reply);
+    let command = Command::Take(Input::Motion(motion::placed(points, now())?), reply);
     let sent = found.commands.try_send(command);
     sent.map_err(|_| "they come too fast".to_owned())
 }

@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
-use tokio::net::unix;
+use tokio::net::{UnixStream, unix};
 
 use super::*;
 use crate::daemon::hub::tests::{hello, press, state};

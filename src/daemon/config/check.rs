@@ -1,11 +1,8 @@
 //! Checks that every value can be used, and that all of them can be used together.
 
-use std::collections::{HashMap, HashSet};
-
 use super::error::Problem;
 use super::{Config, Publish, Ros2, Unix, Zenoh};
 use crate::daemon::baud;
-use hardnessd_core::port::Port;
 use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::{range, verdict, wording};
 
@@ -81,19 +78,17 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
         let found = format!("{count} tables");
         return Err(Problem::found("sensor", found, "at most 1000"));
     }
-    let mut sensors = Vec::with_capacity(count);
-    let mut taken = Taken::default();
-    for (index, given) in config.sensors.iter().enumerate() {
+    let checked = |(index, given): (usize, &sensor::Settings)| {
         let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
         let sensor = sensor.and_then(|sensor| {
-            taken.add(given)?;
+            check_beside(given, &config.sensors[..index])?;
             let carried = baud::check(given, sensor.layout());
             carried.map_err(|problem| Problem::because("sensor.frame_rate_hz", problem))?;
             Ok(sensor)
         });
-        sensors.push(sensor.map_err(|problem| problem.of((index, given)))?);
-    }
-    Ok(sensors)
+        sensor.map_err(|problem| problem.of((index, given)))
+    };
+    config.sensors.iter().enumerate().map(checked).collect()
 }
 
 fn check_unix(unix: &Unix) -> Result<(), Problem> {
@@ -173,33 +168,21 @@ const MOST_ROBOT_CHARS: usize = 255;
 /// The highest domain ID. The ports of a higher domain would exceed 65535 (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN_ID: u16 = 232;
 
-/// The names and the ports that sensors have so far.
-#[derive(Default)]
-struct Taken<'a> {
-    names: HashSet<&'a str>,
-    /// The first sensor of each port.
-    ports: HashMap<&'a Port, &'a sensor::Settings>,
-}
-
-impl<'a> Taken<'a> {
-    /// Checks that a sensor has a name of its own, and that sensors that share a port agree on it.
-    fn add(&mut self, sensor: &'a sensor::Settings) -> Result<(), Problem> {
-        let name = &sensor.name;
-        if !self.names.insert(name) {
-            let problem = "two sensors have this name: give each a name of its own";
-            return Err(Problem::because("sensor.name", problem));
-        }
-        let first = *self.ports.entry(&sensor.port).or_insert(sensor);
-        let other = &first.name;
-        if first.baud != sensor.baud {
-            let problem = format!(
-                "found {}, expected {} as for {other:?}, which has the same port",
-                sensor.baud, first.baud
-            );
-            return Err(Problem::because("sensor.baud", problem));
-        }
-        Ok(())
+/// Checks that a sensor has a name of its own, and agrees with those before it on the port that they share.
+fn check_beside(sensor: &sensor::Settings, before: &[sensor::Settings]) -> Result<(), Problem> {
+    if before.iter().any(|other| other.name == sensor.name) {
+        let problem = "two sensors have this name: give each a name of its own";
+        return Err(Problem::because("sensor.name", problem));
     }
+    let mut at_its_port = before.iter().filter(|other| other.port == sensor.port);
+    let Some(first) = at_its_port.find(|first| first.baud != sensor.baud) else {
+        return Ok(());
+    };
+    let expected = format!(
+        "{} as for {:?}, which has the same port",
+        first.baud, first.name
+    );
+    Err(Problem::found("sensor.baud", sensor.baud, expected))
 }
 
 fn check_model(model: &verdict::Settings) -> Result<(), Problem> {

@@ -1,7 +1,7 @@
 //! The errors of a configuration. Each error names the file, the line and the key.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use toml::de::{DeTable, DeValue};
 
@@ -13,36 +13,41 @@ use hardnessd_core::sensor;
 /// dead.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
-/// The reason a configuration cannot be used. Each message names the file and the key, what was
+/// The reason a configuration cannot be used. The message names the file, the line and the key, what was
 /// found and what was expected.
 #[derive(Debug, thiserror::Error)]
-#[error("{}: {}{problem}", path.display(), line.map_or(String::new(), |line| format!("line {line}: ")))]
+#[error("{message}")]
 pub struct Error {
-    /// The path of the configuration.
-    path: PathBuf,
-    /// The line of the value, if it is written.
-    line: Option<usize>,
-    problem: Box<Problem>,
+    message: String,
+    code: u8,
 }
 
 impl Error {
     /// Makes the error of a problem in the configuration at `path`, which has this text.
     pub(super) fn at(path: &Path, text: &Text) -> impl FnOnce(Problem) -> Self {
         move |problem| {
-            let index = problem.sensor.as_ref().map_or(0, |(index, _)| *index);
-            let key = problem.key.as_deref();
+            let mut message = format!("{}: ", path.display());
+            if let Some(key) = problem.key {
+                let (index, name) = problem.sensor.unwrap_or_default();
+                if let Some(line) = text.line(index, &key) {
+                    message += &format!("line {line}: ");
+                }
+                message += &key;
+                // A name that cannot be one is not repeated.
+                if (1..=sensor::MOST_NAME_CHARS).contains(&name.len()) {
+                    message += &format!(" of {name:?}");
+                }
+                message += ": ";
+            }
             Self {
-                path: path.to_owned(),
-                line: key.and_then(|key| text.line(index, key)),
-                problem: problem.into(),
+                message: message + &problem.words,
+                code: problem.code,
             }
         }
     }
 }
 
 /// The problem of a configuration, which its caller names.
-#[derive(Debug, thiserror::Error)]
-#[error("{}{}{words}", key.as_deref().unwrap_or_default(), after_key(key.as_ref(), sensor.as_ref()))]
 pub(super) struct Problem {
     /// The key, if it is the problem of a value.
     key: Option<String>,
@@ -93,29 +98,17 @@ impl Problem {
 
     /// The same problem in the table of a sensor, if its key is there.
     pub(super) fn of(mut self, (index, sensor): (usize, &sensor::Settings)) -> Self {
-        if self
-            .key
-            .as_ref()
-            .is_some_and(|key| key.starts_with("sensor."))
-        {
+        let mut key = self.key.iter();
+        if key.any(|key| key.starts_with("sensor.")) {
             self.sensor = Some((index, sensor.name.clone()));
         }
         self
     }
 }
 
-/// The name of a sensor after a key. A name that cannot be one is not repeated.
-fn after_key(key: Option<&String>, sensor: Option<&(usize, String)>) -> String {
-    match (key, sensor) {
-        (None, _) => String::new(),
-        (_, Some((_, name))) if name.len() <= sensor::MOST_NAME_CHARS => format!(" of {name:?}: "),
-        _ => ": ".to_owned(),
-    }
-}
-
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
-        self.problem.code
+        self.code
     }
 }
 

@@ -11,7 +11,7 @@ use super::{Config, LevelTable};
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, Hrn, Level};
-use hardnessd_core::{npy, references, sensor, trial, wording};
+use hardnessd_core::{npy, range, references, sensor, trial, wording};
 
 /// The configuration at `path` with its paths resolved and its gains read, and its text.
 pub(super) fn load(path: &Path) -> Result<(Config, Text), Error> {
@@ -42,19 +42,15 @@ fn config(Text(text): &Text, path: &Path) -> Result<Config, Problem> {
         resolved.map_err(|problem| problem.of((index, sensor)))?;
     }
     let unix = &mut config.publish.unix;
+    let record = config.record.as_mut();
     let paths = [
-        ("model.path", Some(&mut config.model.path)),
-        ("publish.unix.path", Some(&mut unix.path)),
-        ("publish.unix.control_path", Some(&mut unix.control_path)),
-        (
-            "record.dir",
-            config.record.as_mut().map(|record| &mut record.dir),
-        ),
+        ("model.path", config.model.path.as_mut()),
+        ("publish.unix.path", unix.path.as_mut()),
+        ("publish.unix.control_path", unix.control_path.as_mut()),
+        ("record.dir", record.and_then(|record| record.dir.as_mut())),
     ];
     for (key, given) in paths {
-        if let Some(Some(given)) = given {
-            resolve(given, directory, key, "a path")?;
-        }
+        resolve(given, directory, key)?;
     }
     Ok(config)
 }
@@ -66,16 +62,9 @@ fn resolve_of(sensor: &mut sensor::Settings, directory: &Path) -> Result<(), Pro
             let expected = "a path under /dev/serial/by-id/";
             return Err(Problem::found("sensor.port", "none", expected));
         }
-        resolve(device, directory, "sensor.port", "the path of a device")?;
+        resolve(Some(device), directory, "sensor.port")?;
     }
-    if let Some(file) = &mut sensor.references {
-        resolve(
-            file,
-            directory,
-            "sensor.references",
-            "the path of an .npz file",
-        )?;
-    }
+    resolve(sensor.references.as_mut(), directory, "sensor.references")?;
     if let Some(given) = &mut sensor.calibration.gains {
         *given = gains(given, directory)?;
     }
@@ -84,12 +73,12 @@ fn resolve_of(sensor: &mut sensor::Settings, directory: &Path) -> Result<(), Pro
 
 /// Reads the gains from the file that the configuration names.
 fn gains(given: &Gains, directory: &Path) -> Result<Gains, Problem> {
-    let (key, expected) = ("sensor.calibration.gains", "the path of an .npy file");
+    let key = "sensor.calibration.gains";
     let Gains::File(file) = given else {
-        return Err(Problem::found(key, "a list", expected));
+        return Err(Problem::found(key, "a list", "the path of an .npy file"));
     };
     let mut file = file.clone();
-    resolve(&mut file, directory, key, expected)?;
+    resolve(Some(&mut file), directory, key)?;
     let bytes = read_named(key, &file, MAX_BYTES)?;
     let rows = npy::table(&mut bytes.as_slice()).map_err(|found| {
         let problem = format!("found {found}, expected f32 [rows, cols]");
@@ -117,19 +106,21 @@ fn unusable(key: &str, file: &Path, problem: impl Display) -> Problem {
     Problem::because(key, format_args!("{}: {problem}", file.display()))
 }
 
-/// Resolves a path of the configuration against its directory. An empty path is refused, because it
-/// would be the directory itself. A path with a hidden character is refused, because it would break
+/// Resolves a path of the configuration, if it is given, against its directory. An empty path is refused,
+/// because it would be the directory itself. A path with a hidden character is refused, because it would break
 /// or disguise a line of the log.
-fn resolve(
-    given: &mut PathBuf,
-    directory: &Path,
-    key: &str,
-    expected: &'static str,
-) -> Result<(), Problem> {
+fn resolve(given: Option<&mut PathBuf>, directory: &Path, key: &str) -> Result<(), Problem> {
+    let Some(given) = given else {
+        return Ok(());
+    };
     let text = given.to_string_lossy();
-    if text.is_empty() || !wording::is_plain(&text) {
-        return Err(Problem::found(key, format_args!("{text:?}"), expected));
-    }
+    let expected = "a path without control or bidirectional characters";
+    range::check(
+        key,
+        &text,
+        !text.is_empty() && wording::is_plain(&text),
+        expected,
+    )?;
     *given = directory.join(&*given);
     Ok(())
 }

@@ -28,20 +28,6 @@ settings! {
     }
 }
 
-impl Publish {
-    /// Settings that publish nothing.
-    pub fn none() -> Self {
-        let unix = Unix {
-            enabled: false,
-            ..Unix::default()
-        };
-        Self {
-            unix,
-            ..Self::default()
-        }
-    }
-}
-
 /// A table with the address to listen on. The default is `PORT` of this machine alone.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, bound = "")]

@@ -13,7 +13,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 
-use crate::daemon::hub::{SensorSnapshot, Snapshot};
+use crate::daemon::hub::{SensorSnapshot, Series, Snapshot};
 use crate::daemon::sensor::SensorState;
 use hardnessd_core::event::{self, LinkState};
 
@@ -37,13 +37,9 @@ pub(super) fn encode(now: &Snapshot) -> String {
     );
     links(&mut registry, now);
     presses(&mut registry, now);
+    let subscribers = [(Vec::new(), now.subscribers as f64)];
     let help = "Subscribers there are, on sockets and pages";
-    gauges(
-        &mut registry,
-        "subscribers",
-        help,
-        [(Vec::new(), now.subscribers as f64)],
-    );
+    gauges(&mut registry, "subscribers", help, subscribers);
     for (name, help, count) in [
         ("events", "Numbered events published", hello.seq),
         ("gaps", "Gaps that subscribers were told of", now.gaps),
@@ -93,11 +89,10 @@ fn gauges(
     registry.register(name, help, family);
 }
 
-/// The labels of a series of a sensor.
-fn of(sensor: &SensorSnapshot, more: &[(&'static str, &str)]) -> Labels {
-    let mut labels = vec![("sensor", sensor.state.status.sensor.clone())];
-    labels.extend(more.iter().map(|&(key, value)| (key, value.to_owned())));
-    labels
+/// These labels of a series, and that of the sensor.
+fn of(sensor: &SensorSnapshot, more: Labels) -> Labels {
+    let sensor = ("sensor", sensor.state.status.sensor.clone());
+    [vec![sensor], more].concat()
 }
 
 /// The series of the links.
@@ -132,64 +127,58 @@ fn links(registry: &mut Registry, now: &Snapshot) {
             |of| of.motion.1,
         ),
     ];
+    let sensors = || now.sensors.iter();
     for (name, help, count) in counts {
-        let series = now
-            .sensors
-            .iter()
-            .map(|one| (of(one, &[]), count(&one.state)));
+        let series = sensors().map(|one| (of(one, Vec::new()), count(&one.state)));
         counters(registry, name, help, series);
     }
-    let states = now.sensors.iter().flat_map(|one| {
+    let states = sensors().flat_map(|one| {
         LinkState::ALL.map(|known| {
             let holds = f64::from(u8::from(one.state.status.state == known));
-            (of(one, &[("state", &event::name(&known))]), holds)
+            (of(one, vec![("state", event::name(&known))]), holds)
         })
     });
     let help = "State of the link: 1 for the one that holds";
     gauges(registry, "link_state", help, states);
-    let rates = now
-        .sensors
-        .iter()
-        .filter_map(|one| Some((of(one, &[]), one.state.status.frame_rate_hz?)));
+    let rates =
+        sensors().filter_map(|one| Some((of(one, Vec::new()), one.state.status.frame_rate_hz?)));
     gauges(registry, "frame_rate_hertz", "Measured frame rate", rates);
-    let ages = now
-        .sensors
-        .iter()
-        .filter_map(|one| Some((of(one, &[]), one.last_frame_age?.as_secs_f64())));
+    let ages =
+        sensors().filter_map(|one| Some((of(one, Vec::new()), one.last_frame_age?.as_secs_f64())));
     let help = "Age of the last whole frame; absent before the first";
     gauges(registry, "last_frame_age_seconds", help, ages);
 }
 
 /// The series of presses and verdicts.
 fn presses(registry: &mut Registry, now: &Snapshot) {
-    let (mut presses, mut verdicts, mut rejected) = (Vec::new(), Vec::new(), Vec::new());
-    for one in &now.sensors {
-        let counts = &one.counts;
-        let with_phase = |phase: &str, key, value: &str| of(one, &[("phase", phase), (key, value)]);
-        let states = ["begin", "end", "aborted"].map(|state| (of(one, &[("state", state)]), 0));
-        presses.extend(states);
-        for phase in ["early", "final"] {
-            for level in &now.hello.model.levels {
-                let level = level.level.to_string();
-                verdicts.push((with_phase(phase, "level", &level), 0));
-            }
-            let reasons = ["low_confidence", "low_force", "ambiguous"];
-            rejected.extend(reasons.map(|reason| (with_phase(phase, "reason", reason), 0)));
+    for (name, help) in [
+        ("presses", "Presses, by what became of them"),
+        ("verdicts", "Verdicts, by level"),
+        ("verdicts_rejected", "Verdicts withheld, by reason"),
+    ] {
+        let series = now.sensors.iter().flat_map(|one| {
+            let zeros = first_series(now).into_iter().map(|series| (series, 0));
+            let counted = one.counts.0.clone().into_iter();
+            let all = zeros.chain(counted);
+            let named = all.filter(|((metric, _), _)| *metric == name);
+            named.map(|((_, labels), count)| (of(one, labels), count))
+        });
+        counters(registry, name, help, series);
+    }
+}
+
+/// The series of a sensor that are there before its first press. A reload may replace the model of some levels.
+fn first_series(now: &Snapshot) -> Vec<Series> {
+    let press = |state: &str| ("presses", vec![("state", state.to_owned())]);
+    let mut all = Vec::from(["begin", "end", "aborted"].map(press));
+    for phase in ["early", "final"] {
+        let with = |key, value| vec![("phase", phase.to_owned()), (key, value)];
+        for level in &now.hello.model.levels {
+            all.push(("verdicts", with("level", level.level.to_string())));
         }
-        // A reload may have replaced the model of some levels.
-        for ([phase, level], &count) in &counts.verdicts {
-            verdicts.push((with_phase(phase, "level", level), count));
-        }
-        for ([phase, reason], &count) in &counts.rejected {
-            rejected.push((with_phase(phase, "reason", reason), count));
-        }
-        for (state, &count) in &counts.presses {
-            presses.push((of(one, &[("state", state)]), count));
+        for reason in ["low_confidence", "low_force", "ambiguous"] {
+            all.push(("verdicts_rejected", with("reason", reason.to_owned())));
         }
     }
-    let help = "Presses, by what became of them";
-    counters(registry, "presses", help, presses);
-    counters(registry, "verdicts", "Verdicts, by level", verdicts);
-    let help = "Verdicts withheld, by reason";
-    counters(registry, "verdicts_rejected", help, rejected);
+    all
 }

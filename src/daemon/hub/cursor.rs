@@ -1,7 +1,9 @@
 //! A subscriber's place in the log, and which events it gets from there on.
 
 use std::collections::{BTreeSet, VecDeque};
-use std::task::Waker;
+use std::sync::Arc;
+
+use tokio::sync::Notify;
 
 use super::log::Entry;
 use crate::daemon::request::{Policy, Subscription};
@@ -51,20 +53,21 @@ pub(super) struct Cursor {
     allowed: u64,
     /// The events that it has missed since its last line. `None`: an unknown number.
     lost: Option<u64>,
-    pub(super) waker: Option<Waker>,
+    /// Wakes the subscriber, because there may be lines for it.
+    pub(super) changed: Arc<Notify>,
 }
 
 impl Cursor {
-    /// A cursor at the end of the log.
-    pub(super) fn new(wanted: &Subscription, end: Place) -> Self {
+    /// A cursor at the end of the log, which wants nothing yet.
+    pub(super) fn new(end: Place) -> Self {
         Self {
-            wanted: wanted.kinds.clone(),
-            policy: wanted.policy,
+            wanted: BTreeSet::new(),
+            policy: Policy::default(),
             next: end,
             had: BTreeSet::new(),
             allowed: QUEUE,
             lost: Some(0),
-            waker: None,
+            changed: Arc::default(),
         }
     }
 

@@ -1,13 +1,12 @@
 //! The log: the last numbered events, the frames that somebody still reads, and the state of each
 //! sensor. It has no clock and no channel.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, OnceLock};
-use std::task::Waker;
 use std::time::Duration;
 
 use super::cursor::{Cursor, Place, QUEUE};
-use super::history::History;
 use super::tally::Counts;
 use crate::daemon::record::EventRecorder;
 use crate::daemon::request::{Since, Subscription};
@@ -89,7 +88,6 @@ struct OfSensor {
     state: Option<SensorState>,
     /// The last final verdict.
     last: Option<Arc<Line>>,
-    history: History,
     counts: Counts,
     /// The numbers of its numbered events and of its frames in the log so far.
     entries: [u64; 2],
@@ -201,24 +199,18 @@ impl Log {
             event.number(self.hello.seq);
         }
         self.recorder.event(&event);
-        let sensor: Arc<str> = event.sensor().into();
-        let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
-        match &event {
-            Event::Frame(frame) => of_sensor.history.add(frame),
-            event => {
-                of_sensor.counts.count(event);
-                log::event(event);
-            }
-        }
         if kind == Kind::Frame && !self.wants_frames() {
             return;
         }
+        let sensor: Arc<str> = event.sensor().into();
+        let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
+        of_sensor.counts.count(&event);
+        log::event(&event);
         let is_final = matches!(&event, Event::Hardness(verdict) if verdict.phase == Phase::Final);
         let line = Line::of_event(event);
         if kind != Kind::Frame {
             line.json();
         }
-        let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
         if is_final {
             of_sensor.last = Some(Arc::clone(&line));
         }
@@ -238,13 +230,10 @@ impl Log {
             line,
         });
         self.forget();
-        for subscriber in self.subscribers.values_mut() {
-            if subscriber.wants_kind(kind)
-                && let Some(waker) = subscriber.waker.take()
-            {
-                waker.wake();
-            }
-        }
+        let interested = self.subscribers.values();
+        interested
+            .filter(|subscriber| subscriber.wants_kind(kind))
+            .for_each(|subscriber| subscriber.changed.notify_one());
     }
 
     fn wants_frames(&self) -> bool {
@@ -313,9 +302,8 @@ impl Log {
     pub(crate) fn close(&mut self) {
         self.is_closed = true;
         self.recorder = EventRecorder::default();
-        let wakers = self.subscribers.values_mut();
-        for waker in wakers.filter_map(|one| one.waker.take()) {
-            waker.wake();
+        for subscriber in self.subscribers.values() {
+            subscriber.changed.notify_one();
         }
     }
 
@@ -354,20 +342,11 @@ impl Log {
         }
     }
 
-    /// The force and contact area of a sensor in the last two minutes. `None` if there is no such
-    /// sensor.
-    pub(super) fn history(&self, sensor: &str) -> Option<History> {
-        Some(self.sensors.get(sensor)?.history.clone())
-    }
-
     /// Adds a subscriber, and returns its number. The error is for the subscriber.
     pub(super) fn join(&mut self, wanted: &Subscription) -> Result<u64, String> {
         let id = self.joined + 1;
-        self.subscribers.insert(id, Cursor::new(wanted, self.end));
-        if let Err(refused) = self.subscribe(id, wanted) {
-            self.leave(id);
-            return Err(refused);
-        }
+        self.subscribers.insert(id, Cursor::new(self.end));
+        self.subscribe(id, wanted).inspect_err(|_| self.leave(id))?;
         self.joined = id;
         Ok(id)
     }
@@ -377,19 +356,12 @@ impl Log {
         self.forget();
     }
 
-    /// Wakes the subscriber when there may be lines for it.
-    pub(super) fn wait(&mut self, id: u64, waker: &Waker) {
-        if let Some(subscriber) = self.subscribers.get_mut(&id) {
-            subscriber.waker = Some(waker.clone());
-        }
-    }
-
     /// Changes what a subscriber gets from now on.
     pub(super) fn subscribe(&mut self, id: u64, wanted: &Subscription) -> Result<(), String> {
-        let from = match &wanted.since {
-            Some(since) => Some(self.place_of(since, wanted)?),
-            None => None,
-        };
+        let since = wanted.since.as_ref();
+        let from = since
+            .map(|since| self.place_of(since, wanted))
+            .transpose()?;
         if let Some(cursor) = self.subscribers.get_mut(&id) {
             cursor.change(wanted, self.end);
             if let Some((place, lost)) = from {
@@ -448,19 +420,14 @@ impl Log {
             held.range(first..)
         });
         let mut entries: Vec<&Entry> = ahead.filter(|entry| cursor.wants(entry)).collect();
-        entries.sort_unstable_by_key(|entry| entry.before.total());
-        // By kind and sensor, where only the newest counts.
-        let mut newest: BTreeMap<(Kind, &str), u64> = BTreeMap::new();
-        for entry in entries
-            .iter()
-            .filter(|entry| cursor.wants_newest(entry.kind))
-        {
-            newest.insert((entry.kind, &entry.sensor), entry.before.total());
-        }
-        let is_superseded = |entry: &Entry| {
-            let newest = newest.get(&(entry.kind, &*entry.sensor));
-            newest.is_some_and(|&newest| newest > entry.before.total())
-        };
+        // The newest first, because it replaces those of its kind and sensor where only the newest counts.
+        entries.sort_unstable_by_key(|entry| Reverse(entry.before.total()));
+        let mut newer = BTreeSet::new();
+        entries.retain(|entry| {
+            !cursor.wants_newest(entry.kind)
+                || newer.insert((entry.kind, &*entry.sensor))
+                || cursor.has_had(entry)
+        });
         let mut announced = |cursor: &mut Cursor| {
             let lost = cursor.take_lost()?;
             self.gaps += 1;
@@ -469,13 +436,12 @@ impl Log {
         };
         let mut lines = Vec::new();
         let mut bytes = 0;
-        for entry in entries {
+        for entry in entries.into_iter().rev() {
             if cursor.has_had(entry) {
                 cursor.pass(entry);
                 continue;
             }
-            let is_dropped = || cursor.drops(entry, end) && !is_in_share(&self.sensors, entry);
-            if is_superseded(entry) || is_dropped() {
+            if cursor.drops(entry, end) && !is_in_share(&self.sensors, entry) {
                 continue;
             }
             cursor.pass(entry);

@@ -1,10 +1,8 @@
 //! A subscriber's handle to its cursor in the log.
 
-use std::future::poll_fn;
 use std::sync::Arc;
-use std::task::Poll;
 
-use tokio::sync::mpsc;
+use tokio::sync::{Notify, mpsc};
 
 use super::{Hub, Line};
 use crate::daemon::request::Subscription;
@@ -14,29 +12,27 @@ use crate::daemon::request::Subscription;
 pub(crate) struct Subscriber {
     hub: Hub,
     id: u64,
+    changed: Arc<Notify>,
 }
 
 impl Subscriber {
-    pub(super) fn new(hub: Hub, id: u64) -> Self {
-        Self { hub, id }
+    pub(super) fn new(hub: Hub, id: u64, changed: Arc<Notify>) -> Self {
+        Self { hub, id, changed }
     }
 
     /// The next lines, as soon as there are any. `None` if the log is closed and there are no more.
     /// Cancelling the wait loses nothing.
     pub(crate) async fn next(&mut self) -> Option<Vec<Arc<Line>>> {
-        poll_fn(|context| {
-            let mut log = self.hub.log();
-            let lines = log.read(self.id);
+        loop {
+            let lines = self.hub.log().read(self.id);
             if !lines.is_empty() {
-                Poll::Ready(Some(lines))
-            } else if log.is_closed() {
-                Poll::Ready(None)
-            } else {
-                log.wait(self.id, context.waker());
-                Poll::Pending
+                return Some(lines);
             }
-        })
-        .await
+            if self.hub.log().is_closed() {
+                return None;
+            }
+            self.changed.notified().await;
+        }
     }
 
     /// Changes the subscription from now on.

@@ -4,32 +4,30 @@ use std::collections::BTreeMap;
 
 use hardnessd_core::event::{Event, name};
 
-/// Counts of one sensor, by the labels of the metrics.
+/// The name of a metric, and the labels of one of its series.
+pub(crate) type Series = (&'static str, Vec<(&'static str, String)>);
+
+/// Counts of one sensor.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Counts {
-    /// By state.
-    pub(crate) presses: BTreeMap<String, u64>,
-    /// By phase and level.
-    pub(crate) verdicts: BTreeMap<[String; 2], u64>,
-    /// By phase and reason.
-    pub(crate) rejected: BTreeMap<[String; 2], u64>,
-}
+pub(crate) struct Counts(pub(crate) BTreeMap<Series, u64>);
 
 impl Counts {
     /// Counts an event of this sensor.
     pub(super) fn count(&mut self, event: &Event) {
-        match event {
-            Event::Status(_) | Event::Frame(_) => {}
-            Event::Press(press) => *self.presses.entry(name(&press.state)).or_default() += 1,
+        let series = match event {
+            Event::Status(_) | Event::Frame(_) => return,
+            Event::Press(press) => ("presses", vec![("state", name(&press.state))]),
             Event::Hardness(verdict) => {
-                let phase = name(&verdict.phase);
-                if let Some(reason) = &verdict.rejected {
-                    *self.rejected.entry([phase, name(reason)]).or_default() += 1;
-                } else if let Some(level) = verdict.level {
-                    let labels = [phase, level.to_string()];
-                    *self.verdicts.entry(labels).or_default() += 1;
+                let phase = ("phase", name(&verdict.phase));
+                match (&verdict.rejected, verdict.level) {
+                    (Some(reason), _) => {
+                        ("verdicts_rejected", vec![phase, ("reason", name(reason))])
+                    }
+                    (None, Some(level)) => ("verdicts", vec![phase, ("level", level.to_string())]),
+                    (None, None) => return,
                 }
             }
-        }
+        };
+        *self.0.entry(series).or_default() += 1;
     }
 }

@@ -7,8 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::daemon::config;
+use hardnessd_core::frame::Stamp;
 use hardnessd_core::part;
-use hardnessd_core::recording::{self, About, Writer};
+use hardnessd_core::recording::{self, About, Entry, Writer};
 
 /// The bytes of a megabyte in the decimal sense, as in the sizes of disks.
 pub(super) const MB: u64 = 1_000_000;
@@ -30,6 +31,31 @@ impl Open {
             file,
             writer,
             since: Instant::now(),
+        })
+    }
+
+    /// Makes a new file in `directory` that holds these entries, each after the index of its sensor. Its name has
+    /// `what` and the time. If this fails, no file is left, because the disk may be full.
+    pub(super) fn filled<'a>(
+        directory: &Path,
+        what: &str,
+        about: &About,
+        entries: impl Iterator<Item = (usize, &'a (Stamp, Entry))>,
+    ) -> Result<Self, recording::Error> {
+        let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
+        let path = directory.join(format!("{what}-{now}.mcap"));
+        let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
+        let fill = || {
+            let mut open = Self::new(path.clone(), file, about)?;
+            for (sensor, (at, entry)) in entries {
+                open.writer.entry(sensor, *at, entry)?;
+            }
+            open.writer.flush()?;
+            Ok(open)
+        };
+        fill().inspect_err(|_| {
+            // A file that cannot be removed stays.
+            let _ = fs::remove_file(&path);
         })
     }
 
@@ -62,14 +88,6 @@ pub(super) fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
         return Err(io::Error::new(ErrorKind::StorageFull, message));
     }
     Ok(())
-}
-
-/// Makes a new file, whose name has `what` and the time.
-pub(super) fn create(directory: &Path, what: &str) -> io::Result<(PathBuf, File)> {
-    let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
-    let path = directory.join(format!("{what}-{now}.mcap"));
-    let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
-    Ok((path, file))
 }
 
 fn named(path: &Path, error: &io::Error) -> io::Error {

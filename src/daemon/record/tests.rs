@@ -5,13 +5,11 @@ use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
 use hardnessd_core::test_support;
 
-fn recorder(sender: Sender<Job>) -> (SensorRecorder, Pipeline) {
+/// A recorder with room for so many bytes.
+fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) {
     let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
     let active = Active {
-        jobs: Jobs {
-            sender,
-            load: Arc::default(),
-        },
+        jobs: Jobs::new(sender, bytes),
         index: 0,
         labels: Labels::new(),
         noted: None,
@@ -31,11 +29,10 @@ fn at(ms: u64) -> Stamp {
 
 /// The count of the recorded inputs, and the numbers of those that follow a gap without a state
 /// between.
-fn drained(inbox: &Receiver<Job>, load: &Load) -> (usize, Vec<u64>) {
+fn drained(inbox: &Receiver<Queued>) -> (usize, Vec<u64>) {
     let (mut count, mut bad) = (0, Vec::new());
     let mut next = None;
-    for job in inbox {
-        load.bytes.fetch_sub(job.weight(), Ordering::Relaxed);
+    for (job, _) in inbox {
         match job {
             Job::Entry {
                 entry: Entry::State(_),
@@ -61,13 +58,10 @@ fn drained(inbox: &Receiver<Job>, load: &Load) -> (usize, Vec<u64>) {
 #[test]
 fn after_a_gap_comes_a_state() {
     let (sender, inbox) = channel();
-    let (mut recorder, pipeline) = recorder(sender);
     // There is room for a state and some inputs, so the first ones are recorded in any order of the threads.
-    let load = recorder.0.as_ref().unwrap().jobs.load.clone();
-    load.bytes
-        .store(QUEUED_BYTES - (160 << 10), Ordering::Relaxed);
+    let (mut recorder, pipeline) = recorder(sender, 160 << 10);
     // The reader takes jobs as fast as they come, so room appears at any moment.
-    let reader = std::thread::spawn(move || drained(&inbox, &load));
+    let reader = std::thread::spawn(move || drained(&inbox));
     for number in 0..20_000_u64 {
         let bytes = number.to_le_bytes().to_vec();
         recorder.note(&pipeline, &Input::Bytes(bytes), at(number));
@@ -81,7 +75,7 @@ fn after_a_gap_comes_a_state() {
 #[test]
 fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
     let (sender, inbox) = channel();
-    let (mut recorder, _) = recorder(sender);
+    let (mut recorder, _) = recorder(sender, QUEUED_BYTES);
     let pressed = test_support::of_a_press(|_| {}, None, false);
     let entries = hardnessd_core::recording::Reader::new(&pressed.0[..]);
     let inputs: Vec<_> = entries
@@ -112,7 +106,7 @@ fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
     drop(recorder);
     let entries: Vec<Entry> = inbox
         .into_iter()
-        .map(|job| match job {
+        .map(|(job, _)| match job {
             Job::Entry { entry, .. } => entry,
             other => panic!("{other:?}"),
         })
@@ -134,13 +128,13 @@ fn a_flood_is_bounded_in_the_black_box() {
     ] {
         assert!(Entry::Input(flood.to_owned()).weight() > 60_000);
         let (sender, inbox) = channel();
-        let (mut recorder, pipeline) = recorder(sender);
+        let (mut recorder, pipeline) = recorder(sender, usize::MAX >> 3);
         for _ in 0..1000 {
             recorder.note(&pipeline, &flood, at(0));
         }
         drop(recorder);
         let mut ring = Ring::default();
-        for job in inbox {
+        for (job, _) in inbox {
             let Job::Entry { at, entry, .. } = job else {
                 panic!("{job:?}");
             };

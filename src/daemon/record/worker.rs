@@ -4,15 +4,15 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::file::{MB, Open, create, has_room};
-use super::{Job, Load, Progress, Target};
+use super::file::{MB, Open, has_room};
+use super::{Job, Progress, Queued, Target};
 use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
@@ -34,16 +34,15 @@ const ROOM_SHARE: u64 = 16;
 pub(super) struct Worker {
     target: Target,
     about: About,
-    load: Arc<Load>,
+    /// The number of entries that had no room in the queue and are not reported yet.
+    dropped: Arc<AtomicU64>,
     /// When dropped entries are reported next.
     report_at: Instant,
     sensors: Vec<Watched>,
     open: Option<Open>,
-    /// The time of the next try, if no file is open in the directory.
-    retry_at: Instant,
-    /// Whether the recording is paused because the disk failed or is full.
-    paused: bool,
-    /// Sent when there is no more to record.
+    /// Until when the recording is paused, because the disk failed or is full.
+    paused: Option<Instant>,
+    /// Dropped when there is no more to record.
     stop: Option<oneshot::Sender<()>>,
     gone: Option<Error>,
     progress: Progress,
@@ -63,18 +62,17 @@ impl Worker {
     pub(super) fn new(
         target: Target,
         about: About,
-        load: Arc<Load>,
+        dropped: Arc<AtomicU64>,
         stop: oneshot::Sender<()>,
     ) -> Self {
         Self {
             sensors: about.sensors.iter().map(|_| Watched::default()).collect(),
             target,
             about,
-            load,
+            dropped,
             report_at: Instant::now(),
             open: None,
-            retry_at: Instant::now(),
-            paused: false,
+            paused: None,
             stop: Some(stop),
             gone: None,
             progress: Progress::default(),
@@ -83,7 +81,7 @@ impl Worker {
 
     /// Writes until the queue has no sender left. A failed write is an error only of a recording
     /// into one file, which ends there. In a directory, it is a line in the log.
-    pub(super) fn run(mut self, jobs: &Receiver<Job>) -> Result<(), Error> {
+    pub(super) fn run(mut self, jobs: &Receiver<Queued>) -> Result<(), Error> {
         if let Target::File { path, file, .. } = &self.target {
             let file = file.try_clone().map_err(recording::Error::from);
             let opened = file.and_then(|file| Open::new(path.clone(), file, &self.about));
@@ -95,10 +93,9 @@ impl Worker {
         loop {
             let left = flush.saturating_duration_since(Instant::now());
             match jobs.recv_timeout(left) {
-                Ok(job) => {
-                    let bytes = job.weight();
-                    self.load.bytes.fetch_sub(bytes, Ordering::Relaxed);
-                    unchecked += bytes;
+                Ok((job, room)) => {
+                    unchecked += room.num_permits();
+                    drop(room);
                     let done = self.take(job);
                     self.settle(done)?;
                 }
@@ -134,19 +131,15 @@ impl Worker {
             return;
         }
         self.gone.get_or_insert(gone);
-        if let Some(stop) = self.stop.take() {
-            // The daemon may be stopping already.
-            let _ = stop.send(());
-        }
+        self.stop = None;
     }
 
     /// Pauses the recording, and logs the reason once.
     fn pause(&mut self, reason: &recording::Error) {
-        if !self.paused {
+        if self.paused.is_none() {
             warn!(%reason, "recording stopped; it goes on when there is room");
         }
-        self.paused = true;
-        self.retry_at = Instant::now() + RETRY_AFTER;
+        self.paused = Some(Instant::now() + RETRY_AFTER);
     }
 
     fn end(mut self) -> Result<(), Error> {
@@ -278,17 +271,14 @@ impl Worker {
         let written = || -> Result<PathBuf, recording::Error> {
             let directory = settings.dir();
             has_room(&directory, settings.keep_free_mb * MB)?;
-            let (path, file) = create(&directory, &format!("blackbox-{name}"))?;
-            // The path must be absolute, because the client may run in another directory.
-            let path = std::path::absolute(&path).unwrap_or(path);
-            or_removed(&path, || {
-                let mut open = Open::new(path.clone(), file, &about)?;
-                for (at, entry) in ring.all() {
-                    open.writer.entry(0, *at, entry)?;
-                }
-                open.finish()
-            })?;
-            Ok(path)
+            let entries = ring.all().map(|entry| (0, entry));
+            let open = Open::filled(&directory, &format!("blackbox-{name}"), &about, entries)?;
+            let path = open.path.clone();
+            // A full disk keeps no half file.
+            open.finish()
+                .inspect_err(|_| drop(fs::remove_file(&path)))?;
+            // The client may run in another directory.
+            Ok(std::path::absolute(&path).unwrap_or(path))
         };
         let path = written().map_err(|error| error.to_string())?;
         log::limited(
@@ -299,18 +289,18 @@ impl Worker {
     }
 
     /// Says how many entries had no room, if there are any.
-    fn report_dropped(&self) -> bool {
-        let count = self.load.dropped.swap(0, Ordering::Relaxed);
+    fn report_dropped(&mut self) {
+        let count = self.dropped.swap(0, Ordering::Relaxed);
         if count > 0 {
             warn!(count, "no room in the recorder's queue: entries dropped");
+            self.report_at = Instant::now() + REPORT_EVERY;
         }
-        count > 0
     }
 
     /// Does the work that is due every [`FLUSH_EVERY`].
     fn look_after(&mut self) -> Result<(), recording::Error> {
-        if Instant::now() >= self.report_at && self.report_dropped() {
-            self.report_at = Instant::now() + REPORT_EVERY;
+        if Instant::now() >= self.report_at {
+            self.report_dropped();
         }
         if let Some(open) = &mut self.open {
             open.writer.flush()?;
@@ -330,15 +320,14 @@ impl Worker {
         if let Some(Err(error)) = self.open.take_if(must_end).map(Open::finish) {
             return self.pause(&error);
         }
-        if self.open.is_some() || Instant::now() < self.retry_at {
+        if self.open.is_some() || self.paused.is_some_and(|until| Instant::now() < until) {
             return;
         }
         // After a pause, a little more room is required, so that the recording does not begin and
         // end again and again.
-        let floor = if self.paused {
-            floor + floor / ROOM_SHARE
-        } else {
-            floor
+        let floor = match self.paused {
+            Some(_) => floor + floor / ROOM_SHARE,
+            None => floor,
         };
         let begun = has_room(&directory, floor)
             .map_err(recording::Error::from)
@@ -347,7 +336,7 @@ impl Worker {
             Ok(open) => {
                 info!(path = %open.path.display(), "recording");
                 self.open = Some(open);
-                self.paused = false;
+                self.paused = None;
             }
             Err(error) => self.pause(&error),
         }
@@ -355,39 +344,23 @@ impl Worker {
 
     /// Begins a file with every sensor's last state at rest and the entries since.
     fn next_file(&mut self, directory: &Path) -> Result<Open, recording::Error> {
-        let (path, file) = create(directory, "hardnessd")?;
-        or_removed(&path, || {
-            let mut open = Open::new(path.clone(), file, &self.about)?;
-            for (index, sensor) in self.sensors.iter_mut().enumerate() {
-                for (at, entry) in sensor.ring.latest() {
-                    open.writer.entry(index, *at, entry)?;
-                }
-                sensor.is_begun = sensor.ring.latest().next().is_some();
-                if sensor.ring.is_waiting() {
-                    let sensor = self.about.sensors[index].name();
-                    info!(
-                        sensor,
-                        "recording begins at its next rest: its press is too long to repeat"
-                    );
-                }
+        let sensors = self.sensors.iter().enumerate();
+        let entries = sensors
+            .flat_map(|(index, sensor)| sensor.ring.latest().map(move |entry| (index, entry)));
+        let open = Open::filled(directory, "hardnessd", &self.about, entries)?;
+        for (sensor, about) in self.sensors.iter_mut().zip(&self.about.sensors) {
+            sensor.is_begun = sensor.ring.latest().next().is_some();
+            if sensor.ring.is_waiting() {
+                info!(
+                    sensor = about.name(),
+                    "recording begins at its next rest: its press is too long to repeat"
+                );
             }
-            open.writer.flush()?;
-            Ok(open)
-        })
+        }
+        Ok(open)
     }
 }
 
 fn cannot_write(path: &Path, error: &recording::Error) -> Error {
     Error::Io(format!("{}: {error}", path.display()))
-}
-
-/// Fills the new file at `path`. If this fails, removes the file, because the disk may be full.
-fn or_removed<T>(
-    path: &Path,
-    fill: impl FnOnce() -> Result<T, recording::Error>,
-) -> Result<T, recording::Error> {
-    fill().inspect_err(|_| {
-        // A file that cannot be removed stays.
-        let _ = fs::remove_file(path);
-    })
 }

@@ -22,28 +22,8 @@ pub(crate) struct Positions {
     pub(crate) points: Vec<ReportedPoint>,
 }
 
-/// A point as it was reported.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(from = "(ReportedTime, f64)")]
-pub(crate) struct ReportedPoint {
-    at: ReportedTime,
-    mm: f64,
-}
-
-impl From<(ReportedTime, f64)> for ReportedPoint {
-    fn from((at, mm): (ReportedTime, f64)) -> Self {
-        Self { at, mm }
-    }
-}
-
-impl ReportedPoint {
-    /// A point at a calendar time. `None` if the position is too far from its zero.
-    #[cfg(feature = "ros2")]
-    pub(crate) fn at_time(at: Timestamp, mm: f64) -> Option<Self> {
-        let at = ReportedTime::Wall(at);
-        (mm.abs() <= FURTHEST_MM).then_some(Self { at, mm })
-    }
-}
+/// A point as it was reported: its time, and its millimetres.
+pub(crate) type ReportedPoint = (ReportedTime, f64);
 
 /// The time of a point, by one of two clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -51,7 +31,7 @@ impl ReportedPoint {
     untagged,
     expecting = "expected nanoseconds of CLOCK_MONOTONIC, or an RFC 3339 time"
 )]
-enum ReportedTime {
+pub(crate) enum ReportedTime {
     /// CLOCK_MONOTONIC of this machine, in nanoseconds.
     Mono(i64),
     /// The same from a language that writes large numbers as 1.2e15.
@@ -74,8 +54,7 @@ pub(crate) fn placed(reported: &[ReportedPoint], now: Stamp) -> Result<Vec<Point
         ));
     }
     let mono_now = now.mono.as_nanos() as i128;
-    let point = |(index, reported): (usize, &ReportedPoint)| {
-        let ReportedPoint { at, mm } = *reported;
+    let point = |(index, &(at, mm)): (usize, &ReportedPoint)| {
         if mm.is_nan() || mm.abs() > FURTHEST_MM {
             let expected = format!("expected at most {FURTHEST_MM} from zero");
             return Err(format!("motion.at[{index}]: found {mm:?} mm, {expected}"));

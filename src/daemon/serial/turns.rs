@@ -13,19 +13,18 @@ use super::Settings;
 /// How long an answer may take, beside its bytes on the line.
 const MOST_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// After a request without an answer, no module that is silent is asked for this time. So silent modules
-/// take less than half of the time of the others, however many they are.
-const REST: Duration = Duration::from_millis(150);
-/// The module itself rests twice as long after each further request without an answer, up to this time. So
+/// After a request without an answer, no module that is silent is asked for this share of the time in which
+/// the answer may come. So silent modules take less than half of the time of the others, however many they are.
+const REST: f64 = 1.5;
+/// The module itself rests twice as long after each further request without an answer, up to this share. So
 /// one that is silent for good takes a twentieth.
-const LONGEST_REST: Duration = Duration::from_secs(2);
+const LONGEST_REST: f64 = 20.0;
 
-/// A request, and the sensors that read its answer.
+/// A request, whose answer is for the sensors that have it.
 #[derive(Debug)]
 struct Ask {
     request: Vec<u8>,
     every: Duration,
-    members: Vec<usize>,
     due: Instant,
     timeout: Duration,
     /// The last rest, if the last request had no answer.
@@ -36,9 +35,8 @@ struct Ask {
 #[derive(Debug)]
 pub(super) struct Turns {
     asks: Vec<Ask>,
-    /// All sensors at the port, and those that do not ask.
-    members: Vec<usize>,
-    listeners: Vec<usize>,
+    /// The request of each sensor, if it has one.
+    of_sensors: Vec<Option<usize>>,
     /// Who is asked, and until when the answer may come.
     asking: Option<(usize, Instant)>,
     /// The last one that was asked, for bytes that come late.
@@ -50,31 +48,27 @@ pub(super) struct Turns {
 impl Turns {
     pub(super) fn new(sensors: &[Settings], now: Instant) -> Self {
         let mut asks: Vec<Ask> = Vec::new();
-        let mut listeners = Vec::new();
-        for (index, sensor) in sensors.iter().enumerate() {
-            let Some((request, every)) = &sensor.request else {
-                listeners.push(index);
-                continue;
-            };
-            match asks.iter_mut().find(|ask| ask.request == *request) {
-                Some(ask) => {
-                    ask.every = ask.every.min(*every);
-                    ask.members.push(index);
-                }
-                None => asks.push(Ask {
+        let mut of = |sensor: &Settings| {
+            let (request, every) = sensor.request.as_ref()?;
+            let timeout = sensor.on_the_line + MOST_TIMEOUT;
+            let known = asks.iter().position(|ask| ask.request == *request);
+            if let Some(ask) = known.map(|index| &mut asks[index]) {
+                ask.every = ask.every.min(*every);
+                ask.timeout = ask.timeout.max(timeout);
+            } else {
+                asks.push(Ask {
                     request: request.clone(),
                     every: *every,
-                    members: vec![index],
                     due: now,
-                    timeout: sensor.on_the_line + MOST_TIMEOUT,
+                    timeout,
                     rest: None,
-                }),
+                });
             }
-        }
+            Some(known.unwrap_or(asks.len() - 1))
+        };
         Self {
+            of_sensors: sensors.iter().map(&mut of).collect(),
             asks,
-            members: (0..sensors.len()).collect(),
-            listeners,
             asking: None,
             last: None,
             may_try: now,
@@ -83,16 +77,14 @@ impl Turns {
 
     /// The port was opened: all are asked anew.
     pub(super) fn begin(&mut self, now: Instant) {
-        self.asking = None;
+        (self.asking, self.last) = (None, None);
         self.asks.iter_mut().for_each(|ask| ask.due = now);
     }
 
-    /// The sensors that bytes are for.
-    pub(super) fn audience(&self) -> Vec<usize> {
-        match self.last {
-            Some(asked) => [self.asks[asked].members.as_slice(), &self.listeners].concat(),
-            None => self.members.clone(),
-        }
+    /// Whether bytes are for this sensor: it was asked last, or it sends by itself.
+    pub(super) fn hears(&self, sensor: usize) -> bool {
+        let own = self.of_sensors[sensor];
+        own.is_none() || self.last.is_none() || own == self.last
     }
 
     /// When there is something to do.
@@ -109,13 +101,12 @@ impl Turns {
 
     /// A frame of a sensor came.
     pub(super) fn answered(&mut self, sensor: usize, now: Instant) {
-        let mut asks = self.asks.iter_mut().enumerate();
-        let Some((index, ask)) = asks.find(|(_, ask)| ask.members.contains(&sensor)) else {
+        let Some(index) = self.of_sensors[sensor] else {
             return;
         };
         // Whoever sends is not silent, even if it is late.
-        if ask.rest.take().is_some() {
-            ask.due = now;
+        if self.asks[index].rest.take().is_some() {
+            self.asks[index].due = now;
         }
         self.asking = self.asking.filter(|(asked, _)| *asked != index);
     }
@@ -124,10 +115,12 @@ impl Turns {
     pub(super) fn ask(&mut self, now: Instant) -> Option<&[u8]> {
         if let Some((silent, _)) = self.asking.take() {
             let ask = &mut self.asks[silent];
-            let rest = ask.rest.map_or(REST, |rest| LONGEST_REST.min(2 * rest));
+            let least = ask.timeout.mul_f64(REST);
+            let most = ask.timeout.mul_f64(LONGEST_REST);
+            let rest = ask.rest.map_or(least, |rest| most.min(2 * rest));
             ask.rest = Some(rest);
             ask.due = now + rest;
-            self.may_try = now + REST;
+            self.may_try = now + least;
         }
         let (may_try, is_alone) = (self.may_try <= now, self.asks.len() == 1);
         let asks = self.asks.iter_mut().enumerate();
