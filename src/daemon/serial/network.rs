@@ -113,17 +113,18 @@ impl Udp {
     ) -> io::Result<Received> {
         let (bytes, address) = self.socket.recv_from(buffer).await?;
         Ok(match &mut self.sender {
-            Some(sender)
-                if sender.address == address
-                    && (sender.sends_frames || sender.is_new(stale_after)) =>
-            {
+            Some(sender) if sender.address == address => {
+                if !sender.sends_frames && !sender.is_new(stale_after) {
+                    // Nobody else came since its time was over.
+                    sender.last = Instant::now();
+                }
                 // An empty datagram is no end.
                 match bytes {
                     0 => Received::Ignored,
                     bytes => Received::Bytes(bytes),
                 }
             }
-            Some(sender) if sender.address != address && sender.is_new(stale_after) => {
+            Some(sender) if sender.is_new(stale_after) => {
                 if !std::mem::replace(&mut sender.reported, true) {
                     log::other_sender(sender.address, address);
                 }
