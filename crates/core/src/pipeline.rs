@@ -95,6 +95,11 @@ impl Pipeline {
     pub fn new(sensor: Sensor, hrn: Arc<Hrn>, clock: Clock) -> Self {
         let sensor = Arc::new(sensor);
         let layout = sensor.layout();
+        let mut decoder = Decoder::new(layout.clone());
+        if clock == Clock::FrameRate {
+            // A file of bytes begins with a frame, as if after a pause.
+            decoder.settle();
+        }
         Self {
             tare: Tare::new(
                 sensor.calibration(),
@@ -103,7 +108,7 @@ impl Pipeline {
             ),
             tracker: PressTracker::new(sensor.thresholds().clone()),
             judge: Judge::new(Arc::clone(&sensor), hrn),
-            decoder: Decoder::new(layout.clone()),
+            decoder,
             link: Link::new(),
             unreleased: None,
             frames: 0,

@@ -189,3 +189,20 @@ fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
         [format!("{silent})"), format!("{silent}, {bytes}")]
     );
 }
+
+#[test]
+fn a_file_of_bare_frames_begins_with_a_frame() {
+    let mut described = Description::default();
+    described.sensor.frame.preset = Some(Preset::None);
+    described.sensor.frame.rows = Some(4);
+    described.sensor.frame.cols = Some(4);
+    let sensor = Sensor::new(described).unwrap();
+    let frames = |clock, bytes: &[u8]| {
+        let mut pipeline = Pipeline::new(sensor.clone(), test_support::hrn(), clock);
+        pipeline.push(bytes, at(0));
+        pipeline.status(at(0)).frames
+    };
+    assert_eq!(frames(Clock::FrameRate, &[7; 16 * 9]), 9);
+    // On a line, only a pause or a request shows where a frame begins.
+    assert_eq!(frames(Clock::Arrival, &[7; 16 * 9]), 0);
+}
