@@ -24,12 +24,16 @@ impl Subscriber {
     /// Cancelling the wait loses nothing.
     pub(crate) async fn next(&mut self) -> Option<Vec<Arc<Line>>> {
         loop {
-            let lines = self.hub.log().read(self.id);
-            if !lines.is_empty() {
-                return Some(lines);
-            }
-            if self.hub.log().is_closed() {
-                return None;
+            {
+                // One lock, so that no line comes between the two questions.
+                let mut log = self.hub.log();
+                let lines = log.read(self.id);
+                if !lines.is_empty() {
+                    return Some(lines);
+                }
+                if log.is_closed() {
+                    return None;
+                }
             }
             self.changed.notified().await;
         }
