@@ -6,21 +6,18 @@
 
 mod world;
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-
 use serde::{Deserialize, Serialize};
 
 pub use self::world::{BroadSensors, SensorDesigns};
-use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
-use super::material::Split;
+use super::dataset::HIGHEST_FORCE_N;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose, Shapes};
-use super::press::{Bench, Specimen, draw_patch};
+use super::press::{Bench, Specimen};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::DatasetSettings;
 use super::solved::SolvedPress;
-use super::subject::{Subject, shared_out, units};
+use super::subject::{Labels, Subject, harder_and_harder, shared_out, units};
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
@@ -91,22 +88,14 @@ pub struct LabelledCourse {
     pub best: usize,
     /// The arm's stiffness as reported.
     pub arm_n_per_mm: f32,
-    /// Hardness level, 1 to 4; 0 for a reference.
-    pub level: u8,
-    /// Number of the object, unique in the data set.
-    pub object: u32,
-    /// Index of the material among [`crate::material_names`].
-    pub material: u8,
     /// Greatest force on the sensor.
     pub force_n: f32,
-    /// The split of the object.
-    pub split: Split,
-    /// The object's Shore hardness.
-    pub shore: f32,
     /// Number of the sensor, unique in the data set. 0 if the sensors have no numbers.
     pub sensor: u32,
-    /// The rigid piece that was pressed. Its level is 0 and its Shore hardness NaN.
+    /// The rigid piece that was pressed.
     pub reference: Option<Reference>,
+    /// The labels.
+    pub labels: Labels,
 }
 
 /// One frame of a press.
@@ -205,39 +194,37 @@ impl Plan {
     }
 }
 
-/// Simulates the presses on `threads` threads, and calls `progress` with the number done. The
-/// presses are in the order of [`super::dataset`], and the result is the same for any number of
-/// threads. A press that never begins, however hard it is made, is left out.
+/// Simulates the presses on `threads` threads, and calls `progress` with the number of objects done and of all, or
+/// of covers if each sensor is another one. The presses are in the order of [`super::dataset`], and the result is
+/// the same for any number of threads. A press is `None` if no sensor sees it, however hard it is made, or if it
+/// lasts too long.
 pub fn courses(
     settings: &CourseSettings,
     threads: usize,
-    progress: impl Fn(usize) + Sync,
-) -> Vec<LabelledCourse> {
+    progress: impl Fn(usize, usize) + Sync,
+) -> Vec<Option<LabelledCourse>> {
     if let Some(sensors) = &settings.sensors {
         return world::courses(settings, sensors, threads, progress);
     }
-    let done = AtomicUsize::new(0);
     let of = &settings.objects;
-    shared_out(
-        &units(of),
-        threads,
-        Bench::default,
-        |bench, object, unit| {
-            let subject = Subject::draw(of, unit, settings.flat_share());
-            let mut made = Vec::with_capacity(of.presses as usize);
-            for press in 0..u64::from(of.presses) {
-                let mut paired = subject.geometry.child(3).child(press);
-                let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
-                let read = subject.pressed(bench, &plan, press, |solved, force_n, noise| {
-                    let press = plan.read(&subject.sensor, solved, force_n, plan.reading, noise)?;
-                    Some(subject.labelled(object, press))
-                });
-                made.extend(read);
-                progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-            }
-            made
-        },
-    )
+    shared_out(&units(of), threads, progress, |&unit| {
+        let mut bench = Bench::default();
+        let subject = Subject::draw(of, unit, settings.flat_share());
+        let pressed = |press| {
+            let mut paired = subject.geometry.child(3).child(press);
+            let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
+            subject.pressed(&mut bench, &plan, press, |solved, noise| {
+                plan.read(
+                    &subject.sensor,
+                    solved,
+                    plan.reading,
+                    noise,
+                    subject.labels(),
+                )
+            })
+        };
+        (0..u64::from(of.presses)).map(pressed).collect()
+    })
 }
 
 impl Subject {
@@ -248,76 +235,49 @@ impl Subject {
         bench: &mut Bench,
         plan: &Plan,
         press: u64,
-        read: impl Fn(&SolvedPress, f64, &mut Stream) -> Option<T>,
+        read: impl Fn(&SolvedPress, &mut Stream) -> Option<T>,
     ) -> Option<T> {
-        let body = &self.body;
-        let face = self.object[plan.posture];
-        let mut roughness = self.draws.child(1).child(plan.posture as u64);
-        let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
-        let pose = Pose::draw(&face, &mut plan.pose.clone());
-        let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+        let face = self.face(plan.posture);
+        let specimen = self.specimen(&face, &Pose::draw(&face.0, &mut plan.pose.clone()));
         let noise = self.draws.child(4).child(press);
-        let mut force_n = plan.travel_mm.map_or(plan.force_n, |travel_mm| {
+        let force_n = plan.travel_mm.map_or(plan.force_n, |travel_mm| {
             bench.force_at(&specimen, plan.arm, travel_mm, plan.highest_force_n)
         });
-        for attempt in 0..TRIES as u64 {
+        for (attempt, force_n) in (0..).zip(harder_and_harder(force_n)) {
             let mut noise = noise.child(attempt);
             // One solve shows whether the press is worth the forty solves of a course.
-            if self.is_felt(bench, &specimen, plan, force_n, &mut noise) {
-                let solved = SolvedPress::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
-                // A material that flows faster than the arm follows never bears the force, and its
-                // press would last minutes.
-                if solved.duration_s() > LONGEST_S {
-                    return None;
-                }
-                if let Some(read) = read(&solved, force_n, &mut noise) {
-                    return Some(read);
-                }
+            let ramp_s = force_n / plan.arm.n_per_mm / plan.arm.speed_mm_s;
+            let (window, pressure, _) = bench.press(&specimen, force_n, ramp_s, 0.0);
+            let forces = self.sensor.grid.taxel_forces(&pressure, window);
+            let raw = self.sensor.read(&forces, 1.0, &mut noise);
+            if !begins_press(&self.sensor.felt(&raw)) {
+                continue;
             }
-            force_n *= HARDER;
+            let solved = SolvedPress::new(bench, &specimen, plan.arm, force_n, plan.hold_s);
+            // A material that flows faster than the arm follows never bears the force, and its
+            // press would last minutes.
+            if solved.duration_s() > LONGEST_S {
+                return None;
+            }
+            let read = read(&solved, &mut noise);
+            if read.is_some() {
+                return read;
+            }
         }
         None
-    }
-
-    fn is_felt(
-        &self,
-        bench: &mut Bench,
-        specimen: &Specimen,
-        plan: &Plan,
-        force_n: f64,
-        noise: &mut Stream,
-    ) -> bool {
-        let ramp_s = force_n / plan.arm.n_per_mm / plan.arm.speed_mm_s;
-        let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, 0.0);
-        let forces = self.sensor.grid.taxel_forces(&pressure, window);
-        begins_press(&self.sensor.felt(&self.sensor.read(&forces, 1.0, noise)))
-    }
-
-    /// A press with the labels of this object.
-    pub(super) fn labelled(&self, object: u32, press: LabelledCourse) -> LabelledCourse {
-        LabelledCourse {
-            level: self.body.level,
-            object,
-            material: self.body.material,
-            split: self.split,
-            shore: self.body.shore as f32,
-            ..press
-        }
     }
 }
 
 impl Plan {
-    /// A press of this plan as a sensor reads it, without labels. `None` unless the daemon sees one press
-    /// in it.
+    /// A press of this plan as a sensor reads it. `None` unless the daemon sees one press in it.
     pub(super) fn read(
         &self,
         sensor: &Sensor,
         solved: &SolvedPress,
-        force_n: f64,
-        reading: Reading,
+        Reading { period_s, phase }: Reading,
         noise: &mut Stream,
+        labels: Labels,
     ) -> Option<LabelledCourse> {
-        let Reading { period_s, phase } = reading;
         // The frames from a few before the touch to the release, with their times after the touch.
         let gain = sensor.press_gain(noise);
         let felt = solved.felt(&sensor.grid);
@@ -354,14 +314,10 @@ impl Plan {
                 .binary_search(&best)
                 .expect("thinning keeps the best frame"),
             arm_n_per_mm: self.arm.n_per_mm as f32,
-            level: 0,
-            object: 0,
-            material: 0,
-            force_n: force_n as f32,
-            split: Split::Train,
-            shore: f32::NAN,
+            force_n: solved.force_n as f32,
             sensor: 0,
             reference: None,
+            labels,
         })
     }
 }

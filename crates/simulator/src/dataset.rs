@@ -3,43 +3,25 @@
 //! The objects are distributed over threads. Every number depends on the seed and on the object,
 //! never on the thread.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-use super::material::Split;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose};
-use super::press::{Bench, Specimen, draw_patch};
+use super::press::{Bench, Specimen};
 use super::sensor::Film;
 use super::settings::DatasetSettings;
-use super::subject::{Subject, shared_out, units};
+use super::subject::{Labels, Subject, harder_and_harder, shared_out, units};
 use super::tracked::begins_press;
 use crate::random::Stream;
 use hardnessd_core::frame::Frame;
-
-impl DatasetSettings {
-    /// The number of samples that the settings make.
-    pub fn samples(&self) -> u64 {
-        units(self).len() as u64 * u64::from(self.presses)
-    }
-}
 
 /// The sample of one press, with its labels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledSample {
     /// The frame after an ideal tare, in newtons.
     pub frame: Frame,
-    /// Hardness level, 1 to 4.
-    pub level: u8,
-    /// Number of the object, unique in the data set.
-    pub object: u32,
-    /// Index of the material among [`super::material_names`].
-    pub material: u8,
     /// Force on the sensor.
     pub force_n: f32,
-    /// The split of the material, and so of the object.
-    pub split: Split,
-    /// The object's Shore hardness.
-    pub shore: f32,
+    /// The labels.
+    pub labels: Labels,
 }
 
 pub(super) const HIGHEST_FORCE_N: f64 = 25.0;
@@ -47,95 +29,73 @@ const FORCES: usize = 8;
 /// The number of presses of an object in each posture under each nominal force.
 const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
-/// Factor on the force when a press was too light to begin.
-pub(super) const HARDER: f64 = 1.5;
-/// The number of attempts at a press before it is taken as it is.
-pub(super) const TRIES: usize = 8;
 
-/// Simulates the data set on `threads` threads, and calls `progress` with the number of samples
-/// done. Samples are in the order of materials (as in [`super::Material::ALL`]) or of split and
+/// Simulates the data set on `threads` threads, and calls `progress` with the number of objects
+/// done and of all. Samples are in the order of materials (as in [`super::Material::ALL`]) or of split and
 /// group, then of object, posture and press. The result is the same for any number of threads.
 pub fn dataset(
     settings: &DatasetSettings,
     threads: usize,
-    progress: impl Fn(usize) + Sync,
+    progress: impl Fn(usize, usize) + Sync,
 ) -> Vec<LabelledSample> {
-    let done = AtomicUsize::new(0);
-    let bench = Bench::default;
-    shared_out(&units(settings), threads, bench, |bench, object, unit| {
-        let progress = || progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-        Subject::draw(settings, unit, 0.0).press_all(settings, object, bench, progress)
+    shared_out(&units(settings), threads, progress, |&unit| {
+        Subject::draw(settings, unit, 0.0).press_all(settings)
     })
 }
 
 impl Subject {
     /// Makes every press of the object. Postures are the outer loop, so that a face's texture and
     /// kernels serve all its presses.
-    fn press_all(
-        &self,
-        settings: &DatasetSettings,
-        object: u32,
-        bench: &mut Bench,
-        progress: impl Fn(),
-    ) -> Vec<LabelledSample> {
-        let body = &self.body;
+    fn press_all(&self, settings: &DatasetSettings) -> Vec<LabelledSample> {
+        let mut bench = Bench::default();
         let presses = press_numbers(settings.presses as usize);
         let mut samples = Vec::with_capacity(presses.len());
         for posture in 0..POSTURES {
-            let face = self.object[posture];
-            let mut roughness = self.draws.child(1).child(posture as u64);
-            let patch = draw_patch(&body.substance.texture, face.roughness, &mut roughness);
-            let of_posture = |press: &usize| press % POSTURES == posture;
-            for press in presses.iter().copied().filter(of_posture) {
+            let face = self.face(posture);
+            let of_posture = |press: &&usize| *press % POSTURES == posture;
+            for &press in presses.iter().filter(of_posture) {
                 let mut paired = self.geometry.child(1).child(press as u64);
-                let pose = Pose::draw(&face, &mut paired);
+                let pose = Pose::draw(&face.0, &mut paired);
                 let nominal = nominal_force_n(settings.lowest_force_n, press / POSTURES % FORCES);
                 let force_n = nominal * (1.0 + FORCE_JITTER * paired.normal()).clamp(0.7, 1.3);
                 let hold_s = paired.range(0.8, 1.5);
-                let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
+                let specimen = self.specimen(&face, &pose);
                 let mut noise = self.draws.child(2).child(press as u64);
-                let (force_n, frame) = self.press(bench, &specimen, force_n, hold_s, &mut noise);
-                samples.push(LabelledSample {
-                    frame,
-                    level: body.level,
-                    object,
-                    material: body.material,
-                    force_n: force_n as f32,
-                    split: self.split,
-                    shore: body.shore as f32,
-                });
-                progress();
+                samples.push(self.press(&mut bench, &specimen, force_n, hold_s, &mut noise));
             }
         }
         samples
     }
 
-    /// Makes one press, harder each time until it reaches the begin area. Returns the force and the
-    /// frame.
+    /// Makes one press, harder each time until it reaches the begin area.
     fn press(
         &self,
         bench: &mut Bench,
         specimen: &Specimen,
-        mut force_n: f64,
+        force_n: f64,
         hold_s: f64,
         noise: &mut Stream,
-    ) -> (f64, Frame) {
-        let arm = Arm::default();
+    ) -> LabelledSample {
+        let (arm, design) = (Arm::default(), &self.sensor.design);
         let gain = self.sensor.press_gain(noise);
-        let mut tries = 0;
-        loop {
+        let mut last = None;
+        for force_n in harder_and_harder(force_n) {
             let ramp_s = (force_n / arm.n_per_mm + TYPICAL_DEPTH_MM) / arm.speed_mm_s;
             let (window, pressure, _) = bench.press(specimen, force_n, ramp_s, hold_s);
             let forces = self.sensor.grid.taxel_forces(&pressure, window);
-            let design = &self.sensor.design;
             let crept = Film::new(design).advance(design, &forces, hold_s + 0.5 * ramp_s);
             let frame = self.sensor.felt(&self.sensor.read(&crept, gain, noise));
-            tries += 1;
-            if begins_press(&frame) || tries == TRIES {
-                return (force_n, frame);
+            let is_felt = begins_press(&frame);
+            last = Some(LabelledSample {
+                frame,
+                force_n: force_n as f32,
+                labels: self.labels(),
+            });
+            if is_felt {
+                break;
             }
-            force_n *= HARDER;
         }
+        last.expect("a press is tried")
     }
 }
 
@@ -168,7 +128,7 @@ fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::level::level_of;
-    use super::super::material::Material;
+    use super::super::material::{Material, Split};
     use super::super::object::Shapes;
     use super::super::settings::Materials;
     use super::*;
@@ -216,9 +176,11 @@ mod tests {
     fn other_samples_are_another_version() {
         // The sums are the newtons of all frames of each material. If they change on purpose,
         // change them and raise VERSION. Differences of a few counts may come from another machine.
-        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        let samples = dataset(&small(Shapes::Matched), 2, |_, _| ());
         let newtons = Material::ALL.map(|material| {
-            let own = samples.iter().filter(|s| s.material == material.index());
+            let own = samples
+                .iter()
+                .filter(|s| s.labels.material == material.index());
             own.map(|sample| sample.frame.force_n()).sum::<f64>()
         });
         let expected = [
@@ -234,16 +196,16 @@ mod tests {
 
     #[test]
     fn samples_are_labelled_as_their_material() {
-        let samples = dataset(&small(Shapes::Matched), 2, |_| ());
+        let samples = dataset(&small(Shapes::Matched), 2, |_, _| ());
         assert_eq!(samples.len(), (4 + 4 * 2) * 9);
         for sample in &samples {
-            let material = Material::ALL[usize::from(sample.material)];
+            let material = Material::ALL[usize::from(sample.labels.material)];
             assert_eq!(
-                (sample.level, sample.split),
+                (sample.labels.level, sample.labels.split),
                 (material.level(), material.split())
             );
             let shore = material.properties().shore;
-            assert!((shore.low..=shore.high).contains(&f64::from(sample.shore)));
+            assert!((shore.low..=shore.high).contains(&f64::from(sample.labels.shore)));
             assert!(begins_press(&sample.frame));
             // Gains, crosstalk and film creep add force, and thresholds remove it.
             let ratio = sample.frame.force_n() / f64::from(sample.force_n);
@@ -252,7 +214,8 @@ mod tests {
                 "{material:?}: reads {ratio} of the force"
             );
         }
-        let objects: std::collections::BTreeSet<u32> = samples.iter().map(|s| s.object).collect();
+        let objects: std::collections::BTreeSet<u32> =
+            samples.iter().map(|s| s.labels.object).collect();
         assert_eq!(objects.len(), 12);
     }
 
@@ -262,14 +225,20 @@ mod tests {
             materials: Materials::Broad,
             ..small(Shapes::Wide)
         };
-        let samples = dataset(&settings, 3, |_| ());
+        let samples = dataset(&settings, 3, |_, _| ());
         assert_eq!(samples.len(), 4 * (1 + 2) * 9);
         for sample in &samples {
-            assert_eq!(sample.level, level_of(f64::from(sample.shore)));
-            assert!((8..12).contains(&sample.material));
+            assert_eq!(
+                sample.labels.level,
+                level_of(f64::from(sample.labels.shore))
+            );
+            assert!((8..12).contains(&sample.labels.material));
             assert!(begins_press(&sample.frame), "{sample:?}");
             // Training objects are 0 to 3.
-            assert_eq!(sample.split == Split::Train, sample.object < 4);
+            assert_eq!(
+                sample.labels.split == Split::Train,
+                sample.labels.object < 4
+            );
         }
     }
 
@@ -281,8 +250,12 @@ mod tests {
             presses: 2,
             ..small(Shapes::Wide)
         };
-        let samples = dataset(&settings, 2, |_| ());
+        let samples = dataset(&settings, 2, |_, _| ());
         assert_eq!(samples.len(), 8 * 2);
-        assert!(samples.iter().all(|sample| sample.split == Split::Test));
+        assert!(
+            samples
+                .iter()
+                .all(|sample| sample.labels.split == Split::Test)
+        );
     }
 }

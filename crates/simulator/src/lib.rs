@@ -47,6 +47,7 @@ pub use rigid::Reference;
 pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};
 pub use sequence::{Pressed, REST_S, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{DatasetSettings, Materials};
+pub use subject::Labels;
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
 

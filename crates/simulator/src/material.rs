@@ -82,16 +82,7 @@ impl Material {
 
     /// The name used in commands and files.
     pub fn name(self) -> &'static str {
-        match self {
-            Material::Wood => "wood",
-            Material::Rubber => "rubber",
-            Material::Plasticine => "plasticine",
-            Material::Sponge => "sponge",
-            Material::HardPlastic => "hard-plastic",
-            Material::Foam => "foam",
-            Material::SoftCandy => "soft-candy",
-            Material::YogaMat => "yoga-mat",
-        }
+        self.properties().name
     }
 
     /// Index in [`Material::ALL`].
@@ -107,6 +98,7 @@ impl Material {
 /// The properties of a material: a row of the table.
 #[derive(Debug)]
 pub(super) struct Properties {
+    name: &'static str,
     pub(super) shore: Shore,
     /// Young's modulus in MPa, from the durometer, at the lowest, the mean and the highest hardness.
     /// Wood and hard plastic are too hard for the Shore OO scale to tell them apart.
@@ -192,13 +184,17 @@ const fn creep(j: f64, tau_s: f64) -> Creep {
     Creep { j, tau_s }
 }
 
-const fn texture(
-    rms_um: f64,
-    shortest_mm: f64,
-    longest_mm: f64,
-    hurst: f64,
-    anisotropy: f64,
-) -> Texture {
+const fn foam(exponent: f64, plateau: f64, strain: f64) -> Law {
+    Law::Foam {
+        exponent,
+        plateau,
+        strain,
+    }
+}
+
+/// A texture of these numbers: rms in um, shortest and longest wavelength in mm, Hurst exponent, anisotropy.
+const fn texture(numbers: [f64; 5]) -> Texture {
+    let [rms_um, shortest_mm, longest_mm, hurst, anisotropy] = numbers;
     Texture {
         rms_um,
         shortest_mm,
@@ -208,101 +204,95 @@ const fn texture(
     }
 }
 
+/// A row of the table: the name, the hardness with the moduli that belong to it, and the substance.
+const fn row(
+    name: &'static str,
+    (shore, young_mpa): (Shore, [f64; 3]),
+    nu: f64,
+    law: Law,
+    creep: [Creep; 2],
+    texture: Texture,
+) -> Properties {
+    Properties {
+        name,
+        shore,
+        young_mpa,
+        substance: Substance {
+            nu,
+            law,
+            creep,
+            texture,
+        },
+    }
+}
+
 const PROPERTIES: [Properties; 8] = [
-    Properties {
-        shore: shore(87.0, 1.5, 82.0, 95.0),
-        young_mpa: [600.0; 3],
-        substance: Substance {
-            nu: 0.35,
-            law: Law::Solid,
-            creep: [creep(0.03, 1.0), Creep::NONE],
-            texture: texture(55.0, 2.5, 18.0, 0.4, 2.0),
+    row(
+        "wood",
+        (shore(87.0, 1.5, 82.0, 95.0), [600.0; 3]),
+        0.35,
+        Law::Solid,
+        [creep(0.03, 1.0), Creep::NONE],
+        texture([55.0, 2.5, 18.0, 0.4, 2.0]),
+    ),
+    row(
+        "rubber",
+        (shore(66.0, 1.2, 61.5, 69.5), [0.4673, 0.5870, 0.7126]),
+        0.49,
+        Law::Solid,
+        [creep(0.10, 0.3), creep(0.06, 3.0)],
+        texture([35.0, 3.0, 40.0, 0.9, 1.0]),
+    ),
+    row(
+        "plasticine",
+        (shore(52.0, 1.0, 51.0, 56.0), [1.1336, 1.1638, 1.3005]),
+        0.45,
+        Law::Plastic {
+            hardness: 1.0 / 12.0,
         },
-    },
-    Properties {
-        shore: shore(66.0, 1.2, 61.5, 69.5),
-        young_mpa: [0.4673, 0.5870, 0.7126],
-        substance: Substance {
-            nu: 0.49,
-            law: Law::Solid,
-            creep: [creep(0.10, 0.3), creep(0.06, 3.0)],
-            texture: texture(35.0, 3.0, 40.0, 0.9, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(52.0, 1.0, 51.0, 56.0),
-        young_mpa: [1.1336, 1.1638, 1.3005],
-        substance: Substance {
-            nu: 0.45,
-            law: Law::Plastic {
-                hardness: 1.0 / 12.0,
-            },
-            creep: [creep(0.10, 0.5), Creep::NONE],
-            texture: texture(90.0, 4.0, 30.0, 0.9, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(32.0, 2.0, 25.0, 40.0),
-        young_mpa: [0.2041, 0.2784, 0.3985],
-        substance: Substance {
-            nu: 0.10,
-            law: Law::Foam {
-                exponent: 2.5,
-                plateau: 0.12,
-                strain: 0.50,
-            },
-            creep: [creep(0.12, 0.3), creep(0.08, 3.0)],
-            texture: texture(160.0, 2.0, 10.0, 0.5, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(88.0, 1.5, 82.0, 95.0),
-        young_mpa: [2200.0; 3],
-        substance: Substance {
-            nu: 0.38,
-            law: Law::Solid,
-            creep: [creep(0.03, 1.0), Creep::NONE],
-            texture: texture(55.0, 4.0, 22.0, 0.6, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(63.0, 1.2, 61.2, 67.0),
-        young_mpa: [0.6990, 0.7628, 0.9340],
-        substance: Substance {
-            nu: 0.25,
-            law: Law::Foam {
-                exponent: 2.5,
-                plateau: 0.35,
-                strain: 0.35,
-            },
-            creep: [creep(0.12, 0.3), creep(0.06, 3.0)],
-            texture: texture(50.0, 3.0, 30.0, 0.7, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(55.0, 1.2, 51.5, 59.0),
-        young_mpa: [0.3417, 0.3971, 0.4757],
-        substance: Substance {
-            nu: 0.48,
-            law: Law::Solid,
-            creep: [creep(0.30, 0.2), creep(0.30, 2.0)],
-            texture: texture(80.0, 5.0, 30.0, 0.9, 1.0),
-        },
-    },
-    Properties {
-        shore: shore(38.0, 2.0, 32.0, 44.0),
-        young_mpa: [0.2464, 0.3179, 0.4121],
-        substance: Substance {
-            nu: 0.15,
-            law: Law::Foam {
-                exponent: 2.0,
-                plateau: 0.15,
-                strain: 0.42,
-            },
-            creep: [creep(0.12, 0.3), creep(0.06, 3.0)],
-            texture: texture(110.0, 3.0, 8.0, 0.5, 1.0),
-        },
-    },
+        [creep(0.10, 0.5), Creep::NONE],
+        texture([90.0, 4.0, 30.0, 0.9, 1.0]),
+    ),
+    row(
+        "sponge",
+        (shore(32.0, 2.0, 25.0, 40.0), [0.2041, 0.2784, 0.3985]),
+        0.10,
+        foam(2.5, 0.12, 0.50),
+        [creep(0.12, 0.3), creep(0.08, 3.0)],
+        texture([160.0, 2.0, 10.0, 0.5, 1.0]),
+    ),
+    row(
+        "hard-plastic",
+        (shore(88.0, 1.5, 82.0, 95.0), [2200.0; 3]),
+        0.38,
+        Law::Solid,
+        [creep(0.03, 1.0), Creep::NONE],
+        texture([55.0, 4.0, 22.0, 0.6, 1.0]),
+    ),
+    row(
+        "foam",
+        (shore(63.0, 1.2, 61.2, 67.0), [0.6990, 0.7628, 0.9340]),
+        0.25,
+        foam(2.5, 0.35, 0.35),
+        [creep(0.12, 0.3), creep(0.06, 3.0)],
+        texture([50.0, 3.0, 30.0, 0.7, 1.0]),
+    ),
+    row(
+        "soft-candy",
+        (shore(55.0, 1.2, 51.5, 59.0), [0.3417, 0.3971, 0.4757]),
+        0.48,
+        Law::Solid,
+        [creep(0.30, 0.2), creep(0.30, 2.0)],
+        texture([80.0, 5.0, 30.0, 0.9, 1.0]),
+    ),
+    row(
+        "yoga-mat",
+        (shore(38.0, 2.0, 32.0, 44.0), [0.2464, 0.3179, 0.4121]),
+        0.15,
+        foam(2.0, 0.15, 0.42),
+        [creep(0.12, 0.3), creep(0.06, 3.0)],
+        texture([110.0, 3.0, 8.0, 0.5, 1.0]),
+    ),
 ];
 
 #[cfg(test)]

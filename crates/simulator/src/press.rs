@@ -80,24 +80,16 @@ pub(super) struct Window {
     pub(super) width: usize,
 }
 
-/// Plans, kernels and fields, kept between presses. By default it is for the default cover.
+/// Solvers and kernels, kept between presses. By default it is for the default cover.
 #[derive(Default)]
 pub(super) struct Bench {
     pub(super) cover: Cover,
-    widths: BTreeMap<usize, Width>,
+    solvers: BTreeMap<usize, Solver>,
     layers: Vec<((f64, Base), Layer)>,
-    combined: Vec<f32>,
+    spectra: Vec<(Influence, Rc<[f32]>)>,
 }
 
-struct Width {
-    solver: Solver,
-    half_space: Rc<Vec<f32>>,
-    cover: Vec<f32>,
-    /// The spectra of the last few layers, because the presses of one posture follow each other.
-    recent: Vec<(LayerKey, Rc<Vec<f32>>)>,
-}
-
-/// The quantities that determine a layer's spectrum.
+/// The layer that bears a load.
 #[derive(Clone, Copy, PartialEq)]
 struct LayerKey {
     nu: f64,
@@ -106,8 +98,17 @@ struct LayerKey {
     height: f64,
 }
 
-/// The number of layer spectra held per width. An object has up to three heights.
-const RECENT: usize = 4;
+/// The quantities that determine a spectrum: the width of the window, the layer (a half-space without one), and a
+/// factor.
+#[derive(Clone, Copy, PartialEq)]
+struct Influence {
+    width: usize,
+    layer: Option<LayerKey>,
+    unit: f64,
+}
+
+/// The number of spectra held: those of the cover, and of an object's up to three heights, for some widths.
+const SPECTRA: usize = 24;
 /// The number of kinds of layers held, including the cover.
 const LAYERS: usize = 8;
 
@@ -347,24 +348,21 @@ impl Bench {
         local: Local,
         pressure_mpa: &mut [f32],
     ) -> Contact {
-        let mut combined = std::mem::take(&mut self.combined);
-        let (held, object) = self.set_up(specimen, window.width);
-        let unit = (local.factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
-        let influence = object.iter().map(|&o| unit * o);
-        combined.clear();
-        if specimen.block.is_some() {
-            combined.extend(influence);
-        } else {
-            combined.extend(influence.zip(&held.cover).map(|(o, &cover)| o + cover));
-        }
-        let block = specimen.standing(window, &combined, local.factor / specimen.young_mpa);
+        let cover = self.spectrum(Influence {
+            width: window.width,
+            layer: Some(LayerKey {
+                nu: COVER_NU,
+                base: Base::RIGID,
+                height: self.cover.thickness_mm / CELL_MM,
+            }),
+            unit: CELL_MM * (1.0 - COVER_NU * COVER_NU) / self.cover.young_mpa,
+        });
+        let object = self.of_object(specimen, window.width, local.factor);
+        let block = specimen.standing(window, &object, local.factor / specimen.young_mpa);
+        let both: Vec<f32> = object.iter().zip(&*cover).map(|(o, c)| o + c).collect();
         let problem = Problem {
             gap_mm,
-            spectrum: if block.is_some() {
-                &held.cover
-            } else {
-                &combined
-            },
+            spectrum: if block.is_some() { &cover } else { &both },
             block,
             local,
             force_n,
@@ -375,9 +373,7 @@ impl Bench {
                 TOLERANCE
             },
         };
-        let contact = held.solver.solve(&problem, pressure_mpa);
-        self.combined = combined;
-        contact
+        self.solver(window.width).solve(&problem, pressure_mpa)
     }
 
     /// Displacement in mm of the object alone under an effective pressure.
@@ -387,39 +383,49 @@ impl Bench {
         window: Window,
         pressure_mpa: &[f32],
     ) -> Vec<f32> {
-        let (held, object) = self.set_up(specimen, window.width);
-        let convolver = &mut held.solver.convolver;
+        let object = self.of_object(specimen, window.width, 1.0);
+        let convolver = &mut self.solver(window.width).convolver;
         let mut displacement = vec![0.0; pressure_mpa.len()];
-        let unit = (CELL_MM / specimen.plane_strain_mpa()) as f32;
-        let spectrum: Vec<f32> = object.iter().map(|&o| unit * o).collect();
-        match specimen.standing(window, &spectrum, 1.0 / specimen.young_mpa) {
+        match specimen.standing(window, &object, 1.0 / specimen.young_mpa) {
             Some(block) => block.displace(convolver, pressure_mpa, &mut displacement),
-            None => convolver.convolve(&spectrum, pressure_mpa, &mut displacement),
+            None => convolver.convolve(&object, pressure_mpa, &mut displacement),
         }
         displacement
     }
 
-    /// What solves windows of this width, and the object's spectrum for E* = 1 and lengths in cells.
-    fn set_up(&mut self, specimen: &Specimen, width: usize) -> (&mut Width, Rc<Vec<f32>>) {
-        let layers = &mut self.layers;
-        let held = self.widths.entry(width).or_insert_with(|| {
-            let layer = layer_of(layers, COVER_NU, Base::RIGID);
-            Width::new(width, layer, self.cover)
+    fn solver(&mut self, width: usize) -> &mut Solver {
+        let solvers = self.solvers.entry(width);
+        solvers.or_insert_with(|| Solver::new(width))
+    }
+
+    /// The spectrum of an object's influence times `factor`, mm per MPa.
+    fn of_object(&mut self, specimen: &Specimen, width: usize, factor: f64) -> Vec<f32> {
+        let unit = (factor * CELL_MM / specimen.plane_strain_mpa()) as f32;
+        let spectrum = self.spectrum(Influence {
+            width,
+            layer: specimen.layer,
+            unit: 1.0,
         });
-        let Some(key) = specimen.layer else {
-            let half_space = Rc::clone(&held.half_space);
-            return (held, half_space);
+        spectrum.iter().map(|&o| unit * o).collect()
+    }
+
+    fn spectrum(&mut self, of: Influence) -> Rc<[f32]> {
+        if let Some((_, held)) = self.spectra.iter().find(|(held, _)| *held == of) {
+            return Rc::clone(held);
+        }
+        let Influence { width, layer, unit } = of;
+        let solvers = self.solvers.entry(width);
+        let convolver = &mut solvers.or_insert_with(|| Solver::new(width)).convolver;
+        let made = match layer {
+            None => convolver.spectrum(|i, j| unit * kernel::half_space(i as f64, j as f64)),
+            Some(LayerKey { nu, base, height }) => {
+                let layer = layer_of(&mut self.layers, nu, base);
+                convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height))
+            }
         };
-        let recent = held.recent.iter().find(|(recent, _)| *recent == key);
-        let spectrum = recent.map(|(_, spectrum)| Rc::clone(spectrum));
-        let spectrum = spectrum.unwrap_or_else(|| {
-            let layer = layer_of(layers, key.nu, key.base);
-            let influence = |i, j| layer.influence(i as f64, j as f64, key.height);
-            let made = Rc::new(held.solver.convolver.spectrum(influence));
-            keep(&mut held.recent, (key, Rc::clone(&made)), RECENT);
-            made
-        });
-        (held, spectrum)
+        let made: Rc<[f32]> = made.into();
+        keep(&mut self.spectra, (of, Rc::clone(&made)), SPECTRA);
+        made
     }
 }
 
@@ -441,23 +447,6 @@ fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
     list.push(item);
 }
 
-impl Width {
-    fn new(width: usize, layer: &Layer, cover: Cover) -> Self {
-        let mut solver = Solver::new(width);
-        let convolver = &mut solver.convolver;
-        let half_space = Rc::new(convolver.spectrum(|i, j| kernel::half_space(i as f64, j as f64)));
-        let unit = CELL_MM * (1.0 - COVER_NU * COVER_NU) / cover.young_mpa;
-        let height = cover.thickness_mm / CELL_MM;
-        let cover = convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height));
-        Self {
-            solver,
-            half_space,
-            cover,
-            recent: Vec::new(),
-        }
-    }
-}
-
 pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
     let last = width - 1;
     (0..width).any(|k| {
@@ -471,7 +460,7 @@ pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
 mod tests {
     use super::super::material::Material;
     use super::super::object::{Face, Pose};
-    use super::super::sensor::Grid;
+    use super::super::sensor::{Design, Grid, SensorProfile};
     use super::*;
 
     /// A ball of radius 27 mm of this material, with `roughness` times its roughness.
@@ -527,6 +516,7 @@ mod tests {
     #[test]
     fn taxels_carry_the_prescribed_force() {
         let mut bench = Bench::default();
+        let grid = Grid::new(&Design::jx255n(SensorProfile::Clean));
         for material in Material::ALL {
             for force_n in [2.0, 25.0] {
                 let (window, pressure, contact) =
@@ -543,7 +533,7 @@ mod tests {
                     (cells / force_n - 1.0).abs() < 1e-4,
                     "{material:?}: cells carry {cells} N"
                 );
-                let taxels = Grid::jx255n().taxel_forces(&pressure, window);
+                let taxels = grid.taxel_forces(&pressure, window);
                 let sum: f64 = taxels.iter().map(|&force| f64::from(force)).sum();
                 // A taxel senses 3.0 of 3.5 mm, so sharp contacts can fall between taxels or upon
                 // them.

@@ -7,7 +7,7 @@
 use super::material::{Body, Material};
 use super::motion::{Arm, Motion};
 use super::press::Bench;
-use super::sensor::{Film, Sensor};
+use super::sensor::{Design, Film, Sensor};
 use super::sequence::{SequenceSettings, presented};
 use super::solved::{FeltPress, SolvedPress};
 use crate::random::Stream;
@@ -18,23 +18,23 @@ pub struct Rig {
     settings: SequenceSettings,
     root: Stream,
     sensor: Sensor,
-    film: Film,
-    /// The forces that the film gives now.
-    felt_n: Vec<f32>,
     bench: Bench,
     object: Placed,
-    /// The noise of the frames, and the gain of the press.
-    noise: Stream,
-    gain: f32,
 }
 
-/// An object in front of the sensor.
+/// An object in front of the sensor, which has rested before.
 struct Placed {
     press: FeltPress,
     motion: Motion,
     /// Where the arm is when the sensor touches the object.
     distance_mm: f64,
     touched: Touched,
+    film: Film,
+    /// The forces that the film gives now.
+    felt_n: Vec<f32>,
+    /// The noise of the frames, and the gain of the press.
+    noise: Stream,
+    gain: f32,
 }
 
 /// The object, and how it is touched.
@@ -65,67 +65,49 @@ impl Rig {
     /// Panics if there are no materials.
     pub fn new(settings: SequenceSettings) -> Self {
         let root = Stream::new(settings.seed, "rig");
-        let sensor = Sensor::new(settings.profile, &root.child(0));
+        let sensor = Sensor::draw(Design::jx255n(settings.profile), &root.child(0));
         let mut bench = Bench::default();
         Self {
             object: Placed::draw(&settings, &root, &mut bench, &sensor, 1),
-            film: Film::new(&sensor.design),
-            felt_n: vec![0.0; sensor.grid.array.taxels()],
-            sensor,
-            bench,
-            noise: noise_of(&root, 1),
-            gain: 1.0,
             settings,
             root,
+            sensor,
+            bench,
         }
     }
 
     /// Puts another object in front of the sensor, which has rested. The same number is the same object,
     /// and the same noise.
     pub fn place(&mut self, object: u32) {
-        self.film = Film::new(&self.sensor.design);
-        self.noise = noise_of(&self.root, object);
-        let Self {
-            settings,
-            root,
-            bench,
-            sensor,
-            ..
-        } = self;
-        self.object = Placed::draw(settings, root, bench, sensor, object);
+        let (settings, bench) = (&self.settings, &mut self.bench);
+        self.object = Placed::draw(settings, &self.root, bench, &self.sensor, object);
     }
 
     /// Moves the arm to `position_mm`, in `time_s` since the last move. The object is 2 to 4 mm beyond
     /// 0.
     pub fn move_to(&mut self, position_mm: f64, time_s: f64) {
-        let Placed {
-            press,
-            motion,
-            distance_mm,
-            touched,
-        } = &mut self.object;
-        let (force_n, forces) = press.at(motion.loading_s(position_mm - *distance_mm));
+        let of = &mut self.object;
+        let loading_s = of.motion.loading_s(position_mm - of.distance_mm);
+        let (force_n, forces) = of.press.at(loading_s);
+        let touched = &mut of.touched;
         if touched.force_n == 0.0 && force_n > 0.0 {
-            self.gain = self.sensor.press_gain(&mut self.noise);
+            of.gain = self.sensor.press_gain(&mut of.noise);
         }
         touched.force_n = force_n;
         touched.greatest_n = touched.greatest_n.max(force_n);
-        self.felt_n = self.film.advance(&self.sensor.design, &forces, time_s);
+        of.felt_n = of.film.advance(&self.sensor.design, &forces, time_s);
     }
 
     /// What the sensor reads now.
     pub fn read(&mut self) -> RawFrame {
-        self.sensor.read(&self.felt_n, self.gain, &mut self.noise)
+        let of = &mut self.object;
+        self.sensor.read(&of.felt_n, of.gain, &mut of.noise)
     }
 
     /// The object in front of the sensor.
     pub fn touched(&self) -> Touched {
         self.object.touched
     }
-}
-
-fn noise_of(root: &Stream, object: u32) -> Stream {
-    root.child(2).child(u64::from(object))
 }
 
 impl Placed {
@@ -152,6 +134,10 @@ impl Placed {
                 force_n: 0.0,
                 greatest_n: 0.0,
             },
+            film: Film::new(&sensor.design),
+            felt_n: vec![0.0; sensor.grid.array.taxels()],
+            noise: root.child(2).child(u64::from(object)),
+            gain: 1.0,
         }
     }
 }

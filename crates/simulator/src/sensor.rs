@@ -9,8 +9,6 @@
 mod design;
 mod grid;
 
-use std::sync::Arc;
-
 use serde::{Deserialize, Serialize};
 
 pub(super) use self::design::{BROAD_PITCHES_MM, Design};
@@ -41,7 +39,7 @@ pub enum SensorProfile {
 #[derive(Debug, Clone)]
 pub(super) struct Sensor {
     pub(super) design: Design,
-    pub(super) grid: Arc<Grid>,
+    pub(super) grid: Grid,
     /// The gain of each taxel; 0 for a dead one.
     pub(super) gain: Vec<f32>,
     threshold_n: Vec<f32>,
@@ -57,18 +55,8 @@ pub(super) struct Sensor {
 const QUIET_SIGMAS: f32 = 6.5;
 
 impl Sensor {
-    /// Draws a JX255N.
-    pub(super) fn new(profile: SensorProfile, stream: &Stream) -> Self {
-        Self::of(Design::jx255n(profile), Grid::jx255n(), stream)
-    }
-
     /// Draws a sensor of a design.
     pub(super) fn draw(design: Design, stream: &Stream) -> Self {
-        let grid = Arc::new(Grid::new(&design));
-        Self::of(design, grid, stream)
-    }
-
-    fn of(design: Design, grid: Arc<Grid>, stream: &Stream) -> Self {
         let Array { rows, cols } = design.array;
         let count = design.array.taxels();
         let spread = design.spread;
@@ -100,8 +88,8 @@ impl Sensor {
         });
         let mut sensor = Self {
             newtons_per_count: design.count_n,
+            grid: Grid::new(&design),
             design,
-            grid,
             gain,
             threshold_n,
             rest_counts,
@@ -223,24 +211,23 @@ impl Sensor {
     }
 }
 
-/// The state of the film under each taxel.
+/// The film under each taxel.
 #[derive(Debug, Clone)]
-pub(super) struct Film {
-    crept: Vec<[f32; 2]>,
-    /// The delayed forces, and the greatest of them since a taxel was touched.
-    delayed_n: Vec<f32>,
-    greatest_n: Vec<f32>,
+pub(super) struct Film(Vec<Taxel>);
+
+/// The state of the film under a taxel.
+#[derive(Debug, Clone, Default)]
+struct Taxel {
+    crept: [f32; 2],
+    /// The delayed force, and the greatest one since the taxel was touched.
+    delayed_n: f32,
+    greatest_n: f32,
 }
 
 impl Film {
     /// A film at rest.
     pub(super) fn new(design: &Design) -> Self {
-        let taxels = design.array.taxels();
-        Self {
-            crept: vec![[0.0; 2]; taxels],
-            delayed_n: vec![0.0; taxels],
-            greatest_n: vec![0.0; taxels],
-        }
+        Self(vec![Taxel::default(); design.array.taxels()])
     }
 
     /// Advances by `time_s` under `forces_n` and returns the forces with delay, hysteresis and
@@ -250,35 +237,32 @@ impl Film {
         let creep = design.creep;
         let step = creep.map(|(_, tau)| -(-(time_s as f32) / tau).exp_m1());
         let follow = -(-(time_s as f32) / design.lag_s).exp_m1();
-        let mut read = vec![0.0; forces_n.len()];
-        for (k, (read, &force)) in read.iter_mut().zip(forces_n).enumerate() {
+        let read = self.0.iter_mut().zip(forces_n).map(|(taxel, &force)| {
             let mut force = force;
             if design.lag_s > 0.0 {
-                let delayed = &mut self.delayed_n[k];
-                *delayed += follow * (force - *delayed);
-                if *delayed < NOTHING_N {
-                    *delayed = 0.0;
+                taxel.delayed_n += follow * (force - taxel.delayed_n);
+                if taxel.delayed_n < NOTHING_N {
+                    taxel.delayed_n = 0.0;
                 }
-                force = *delayed;
+                force = taxel.delayed_n;
             }
-            let goal = if force > 0.0 { 1.0 } else { 0.0 };
+            let is_loaded = force > 0.0;
             let mut factor = 1.0;
-            for ((crept, step), (ratio, _)) in self.crept[k].iter_mut().zip(step).zip(creep) {
-                *crept += step * (goal - *crept);
+            for ((crept, step), (ratio, _)) in taxel.crept.iter_mut().zip(step).zip(creep) {
+                *crept += step * (f32::from(u8::from(is_loaded)) - *crept);
                 factor += ratio * *crept;
             }
-            let greatest = &mut self.greatest_n[k];
-            *greatest = if force > 0.0 {
-                greatest.max(force)
+            taxel.greatest_n = if is_loaded {
+                taxel.greatest_n.max(force)
             } else {
                 0.0
             };
-            if force < *greatest {
-                factor *= 1.0 + design.hysteresis * (1.0 - force / *greatest);
+            if force < taxel.greatest_n {
+                factor *= 1.0 + design.hysteresis * (1.0 - force / taxel.greatest_n);
             }
-            *read = force * factor;
-        }
-        read
+            force * factor
+        });
+        read.collect()
     }
 }
 

@@ -6,14 +6,15 @@
 use std::collections::VecDeque;
 
 use super::broad;
-use super::dataset::{HARDER, HIGHEST_FORCE_N, TRIES};
+use super::dataset::HIGHEST_FORCE_N;
 use super::material::{Body, Material};
 use super::motion::{Approach, Arm, Motion};
 use super::object::{self, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen, draw_patch};
 use super::rigid::{self, Reference};
-use super::sensor::{ARRAY, Film, Sensor, SensorProfile};
+use super::sensor::{ARRAY, Design, Film, Sensor, SensorProfile};
 use super::solved::SolvedPress;
+use super::subject::harder_and_harder;
 use super::tracked::one_press;
 use crate::random::Stream;
 use hardnessd_core::frame::RawFrame;
@@ -59,6 +60,16 @@ impl Default for SequenceSettings {
 }
 
 impl SequenceSettings {
+    /// The stream. It has a name of its own, so that a sequence shares no object and no sensor with a data set.
+    fn root(&self) -> Stream {
+        Stream::new(self.seed, "sequence")
+    }
+
+    /// The stream that press `number`, from 1, is drawn from.
+    fn draws(&self, number: u32) -> Stream {
+        self.root().child(1).child((number - 1).into())
+    }
+
     /// The material of press `number`, from 1; `None` for a random one.
     fn material(&self, number: u32) -> Option<Material> {
         let (before, round) = (number as usize - 1, self.materials.len());
@@ -69,17 +80,13 @@ impl SequenceSettings {
     /// What press `number`, from 1, presses.
     pub fn pressed(&self, number: u32) -> Pressed {
         let material = self.material(number);
-        let draws = draws(&root(self), number - 1);
-        let body = broad::body_of(material, &mut draws.child(3));
-        let name = match material {
-            Some(material) => material.name().to_owned(),
-            None => {
-                let law = usize::from(body.material) - Material::ALL.len();
-                broad::LAWS[law].replace("broad", "random")
-            }
-        };
+        let body = broad::body_of(material, &mut self.draws(number).child(3));
+        let random = || broad::LAWS[usize::from(body.material) - Material::ALL.len()];
         Pressed {
-            name,
+            name: match material {
+                Some(material) => material.name().to_owned(),
+                None => random().replace("broad", "random"),
+            },
             shore: body.shore,
             level: body.level,
         }
@@ -95,17 +102,6 @@ pub struct Pressed {
     pub shore: f64,
     /// The hardness level, 1 to 4.
     pub level: u8,
-}
-
-/// The stream of a sequence. It has a name of its own, so that a sequence shares no object and no sensor
-/// with a data set.
-fn root(settings: &SequenceSettings) -> Stream {
-    Stream::new(settings.seed, "sequence")
-}
-
-/// The stream that a press is drawn from, which comes after `before` others.
-fn draws(root: &Stream, before: u32) -> Stream {
-    root.child(1).child(before.into())
 }
 
 /// One frame, with the state of the press.
@@ -129,7 +125,6 @@ pub struct SequenceFrame {
 /// (3 taxels) is made anew with more force, so that a press tracker sees `presses` presses.
 pub struct Sequence {
     settings: SequenceSettings,
-    root: Stream,
     sensor: Sensor,
     bench: Bench,
     film: Film,
@@ -168,12 +163,11 @@ impl Sequence {
             rate.is_finite() && rate > 0.0,
             "frame rate {rate} is not a positive number"
         );
-        let root = root(&settings);
-        let sensor = Sensor::new(settings.profile, &root.child(0));
+        let design = Design::jx255n(settings.profile);
+        let sensor = Sensor::draw(design, &settings.root().child(0));
         Self {
             free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
             settings,
-            root,
             bench: Bench::default(),
             film: Film::new(&sensor.design),
             sensor,
@@ -192,7 +186,7 @@ impl Sequence {
     /// The touch time of the next press, and the stream that the press is drawn from, after its
     /// first draw, the delay.
     fn next_draws(&self) -> (f64, Stream) {
-        let mut draws = draws(&self.root, self.made);
+        let mut draws = self.settings.draws(self.made + 1);
         let delay_s = draws.range(0.0, DELAY_S);
         (self.free_s + delay_s, draws)
     }
@@ -208,11 +202,9 @@ impl Sequence {
             last: self.last,
             next_s: (!self.is_done()).then(|| self.next_draws().0),
         };
-        self.film.advance(
-            &self.sensor.design,
-            &vec![0.0; ARRAY.taxels()],
-            1.0 / self.settings.frame_rate_hz,
-        );
+        let unloaded = vec![0.0; ARRAY.taxels()];
+        let period_s = 1.0 / self.settings.frame_rate_hz;
+        (self.film).advance(&self.sensor.design, &unloaded, period_s);
         self.frames += 1;
         SequenceFrame {
             raw: RawFrame::zero(ARRAY),
@@ -229,7 +221,7 @@ impl Sequence {
         let material = self.settings.material(self.made);
         let drawn = draws.range(5.0, HIGHEST_FORCE_N);
         let in_turn = (self.made as usize - 1).checked_rem(self.settings.forces_n.len());
-        let mut force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
+        let force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
         let specimen = match self.settings.piece {
             Some(piece) => rigid::specimen(&rigid::face(piece), &mut draws.child(2)),
             None => presented(material, &mut draws).1,
@@ -237,55 +229,43 @@ impl Sequence {
         let rate = self.settings.frame_rate_hz;
         let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
-        for attempt in 1.. {
-            let solved =
-                SolvedPress::new(&mut self.bench, &specimen, Arm::default(), force_n, hold_s);
+        let before = self.film.clone();
+        for (attempt, force_n) in (1..).zip(harder_and_harder(force_n)) {
+            let bench = &mut self.bench;
+            let solved = SolvedPress::new(bench, &specimen, Arm::default(), force_n, hold_s);
             self.last = Some((touch_s, solved.motion));
-            let mut film = self.film.clone();
-            let mut noise = draws.child(4).child(attempt);
-            let frames = self.play(&solved, touch_s, &mut film, &mut noise);
-            let felt = frames.iter().map(|frame| self.sensor.felt(&frame.raw));
+            self.film.clone_from(&before);
+            self.play(&solved, touch_s, &mut draws.child(4).child(attempt));
+            self.free_s = touch_s + solved.duration_s() + rest_s;
+            let felt = self.ready.iter().map(|frame| self.sensor.felt(&frame.raw));
             let felt: Vec<_> = felt.collect();
-            let seen = one_press(&felt, &self.sensor.thresholds(), 1.0 / rate);
-            if attempt as usize == TRIES || seen.is_some() {
-                self.film = film;
-                self.frames += frames.len() as u64;
-                self.free_s = touch_s + solved.duration_s() + rest_s;
-                self.ready.extend(frames);
-                return;
+            if one_press(&felt, &self.sensor.thresholds(), 1.0 / rate).is_some() {
+                break;
             }
-            force_n *= HARDER;
         }
+        self.frames += self.ready.len() as u64;
     }
 
-    /// The frames from now until the end of a press.
-    fn play(
-        &self,
-        solved: &SolvedPress,
-        touch_s: f64,
-        film: &mut Film,
-        noise: &mut Stream,
-    ) -> Vec<SequenceFrame> {
+    /// Makes the frames from now until the end of a press.
+    fn play(&mut self, solved: &SolvedPress, touch_s: f64, noise: &mut Stream) {
         let period_s = 1.0 / self.settings.frame_rate_hz;
         let gain = self.sensor.press_gain(noise);
         let felt = solved.felt(&self.sensor.grid);
         let times = (self.frames..).map(|number| number as f64 * period_s - touch_s);
-        let frames = times
-            .take_while(|&time_s| time_s < solved.duration_s())
-            .map(|time_s| {
-                let (_, forces) = felt.at(time_s);
-                let crept = film.advance(&self.sensor.design, &forces, period_s);
-                SequenceFrame {
-                    raw: self.sensor.read(&crept, gain, noise),
-                    press: self.made,
-                    loaded: time_s > 0.0,
-                    approach: Approach {
-                        last: self.last,
-                        next_s: None,
-                    },
-                }
+        self.ready.clear();
+        for time_s in times.take_while(|&time_s| time_s < solved.duration_s()) {
+            let (_, forces) = felt.at(time_s);
+            let crept = self.film.advance(&self.sensor.design, &forces, period_s);
+            self.ready.push_back(SequenceFrame {
+                raw: self.sensor.read(&crept, gain, noise),
+                press: self.made,
+                loaded: time_s > 0.0,
+                approach: Approach {
+                    last: self.last,
+                    next_s: None,
+                },
             });
-        frames.collect()
+        }
     }
 }
 

@@ -18,6 +18,8 @@ pub(super) struct SolvedPress {
     window: Window,
     /// The arm's motion during the press.
     pub(super) motion: Motion,
+    /// The greatest force, at the end of the approach.
+    pub(super) force_n: f64,
 }
 
 /// A solved moment.
@@ -67,25 +69,23 @@ impl SolvedPress {
         loop {
             let mut run = Run::new(bench, specimen, arm, window);
             run.load(force_n);
-            let SolvedStep {
-                travel_mm, time_s, ..
-            } = *run.last();
+            let motion = Motion {
+                top_mm: run.last().travel_mm,
+                load_s: run.last().time_s,
+                hold_s,
+                speed_mm_s: arm.speed_mm_s,
+            };
             run.hold(hold_s);
             run.unload();
             let (moments, fits) = (run.moments, run.fits);
             match window.wider(specimen, bench.cover, force_n) {
                 Some(wider) if !fits => window = wider,
                 _ => {
-                    let motion = Motion {
-                        top_mm: travel_mm,
-                        load_s: time_s,
-                        hold_s,
-                        speed_mm_s: arm.speed_mm_s,
-                    };
                     return Self {
                         moments,
                         window,
                         motion,
+                        force_n,
                     };
                 }
             }
@@ -177,19 +177,12 @@ impl<'a> Run<'a> {
     }
 
     fn load(&mut self, force_n: f64) {
-        // Of the first step we only know that it is short. The later guesses are the length of the
-        // step before.
-        let mut guess_s = 0.05;
-        for goal_n in self.levels(force_n) {
-            guess_s = self.step_to_force(goal_n, guess_s, 1.0);
-        }
+        self.step_to_forces(self.levels(force_n), 1.0);
     }
 
     fn unload(&mut self) {
-        let mut guess_s = 0.05;
-        for goal_n in self.levels(self.last().force_n).rev().skip(1) {
-            guess_s = self.step_to_force(goal_n, guess_s, -1.0);
-        }
+        let levels = self.levels(self.last().force_n);
+        self.step_to_forces(levels.rev().skip(1), -1.0);
         // The press ends where the sensor leaves the surface, with its creep and dents at that
         // time.
         let (gap, _) = self.effective_gap(0.0);
@@ -206,25 +199,30 @@ impl<'a> Run<'a> {
         self.moments.push(end);
     }
 
-    /// Moves in `direction` until the force is `goal_n`, and returns the time that this took. It depends on
-    /// the travel, and the travel, through creep, on the time. Two or three rounds settle both.
-    fn step_to_force(&mut self, goal_n: f64, guess_s: f64, direction: f64) -> f64 {
-        let (before_mm, before_s) = (self.last().travel_mm, self.last().time_s);
-        let mut time_s = guess_s.max(LEAST_STEP_S);
-        let mut guess = self.guess(goal_n);
-        for round in 1.. {
-            let mut step = self.attempt(goal_n, time_s, guess);
-            let needed_s =
-                (direction * (step.travel_mm - before_mm) / self.arm.speed_mm_s).max(LEAST_STEP_S);
-            if round == 3 || (needed_s - time_s).abs() < 0.05 * needed_s {
-                step.time_s = before_s + needed_s;
-                self.take(step, needed_s);
-                break;
+    /// Moves in `direction` from one force to the next. The time that this takes depends on the travel, and the
+    /// travel, through creep, on the time. Two or three rounds settle both.
+    fn step_to_forces(&mut self, goals_n: impl Iterator<Item = f64>, direction: f64) {
+        // Of the first step we only know that it is short. The later guesses are the length of the
+        // step before.
+        let mut time_s = 0.05;
+        for goal_n in goals_n {
+            let (before_mm, before_s) = (self.last().travel_mm, self.last().time_s);
+            let mut guess = self.guess(goal_n);
+            for round in 1.. {
+                let mut step = self.attempt(goal_n, time_s, guess);
+                let needed_s = direction * (step.travel_mm - before_mm) / self.arm.speed_mm_s;
+                let needed_s = needed_s.max(LEAST_STEP_S);
+                let is_settled = (needed_s - time_s).abs() < 0.05 * needed_s;
+                time_s = needed_s;
+                if round == 3 || is_settled {
+                    step.time_s = before_s + needed_s;
+                    self.take(step, needed_s);
+                    break;
+                }
+                guess = step.pressure;
             }
-            time_s = needed_s;
-            guess = step.pressure;
+            time_s = (self.last().time_s - before_s).max(LEAST_STEP_S);
         }
-        self.last().time_s - before_s
     }
 
     /// A guess at the pressure under `force_n`: each cell goes on as between the last two moments.

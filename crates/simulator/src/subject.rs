@@ -4,14 +4,18 @@
 //! An object's draws follow from the seed, its kind and its number. So all data sets of a seed
 //! contain the same objects, whatever the number of objects.
 
+use std::collections::BTreeMap;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::broad;
 use super::level::LEVELS;
 use super::material::{Body, Material, Split};
-use super::object::{self, Object, Shapes};
-use super::sensor::Sensor;
+use super::object::{self, Face, Object, Pose, Shapes};
+use super::press::{Specimen, draw_patch};
+use super::sensor::{Design, Sensor};
 use super::settings::{DatasetSettings, Materials};
+use super::texture::Patch;
 use crate::random::Stream;
 
 /// The number of groups of broad objects. It equals the number of levels, so that named and broad
@@ -19,10 +23,37 @@ use crate::random::Stream;
 const GROUPS: u8 = LEVELS.len() as u8;
 /// The number of sensors that each split's objects are distributed over.
 const SENSORS: u32 = 8;
+/// Factor on the force when a press was too light to begin.
+const HARDER: f64 = 1.5;
+/// The number of attempts at a press.
+const TRIES: usize = 8;
+
+/// The forces at which a press is tried, until a sensor feels it.
+pub(super) fn harder_and_harder(force_n: f64) -> impl Iterator<Item = f64> {
+    let forces = std::iter::successors(Some(force_n), |force_n| Some(HARDER * force_n));
+    forces.take(TRIES)
+}
+
+/// What a press is labelled with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Labels {
+    /// Hardness level, 1 to 4; 0 for a rigid piece.
+    pub level: u8,
+    /// Number of the object, unique in the data set.
+    pub object: u32,
+    /// Index of the material among [`super::material_names`].
+    pub material: u8,
+    /// The split of the object.
+    pub split: Split,
+    /// The object's Shore hardness; NaN for a rigid piece.
+    pub shore: f32,
+}
 
 /// One object of a data set.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unit {
+    /// Its number, unique in the data set.
+    pub(super) object: u32,
     /// Its material; `None` for a broad one.
     material: Option<Material>,
     /// The index of its material, or of its group of broad objects. Test objects of the same number
@@ -44,50 +75,51 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
         Materials::Named => named.to_vec(),
         Materials::Broad => groups(Split::Train).chain(groups(Split::Test)).collect(),
     };
-    let units = kinds.into_iter().flat_map(|(material, kind, split)| {
+    let mut units = Vec::new();
+    for (material, kind, split) in kinds {
         let count = match split {
             Split::Train => settings.objects,
             Split::Test => settings.test_objects,
         };
-        (0..count).map(move |number| Unit {
-            material,
-            kind,
-            split,
-            number,
-        })
-    });
-    units.collect()
+        units.extend(
+            (units.len() as u32..)
+                .zip(0..count)
+                .map(|(object, number)| Unit {
+                    object,
+                    material,
+                    kind,
+                    split,
+                    number,
+                }),
+        );
+    }
+    units
 }
 
-/// Runs `work` on each unit and its index, on `threads` threads. The results are in the order of
-/// the units, whichever thread makes them.
-pub(super) fn shared_out<U: Sync, B, T: Send>(
+/// Runs `work` on each unit, on `threads` threads, and calls `progress` with the number of units done and of
+/// all. The results are in the order of the units, whichever thread makes them.
+pub(super) fn shared_out<U: Sync, T: Send>(
     units: &[U],
     threads: usize,
-    bench: impl Fn() -> B + Sync,
-    work: impl Fn(&mut B, u32, &U) -> Vec<T> + Sync,
+    progress: impl Fn(usize, usize) + Sync,
+    work: impl Fn(&U) -> Vec<T> + Sync,
 ) -> Vec<T> {
-    let next = AtomicUsize::new(0);
-    let take = || {
-        let index = next.fetch_add(1, Ordering::Relaxed);
-        Some((index as u32, units.get(index)?))
-    };
+    let (next, made) = (AtomicUsize::new(0), Mutex::new(BTreeMap::new()));
     let share = || {
-        let (mut bench, mut made) = (bench(), Vec::new());
-        while let Some((index, unit)) = take() {
-            made.push((index, work(&mut bench, index, unit)));
+        loop {
+            let place = next.fetch_add(1, Ordering::Relaxed);
+            let Some(unit) = units.get(place) else {
+                return;
+            };
+            let own = work(unit);
+            let mut made = made.lock().expect("no work panics");
+            made.insert(place, own);
+            progress(made.len(), units.len());
         }
-        made
     };
-    let mut parts: Vec<(u32, Vec<T>)> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(share)).collect();
-        let shares = threads.into_iter().map(std::thread::ScopedJoinHandle::join);
-        shares
-            .flat_map(|share| share.expect("no work panics"))
-            .collect()
-    });
-    parts.sort_by_key(|&(index, _)| index);
-    parts.into_iter().flat_map(|(_, made)| made).collect()
+    std::thread::scope(|scope| (0..threads.max(1)).for_each(|_| drop(scope.spawn(share))));
+    let made = made.into_inner().expect("no work panics");
+    made.into_values().flatten().collect()
 }
 
 /// The streams of one object: one for its geometry, poses and forces, and one for its material. The first
@@ -115,9 +147,9 @@ fn streams(settings: &DatasetSettings, unit: &Unit) -> [Stream; 2] {
 
 /// An object with its material, the sensor it is pressed on, and its streams.
 pub(super) struct Subject {
-    pub(super) split: Split,
-    pub(super) body: Body,
-    pub(super) object: Object,
+    unit: Unit,
+    body: Body,
+    object: Object,
     pub(super) sensor: Sensor,
     pub(super) geometry: Stream,
     pub(super) draws: Stream,
@@ -125,8 +157,8 @@ pub(super) struct Subject {
 
 impl Subject {
     /// Draws a subject. A share of the objects has flat faces, whatever the shapes of the others.
-    pub(super) fn draw(settings: &DatasetSettings, unit: &Unit, flat_share: f64) -> Self {
-        let [geometry, draws] = streams(settings, unit);
+    pub(super) fn draw(settings: &DatasetSettings, unit: Unit, flat_share: f64) -> Self {
+        let [geometry, draws] = streams(settings, &unit);
         let body = broad::body_of(unit.material, &mut draws.child(0));
         // Different stream names keep the splits' sensors apart.
         let sensors = match unit.split {
@@ -140,12 +172,35 @@ impl Subject {
             object::draw(settings.shapes, body.level, &mut geometry.child(0))
         };
         Self {
-            split: unit.split,
+            unit,
             object,
             body,
-            sensor: Sensor::new(settings.profile, &of_sensor),
+            sensor: Sensor::draw(Design::jx255n(settings.profile), &of_sensor),
             geometry,
             draws,
+        }
+    }
+
+    /// The face of a posture, with its roughness.
+    pub(super) fn face(&self, posture: usize) -> (Face, Patch) {
+        let face = self.object[posture];
+        let mut roughness = self.draws.child(1).child(posture as u64);
+        let patch = draw_patch(&self.body.substance.texture, face.roughness, &mut roughness);
+        (face, patch)
+    }
+
+    /// A face in a pose.
+    pub(super) fn specimen(&self, (face, patch): &(Face, Patch), pose: &Pose) -> Specimen {
+        Specimen::new(self.body.substance, self.body.young_mpa, face, pose, patch)
+    }
+
+    pub(super) fn labels(&self) -> Labels {
+        Labels {
+            level: self.body.level,
+            object: self.unit.object,
+            material: self.body.material,
+            split: self.unit.split,
+            shore: self.body.shore as f32,
         }
     }
 }
@@ -165,6 +220,7 @@ mod tests {
             };
             let draw = |(material, kind), split, number| {
                 let unit = Unit {
+                    object: 0,
                     material,
                     kind,
                     split,

@@ -26,8 +26,10 @@ fn force_read_n(course: &LabelledCourse) -> f64 {
 #[test]
 fn threads_do_not_show_and_courses_are_whole() {
     let settings = small();
-    let made = courses(&settings, 2, |_| ());
-    assert!(made == courses(&settings, 1, |_| ()), "threads show");
+    let made = courses(&settings, 2, |_, _| ());
+    assert!(made == courses(&settings, 1, |_, _| ()), "threads show");
+    assert_eq!(made.len(), 8 * 4);
+    let made: Vec<LabelledCourse> = made.into_iter().flatten().collect();
     assert!(made.len() >= 8 * 4 - 2, "{} presses begin", made.len());
     for course in &made {
         let times: Vec<f32> = course.moments.iter().map(|m| m.time_s).collect();
@@ -55,7 +57,9 @@ fn threads_do_not_show_and_courses_are_whole() {
     // Test presses of the same number are paired over the objects, except those that never
     // begin.
     let motion = |object: u32| {
-        let own = made.iter().filter(move |course| course.object == object);
+        let own = made
+            .iter()
+            .filter(move |course| course.labels.object == object);
         own.map(|course| course.arm_n_per_mm).collect::<Vec<_>>()
     };
     assert_eq!(motion(5), motion(7));

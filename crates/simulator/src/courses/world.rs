@@ -5,8 +5,6 @@
 //! drawn, objects are pressed on each, and several electronics read each of these presses: a
 //! sensor is one electronics under one cover. Train and test sensors share nothing.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-
 use serde::{Deserialize, Serialize};
 
 use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading};
@@ -17,7 +15,7 @@ use crate::rigid::{self, FLAT_MM, Reference};
 use crate::sensor::{BROAD_PITCHES_MM, Design, Sensor};
 use crate::settings::DatasetSettings;
 use crate::solved::SolvedPress;
-use crate::subject::{Subject, Unit, shared_out, units};
+use crate::subject::{Labels, Subject, Unit, shared_out, units};
 use hardnessd_core::frame::Pitch;
 
 /// What the sensors of a data set have in common.
@@ -79,8 +77,7 @@ struct Place {
     number: u32,
     /// Number of the cover over both splits.
     index: u32,
-    /// The objects with their numbers.
-    units: Vec<(u32, Unit)>,
+    units: Vec<Unit>,
 }
 
 impl SensorDesigns {
@@ -96,19 +93,18 @@ impl SensorDesigns {
 impl BroadSensors {
     /// The covers that objects are pressed on.
     fn places(&self, of: &DatasetSettings) -> Vec<Place> {
-        let units: Vec<(u32, Unit)> = (0..).zip(units(of)).collect();
+        let units = units(of);
         let train = (0..self.covers.min(of.objects)).map(|n| (Split::Train, self.covers, n));
         let test = 0..self.test_covers.min(of.test_objects);
         let test = test.map(|n| (Split::Test, self.test_covers, n));
         let places = (0..).zip(train.chain(test));
         let places = places.map(|(index, (split, covers, number))| {
-            let is_on = |unit: &Unit| unit.split == split && unit.number % covers == number;
-            let own = units.iter().filter(|(_, unit)| is_on(unit));
+            let is_on = |unit: &&Unit| unit.split == split && unit.number % covers == number;
             Place {
                 split,
                 number,
                 index,
-                units: own.copied().collect(),
+                units: units.iter().filter(is_on).copied().collect(),
             }
         });
         places.collect()
@@ -116,19 +112,6 @@ impl BroadSensors {
 }
 
 impl CourseSettings {
-    /// The number of presses that the settings make, if all begin.
-    pub fn presses(&self) -> u64 {
-        let of = &self.objects;
-        let Some(sensors) = &self.sensors else {
-            return of.samples();
-        };
-        let contacts = |place: Place| {
-            place.units.len() as u64 * u64::from(of.presses) + 2 * u64::from(REFERENCES)
-        };
-        let contacts = sensors.places(of).into_iter().map(contacts);
-        contacts.sum::<u64>() * u64::from(sensors.electronics)
-    }
-
     /// The names that a press's `material` indexes.
     pub fn material_names(&self) -> Vec<&'static str> {
         let mut names = crate::material_names(self.objects.materials);
@@ -142,25 +125,18 @@ pub(super) fn courses(
     settings: &CourseSettings,
     sensors: &BroadSensors,
     threads: usize,
-    progress: impl Fn(usize) + Sync,
-) -> Vec<LabelledCourse> {
+    progress: impl Fn(usize, usize) + Sync,
+) -> Vec<Option<LabelledCourse>> {
     let places = sensors.places(&settings.objects);
     let objects = units(&settings.objects).len() as u32;
-    let done = AtomicUsize::new(0);
-    let progress = || progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-    shared_out(
-        &places,
-        threads,
-        || (),
-        |(), _, place| {
-            let mut station = Station::draw(settings, sensors, place);
-            let mut made = station.references(objects, &progress);
-            for (object, unit) in &place.units {
-                made.extend(station.object(*object, unit, &progress));
-            }
-            made
-        },
-    )
+    shared_out(&places, threads, progress, |place| {
+        let mut station = Station::draw(settings, sensors, place);
+        let mut made = station.references(objects);
+        for &unit in &place.units {
+            made.extend(station.object(unit));
+        }
+        made
+    })
 }
 
 /// One cover on its arm, with the electronics under it.
@@ -183,19 +159,20 @@ struct Electronics {
 }
 
 impl Electronics {
-    /// A press of this plan as these electronics and the robot give it.
+    /// A press of this plan as these electronics and the robot give it. Each electronics have noise of their own.
     fn course(
         &self,
         plan: &Plan,
         solved: &SolvedPress,
-        force_n: f64,
-        noise: &mut Stream,
+        noise: &Stream,
+        labels: Labels,
     ) -> Option<LabelledCourse> {
+        let mut noise = noise.child(self.number.into());
         let reading = Reading {
             period_s: self.period_s,
             phase: noise.uniform(),
         };
-        let press = plan.read(&self.sensor, solved, force_n, reading, noise)?;
+        let press = plan.read(&self.sensor, solved, reading, &mut noise, labels)?;
         Some(LabelledCourse {
             sensor: self.number,
             arm_n_per_mm: (plan.arm.n_per_mm * self.arm_factor) as f32,
@@ -258,36 +235,36 @@ impl<'a> Station<'a> {
     }
 
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
-    fn references(&mut self, objects: u32, progress: &impl Fn()) -> Vec<LabelledCourse> {
+    fn references(&mut self, objects: u32) -> Vec<Option<LabelledCourse>> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
         let pieces = [Reference::Flat { width_mm }, Reference::Ball { radius_mm }];
-        let material = self.settings.material_names().len() as u8 - 1;
         let mut made = Vec::new();
         for (piece, reference) in (0_u32..).zip(pieces) {
-            let face = rigid::face(reference);
+            let labels = Labels {
+                level: 0,
+                object: objects + 2 * self.place.index + piece,
+                material: self.settings.material_names().len() as u8 - 1,
+                split: self.place.split,
+                shore: f32::NAN,
+            };
             for press in 0..REFERENCES {
-                let number = piece * REFERENCES + press;
-                let draws = self.draws.child(2).child(number.into());
+                let draws = self.draws.child(2);
+                let draws = draws.child((piece * REFERENCES + press).into());
                 let mut own = draws.child(0);
                 let plan = self.plan(&mut own);
                 let part = (f64::from(press) + own.uniform()) / f64::from(REFERENCES);
                 let [least, most] = REFERENCE_N;
                 let force_n = least * (most / least).powf(part);
-                let specimen = rigid::specimen(&face, &mut draws.child(1));
+                let specimen = rigid::specimen(&rigid::face(reference), &mut draws.child(1));
                 let (arm, hold_s) = (plan.arm, plan.hold_s);
                 let solved = SolvedPress::new(&mut self.bench, &specimen, arm, force_n, hold_s);
-                for electronics in &self.electronics {
-                    let mut noise = draws.child(2).child(electronics.number.into());
-                    let press = electronics.course(&plan, &solved, force_n, &mut noise);
-                    progress();
-                    made.extend(press.map(|press| LabelledCourse {
-                        object: objects + 2 * self.place.index + piece,
-                        material,
-                        split: self.place.split,
+                made.extend(self.electronics.iter().map(|electronics| {
+                    let press = electronics.course(&plan, &solved, &draws.child(2), labels)?;
+                    Some(LabelledCourse {
                         reference: Some(reference),
                         ..press
-                    }));
-                }
+                    })
+                }));
             }
         }
         made
@@ -295,23 +272,18 @@ impl<'a> Station<'a> {
 
     /// The presses of one object. A press that only some of the electronics see is in the data set
     /// for these.
-    fn object(&mut self, object: u32, unit: &Unit, progress: &impl Fn()) -> Vec<LabelledCourse> {
-        let flat_share = self.settings.flat_share();
-        let subject = Subject::draw(&self.settings.objects, unit, flat_share);
+    fn object(&mut self, unit: Unit) -> Vec<Option<LabelledCourse>> {
+        let subject = Subject::draw(&self.settings.objects, unit, self.settings.flat_share());
         let mut made = Vec::new();
         for press in 0..u64::from(self.settings.objects.presses) {
             let plan = self.plan(&mut subject.geometry.child(3).child(press));
             let electronics = &self.electronics;
-            let read = subject.pressed(&mut self.bench, &plan, press, |solved, force_n, noise| {
-                let of = |electronics: &Electronics| {
-                    let mut noise = noise.child(electronics.number.into());
-                    let press = electronics.course(&plan, solved, force_n, &mut noise)?;
-                    Some(subject.labelled(object, press))
-                };
-                Some(electronics.iter().filter_map(of).collect::<Vec<_>>())
+            let read = subject.pressed(&mut self.bench, &plan, press, |solved, noise| {
+                let of = electronics.iter();
+                let read = of.map(|of| of.course(&plan, solved, noise, subject.labels()));
+                Some(read.collect::<Vec<_>>())
             });
-            made.extend(read.into_iter().flatten());
-            electronics.iter().for_each(|_| progress());
+            made.extend(read.unwrap_or_else(|| vec![None; electronics.len()]));
         }
         made
     }

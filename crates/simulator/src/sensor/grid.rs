@@ -1,8 +1,6 @@
 //! The taxels under the cells on which a press is solved, and the share of a cell's load that each
 //! taxel feels.
 
-use std::sync::{Arc, OnceLock};
-
 use super::design::Design;
 use crate::press::{CELL_MM, CELLS, Window};
 use hardnessd_core::frame::{Array, Pitch};
@@ -16,7 +14,7 @@ const FINE: (usize, f64) = (12, 4.0);
 const PARTS: (usize, f64) = (3, 3.0);
 
 /// The taxels of an array in the middle of the cells.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Grid {
     pub(crate) array: Array,
     pub(crate) pitch: Pitch,
@@ -33,19 +31,11 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
-    /// The grid of the JX255N.
-    pub(crate) fn jx255n() -> Arc<Self> {
-        static GRID: OnceLock<Arc<Grid>> = OnceLock::new();
-        Arc::clone(
-            GRID.get_or_init(|| Arc::new(Self::new(&Design::jx255n(super::SensorProfile::Clean)))),
-        )
-    }
-
     /// The square grid of a design.
     ///
     /// Where the taxels' borders lie on the cells' borders, a cell has one of a few places in a
     /// taxel. In other grids its place is rounded to an eighth of a cell.
-    pub(super) fn new(design: &Design) -> Self {
+    pub(crate) fn new(design: &Design) -> Self {
         let pitch_mm = design.pitch_mm;
         let count = design.array.rows;
         let first_mm = 0.5 * (CELLS as f64 * CELL_MM - count as f64 * pitch_mm);

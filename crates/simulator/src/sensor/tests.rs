@@ -20,7 +20,10 @@ fn smooth_load() -> (Vec<f32>, f64) {
 
 /// A raw sensor without activation thresholds.
 fn without_thresholds(seed: u64) -> Sensor {
-    let mut sensor = Sensor::new(SensorProfile::Raw, &Stream::new(seed, "sensor"));
+    let mut sensor = Sensor::draw(
+        Design::jx255n(SensorProfile::Raw),
+        &Stream::new(seed, "sensor"),
+    );
     sensor.threshold_n.fill(0.0);
     sensor
 }
@@ -177,7 +180,10 @@ fn a_restless_array_has_noise_on_every_taxel_and_is_tared_to_a_mean_of_zero() {
 
 #[test]
 fn every_taxel_feels_the_guaranteed_load_and_full_scale_is_8_bits() {
-    let sensor = Sensor::new(SensorProfile::Clean, &Stream::new(9, "sensor"));
+    let sensor = Sensor::draw(
+        Design::jx255n(SensorProfile::Clean),
+        &Stream::new(9, "sensor"),
+    );
     let mut noise = Stream::new(9, "noise");
     let dead = sensor.gain.iter().filter(|&&gain| gain == 0.0).count();
     let felt = |raw: RawFrame| raw.counts.iter().filter(|&&c| c > 0.0).count();

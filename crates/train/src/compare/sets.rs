@@ -119,7 +119,7 @@ fn simulated(
     let path = directory.join(format!("{name}-{}.npz", &hash[..8]));
     if !path.exists() {
         hardnessd_core::stderr_line!("simulating {}", path.display());
-        let presses = simulated::simulate(settings, layout);
+        let (presses, _) = simulated::simulate(settings, layout);
         write_whole(&path, &simulated::to_bytes(settings, layout, &presses)?)?;
     }
     read_one(&path)

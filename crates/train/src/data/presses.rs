@@ -16,7 +16,7 @@ use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
     COLS, COURSE_FRAMES, Level, ModelFrame, ROWS, Resampling, Sample, TimeSeries, parts,
 };
-use hardnessd_simulator::{LabelledCourse, LabelledSample, Reference, Split};
+use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Reference, Split};
 
 pub use self::file::{Layout, meta, write};
 use self::frames::Frames;
@@ -63,6 +63,18 @@ pub struct Press {
 }
 
 impl Press {
+    fn labelled(labels: Labels, force_n: f32) -> Self {
+        Self {
+            level: labels.level,
+            object: Some(labels.object),
+            material: Some(labels.material),
+            split: labels.split,
+            shore: Some(labels.shore).filter(|shore| shore.is_finite()),
+            force_n: Some(force_n),
+            ..Self::default()
+        }
+    }
+
     /// The pressed object, if the data say which one it is.
     pub fn pressed(&self) -> Option<Object> {
         Some(Object {
@@ -124,36 +136,22 @@ impl Presses {
     pub fn of_samples(samples: Vec<LabelledSample>) -> Self {
         let mut all = Self::default();
         for sample in samples {
-            let press = Press {
-                level: sample.level,
-                object: Some(sample.object),
-                material: Some(sample.material),
-                split: sample.split,
-                shore: Some(sample.shore),
-                force_n: Some(sample.force_n),
-                ..Press::default()
-            };
+            let press = Press::labelled(sample.labels, sample.force_n);
             all.push(press, [(0.0, None, resampled(&sample.frame).newtons)]);
         }
         all
     }
 
     /// The simulator's presses over time.
-    pub fn of_courses(courses: &[LabelledCourse]) -> Self {
+    pub fn of_courses<'a>(courses: impl IntoIterator<Item = &'a LabelledCourse>) -> Self {
         let mut all = Self::default();
         for course in courses {
             let press = Press {
-                level: course.level,
-                object: Some(course.object),
-                material: Some(course.material),
-                split: course.split,
-                shore: Some(course.shore).filter(|shore| shore.is_finite()),
-                force_n: Some(course.force_n),
                 arm_n_per_mm: course.arm_n_per_mm,
                 sensor: course.sensor,
                 reference: course.reference,
                 best: course.best,
-                ..Press::default()
+                ..Press::labelled(course.labels, course.force_n)
             };
             let moments = course.moments.iter().map(|moment| {
                 let millinewtons = moment.millinewtons.iter();

@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
-use hardnessd_simulator::{self, CourseSettings, DatasetSettings, LEVELS, Materials};
+use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Materials};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
@@ -29,37 +29,36 @@ pub fn configured(settings: &CourseSettings, text: &str) -> anyhow::Result<Cours
     overridden(settings, &table)
 }
 
-/// Simulates presses, with a progress bar on a terminal. Single frames are those of `settings.objects`.
-pub fn simulate(settings: &CourseSettings, layout: Layout) -> Presses {
+/// Simulates presses, with a progress bar on a terminal. Single frames are those of `settings.objects`. Also returns
+/// the number of presses that no sensor saw, or that lasted too long.
+pub fn simulate(settings: &CourseSettings, layout: Layout) -> (Presses, usize) {
     let jobs = std::thread::available_parallelism().map_or(1, usize::from);
-    let total = match layout {
-        Layout::Frames => settings.objects.samples(),
-        Layout::OverTime => settings.presses(),
+    let style = ProgressStyle::with_template("{bar:30} {percent} %, {eta} left");
+    let bar = ProgressBar::new(0).with_style(style.expect("the template is right"));
+    let progress = |done: usize, all: usize| {
+        bar.set_length(all as u64);
+        bar.set_position(done as u64);
     };
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} presses, {eta} left");
-    let bar = ProgressBar::new(total).with_style(style.expect("the template is right"));
-    let progress = |done: usize| bar.set_position(done as u64);
-    let presses = match layout {
-        Layout::Frames => Presses::of_samples(hardnessd_simulator::dataset(
-            &settings.objects,
-            jobs,
-            progress,
-        )),
+    let (presses, left_out) = match layout {
+        Layout::Frames => {
+            let samples = hardnessd_simulator::dataset(&settings.objects, jobs, progress);
+            (Presses::of_samples(samples), 0)
+        }
         Layout::OverTime => {
-            Presses::of_courses(&hardnessd_simulator::courses(settings, jobs, progress))
+            let courses = hardnessd_simulator::courses(settings, jobs, progress);
+            let presses = Presses::of_courses(courses.iter().flatten());
+            let left_out = courses.len() - presses.all.len();
+            (presses, left_out)
         }
     };
     bar.finish_and_clear();
-    presses
+    (presses, left_out)
 }
 
 /// The levels with their intervals of Shore. Those of the named materials are the paper's.
 fn levels(settings: &DatasetSettings) -> Vec<Level> {
     match settings.materials {
-        Materials::Broad => LEVELS
-            .iter()
-            .map(|range| source::level(range, range.touching))
-            .collect(),
+        Materials::Broad => source::levels(|range| range.touching),
         Materials::Named => source::papers_levels(),
     }
 }

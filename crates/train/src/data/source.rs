@@ -17,19 +17,19 @@ pub const SIMULATOR: &str = "hardnessd simulator";
 /// The name of `hrn-train collect` in `meta.generator`.
 pub const COLLECTOR: &str = "hrn-train collect";
 
-/// The four hardness levels of the paper's Table 1.
-pub fn papers_levels() -> Vec<Level> {
-    let level = |range: &LevelRange| level(range, range.table);
-    LEVELS.iter().map(level).collect()
+/// The four hardness levels, each with the interval of Shore that `shore` picks.
+pub(super) fn levels(shore: fn(&LevelRange) -> &'static str) -> Vec<Level> {
+    let level = |(level, range): (u8, &LevelRange)| Level {
+        level,
+        label: range.label.to_owned(),
+        shore: shore(range).to_owned(),
+    };
+    (1..).zip(&LEVELS).map(level).collect()
 }
 
-/// A level with its interval of Shore, as it is written in files.
-pub(super) fn level(range: &LevelRange, shore: &str) -> Level {
-    Level {
-        level: range.level,
-        label: range.label.to_owned(),
-        shore: shore.to_owned(),
-    }
+/// The four hardness levels of the paper's Table 1.
+pub fn papers_levels() -> Vec<Level> {
+    levels(|range| range.table)
 }
 
 /// What felt a press, with its number in files.

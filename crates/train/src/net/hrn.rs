@@ -154,7 +154,7 @@ mod tests {
                 ..DatasetSettings::default()
             },
             1,
-            |_| (),
+            |_, _| (),
         );
         let frames: Vec<_> = samples
             .iter()

@@ -58,19 +58,18 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     };
     check_new(&arguments.out)?;
     let begun = Instant::now();
-    let presses = simulated::simulate(&settings, layout);
+    let (presses, left_out) = simulated::simulate(&settings, layout);
     let seconds = begun.elapsed().as_secs_f64();
     write(
         &arguments.out,
         &simulated::to_bytes(&settings, layout, &presses)?,
     )?;
-    let count = presses.all.len() as u64;
+    let count = presses.all.len();
     let left_out = match layout {
         Layout::Frames => String::new(),
-        Layout::OverTime => format!(
-            "; {} left out: no sensor saw them, or they lasted over 30 s",
-            settings.presses() - count
-        ),
+        Layout::OverTime => {
+            format!("; {left_out} left out: no sensor saw them, or they lasted over 30 s")
+        }
     };
     Ok(format!(
         "{}: {count} presses in {seconds:.1} s, {:.0} a second{left_out}\n",

@@ -48,7 +48,8 @@ fn courses() -> Presses {
         },
         ..CourseSettings::default()
     };
-    let mut presses = Presses::of_courses(&hardnessd_simulator::courses(&settings, 2, |_| ()));
+    let courses = hardnessd_simulator::courses(&settings, 2, |_, _| ());
+    let mut presses = Presses::of_courses(courses.iter().flatten());
     for (place, reference) in [
         (1, Reference::Flat { width_mm: 20.0 }),
         (3, Reference::Ball { radius_mm: 7.5 }),
