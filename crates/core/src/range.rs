@@ -162,6 +162,7 @@ macro_rules! ranged {
 ranged! {
     f64, f64::from, false;
     f32, as_written, false;
+    u8, f64::from, true;
     u16, f64::from, true;
     u32, f64::from, true;
     u64, |number| number as f64, true;

@@ -6,16 +6,13 @@
 
 mod world;
 
-use serde::{Deserialize, Serialize};
-
-pub use self::world::{BroadSensors, SensorDesigns};
 use super::dataset::HIGHEST_FORCE_N;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
 use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
-use super::settings::DatasetSettings;
+use super::settings::{CourseSettings, SensorDesigns};
 use super::solved::SolvedPress;
 use super::subject::{Labels, Subject, harder_and_harder, shared_out, units};
 use super::tracked::{Seen, begins_press, one_press};
@@ -23,34 +20,6 @@ use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
 use hardnessd_core::verdict::{COURSE_FRAMES, Resampling};
-
-/// The settings of a simulated data set of presses.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct CourseSettings {
-    /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
-    /// stops by force.
-    pub objects: DatasetSettings,
-    /// Least and greatest frame rate, drawn log-uniformly.
-    pub frame_rate_hz: [f64; 2],
-    /// The sensors, if each is another one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub sensors: Option<BroadSensors>,
-}
-
-impl Default for CourseSettings {
-    /// 200 + 20 objects of the named materials in matched shapes, 6 presses each.
-    fn default() -> Self {
-        Self {
-            objects: DatasetSettings {
-                presses: 6,
-                ..DatasetSettings::default()
-            },
-            frame_rate_hz: [5.0, 100.0],
-            sensors: None,
-        }
-    }
-}
 
 impl CourseSettings {
     fn has_broad_sensors(&self) -> bool {

@@ -36,7 +36,7 @@ mod courses;
 mod sequence;
 mod rig;
 
-pub use courses::{BroadSensors, CourseSettings, LabelledCourse, Sample, SensorDesigns, courses};
+pub use courses::{LabelledCourse, Sample, courses};
 pub use dataset::{LabelledSample, dataset};
 pub use level::{LEVELS, LevelRange, level_of};
 pub use material::{Material, Split};
@@ -46,7 +46,7 @@ pub use rig::{Rig, Touched};
 pub use rigid::Reference;
 pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};
 pub use sequence::{Pressed, REST_S, Sequence, SequenceFrame, SequenceSettings};
-pub use settings::{DatasetSettings, Materials};
+pub use settings::{BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns};
 pub use subject::Labels;
 
 pub use hardnessd_core::tare::NEWTONS_PER_COUNT;

@@ -1,11 +1,12 @@
 //! The settings of a simulated data set.
 
-use std::ops::RangeInclusive;
-
 use serde::{Deserialize, Serialize};
 
 use super::object::Shapes;
-use super::sensor::SensorProfile;
+use super::sensor::{BROAD_PITCHES_MM, SensorProfile};
+use hardnessd_core::frame::Pitch;
+use hardnessd_core::range::{self, OutOfRange, from_to};
+use hardnessd_core::settings;
 
 /// The materials of the objects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -17,54 +18,117 @@ pub enum Materials {
     Broad,
 }
 
-/// The settings of a simulated data set.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct DatasetSettings {
-    /// The seed of everything random.
-    pub seed: u64,
-    /// The materials of the objects.
-    pub materials: Materials,
-    /// The number of objects of each training material. Broad materials have four times as many
-    /// objects, each of a material of its own.
-    pub objects: u32,
-    /// The number of objects of each test material. Broad materials have four times as many
-    /// objects.
-    pub test_objects: u32,
-    /// Whether all eight named materials are test materials.
-    pub all_test: bool,
-    /// The number of presses of each object. All postures under all nominal forces are 48 presses.
-    /// Fewer presses are a part of those, spread over postures and forces.
-    pub presses: u32,
-    /// The least of the eight nominal forces. The greatest is 25 N (paper).
-    pub lowest_force_n: f32,
-    /// Distribution of shapes.
-    pub shapes: Shapes,
-    /// Spread of the sensors.
-    pub profile: SensorProfile,
+/// What the sensors of a data set have in common.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SensorDesigns {
+    /// Nothing: each is of a design of its own, under a cover of its own.
+    #[default]
+    Broad,
+    /// The simulated JX255N under its usual cover. Its users state the right newtons.
+    Jx255n,
 }
 
-impl Default for DatasetSettings {
-    /// The paper's data set: 10,000 + 1,000 samples.
-    fn default() -> Self {
-        Self {
-            seed: 0,
-            materials: Materials::Named,
-            objects: 50,
-            test_objects: 5,
-            all_test: false,
-            presses: 50,
-            lowest_force_n: 1.0,
-            shapes: Shapes::Matched,
-            profile: SensorProfile::Clean,
+impl SensorDesigns {
+    /// The distances between the taxels of the sensors, in mm.
+    pub fn pitches_mm(self) -> [f64; 2] {
+        match self {
+            Self::Broad => BROAD_PITCHES_MM,
+            Self::Jx255n => [Pitch::JX255N.rows_mm; 2],
         }
+    }
+}
+
+/// The most objects of a material, presses of an object, and sensors.
+const MOST: f64 = DatasetSettings::MOST as f64;
+
+settings! {
+    /// The settings of a simulated data set. By default it is the paper's: 10,000 + 1,000 samples.
+    #[derive(Copy)]
+    pub struct DatasetSettings {
+        /// The seed of everything random.
+        pub seed: u64 = 0;
+        /// The materials of the objects.
+        pub materials: Materials = Materials::Named;
+        /// The number of objects of each training material. Broad materials have four times as many
+        /// objects, each of a material of its own.
+        pub objects: u32 = 50, in from_to((0.0, MOST), "");
+        /// The number of objects of each test material. Broad materials have four times as many
+        /// objects.
+        pub test_objects: u32 = 5, in from_to((0.0, MOST), "");
+        /// Whether all eight named materials are test materials.
+        pub all_test: bool = false;
+        /// The number of presses of each object. All postures under all nominal forces are 48 presses.
+        /// Fewer presses are a part of those, spread over postures and forces.
+        pub presses: u32 = 50, in from_to((1.0, MOST), "");
+        /// The least of the eight nominal forces. The greatest is 25 N (paper).
+        pub lowest_force_n: f32 = 1.0, in from_to((0.01, 25.0), "N");
+        /// Distribution of shapes.
+        pub shapes: Shapes = Shapes::Matched;
+        /// Spread of the sensors.
+        pub profile: SensorProfile = SensorProfile::Clean;
+    }
+}
+
+settings! {
+    /// The sensors of a data set that has many, each with references. By default these are 1,600 + 160.
+    #[derive(Copy)]
+    pub struct BroadSensors {
+        /// What the sensors have in common.
+        pub designs: SensorDesigns = SensorDesigns::Broad;
+        /// The number of covers that training objects are pressed on, at most one for each object of a
+        /// material.
+        pub covers: u32 = 200, in from_to((1.0, MOST), "");
+        /// The number of covers for test objects.
+        pub test_covers: u32 = 20, in from_to((1.0, MOST), "");
+        /// The number of electronics that read the presses on each cover.
+        pub electronics: u32 = 8, in from_to((1.0, MOST), "");
+    }
+}
+
+settings! {
+    /// The settings of a simulated data set of presses. By default it has 200 + 20 objects of the named materials in
+    /// matched shapes, with 6 presses each.
+    #[derive(Copy)]
+    pub struct CourseSettings {
+        /// Objects, materials, shapes, sensors. `lowest_force_n` is the least force of an arm that
+        /// stops by force.
+        pub objects: DatasetSettings = DatasetSettings {
+            presses: 6,
+            ..DatasetSettings::default()
+        };
+        /// Least and greatest frame rate, drawn log-uniformly.
+        pub frame_rate_hz: [f64; 2] = [5.0, 100.0];
+        /// The sensors, if each is another one.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub sensors: Option<BroadSensors>;
     }
 }
 
 impl DatasetSettings {
     /// The most objects of a material, and the most presses of an object.
     pub const MOST: u32 = 10_000;
+}
 
-    /// The range of the least nominal force, N.
-    pub const LOWEST_FORCES_N: RangeInclusive<f32> = 0.01..=25.0;
+impl CourseSettings {
+    /// Checks that each value is in its range.
+    ///
+    /// # Errors
+    ///
+    /// Names the first one that is not.
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        let objects = self.objects.check_ranges();
+        objects.map_err(|error| error.within("objects"))?;
+        let sensors = self.sensors.as_ref().map(BroadSensors::check_ranges);
+        let sensors = sensors.transpose();
+        sensors.map_err(|error| error.within("sensors"))?;
+        let [least, most] = self.frame_rate_hz;
+        let fits = 1.0 <= least && least <= most && most <= 200.0;
+        range::check(
+            "frame_rate_hz",
+            self.frame_rate_hz,
+            fits,
+            "1 to 200, ascending",
+        )
+    }
 }

@@ -6,7 +6,9 @@ use std::sync::LazyLock;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use serde::Deserialize;
 
+use crate::exit::coded;
 use crate::settings::{Profile, Settings, overridden};
+use hardnessd_core::exit::CONFIG;
 
 /// What learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -128,7 +130,9 @@ impl Recipe {
             let epochs = u32::try_from(steps.div_ceil(an_epoch));
             settings.training.epochs = epochs.unwrap_or(u32::MAX);
         }
-        overridden(&settings, given)
+        let settings = overridden(&settings, given)?;
+        settings.check().map_err(|error| coded(CONFIG, error))?;
+        Ok(settings)
     }
 }
 

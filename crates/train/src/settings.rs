@@ -6,11 +6,16 @@
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-mod bounds;
-
 use crate::exit::coded;
 use hardnessd_core::exit::CONFIG;
+use hardnessd_core::range::{self, OutOfRange, Range, from_to};
+use hardnessd_core::settings;
 use hardnessd_core::wording;
+
+/// Any share.
+const SHARE: Range = from_to((0.0, 1.0), "");
+/// The greatest number of settings that have no other bound.
+const MOST: f64 = 1e9;
 
 /// How long a run may take.
 #[derive(
@@ -57,44 +62,31 @@ pub enum Schedule {
     Cosine,
 }
 
-/// Settings for the training of a stage. The defaults are the paper's ("Training of HRN").
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Training {
-    /// Samples per step, of a GAN the real ones. The last batch of an epoch may be smaller.
-    pub batch: usize,
-    /// Passes over the samples: what the paper calls iterations. If the 500 of its GANs were steps, they
-    /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
-    /// iteration.
-    pub epochs: u32,
-    /// Decay per step of the running average of the weights, of a GAN those of the discriminator. The
-    /// average is evaluated and exported. With 0, the weights themselves are.
-    pub averaging: f64,
-    /// The rule of a step: `sgd` or `adam`.
-    pub rule: Rule,
-    /// The learning rate of the first step.
-    pub learning_rate: f64,
-    /// The schedule of the learning rate: `constant` or `cosine`.
-    pub schedule: Schedule,
-    /// Adam's decay of the gradient's mean.
-    pub beta1: f64,
-    /// The share, times the learning rate, by which each step shrinks a kernel. Biases and the
-    /// mixture's mu and sigma do not decay.
-    pub weight_decay: f64,
-}
-
-impl Default for Training {
-    fn default() -> Self {
-        Self {
-            batch: 100,
-            epochs: 200,
-            averaging: 0.0,
-            rule: Rule::Sgd,
-            learning_rate: 1e-3,
-            schedule: Schedule::Constant,
-            beta1: 0.9,
-            weight_decay: 0.0,
-        }
+settings! {
+    /// Settings for the training of a stage. The defaults are the paper's ("Training of HRN").
+    #[derive(Copy)]
+    pub struct Training {
+        /// Samples per step, of a GAN the real ones. The last batch of an epoch may be smaller. Batch normalisation needs
+        /// two samples.
+        pub batch: usize = 100, in from_to((2.0, 1e6), "");
+        /// Passes over the samples: what the paper calls iterations. If the 500 of its GANs were steps, they
+        /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
+        /// iteration.
+        pub epochs: u32 = 200, in from_to((1.0, MOST), "");
+        /// Decay per step of the running average of the weights, of a GAN those of the discriminator. The
+        /// average is evaluated and exported. With 0, the weights themselves are.
+        pub averaging: f64 = 0.0, in from_to((0.0, 0.999_999), "");
+        /// The rule of a step: `sgd` or `adam`.
+        pub rule: Rule = Rule::Sgd;
+        /// The learning rate of the first step.
+        pub learning_rate: f64 = 1e-3, in from_to((1e-9, MOST), "");
+        /// The schedule of the learning rate: `constant` or `cosine`.
+        pub schedule: Schedule = Schedule::Constant;
+        /// Adam's decay of the gradient's mean.
+        pub beta1: f64 = 0.9, in from_to((0.0, 0.999_999), "");
+        /// The share, times the learning rate, by which each step shrinks a kernel. Biases and the
+        /// mixture's mu and sigma do not decay.
+        pub weight_decay: f64 = 0.0, in from_to((0.0, MOST), "");
     }
 }
 
@@ -122,123 +114,116 @@ impl Training {
     }
 }
 
-/// The changes made to a labelled frame before each use in training.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Augmentation {
-    /// Whether frames are turned and mirrored.
-    pub symmetries: bool,
-    /// The largest shift along each axis, in taxels. The taxels that come in are background.
-    pub shift_taxels: u8,
-}
-
-/// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
-/// network that has only learnt from correct reports trusts every report.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ArmReports {
-    /// Share of the presses for which nothing is known about the arm.
-    pub unknown: f64,
-    /// Share of the other presses for which the stiffness is unknown.
-    pub unknown_arm: f64,
-    /// Share of the other presses whose reports have no error.
-    pub exact: f64,
-    /// The largest relative error of the positions.
-    pub position: f64,
-    /// The largest relative error of the stiffness.
-    pub arm: f64,
-    /// The largest error of the moments, in frames.
-    pub clock_frames: f64,
-    /// Share of the presses that are judged before their end.
-    pub early: f64,
-    /// Share of the presses that a slower sensor sees, with only every second to eighth frame.
-    pub slower: f64,
-    /// Share of the presses that take half to sixteen times as long.
-    pub stretched: f64,
-}
-
-impl Default for ArmReports {
-    fn default() -> Self {
-        Self {
-            unknown: 0.3,
-            unknown_arm: 0.1,
-            exact: 0.5,
-            position: 0.1,
-            arm: 0.3,
-            clock_frames: 1.0,
-            early: 0.25,
-            slower: 0.3,
-            stretched: 0.3,
-        }
+settings! {
+    /// The changes made to a labelled frame before each use in training.
+    #[derive(Copy)]
+    pub struct Augmentation {
+        /// Whether frames are turned and mirrored.
+        pub symmetries: bool = false;
+        /// The largest shift along each axis, in taxels. The taxels that come in are background.
+        pub shift_taxels: u8 = 0, in from_to((0.0, 4.0), "taxels");
     }
 }
 
-/// Settings of a run. The defaults are the paper's. A method ignores the tables of stages that it
-/// does not have.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Settings {
-    /// The force on a taxel, in newtons, that becomes 1 in the network's image. 0 N becomes -1.
-    /// 10.2 N is the full scale of 8 bits of 0.04 N.
-    pub full_scale_n: f64,
-    /// Above 0, the image is linear in log(1 + newtons / this value). With 0, it is linear in
-    /// newtons.
-    pub log_above_n: f64,
-    /// Whether the recogniser's last layer takes each channel's mean beside its greatest value. A mean can add up
-    /// an area or a force. It applies to a recogniser with a last layer of its own, so not to SGAN
-    /// and IGAN, whose discriminator is the recogniser.
-    pub mean_pooling: bool,
-    /// Samples that the STGANs generate of each component of each level's mixture: 225 x 50 = 11,250 per
-    /// level, which is thirty for each of the paper's 375 labelled samples.
-    pub generated_a_component: u32,
-    /// Share of the labelled objects of each level that are held out, to fit the temperature and to follow the
-    /// training, from 0 to 0.5. With 0, as in the paper, none are.
-    pub held_out: f64,
-    /// The GAN on unlabelled samples: USTGAN, or the GAN of SGAN and IGAN.
-    pub ustgan: Training,
-    /// Each STGAN.
-    pub stgan: Training,
-    /// The training of HRN on the generated samples.
-    pub pretraining: Training,
-    /// The training on the labelled samples, from random weights or as the fine-tuning of other weights.
-    pub training: Training,
-    /// The changes made to a frame before HRN learns from it.
-    pub augmentation: Augmentation,
-    /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
-    pub reports: ArmReports,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            full_scale_n: 10.2,
-            log_above_n: 0.0,
-            mean_pooling: false,
-            generated_a_component: 225,
-            held_out: 0.0,
-            ustgan: Training::of_a_gan(),
-            stgan: Training::of_a_gan(),
-            pretraining: Training::default(),
-            training: Training::default(),
-            augmentation: Augmentation::default(),
-            reports: ArmReports::default(),
-        }
+settings! {
+    /// Errors in the reports about the arm, and other changes to a press, drawn anew for each press. A
+    /// network that has only learnt from correct reports trusts every report.
+    #[derive(Copy)]
+    pub struct ArmReports {
+        /// Share of the presses for which nothing is known about the arm.
+        pub unknown: f64 = 0.3, in SHARE;
+        /// Share of the other presses for which the stiffness is unknown.
+        pub unknown_arm: f64 = 0.1, in SHARE;
+        /// Share of the other presses whose reports have no error.
+        pub exact: f64 = 0.5, in SHARE;
+        /// The largest relative error of the positions.
+        pub position: f64 = 0.1, in from_to((0.0, 0.5), "");
+        /// The largest relative error of the stiffness.
+        pub arm: f64 = 0.3, in from_to((0.0, 0.9), "");
+        /// The largest error of the moments, in frames.
+        pub clock_frames: f64 = 1.0, in from_to((0.0, 5.0), "frames");
+        /// Share of the presses that are judged before their end.
+        pub early: f64 = 0.25, in SHARE;
+        /// Share of the presses that a slower sensor sees, with only every second to eighth frame.
+        pub slower: f64 = 0.3, in SHARE;
+        /// Share of the presses that take half to sixteen times as long.
+        pub stretched: f64 = 0.3, in SHARE;
     }
 }
 
-/// Settings with the values in `given` in place of their own.
+settings! {
+    /// Settings of a run. The defaults are the paper's. A method ignores the tables of stages that it
+    /// does not have.
+    #[derive(Copy)]
+    pub struct Settings {
+        /// The force on a taxel, in newtons, that becomes 1 in the network's image. 0 N becomes -1.
+        /// 10.2 N is the full scale of 8 bits of 0.04 N.
+        pub full_scale_n: f64 = 10.2, in from_to((1e-3, MOST), "N");
+        /// Above 0, the image is linear in log(1 + newtons / this value). With 0, it is linear in
+        /// newtons.
+        pub log_above_n: f64 = 0.0;
+        /// Whether the recogniser's last layer takes each channel's mean beside its greatest value. A mean can add up
+        /// an area or a force. It applies to a recogniser with a last layer of its own, so not to SGAN
+        /// and IGAN, whose discriminator is the recogniser.
+        pub mean_pooling: bool = false;
+        /// Samples that the STGANs generate of each component of each level's mixture: 225 x 50 = 11,250 per
+        /// level, which is thirty for each of the paper's 375 labelled samples. Fifty components of 10,000 samples
+        /// each take 1.6 GB.
+        pub generated_a_component: u32 = 225, in from_to((1.0, 1e4), "");
+        /// Share of the labelled objects of each level that are held out, to fit the temperature and to follow the
+        /// training, from 0 to 0.5. With 0, as in the paper, none are.
+        pub held_out: f64 = 0.0, in from_to((0.0, 0.5), "");
+        /// The GAN on unlabelled samples: USTGAN, or the GAN of SGAN and IGAN.
+        pub ustgan: Training = Training::of_a_gan();
+        /// Each STGAN.
+        pub stgan: Training = Training::of_a_gan();
+        /// The training of HRN on the generated samples.
+        pub pretraining: Training = Training::default();
+        /// The training on the labelled samples, from random weights or as the fine-tuning of other weights.
+        pub training: Training = Training::default();
+        /// The changes made to a frame before HRN learns from it.
+        pub augmentation: Augmentation = Augmentation::default();
+        /// What a robot reports of its arm, and the errors in it, for networks of whole presses.
+        pub reports: ArmReports = ArmReports::default();
+    }
+}
+
+impl Settings {
+    /// Checks that each value is in its range.
+    ///
+    /// # Errors
+    ///
+    /// Names the first one that is not.
+    pub(crate) fn check(&self) -> Result<(), OutOfRange> {
+        self.check_ranges()?;
+        let found = self.log_above_n;
+        let fits = found == 0.0 || (1e-3..=1e3).contains(&found);
+        range::check("log_above_n", found, fits, "0, or 0.001 to 1000 N")?;
+        for (table, checked) in [
+            ("ustgan", self.ustgan.check_ranges()),
+            ("stgan", self.stgan.check_ranges()),
+            ("pretraining", self.pretraining.check_ranges()),
+            ("training", self.training.check_ranges()),
+            ("augmentation", self.augmentation.check_ranges()),
+            ("reports", self.reports.check_ranges()),
+        ] {
+            checked.map_err(|error| error.within(table))?;
+        }
+        Ok(())
+    }
+}
+
+/// Settings with the values in `given` in place of their own, whatever their range.
 ///
 /// # Errors
 ///
-/// Returns an error if a key is unknown, or a value lies outside its range.
+/// Returns an error if a key is unknown.
 pub(crate) fn overridden<T: Serialize + DeserializeOwned>(
     settings: &T,
     given: &toml::Table,
 ) -> anyhow::Result<T> {
     let own = toml::Table::try_from(settings).expect("settings are plain tables");
-    let merged = merged(own, given.clone());
-    bounds::check(&merged)?;
-    merged
+    merged(own, given.clone())
         .try_into()
         .map_err(|error| coded(CONFIG, error.message()))
 }
@@ -250,11 +235,10 @@ pub(crate) fn overridden<T: Serialize + DeserializeOwned>(
 /// Returns an error if the text is not TOML with known keys, or a value lies outside its range.
 pub fn parse(text: &str) -> anyhow::Result<toml::Table> {
     let syntax = |error| coded(CONFIG, wording::of_toml(text, &error));
-    // The settings are read only so that an error can show the line.
-    let _: Settings = toml::from_str(text).map_err(syntax)?;
-    let given = toml::from_str(text).map_err(syntax)?;
-    bounds::check(&given)?;
-    Ok(given)
+    // The settings are read so that an error can show the line, and to check the given values.
+    let settings: Settings = toml::from_str(text).map_err(syntax)?;
+    settings.check().map_err(|error| coded(CONFIG, error))?;
+    toml::from_str(text).map_err(syntax)
 }
 
 /// The values of `under`, with those of `over` in place of its own.
@@ -296,17 +280,16 @@ mod tests {
         for (text, expected) in [
             ("epoch = 3", "unknown field `epoch`"),
             ("[training]\nepochs = \"3\"", "invalid type: string \"3\""),
-            ("[stgan]\nbeta1 = 1", "`stgan.beta1`: found 1"),
-            ("held_out = nan", "`held_out`: found NaN"),
+            ("[stgan]\nbeta1 = 1", "stgan.beta1: found 1"),
+            ("held_out = nan", "held_out: found NaN"),
             (
                 "log_above_n = 1e-4",
-                "`log_above_n`: found 0.0001, expected 0, or 0.001 to 1000",
+                "log_above_n: found 0.0001, expected 0, or 0.001 to 1000",
             ),
             ("log_above_n = 1e-40", "expected 0, or 0.001 to 1000"),
             ("log_above_n = 1e4", "expected 0, or 0.001 to 1000"),
         ] {
-            let given = parse(text).and_then(|given| overridden(&Settings::default(), &given));
-            let error = given.unwrap_err().to_string();
+            let error = parse(text).unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");
             assert!(!error.contains('\n'), "{text}: {error}");
         }

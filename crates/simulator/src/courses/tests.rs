@@ -1,5 +1,5 @@
 use super::super::object::Shapes;
-use super::super::settings::Materials;
+use super::super::settings::{DatasetSettings, Materials};
 use super::*;
 
 fn small() -> CourseSettings {

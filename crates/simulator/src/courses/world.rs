@@ -5,56 +5,15 @@
 //! drawn, objects are pressed on each, and several electronics read each of these presses: a
 //! sensor is one electronics under one cover. Train and test sensors share nothing.
 
-use serde::{Deserialize, Serialize};
-
-use super::{ARM_N_PER_MM, CourseSettings, LabelledCourse, Plan, Reading};
+use super::{ARM_N_PER_MM, LabelledCourse, Plan, Reading};
 use crate::material::Split;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
 use crate::rigid::{self, FLAT_MM, Reference};
-use crate::sensor::{BROAD_PITCHES_MM, Design, Sensor};
-use crate::settings::DatasetSettings;
+use crate::sensor::{Design, Sensor};
+use crate::settings::{BroadSensors, CourseSettings, DatasetSettings, SensorDesigns};
 use crate::solved::SolvedPress;
 use crate::subject::{Labels, Subject, Unit, shared_out, units};
-use hardnessd_core::frame::Pitch;
-
-/// What the sensors of a data set have in common.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SensorDesigns {
-    /// Nothing: each is of a design of its own, under a cover of its own.
-    #[default]
-    Broad,
-    /// The simulated JX255N under its usual cover. Its users state the right newtons.
-    Jx255n,
-}
-
-/// The sensors of a data set that has many, each with references.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct BroadSensors {
-    /// What the sensors have in common.
-    pub designs: SensorDesigns,
-    /// The number of covers that training objects are pressed on, at most one for each object of a
-    /// material.
-    pub covers: u32,
-    /// The number of covers for test objects.
-    pub test_covers: u32,
-    /// The number of electronics that read the presses on each cover.
-    pub electronics: u32,
-}
-
-impl Default for BroadSensors {
-    /// 1,600 + 160 sensors.
-    fn default() -> Self {
-        Self {
-            designs: SensorDesigns::Broad,
-            covers: 200,
-            test_covers: 20,
-            electronics: 8,
-        }
-    }
-}
 
 /// Presses of each rigid piece on each sensor.
 const REFERENCES: u32 = 5;
@@ -78,16 +37,6 @@ struct Place {
     /// Number of the cover over both splits.
     index: u32,
     units: Vec<Unit>,
-}
-
-impl SensorDesigns {
-    /// The distances between the taxels of the sensors, in mm.
-    pub fn pitches_mm(self) -> [f64; 2] {
-        match self {
-            Self::Broad => BROAD_PITCHES_MM,
-            Self::Jx255n => [Pitch::JX255N.rows_mm; 2],
-        }
-    }
 }
 
 impl BroadSensors {

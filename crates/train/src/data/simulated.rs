@@ -26,7 +26,9 @@ use crate::settings::overridden;
 pub fn configured(settings: &CourseSettings, text: &str) -> anyhow::Result<CourseSettings> {
     let table: Result<toml::Table, _> = toml::from_str(text);
     let table = table.map_err(|error| coded(CONFIG, wording::of_toml(text, &error)))?;
-    overridden(settings, &table)
+    let settings = overridden(settings, &table)?;
+    settings.check().map_err(|error| coded(CONFIG, error))?;
+    Ok(settings)
 }
 
 /// Simulates presses, with a progress bar on a terminal. Single frames are those of `settings.objects`. Also returns

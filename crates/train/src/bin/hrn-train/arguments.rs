@@ -184,13 +184,16 @@ pub(super) struct Collect {
     pub(super) captures: Vec<PathBuf>,
 }
 
-/// Parses a force in newtons, from the least of `hardnessd simulate --force` to the greatest
-/// nominal force.
+/// Parses a force in newtons.
 fn lowest_force_n(text: &str) -> Result<f32, String> {
-    match text.parse() {
-        Ok(force_n) if DatasetSettings::LOWEST_FORCES_N.contains(&force_n) => Ok(force_n),
-        _ => Err("expected newtons from 0.01 to 25".to_owned()),
-    }
+    let lowest_force_n = text.parse().map_err(|_| "expected newtons")?;
+    let settings = DatasetSettings {
+        lowest_force_n,
+        ..DatasetSettings::default()
+    };
+    let checked = settings.check_ranges();
+    checked.map_err(|error| error.problem.into_string())?;
+    Ok(lowest_force_n)
 }
 
 #[derive(Debug, clap::Args)]
