@@ -1,12 +1,15 @@
-//! Arrays of an `.npz` file: the types of their elements, and the writer.
+//! Arrays of an `.npz` file: the types of their elements, the writer and the reader.
 //!
 //! In: the name, the shape and the elements of each array, row by row. Out: a zip archive with an
-//! `.npy` file for each, as numpy's `savez` and `savez_compressed` write it.
+//! `.npy` file for each, as numpy's `savez` and `savez_compressed` write it; and back.
 
-use std::io::{self, Seek, Write};
+use std::fmt::Display;
+use std::io::{self, Cursor, Seek, Write};
+use std::ops::RangeInclusive;
 
+use zip::result::ZipResult;
 use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use crate::npy::Header;
 
@@ -132,5 +135,139 @@ impl<W: Write + Seek> Writer<W> {
         let mut out = self.zip.finish()?;
         out.flush()?;
         Ok(out)
+    }
+}
+
+/// An array that is not as it should be.
+#[derive(Debug, thiserror::Error)]
+#[error("array `{array}`: found {found}, expected {expected}")]
+pub struct Unexpected {
+    array: String,
+    found: String,
+    expected: String,
+}
+
+impl Unexpected {
+    /// The error of an array, with what was found and what was expected.
+    pub fn new(array: &str, found: impl Display, expected: impl Display) -> Self {
+        Self {
+            array: array.to_owned(),
+            found: found.to_string(),
+            expected: expected.to_string(),
+        }
+    }
+}
+
+/// Any number of rows.
+pub const ANY: RangeInclusive<usize> = 0..=usize::MAX;
+
+/// An `.npz` file being read.
+pub struct Reader<'a> {
+    zip: ZipArchive<Cursor<&'a [u8]>>,
+    most_bytes: usize,
+}
+
+impl<'a> Reader<'a> {
+    /// Begins to read a file, of whose arrays none may have more than `most_bytes`: a packed file may hold a
+    /// thousand times its size.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the bytes are no such file.
+    pub fn new(bytes: &'a [u8], most_bytes: usize) -> ZipResult<Self> {
+        let zip = ZipArchive::new(Cursor::new(bytes))?;
+        Ok(Self { zip, most_bytes })
+    }
+
+    /// Whether the file has this array.
+    pub fn has(&self, array: &str) -> bool {
+        self.zip.index_for_name(&format!("{array}.npy")).is_some()
+    }
+
+    /// The elements of an array, row by row. Each row has the shape `row`. Nothing is unpacked of an array with
+    /// another number of `rows`.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the array is missing, damaged, or of another shape or type.
+    pub fn read<T: Element>(
+        &mut self,
+        array: &str,
+        row: &[usize],
+        rows: RangeInclusive<usize>,
+    ) -> Result<Vec<T>, Unexpected> {
+        let found = self.find(array, row, rows.clone())?;
+        found.ok_or_else(|| Unexpected::new(array, "none", expected::<T>(row, &rows)))
+    }
+
+    /// The same of an array that may be missing.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Reader::read`].
+    pub fn find<T: Element>(
+        &mut self,
+        array: &str,
+        row: &[usize],
+        rows: RangeInclusive<usize>,
+    ) -> Result<Option<Vec<T>>, Unexpected> {
+        if !self.has(array) {
+            return Ok(None);
+        }
+        let unpacked = self.unpacked(array, row, &rows).map(Some);
+        unpacked.map_err(|found| Unexpected::new(array, found, expected::<T>(row, &rows)))
+    }
+
+    fn unpacked<T: Element>(
+        &mut self,
+        array: &str,
+        row: &[usize],
+        rows: &RangeInclusive<usize>,
+    ) -> io::Result<Vec<T>> {
+        let mut reader = self.zip.by_name(&format!("{array}.npy"))?;
+        let header = Header::read(&mut reader)?;
+        let fits = matches!(header.shape.split_first(), Some((first, rest)) if rest == row && rows.contains(first));
+        let count = header.count().filter(|_| fits);
+        let count = count.ok_or_else(|| header.unexpected_shape())?;
+        let bytes = count.saturating_mul(size_of::<T>());
+        if bytes > self.most_bytes {
+            return Err(io::Error::other(format!("{bytes} bytes of a small file")));
+        }
+        header.elements(&mut reader, T::of)
+    }
+}
+
+/// The type and the shape of an array, such as `f32 [N,28,28]`.
+fn expected<T: Element>(row: &[usize], rows: &RangeInclusive<usize>) -> String {
+    let lengths: String = row.iter().map(|length| format!(",{length}")).collect();
+    let count = match rows {
+        _ if *rows == ANY => "N".to_owned(),
+        _ => in_words(rows),
+    };
+    format!("{} [{count}{lengths}]", T::NAME)
+}
+
+/// Refuses values of an array outside a range.
+///
+/// # Errors
+///
+/// Names the first of them.
+pub fn within<T: PartialOrd + Display>(
+    array: &str,
+    values: &[T],
+    range: &RangeInclusive<T>,
+) -> Result<(), Unexpected> {
+    let Some(place) = values.iter().position(|value| !range.contains(value)) else {
+        return Ok(());
+    };
+    let found = format!("{} at {place}", values[place]);
+    Err(Unexpected::new(array, found, in_words(range)))
+}
+
+fn in_words<T: Display + PartialEq>(range: &RangeInclusive<T>) -> String {
+    let (least, most) = (range.start(), range.end());
+    match least == most {
+        true => least.to_string(),
+        false => format!("{least} to {most}"),
     }
 }

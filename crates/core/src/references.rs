@@ -4,36 +4,30 @@
 //! `docs/formats.md` has the arrays. A daemon gives them to its model, and they replace nothing of the
 //! calibration.
 
-use std::fmt::Display;
 use std::io::Cursor;
-use std::ops::RangeInclusive;
 
-use zip::ZipArchive;
-
-use crate::npy::Header;
-use crate::npz::Writer;
+use crate::npz::{Reader, Unexpected, Writer, within};
 use crate::verdict::{
     COLS, COURSE_FRAMES, MOST_REFERENCES, ModelFrame, Piece, ROWS, ReferencePress, Sample, TAXELS,
     TimeSeries,
 };
 
 /// The newtons on a taxel, without the sign.
-const MOST_N: f64 = 1e6;
+const MOST_N: f32 = 1e6;
 /// The lengths of pieces, in mm.
-const MOST_MM: f64 = 1000.0;
+const MOST_MM: f32 = 1000.0;
 /// The largest file that is read, in bytes.
 pub const MAX_FILE_BYTES: usize = 16_000_000;
 
 /// The reason why bytes are not a file of references.
 #[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct Error(String);
-
-impl Error {
-    /// The error of an array.
-    fn of(array: &str, found: impl Display, expected: impl Display) -> Self {
-        Self(format!("{array}: found {found}, expected {expected}"))
-    }
+pub enum Error {
+    /// They are no archive.
+    #[error("found no .npz file ({0}), expected one of `hardnessd identify`")]
+    Archive(#[from] zip::result::ZipError),
+    /// An array is another one than `docs/formats.md` says.
+    #[error(transparent)]
+    Array(#[from] Unexpected),
 }
 
 /// Reads a file.
@@ -43,104 +37,65 @@ impl Error {
 /// Returns an [`Error`] if the bytes are no such file, or have no press or more than
 /// [`MOST_REFERENCES`].
 pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
-    let archive = ZipArchive::new(Cursor::new(bytes)).map_err(|error| {
-        Error(format!(
-            "found no .npz file ({error}), expected one of `hardnessd identify`"
-        ))
-    })?;
-    let mut arrays = Arrays(archive);
-    let kinds = arrays.read("piece", &[], 1..=MOST_REFERENCES, 0.0..=255.0)?;
+    let mut file = Reader::new(bytes, usize::MAX)?;
+    let kinds: Vec<u8> = file.read("piece", &[], 1..=MOST_REFERENCES)?;
     let count = kinds.len();
-    let piece_mm = arrays.read("piece_mm", &[], count..=count, 0.0..=MOST_MM)?;
-    let shore = arrays.read("shore", &[2], count..=count, 0.0..=100.0)?;
-    let arm_n_per_mm = arrays.read("arm_n_per_mm", &[], count..=count, 0.0..=1e6)?;
+    let mut column = |array: &str, row: &[usize], rows: usize, range| {
+        let values: Vec<f32> = file.read(array, row, rows..=rows)?;
+        within(array, &values, &range).map(|()| values)
+    };
+    let piece_mm = column("piece_mm", &[], count, 0.0..=MOST_MM)?;
+    let shore = column("shore", &[2], count, 0.0..=100.0)?;
+    let arm_n_per_mm = column("arm_n_per_mm", &[], count, 0.0..=1e6)?;
     let most = MOST_REFERENCES * COURSE_FRAMES.1;
-    let press = arrays.read("press", &[], 1..=most, 0.0..=f64::from(u32::MAX))?;
+    let press: Vec<u32> = file.read("press", &[], 1..=most)?;
     let frames = press.len();
-    let time_s = arrays.read("time_s", &[], frames..=frames, 0.0..=1e5)?;
-    let approach_mm = arrays.read("approach_mm", &[], frames..=frames, -1e6..=1e6)?;
-    let known = arrays.read("known", &[], frames..=frames, 0.0..=1.0)?;
-    let newtons = arrays.read("frames", &[ROWS, COLS], frames..=frames, -MOST_N..=MOST_N)?;
+    let mut column = |array: &str, row: &[usize], range| {
+        let values: Vec<f32> = file.read(array, row, frames..=frames)?;
+        within(array, &values, &range).map(|()| values)
+    };
+    let time_s = column("time_s", &[], 0.0..=1e5)?;
+    let approach_mm = column("approach_mm", &[], -1e6..=1e6)?;
+    let newtons = column("frames", &[ROWS, COLS], -MOST_N..=MOST_N)?;
+    let known: Vec<u8> = file.read("known", &[], frames..=frames)?;
+    within("known", &known, &(0..=1))?;
 
-    let of_presses: Vec<&[f64]> = press.chunk_by(f64::eq).collect();
-    let is_one = |(number, rows): (usize, &&[f64])| {
-        rows[0] == number as f64 && rows.len() <= COURSE_FRAMES.1
+    let of_presses: Vec<&[u32]> = press.chunk_by(u32::eq).collect();
+    let is_one = |(number, rows): (usize, &&[u32])| {
+        rows[0] as usize == number && rows.len() <= COURSE_FRAMES.1
     };
     if of_presses.len() != count || !of_presses.iter().enumerate().all(is_one) {
         let most = COURSE_FRAMES.1;
         let expected = format!("1 to {most} of each of {count} presses, in order");
-        return Err(Error::of("press", format!("{frames} frames"), expected));
+        return Err(Unexpected::new("press", format!("{frames} frames"), expected).into());
     }
     let mut moments = (0..frames).map(|row| Sample {
-        time_s: time_s[row] as f32,
-        approach_mm: (known[row] == 1.0).then_some(approach_mm[row] as f32),
+        time_s: time_s[row],
+        approach_mm: (known[row] == 1).then_some(approach_mm[row]),
         frame: ModelFrame {
-            newtons: std::array::from_fn(|k| newtons[row * TAXELS + k] as f32),
+            newtons: std::array::from_fn(|k| newtons[row * TAXELS + k]),
         },
     });
-    let reference = |(number, rows): (usize, &&[f64])| {
-        let mm = piece_mm[number] as f32;
-        let range = [shore[2 * number] as f32, shore[2 * number + 1] as f32];
+    let reference = |(number, rows): (usize, &&[u32])| {
+        let mm = piece_mm[number];
+        let range = [shore[2 * number], shore[2 * number + 1]];
         let piece = match kinds[number] {
-            1.0 if mm > 0.0 => Piece::Flat { width_mm: mm },
-            2.0 if mm > 0.0 => Piece::Ball { radius_mm: mm },
-            3.0 if range[0] <= range[1] => Piece::Shore { range },
+            1 if mm > 0.0 => Piece::Flat { width_mm: mm },
+            2 if mm > 0.0 => Piece::Ball { radius_mm: mm },
+            3 if range[0] <= range[1] => Piece::Shore { range },
             kind => {
                 let found = format!("{kind} of {mm} mm or Shore {range:?}");
                 let expected = "1 (flat), 2 (ball), 3 (known hardness)";
-                return Err(Error::of("piece", found, expected));
+                return Err(Unexpected::new("piece", found, expected).into());
             }
         };
         let course = TimeSeries {
             moments: moments.by_ref().take(rows.len()).collect(),
-            arm_n_per_mm: arm_n_per_mm[number] as f32,
+            arm_n_per_mm: arm_n_per_mm[number],
         };
         Ok(ReferencePress { course, piece })
     };
     of_presses.iter().enumerate().map(reference).collect()
-}
-
-/// The arrays of a file.
-struct Arrays<'a>(ZipArchive<Cursor<&'a [u8]>>);
-
-impl Arrays<'_> {
-    /// An array with so many rows of this shape. Nothing is unpacked of an array with another number of rows.
-    fn read(
-        &mut self,
-        array: &str,
-        row: &[usize],
-        rows: RangeInclusive<usize>,
-        range: RangeInclusive<f64>,
-    ) -> Result<Vec<f64>, Error> {
-        let Ok(mut entry) = self.0.by_name(&format!("{array}.npy")) else {
-            let expected = format!("an array with rows of shape {row:?}");
-            return Err(Error::of(array, "none", expected));
-        };
-        let failed = |error: std::io::Error| Error(format!("{array}: found {error}"));
-        let header = Header::read(&mut entry).map_err(failed)?;
-        let found = match header.shape.split_first() {
-            Some((&found, rest)) if rest == row => found,
-            _ => return Err(failed(header.unexpected_shape())),
-        };
-        if !rows.contains(&found) {
-            return Err(Error::of(array, format!("{found} rows"), within(&rows)));
-        }
-        let values = header.elements(&mut entry, Some).map_err(failed)?;
-        match values.iter().find(|value| !range.contains(*value)) {
-            None => Ok(values),
-            Some(found) => Err(Error::of(array, found, within(&range))),
-        }
-    }
-}
-
-/// A range in words.
-fn within<T: Display + PartialEq>(range: &RangeInclusive<T>) -> String {
-    let (least, most) = (range.start(), range.end());
-    if least == most {
-        least.to_string()
-    } else {
-        format!("{least} to {most}")
-    }
 }
 
 /// The bytes of a file with these presses. The same presses give the same bytes.
@@ -190,7 +145,10 @@ pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
+    use zip::ZipArchive;
+
     use super::*;
+    use crate::npy::Header;
 
     fn press(frames: usize, piece: Piece) -> ReferencePress {
         let moment = |place: usize| {
@@ -243,16 +201,19 @@ mod tests {
         for (bytes, expected) in [
             (b"PK".to_vec(), "found no .npz file"),
             (bytes[..bytes.len() / 2].to_vec(), "found no .npz file"),
-            (of(&[]), "piece: found 0 rows, expected 1 to 64"),
-            (of(&vec![press(1, flat); 65]), "piece: found 65 rows"),
+            (of(&[]), "expected u8 [1 to 64]"),
+            (
+                of(&vec![press(1, flat); 65]),
+                "shape [65], expected u8 [1 to 64]",
+            ),
             (
                 of(&[press(49, flat)]),
-                "press: found 49 frames, expected 1 to 48 of each of 1 presses",
+                "array `press`: found 49 frames, expected 1 to 48 of each of 1 presses",
             ),
             (of(&[press(4, turned)]), "Shore [70.0, 61.0]"),
             (
                 of(&[press(4, Piece::Flat { width_mm: f32::NAN })]),
-                "piece_mm: found NaN",
+                "array `piece_mm`: found NaN",
             ),
         ] {
             let error = read(&bytes).unwrap_err().to_string();
@@ -266,10 +227,10 @@ mod tests {
         let good = write(&presses()[..1]).unwrap();
         let most = MOST_REFERENCES * COURSE_FRAMES.1;
         for (array, rows, expected) in [
-            ("piece", 65, "1 to 64"),
-            ("piece_mm", 2, "1"),
-            ("press", most + 1, "1 to 3072"),
-            ("known", 5, "4"),
+            ("piece", 65, "u8 [1 to 64]"),
+            ("piece_mm", 2, "f32 [1]"),
+            ("press", most + 1, "u32 [1 to 3072]"),
+            ("known", 5, "u8 [4]"),
         ] {
             let mut whole = ZipArchive::new(Cursor::new(&good)).unwrap();
             let mut npz = Writer::compressed(Cursor::new(Vec::new()));
@@ -287,7 +248,8 @@ mod tests {
                 }
             }
             let error = read(&npz.finish().unwrap().into_inner()).unwrap_err();
-            let expected = format!("{array}: found {rows} rows, expected {expected}");
+            let found = format!("an array of shape [{rows}]");
+            let expected = format!("array `{array}`: found {found}, expected {expected}");
             assert_eq!(error.to_string(), expected);
         }
     }

@@ -1,22 +1,19 @@
 //! Presses as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
-use std::fmt::Display;
-use std::io::{self, Cursor, Seek, Write};
+use std::io::{self, Seek, Write};
 use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use anyhow::{anyhow, bail, ensure};
+use anyhow::{Context as _, anyhow};
 use serde::Deserialize;
 use serde_json::{Value, json};
-use zip::ZipArchive;
 
 use super::{MILLINEWTON, Press, Presses};
 use crate::data::source::{Kind, MOST_LEVELS, SIMULATOR, Source};
 use crate::exit::unreadable;
 use hardnessd_core::frame::Array;
-use hardnessd_core::npy::Header;
-use hardnessd_core::npz::{Element, Writer};
+use hardnessd_core::npz::{ANY, Element, Reader, Unexpected, Writer, within};
 use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Level, ROWS, TAXELS, are_levels, sha256_hex};
 use hardnessd_simulator::{BroadSensors, Reference, Split};
 
@@ -52,7 +49,40 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Presses> {
 ///
 /// Returns an error if the file cannot be read, or `meta` is not JSON.
 pub fn meta(path: &Path) -> anyhow::Result<Value> {
-    File::open(&whole(path)?, path)?.meta()
+    let bytes = whole(path)?;
+    let found = opened(&bytes).and_then(|mut file| Ok(described(&mut file)?));
+    found.with_context(|| path.display().to_string())
+}
+
+fn opened(bytes: &[u8]) -> anyhow::Result<Reader<'_>> {
+    let most_bytes = FREE_BYTES.max(bytes.len().saturating_mul(MOST_PACKED));
+    let file = Reader::new(bytes, most_bytes);
+    file.map_err(|_| anyhow!("not an .npz file, or a damaged one"))
+}
+
+/// The array `meta` as JSON. Null if it is missing.
+fn described(file: &mut Reader) -> Result<Value, Unexpected> {
+    let Some(text) = file.find::<u8>("meta", &[], ANY)? else {
+        return Ok(Value::Null);
+    };
+    serde_json::from_slice(&text).map_err(|error| Unexpected::new("meta", error, "JSON in UTF-8"))
+}
+
+/// A value of each press or moment, of an array that may be missing. NaN is a value that is not known.
+fn column<T: Element + PartialOrd + std::fmt::Display>(
+    file: &mut Reader,
+    array: &str,
+    count: usize,
+    range: &RangeInclusive<T>,
+) -> Result<Vec<Option<T>>, Unexpected> {
+    let Some(values) = file.find::<T>(array, &[], count..=count)? else {
+        return Ok(vec![None; count]);
+    };
+    let known = |value: T| Some(value).filter(|value| value.partial_cmp(value).is_some());
+    let values: Vec<Option<T>> = values.into_iter().map(known).collect();
+    let given: Vec<T> = values.iter().copied().flatten().collect();
+    within(array, &given, range)?;
+    Ok(values)
 }
 
 /// Reads a whole file. Refuses a device, such as a serial port, because it has no end.
@@ -66,86 +96,98 @@ pub(in crate::data) fn whole(path: &Path) -> anyhow::Result<Vec<u8>> {
 
 /// Reads the presses in `bytes`, the content of the file `path`.
 pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
-    let mut file = File::open(bytes, path)?;
+    let read = opened(bytes).and_then(|mut file| Ok(presses(&mut file, bytes, path)?));
+    read.with_context(|| path.display().to_string())
+}
+
+fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unexpected> {
     let mut presses = Presses {
-        sources: vec![source(bytes, &mut file)?],
+        sources: vec![source(file, bytes, path)?],
         ..Presses::default()
     };
-    let level: Vec<u8> = file.required("level", &[], None)?;
+    let level: Vec<u8> = file.read("level", &[], ANY)?;
     let count = level.len();
     if count == 0 {
-        return Err(file.error("level", "no press", "at least one"));
+        return Err(Unexpected::new("level", "no press", "at least one"));
     }
-    file.within("level", &level, &(0..=presses.levels().len() as u8))?;
-    let (array, newtons_each) = match file.layout() {
-        Layout::Frames => ("frames", 1.0),
-        Layout::OverTime => ("frames_mn", MILLINEWTON),
+    within("level", &level, &(0..=presses.levels().len() as u8))?;
+    let (array, of_each, newtons_each) = match file.has("frames_mn") {
+        true => ("frames_mn", ANY, MILLINEWTON),
+        false => ("frames", count..=count, 1.0),
     };
-    let of_each = Some(count).filter(|_| file.layout() == Layout::Frames);
-    let frames: Vec<f32> = file.required(array, &[ROWS, COLS], of_each)?;
-    file.within(array, &frames, &FORCES)?;
+    let frames: Vec<f32> = file.read(array, &[ROWS, COLS], of_each)?;
+    within(array, &frames, &FORCES)?;
     let moments = frames.len() / TAXELS;
     // A single frame is a press of one moment.
     let each: Vec<u32> = (0..moments as u32).collect();
-    let press = file.read("press", &[], Some(moments))?;
+    let press = file.find("press", &[], moments..=moments)?;
     let press = press.unwrap_or_else(|| each.clone());
-    let best = file.read("best", &[], Some(count))?.unwrap_or(each);
-    let time_s: Option<Vec<f32>> = file.read("time_s", &[], Some(moments))?;
+    let best = file.find("best", &[], count..=count)?.unwrap_or(each);
+    let time_s: Option<Vec<f32>> = file.find("time_s", &[], moments..=moments)?;
     let time_s = time_s.unwrap_or_else(|| vec![0.0; moments]);
-    file.within("time_s", &time_s, &(-1e5..=1e5))?;
-    let approach_mm = file.column("approach_mm", moments, &FORCES)?;
-    let known = file.column("known", moments, &(0..=1_u8))?;
-    let object = file.column("object", count, &(0..=u32::MAX))?;
-    let material = file.column("material", count, &(0..=u8::MAX))?;
-    let sensor = file.column("sensor", count, &(0..=u32::MAX))?;
-    let split = file.column("split", count, &(0..=1_u8))?;
-    let force_n = file.column("force", count, &FORCES)?;
-    let shore = file.column("shore", count, &SHORE)?;
-    let arm_n_per_mm = file.column("arm_n_per_mm", count, &(0.0..=1e6))?;
-    let reference = file.column("reference", count, &(0..=2_u8))?;
-    let reference_mm = file.column("reference_mm", count, &(0.0..=1e6_f32))?;
+    within("time_s", &time_s, &(-1e5..=1e5))?;
+    let approach_mm = column(file, "approach_mm", moments, &FORCES)?;
+    let known = column(file, "known", moments, &(0..=1_u8))?;
+    let object = column(file, "object", count, &(0..=u32::MAX))?;
+    let material = column(file, "material", count, &(0..=u8::MAX))?;
+    let sensor = column(file, "sensor", count, &(0..=u32::MAX))?;
+    let split = column(file, "split", count, &(0..=1_u8))?;
+    let force_n = column(file, "force", count, &FORCES)?;
+    let shore = column(file, "shore", count, &SHORE)?;
+    let arm_n_per_mm = column(file, "arm_n_per_mm", count, &(0.0..=1e6))?;
+    let reference = column(file, "reference", count, &(0..=2_u8))?;
+    let reference_mm = column(file, "reference_mm", count, &(0.0..=1e6_f32))?;
+    let kind = column(file, "kind", count, &(0..=2_u8))?;
     let unloaded = match presses.grid() {
-        Some(Array { rows, cols }) => file.read::<f32>("unloaded", &[rows, cols], Some(count))?,
+        Some(Array { rows, cols }) => file.find("unloaded", &[rows, cols], count..=count)?,
         None => None,
     };
-    let mut unloaded = unloaded
-        .iter()
-        .flat_map(|all| all.chunks(all.len() / count));
+    let unloaded: Vec<f32> = unloaded.unwrap_or_default();
+    let mut unloaded = unloaded.chunks((unloaded.len() / count).max(1));
     let generator = presses.sources[0].generator.as_deref().unwrap_or_default();
     let of_file = match generator.starts_with(SIMULATOR) {
         true => Kind::Simulated,
         false => Kind::Unknown,
     };
-    let kind = file.column("kind", count, &(0..=2_u8))?;
     let mut first = 0;
     for (number, of_press) in press.chunk_by(|a, b| a == b).enumerate() {
         let rows = first..first + of_press.len();
         first = rows.end;
         if of_press[0] as usize != number || number >= count {
             let expected = format!("0 to {}, one after the other", count - 1);
-            return Err(file.error("press", of_press[0], expected));
+            return Err(Unexpected::new("press", of_press[0], expected));
         }
         let best = best[number] as usize;
         if !rows.contains(&best) {
             let found = format!("{best} of press {number}");
-            return Err(file.error("best", found, format!("one of its frames, {rows:?}")));
+            return Err(Unexpected::new(
+                "best",
+                found,
+                format!("one of its frames, {rows:?}"),
+            ));
         }
         let times = &time_s[rows.clone()];
         let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
         if !(1..=COURSE_FRAMES.1).contains(&used) || !times.is_sorted_by(|a, b| a < b) {
             let found = format!("{used} of 0 s or later in press {number}");
             let expected = format!("1 to {} of these, and all ascending", COURSE_FRAMES.1);
-            return Err(file.error("time_s", found, expected));
+            return Err(Unexpected::new("time_s", found, expected));
         }
         let piece = match (reference[number].unwrap_or(0), reference_mm[number]) {
             (0, _) => None,
-            (_, None) => return Err(file.error("reference_mm", "none", "that of each reference")),
+            (_, None) => {
+                return Err(Unexpected::new(
+                    "reference_mm",
+                    "none",
+                    "that of each reference",
+                ));
+            }
             (1, Some(width_mm)) => Some(Reference::Flat { width_mm }),
             (_, Some(radius_mm)) => Some(Reference::Ball { radius_mm }),
         };
         if level[number] > 0 && piece.is_some() {
             let found = format!("{} of press {number}, a reference", level[number]);
-            return Err(file.error("level", found, 0));
+            return Err(Unexpected::new("level", found, 0));
         }
         let press = Press {
             level: level[number],
@@ -179,7 +221,11 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> anyhow::Result<Presses> {
         presses.push(press, of_press);
     }
     if presses.all.len() < count {
-        return Err(file.error("press", format!("{} presses", presses.all.len()), count));
+        return Err(Unexpected::new(
+            "press",
+            format!("{} presses", presses.all.len()),
+            count,
+        ));
     }
     Ok(presses)
 }
@@ -198,18 +244,26 @@ struct Meta {
 }
 
 /// The source of a file's presses.
-fn source(bytes: &[u8], file: &mut File) -> anyhow::Result<Source> {
-    let meta: Option<Meta> = serde_json::from_value(file.meta()?)
-        .map_err(|error| file.error("meta", error, "the keys of docs/formats.md"))?;
+fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpected> {
+    let meta: Option<Meta> = serde_json::from_value(described(file)?)
+        .map_err(|error| Unexpected::new("meta", error, "the keys of docs/formats.md"))?;
     let meta = meta.unwrap_or_default();
     if let Some(mm) = meta.pitch_mm.filter(|mm| !PITCHES_MM.contains(mm)) {
         let found = format!("pitch_mm {mm}");
-        return Err(file.error("meta", found, "millimetres from 0.01 to 1000"));
+        return Err(Unexpected::new(
+            "meta",
+            found,
+            "millimetres from 0.01 to 1000",
+        ));
     }
     let is_wrong = |of: &&Vec<Level>| !are_levels(of) || of.len() > MOST_LEVELS;
     if let Some(levels) = meta.levels.as_ref().filter(is_wrong) {
         let expected = "`level`, `label` and `shore` of each of 2 to 16 levels, from 1 on";
-        return Err(file.error("meta", format!("levels {}", json!(levels)), expected));
+        return Err(Unexpected::new(
+            "meta",
+            format!("levels {}", json!(levels)),
+            expected,
+        ));
     }
     // The distances between the taxels of many simulated sensors.
     let sensors = meta.settings.get("sensors").cloned().unwrap_or_default();
@@ -223,10 +277,10 @@ fn source(bytes: &[u8], file: &mut File) -> anyhow::Result<Source> {
         None => None,
     };
     let fits = |array: &Array| (1..=ROWS).contains(&array.rows) && (1..=COLS).contains(&array.cols);
-    let name = file.path.file_name().unwrap_or_default();
+    let name = path.file_name().unwrap_or_default();
     Ok(Source {
         name: name.to_string_lossy().into_owned(),
-        path: file.path.to_owned(),
+        path: path.to_owned(),
         seed: meta.seed.and_then(|seed| u64::try_from(seed).ok()),
         sha256: sha256_hex(bytes),
         pitch_mm: meta.pitch_mm,
@@ -336,131 +390,4 @@ fn write_moments<W: Write + Seek>(npz: &mut Writer<W>, presses: &Presses) -> io:
     add(npz, "best", all, None, best)?;
     let arm_n_per_mm = |press: &Press| Some(press.arm_n_per_mm);
     add(npz, "arm_n_per_mm", all, None, arm_n_per_mm)
-}
-
-/// An `.npz` file being read.
-struct File<'a> {
-    zip: ZipArchive<Cursor<&'a [u8]>>,
-    path: &'a Path,
-    /// The largest array that is read, in bytes.
-    most: usize,
-}
-
-impl<'a> File<'a> {
-    fn open(bytes: &'a [u8], path: &'a Path) -> anyhow::Result<Self> {
-        let zip = ZipArchive::new(Cursor::new(bytes));
-        let zip =
-            zip.map_err(|_| anyhow!("{}: not an .npz file, or a damaged one", path.display()))?;
-        let most = FREE_BYTES.max(bytes.len().saturating_mul(MOST_PACKED));
-        Ok(Self { zip, path, most })
-    }
-
-    fn error(&self, array: &str, found: impl Display, expected: impl Display) -> anyhow::Error {
-        let path = self.path.display();
-        anyhow!("{path}: array `{array}`: found {found}, expected {expected}")
-    }
-
-    fn layout(&self) -> Layout {
-        match self.zip.index_for_name("frames_mn.npy") {
-            Some(_) => Layout::OverTime,
-            None => Layout::Frames,
-        }
-    }
-
-    /// Reads an array of `n` (or any number of) elements of shape `inner`, row-major. `None` if it
-    /// is missing. If its header is not as expected, the rest is not unpacked.
-    fn read<T: Element>(
-        &mut self,
-        array: &str,
-        inner: &[usize],
-        n: Option<usize>,
-    ) -> anyhow::Result<Option<Vec<T>>> {
-        let name = format!("{array}.npy");
-        if self.zip.index_for_name(&name).is_none() {
-            return Ok(None);
-        }
-        let read = self.unpacked::<T>(&name, inner, n);
-        read.map(Some)
-            .map_err(|found| self.error(array, found, shape_of::<T>(inner, n)))
-    }
-
-    /// Like [`File::read`], for an array that must not be missing.
-    fn required<T: Element>(
-        &mut self,
-        array: &str,
-        inner: &[usize],
-        n: Option<usize>,
-    ) -> anyhow::Result<Vec<T>> {
-        let found = self.read(array, inner, n)?;
-        found.ok_or_else(|| self.error(array, "none", shape_of::<T>(inner, n)))
-    }
-
-    fn unpacked<T: Element>(
-        &mut self,
-        name: &str,
-        inner: &[usize],
-        n: Option<usize>,
-    ) -> anyhow::Result<Vec<T>> {
-        let mut reader = self.zip.by_name(name)?;
-        let header = Header::read(&mut reader)?;
-        let fits = header
-            .shape
-            .split_first()
-            .is_some_and(|(first, rest)| rest == inner && n.is_none_or(|n| *first == n));
-        let Some(count) = header.count().filter(|_| fits) else {
-            bail!("{} {:?}", T::NAME, header.shape);
-        };
-        let bytes = count.saturating_mul(size_of::<T>());
-        ensure!(bytes <= self.most, "{bytes} bytes of a small file");
-        Ok(header.elements(&mut reader, T::of)?)
-    }
-
-    /// The array `meta` as JSON. Null if it is missing.
-    fn meta(&mut self) -> anyhow::Result<Value> {
-        let Some(text) = self.read::<u8>("meta", &[], None)? else {
-            return Ok(Value::Null);
-        };
-        serde_json::from_slice(&text).map_err(|error| self.error("meta", error, "JSON in UTF-8"))
-    }
-
-    /// A value of each press, of an array that may be missing. NaN is a value that is not known.
-    fn column<T: Element + PartialOrd + Display>(
-        &mut self,
-        array: &str,
-        count: usize,
-        range: &RangeInclusive<T>,
-    ) -> anyhow::Result<Vec<Option<T>>> {
-        let Some(values) = self.read::<T>(array, &[], Some(count))? else {
-            return Ok(vec![None; count]);
-        };
-        let known = |value: T| Some(value).filter(|value| value.partial_cmp(value).is_some());
-        let values: Vec<Option<T>> = values.into_iter().map(known).collect();
-        let given: Vec<T> = values.iter().copied().flatten().collect();
-        self.within(array, &given, range)?;
-        Ok(values)
-    }
-
-    /// Refuses values outside a range.
-    fn within<T: PartialOrd + Display>(
-        &self,
-        array: &str,
-        values: &[T],
-        range: &RangeInclusive<T>,
-    ) -> anyhow::Result<()> {
-        match values.iter().position(|value| !range.contains(value)) {
-            None => Ok(()),
-            Some(place) => {
-                let found = format!("{} at {place}", values[place]);
-                let expected = format!("{} to {}", range.start(), range.end());
-                Err(self.error(array, found, expected))
-            }
-        }
-    }
-}
-
-/// The type and the shape of an array, such as `f32 [N,28,28]`.
-fn shape_of<T: Element>(inner: &[usize], n: Option<usize>) -> String {
-    let lengths: String = inner.iter().map(|length| format!(",{length}")).collect();
-    let count = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
-    format!("{} [{count}{lengths}]", T::NAME)
 }

@@ -74,7 +74,7 @@ fn parse(bytes: &[u8]) -> anyhow::Result<Presses> {
 
 #[track_caller]
 fn assert_refused(bytes: &[u8], expected: &str) {
-    let error = parse(bytes).unwrap_err().to_string();
+    let error = format!("{:#}", parse(bytes).unwrap_err());
     assert!(
         error.starts_with("D.npz: ") && error.contains(expected),
         "{error}\nshould contain\n{expected}"
@@ -241,7 +241,7 @@ fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
     );
     check(
         &|npz| add_frames(npz, 1, 0.0),
-        "array `frames`: found f32 [1, 28, 28], expected f32 [2,28,28]",
+        "array `frames`: found an array of shape [1, 28, 28], expected f32 [2,28,28]",
     );
     check(
         &|npz| add_frames(npz, 2, f32::NAN),
