@@ -15,7 +15,7 @@ use hardnessd_simulator::random::Stream;
 use hrn_train::learn::learner::Learner;
 use hrn_train::learn::{gan, hrn as learn_hrn};
 use hrn_train::net::losses::Game;
-use hrn_train::net::network::{Weights, numbers};
+use hrn_train::net::network::{Weights, numbers, targets};
 use hrn_train::net::{generator, hrn};
 use hrn_train::settings::Training;
 use rustix::time::{ClockId, clock_gettime};
@@ -101,7 +101,7 @@ impl Inputs {
         Self {
             hrn: hrn::initial(None, LEVELS, false, 1, &device),
             gan: gan::initial(GAME, LEVELS, 1, &device),
-            targets: hrn::targets(levels_of, LEVELS, &device),
+            targets: targets(levels_of, LEVELS, &device),
             batch: gan::Batch {
                 real: Tensor::from_data(TensorData::new(images, [BATCH, 1, 28, 28]), &device),
                 labelled: None,

@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context as _, ensure};
+use clap::ValueEnum as _;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -108,7 +109,9 @@ impl Plan {
         let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);
         option("--out", path(&self.directory(&name)));
         option("--seed", seed.to_string());
-        option("--profile", self.profile.name().to_owned());
+        let profile = self.profile.to_possible_value();
+        let profile = profile.expect("no profile is hidden");
+        option("--profile", profile.get_name().to_owned());
         if let Some(labels) = labels {
             option("--labels", labels.to_string());
         }

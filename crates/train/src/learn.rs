@@ -100,6 +100,16 @@ pub struct Question {
     pub references: Vec<(usize, Piece)>,
 }
 
+/// The share of rows of logits or probabilities whose greatest number is at the level, from 1.
+fn share_right<'a>(
+    levels: impl ExactSizeIterator<Item = u8>,
+    rows: impl Iterator<Item = &'a [f32]>,
+) -> f64 {
+    let count = levels.len() as f64;
+    let is_right = |(level, row): &(u8, &[f32])| argmax(row).0 + 1 == usize::from(*level);
+    levels.zip(rows).filter(is_right).count() as f64 / count
+}
+
 impl Question {
     /// Presses without references.
     pub fn alone(presses: &[usize]) -> Self {

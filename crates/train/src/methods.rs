@@ -24,11 +24,6 @@ use crate::run::Run;
 use crate::settings::{Settings, Training};
 use hardnessd_simulator::random::Stream;
 
-/// Stage names of the STGANs, one for each hardness level.
-const STGANS: [&str; 16] = [
-    "stgan1", "stgan2", "stgan3", "stgan4", "stgan5", "stgan6", "stgan7", "stgan8", "stgan9",
-    "stgan10", "stgan11", "stgan12", "stgan13", "stgan14", "stgan15", "stgan16",
-];
 /// Why there is no model of the taxels.
 const NO_GRID: &str = "the data have no whole presses on the grid of one array of at most 28x28 square taxels: make \
                        them with `collect --sequences`";
@@ -180,7 +175,8 @@ impl<'a> Stages<'a> {
     /// because the STGANs' last checkpoints determine them. Some are kept to look at.
     fn generated(&self, ustgan: &[Weights; 2]) -> anyhow::Result<Presses> {
         let (mut all, mut kept) = (Presses::default(), Presses::default());
-        for (stage, level) in STGANS.into_iter().zip(1..=self.levels() as u8) {
+        for level in 1..=self.levels() as u8 {
+            let stage: &str = format!("stgan{level}").leak();
             let of_level = |press: &&usize| self.presses.all[**press].level == level;
             let real: Vec<usize> = self.parts.train.iter().filter(of_level).copied().collect();
             let gan = Gan {

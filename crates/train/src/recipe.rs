@@ -51,12 +51,9 @@ pub struct Recipe {
     steps: Option<BTreeMap<Profile, u64>>,
     #[serde(default)]
     settings: toml::Table,
+    /// What profiles change.
     #[serde(default)]
-    paper: toml::Table,
-    #[serde(default)]
-    quick: toml::Table,
-    #[serde(default)]
-    smoke: toml::Table,
+    profiles: BTreeMap<Profile, toml::Table>,
 }
 
 #[derive(Deserialize)]
@@ -113,14 +110,12 @@ impl Recipe {
         samples: usize,
         given: &toml::Table,
     ) -> anyhow::Result<Settings> {
-        let of_profile = match profile {
-            Profile::Paper => &self.paper,
-            Profile::Quick => &self.quick,
-            Profile::Smoke => &self.smoke,
-        };
         let mut settings = Settings::default();
-        let for_all = ALL.profiles.get(&profile);
-        for table in for_all.into_iter().chain([&self.settings, of_profile]) {
+        let for_all = ALL.profiles.get(&profile).into_iter();
+        let own = [&self.settings]
+            .into_iter()
+            .chain(self.profiles.get(&profile));
+        for table in for_all.chain(own) {
             settings = overridden(&settings, table)?;
         }
         if let Some(&steps) = self.steps.as_ref().and_then(|steps| steps.get(&profile)) {

@@ -31,17 +31,6 @@ pub enum Profile {
     Smoke,
 }
 
-impl Profile {
-    /// The profile's name in commands and files.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Paper => "paper",
-            Self::Quick => "quick",
-            Self::Smoke => "smoke",
-        }
-    }
-}
-
 /// The rule of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

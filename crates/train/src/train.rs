@@ -72,19 +72,18 @@ impl DeviceName {
             return Ok(Device::flex());
         };
         #[cfg(feature = "cuda")]
-        let (found, remedy) = (
-            Device::enumerate(burn::tensor::DeviceType::Cuda),
-            "no CUDA device found: check the device and its driver with nvidia-smi",
-        );
-        #[cfg(not(feature = "cuda"))]
-        let (found, remedy) = (
-            Vec::new(),
-            "this build has no CUDA: build with --features cuda",
-        );
-        found.into_iter().next().ok_or_else(|| {
-            let text = format!("--device cuda: {remedy}, or use --device cpu");
-            coded(UNAVAILABLE, text)
-        })
+        if let Some(found) = Device::enumerate(burn::tensor::DeviceType::Cuda)
+            .into_iter()
+            .next()
+        {
+            return Ok(found);
+        }
+        let remedy = match cfg!(feature = "cuda") {
+            true => "no CUDA device found: check the device and its driver with nvidia-smi",
+            false => "this build has no CUDA: build with --features cuda",
+        };
+        let text = format!("--device cuda: {remedy}, or use --device cpu");
+        Err(coded(UNAVAILABLE, text))
     }
 }
 

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor};
 
 use self::lots::Lots;
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
 use crate::data::presses::{Presses, Timed};
 use crate::net::bins::{self, BINS};
 use crate::net::course;
@@ -16,7 +16,7 @@ use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, Moment};
-use hardnessd_core::verdict::{Borders, Extents, Knowledge, ModelError, Piece, argmax};
+use hardnessd_core::verdict::{Borders, Extents, Knowledge, ModelError, Piece};
 use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
@@ -85,15 +85,6 @@ impl Press {
         let moments = self.moments.iter_mut();
         moments.for_each(|moment| moment.approach_mm = None);
         self
-    }
-
-    /// The network's inputs.
-    fn inputs(&self, standard: &Standard) -> Vec<f32> {
-        let features = self.features();
-        let standardised = features.iter().enumerate();
-        standardised
-            .map(|(column, &x)| standard.apply(column, x))
-            .collect()
     }
 }
 
@@ -170,7 +161,7 @@ impl<'a> Course<'a> {
                 Some(stream) => &reports.varied(press, stream),
                 None => press,
             };
-            press.inputs(&self.standard)
+            self.standard.row(&press.features())
         };
         let presses = question.presses.iter();
         let references = question.references.iter();
@@ -226,14 +217,10 @@ impl Learning for Course<'_> {
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
         let rows = judged.chunks(self.parts.dims()[1]);
-        let right = labels
-            .iter()
-            .zip(rows)
-            .filter(|((level, _), row)| argmax(row).0 + 1 == usize::from(*level))
-            .count();
+        let levels = labels.iter().map(|&(level, _)| level);
         Taken {
             loss: f64::from(numbers(&loss)[0]),
-            accuracy: Some(right as f64 / labels.len() as f64),
+            accuracy: Some(share_right(levels, rows)),
             ..Taken::default()
         }
     }

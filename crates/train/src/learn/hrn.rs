@@ -3,15 +3,15 @@
 use burn::tensor::{Device, Tensor};
 
 use super::learner::Learner;
-use super::{Learning, Outputs, Plan, Question, Taken};
+use super::{Learning, Outputs, Plan, Question, Taken, share_right};
 use crate::data::augment;
 use crate::data::presses::Presses;
 use crate::net::graph::Graph;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
-use crate::net::network::{Normalisation, Statistics, Weights, numbers};
+use crate::net::network::{Normalisation, Statistics, Weights, numbers, targets};
 use crate::settings::{Augmentation, Training};
-use hardnessd_core::verdict::{ModelFrame, argmax};
+use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
 /// Frames per pass without gradients.
@@ -62,7 +62,7 @@ impl Frames<'_> {
     /// The levels of labelled presses as targets `[batch, L]`.
     pub fn targets(&self, presses: &[usize]) -> Tensor<2> {
         let levels = self.presses.of(presses).map(|press| press.level);
-        hrn::targets(levels, self.levels, self.device)
+        targets(levels, self.levels, self.device)
     }
 }
 
@@ -130,11 +130,10 @@ impl Learning for Hrn<'_> {
     }
 
     fn plan(&self) -> Plan {
-        let level = |&press: &usize| (press, self.on.presses.all[press].level);
         Plan {
             sides: vec![Learner::fresh(self.initial.clone(), self.on.training)],
             samples: self.train.clone(),
-            held_out: self.held_out.iter().map(level).collect(),
+            held_out: self.on.presses.with_levels(self.held_out),
             batch: self.on.training.batch,
             training: self.on.training,
             seed: self.on.seed,
@@ -147,13 +146,9 @@ impl Learning for Hrn<'_> {
         let targets = self.on.targets(samples);
         let (loss, judged) = self::step(&mut sides[0], images, targets, rate);
         let levels = self.on.presses.of(samples).map(|press| press.level);
-        let right = levels
-            .zip(judged.chunks(self.on.levels))
-            .filter(|(level, logits)| argmax(logits).0 + 1 == usize::from(*level))
-            .count();
         Taken {
             loss,
-            accuracy: Some(right as f64 / samples.len() as f64),
+            accuracy: Some(share_right(levels, judged.chunks(self.on.levels))),
             ..Taken::default()
         }
     }

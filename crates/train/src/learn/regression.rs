@@ -10,14 +10,13 @@ use std::slice;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Taken};
+use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
 use crate::data::presses::Presses;
 use crate::net::graph::{Graph, RAW};
 use crate::net::network::{Weights, dense, numbers};
 use crate::net::standard::Standard;
 use crate::settings::Training;
 use hardnessd_core::frame::{Array, Pitch};
-use hardnessd_core::verdict::argmax;
 use hardnessd_core::verdict::features::{FEATURES, FRAME};
 use hardnessd_core::verdict::parts::PARTS;
 use hardnessd_simulator::random::Stream;
@@ -161,9 +160,7 @@ impl<'a> Regression<'a> {
 
     /// The standardised columns of a press.
     fn row(&self, press: usize) -> Vec<f32> {
-        let seen = self.seen.of(self.presses, press).into_iter().enumerate();
-        let standardised = seen.map(|(column, x)| self.standard.apply(column, x));
-        standardised.collect()
+        self.standard.row(&self.seen.of(self.presses, press))
     }
 
     /// The coefficients of each level, those of the columns and the bias, as a layer.
@@ -198,11 +195,10 @@ impl Learning for Regression<'_> {
             epochs: 1,
             ..Training::default()
         };
-        let level = |&press: &usize| (press, self.presses.all[press].level);
         Plan {
             sides: vec![Learner::fresh(self.weights(&nothing), training)],
             samples: self.train.to_vec(),
-            held_out: self.held_out.iter().map(level).collect(),
+            held_out: self.presses.with_levels(self.held_out),
             batch: training.batch,
             training,
             seed: 0,
@@ -216,12 +212,11 @@ impl Learning for Regression<'_> {
         let weights = self.weights(&fitted);
         let question = Question::alone(self.train);
         let judged = self.judge(slice::from_ref(&weights), &[question], None);
-        let right = judged.iter().zip(&samples.of_level);
-        let right = right.filter(|(logits, level)| argmax(logits).0 == **level);
+        let levels = self.presses.of(self.train).map(|press| press.level);
         sides[0].weights = weights;
         Taken {
             loss: samples.loss(&fitted).0,
-            accuracy: Some(right.count() as f64 / judged.len() as f64),
+            accuracy: Some(share_right(levels, judged.iter().map(Vec::as_slice))),
             ..Taken::default()
         }
     }

@@ -5,7 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-use crate::net::network::numbers;
+use crate::net::network::{numbers, targets};
 use hardnessd_core::verdict::Borders;
 
 /// The number of bins. A border between two of the paper's levels is a border between two bins.
@@ -76,11 +76,7 @@ pub fn loss(outputs: Tensor<2>, labels: &[Label], parts: &Tensor<2>) -> (Tensor<
         .flat_map(|&(_, shore)| reading(shore))
         .collect();
     let readings = Tensor::<2>::from_data(TensorData::new(readings, [count, BINS]), &device);
-    let mut is_level = vec![0.0; count * levels];
-    for (row, &(level, _)) in is_level.chunks_mut(levels).zip(labels) {
-        row[usize::from(level) - 1] = 1.0;
-    }
-    let is_level = Tensor::<2>::from_data(TensorData::new(is_level, [count, levels]), &device);
+    let is_level = targets(labels.iter().map(|&(level, _)| level), levels, &device);
 
     let logarithms = activation::log_softmax(outputs, 1);
     let of_levels = logarithms.clone().exp().matmul(parts.clone());

@@ -3,7 +3,7 @@
 //! In: frames with levels. Out: weights, and the graph of the exported file. 32,196 parameters
 //! for four levels.
 
-use burn::tensor::{Device, Tensor, TensorData, activation};
+use burn::tensor::{Device, Tensor, activation};
 
 use crate::net::graph::{Graph, Inputs, RAW};
 use crate::net::image::PixelScale;
@@ -74,20 +74,6 @@ pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
         .sum()
         .neg()
         .div_scalar(batch)
-}
-
-/// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.
-pub fn targets(
-    levels_of: impl ExactSizeIterator<Item = u8>,
-    levels: usize,
-    device: &Device,
-) -> Tensor<2> {
-    let batch = levels_of.len();
-    let mut values = vec![0.0_f32; batch * levels];
-    for (row, level) in levels_of.enumerate() {
-        values[row * levels + usize::from(level) - 1] = 1.0;
-    }
-    Tensor::from_data(TensorData::new(values, [batch, levels]), device)
 }
 
 /// The graph from newtons to logits. The inference library fuses batch normalisation with the convolution

@@ -148,6 +148,20 @@ pub fn numbers<const D: usize>(tensor: &Tensor<D>) -> Vec<f32> {
         .expect("all our tensors are of f32")
 }
 
+/// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.
+pub fn targets(
+    levels_of: impl ExactSizeIterator<Item = u8>,
+    levels: usize,
+    device: &Device,
+) -> Tensor<2> {
+    let batch = levels_of.len();
+    let mut values = vec![0.0_f32; batch * levels];
+    for (row, level) in levels_of.enumerate() {
+        values[row * levels + usize::from(level) - 1] = 1.0;
+    }
+    Tensor::from_data(TensorData::new(values, [batch, levels]), device)
+}
+
 /// `count` values of N(0, 0.02) cut at two deviations, as DeLiGAN's code starts its layers.
 pub fn truncated_normal(count: usize, stream: &mut Stream) -> Vec<f32> {
     let draw = |stream: &mut Stream| loop {

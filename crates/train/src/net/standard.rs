@@ -48,9 +48,11 @@ impl Standard {
         self.deviation[column] > LEAST as f32
     }
 
-    /// A column's number on the scale that the network takes.
-    pub fn apply(&self, column: usize, x: f32) -> f32 {
-        ((x - self.mean[column]) / self.deviation[column]).clamp(-CLIP, CLIP)
+    /// A row on the scale that the network takes.
+    pub fn row(&self, row: &[f32]) -> Vec<f32> {
+        let columns = row.iter().zip(&self.mean).zip(&self.deviation);
+        let standardised = columns.map(|((x, mean), deviation)| (x - mean) / deviation);
+        standardised.map(|x| x.clamp(-CLIP, CLIP)).collect()
     }
 
     /// Adds the nodes that bring `columns` to the scale, as `standardised`.

@@ -15,13 +15,13 @@ use hardnessd_core::event::{self, Event, PressState};
 use hardnessd_core::exit::USAGE;
 use hardnessd_core::frame::{Array, Stamp};
 use hardnessd_core::judge::EndedPress;
-use hardnessd_core::pipeline::{Clock, Input, Pipeline};
-use hardnessd_core::recording::{Entry, FileKind, Labels, Playback, Reader};
+use hardnessd_core::pipeline::Input;
+use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{Borders, COLS, Hrn, ROWS, sha256_hex};
 use hardnessd_simulator::Reference;
 
-/// The time given to a pipeline whose clock is the frame rate.
+/// The moment of raw bytes, whose times come from the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {
     mono: std::time::Duration::ZERO,
     wall: jiff::Timestamp::UNIX_EPOCH,
@@ -76,10 +76,7 @@ impl Recording {
             sensors: Vec::new(),
             presses: Presses::default(),
         };
-        match FileKind::of(bytes) {
-            FileKind::Recording => recording.play(bytes, hrn.clone())?,
-            FileKind::Raw => recording.play_raw(bytes, sensor, hrn.clone()),
-        }
+        recording.play(bytes, sensor, hrn)?;
         let source = recording.source()?;
         recording.presses.sources.push(source);
         Ok(recording)
@@ -154,11 +151,25 @@ impl Recording {
         Ok(())
     }
 
-    /// Plays a recording of hardnessd.
-    fn play(&mut self, bytes: &[u8], hrn: Arc<Hrn>) -> anyhow::Result<()> {
-        let mut playback = Playback::new(hrn);
+    /// Plays a recording of hardnessd, or raw bytes of this sensor.
+    fn play(&mut self, bytes: &[u8], sensor: &Sensor, hrn: &Arc<Hrn>) -> anyhow::Result<()> {
+        let (mut playback, entries): (_, Box<dyn Iterator<Item = Result<Found, _>>>) =
+            match FileKind::of(bytes) {
+                FileKind::Recording => (Playback::new(hrn.clone()), Box::new(Reader::new(bytes))),
+                FileKind::Raw => {
+                    self.watch(sensor.clone());
+                    let found = |chunk: &[u8]| Found {
+                        sensor: sensor.name().to_owned(),
+                        at: NOT_LOOKED_AT,
+                        entry: Entry::Input(Input::Bytes(chunk.to_vec())),
+                    };
+                    let chunks = bytes.chunks(CHUNK_BYTES).map(found).map(Ok);
+                    let playback = Playback::of_bytes(sensor.clone(), hrn.clone());
+                    (playback, Box::new(chunks))
+                }
+            };
         playback.keep_courses();
-        for found in Reader::new(bytes) {
+        for found in entries {
             let found = found?;
             // A wrong description is an error of the playback.
             if let Entry::State(state) = &found.entry
@@ -185,19 +196,6 @@ impl Recording {
         );
         self.labels = playback.labels();
         Ok(())
-    }
-
-    /// Plays bytes of this sensor.
-    fn play_raw(&mut self, bytes: &[u8], sensor: &Sensor, hrn: Arc<Hrn>) {
-        self.watch(sensor.clone());
-        let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::FrameRate);
-        pipeline.keep_courses();
-        for chunk in bytes.chunks(CHUNK_BYTES) {
-            let events = pipeline.take(Input::Bytes(chunk.to_vec()), NOT_LOOKED_AT);
-            self.take(events.unwrap_or_default(), &pipeline.ended());
-        }
-        let events = pipeline.end_of_recording(None);
-        self.take(events, &pipeline.ended());
     }
 
     /// Takes a sensor as it is from now on.
