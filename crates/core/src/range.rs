@@ -96,6 +96,11 @@ pub const fn from_to((least, most): (f64, f64), unit: &'static str) -> Range {
     }
 }
 
+/// The finite numbers from `least` on.
+pub const fn at_least(least: f64) -> Range {
+    from_to((least, f64::MAX), "")
+}
+
 /// The numbers above 0 and up to `most`.
 pub const fn above_0(most: f64) -> Range {
     Range {
@@ -125,6 +130,7 @@ impl Range {
         };
         let expected = match is_open {
             true => format!("a number above {least} and at most {most}"),
+            false if most == f64::MAX => format!("{least} or more"),
             false => format!("{least} to {most} {unit}"),
         };
         let found = match T::IS_WHOLE {

@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn other_samples_are_another_version() {
+    fn samples_are_labelled_as_their_material_and_others_are_another_version() {
         // The sums are the newtons of all frames of each material. If they change on purpose,
         // change them and raise VERSION. Differences of a few counts may come from another machine.
         let samples = dataset(&small(Shapes::Matched), 2, |_, _| ());
@@ -192,11 +192,6 @@ mod tests {
             "{newtons:.2?} of version {}",
             super::super::VERSION
         );
-    }
-
-    #[test]
-    fn samples_are_labelled_as_their_material() {
-        let samples = dataset(&small(Shapes::Matched), 2, |_, _| ());
         assert_eq!(samples.len(), (4 + 4 * 2) * 9);
         for sample in &samples {
             let material = Material::ALL[usize::from(sample.labels.material)];
@@ -246,16 +241,10 @@ mod tests {
     fn all_eight_materials_can_be_for_test() {
         let settings = DatasetSettings {
             all_test: true,
-            test_objects: 1,
-            presses: 2,
             ..small(Shapes::Wide)
         };
-        let samples = dataset(&settings, 2, |_, _| ());
-        assert_eq!(samples.len(), 8 * 2);
-        assert!(
-            samples
-                .iter()
-                .all(|sample| sample.labels.split == Split::Test)
-        );
+        let all = units(&settings);
+        assert_eq!(all.len(), 8 * 2);
+        assert!(all.iter().all(|unit| unit.split == Split::Test));
     }
 }

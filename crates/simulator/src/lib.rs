@@ -44,12 +44,10 @@ pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::Shapes;
 pub use rig::{Rig, Touched};
 pub use rigid::Reference;
-pub use sensor::{FULL_SCALE_COUNTS, SensorProfile};
-pub use sequence::{Pressed, REST_S, Sequence, SequenceFrame, SequenceSettings};
+pub use sensor::SensorProfile;
+pub use sequence::{Pressed, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns};
 pub use subject::Labels;
-
-pub use hardnessd_core::tare::NEWTONS_PER_COUNT;
 
 /// The names that a sample's `material` indexes: the eight named materials, then, for broad
 /// materials, their laws.

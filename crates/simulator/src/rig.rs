@@ -7,7 +7,7 @@
 use super::material::{Body, Material};
 use super::motion::{Arm, Motion};
 use super::press::Bench;
-use super::sensor::{Design, Film, Sensor};
+use super::sensor::{Design, Film, Sensor, SensorProfile};
 use super::sequence::{SequenceSettings, presented};
 use super::solved::{FeltPress, SolvedPress};
 use crate::random::Stream;
@@ -65,7 +65,7 @@ impl Rig {
     /// Panics if there are no materials.
     pub fn new(settings: SequenceSettings) -> Self {
         let root = Stream::new(settings.seed, "rig");
-        let sensor = Sensor::draw(Design::jx255n(settings.profile), &root.child(0));
+        let sensor = Sensor::draw(Design::jx255n(SensorProfile::Clean), &root.child(0));
         let mut bench = Bench::default();
         Self {
             object: Placed::draw(&settings, &root, &mut bench, &sensor, 1),

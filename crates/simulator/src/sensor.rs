@@ -21,7 +21,7 @@ use hardnessd_core::tare;
 /// The array of a sequence.
 pub(super) const ARRAY: Array = Array::JX255N;
 /// The largest count of the simulated JX255N, which has 8 bits.
-pub const FULL_SCALE_COUNTS: u16 = 255;
+const FULL_SCALE_COUNTS: u16 = 255;
 /// A force on a taxel that is no longer felt, N. The film's delay alone would never end a press.
 const NOTHING_N: f32 = 1e-4;
 
@@ -41,7 +41,7 @@ pub(super) struct Sensor {
     pub(super) design: Design,
     pub(super) grid: Grid,
     /// The gain of each taxel; 0 for a dead one.
-    pub(super) gain: Vec<f32>,
+    gain: Vec<f32>,
     threshold_n: Vec<f32>,
     /// The counts at which taxels rest, and what a tare took them for. Empty for a film, which rests at 0.
     rest_counts: Vec<f32>,

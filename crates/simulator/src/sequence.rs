@@ -34,10 +34,6 @@ pub struct SequenceSettings {
     pub forces_n: Vec<f32>,
     /// The number of presses; `None` for an endless sequence.
     pub presses: Option<u32>,
-    /// Least rest before the first press and after each, s.
-    pub rest_s: f64,
-    /// Spread of the sensor.
-    pub profile: SensorProfile,
     /// The rigid piece to press in place of the objects.
     pub piece: Option<Reference>,
 }
@@ -52,8 +48,6 @@ impl Default for SequenceSettings {
             has_random: false,
             forces_n: Vec::new(),
             presses: None,
-            rest_s: REST_S,
-            profile: SensorProfile::Clean,
             piece: None,
         }
     }
@@ -120,9 +114,8 @@ pub struct SequenceFrame {
 /// An iterator over the frames of a sequence; see [`SequenceSettings`].
 ///
 /// The sequence begins with at least 2 s and ten frames without load, so that tare has its frames
-/// at any rate. Each press is held for at least three frames. The rest after it has at least five
-/// frames. No rest is shorter than [`SequenceSettings::rest_s`]. A press too light to begin one
-/// (3 taxels) is made anew with more force, so that a press tracker sees `presses` presses.
+/// at any rate. Each press is held for at least three frames. The rest after it is at least 1 s and five
+/// frames. A press too light to begin one (3 taxels) is made anew with more force, so that a press tracker sees `presses` presses.
 pub struct Sequence {
     settings: SequenceSettings,
     sensor: Sensor,
@@ -141,10 +134,8 @@ pub struct Sequence {
 
 /// Least rest before the first press, in s and in frames.
 const FIRST_REST: (f64, f64) = (2.0, 10.0);
-/// Least rest after a press, unless the settings say otherwise, s.
-pub const REST_S: f64 = 1.0;
-/// Least rest after a press, in frames.
-const REST_FRAMES: f64 = 5.0;
+/// Least rest after a press, in s and in frames.
+const REST: (f64, f64) = (1.0, 5.0);
 /// The least number of frames that a press is held.
 const HOLD_FRAMES: f64 = 3.0;
 /// Greatest delay of a press, s. Each press gets a random delay, so that presses are not in step
@@ -163,10 +154,10 @@ impl Sequence {
             rate.is_finite() && rate > 0.0,
             "frame rate {rate} is not a positive number"
         );
-        let design = Design::jx255n(settings.profile);
+        let design = Design::jx255n(SensorProfile::Clean);
         let sensor = Sensor::draw(design, &settings.root().child(0));
         Self {
-            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate).max(settings.rest_s),
+            free_s: FIRST_REST.0.max(FIRST_REST.1 / rate),
             settings,
             bench: Bench::default(),
             film: Film::new(&sensor.design),
@@ -176,11 +167,6 @@ impl Sequence {
             frames: 0,
             last: None,
         }
-    }
-
-    /// The true gain of each taxel, which a calibration should find; 0 for a dead taxel.
-    pub fn gains(&self) -> &[f32] {
-        &self.sensor.gain
     }
 
     /// The touch time of the next press, and the stream that the press is drawn from, after its
@@ -227,7 +213,7 @@ impl Sequence {
             None => presented(material, &mut draws).1,
         };
         let rate = self.settings.frame_rate_hz;
-        let rest_s = self.settings.rest_s.max(REST_FRAMES / rate);
+        let rest_s = REST.0.max(REST.1 / rate);
         let hold_s = draws.range(0.8, 1.5).max(HOLD_FRAMES / rate);
         let before = self.film.clone();
         for (attempt, force_n) in (1..).zip(harder_and_harder(force_n)) {
@@ -325,19 +311,12 @@ mod tests {
 
     #[test]
     fn a_tracker_sees_every_press_once() {
-        for (seed, frame_rate_hz, profile) in [
-            (1, 5.0, SensorProfile::Clean),
-            (2, 20.0, SensorProfile::Raw),
-            (3, 100.0, SensorProfile::Clean),
-            (4, 0.5, SensorProfile::Clean),
-            (5, 1.5, SensorProfile::Raw),
-        ] {
+        for (seed, frame_rate_hz) in [(1, 5.0), (2, 20.0), (3, 100.0), (4, 0.5), (5, 1.5)] {
             check(&SequenceSettings {
                 seed,
                 frame_rate_hz,
                 materials: Material::ALL.to_vec(),
                 presses: Some(8),
-                profile,
                 ..SequenceSettings::default()
             });
         }

@@ -39,8 +39,9 @@ impl SensorDesigns {
     }
 }
 
-/// The most objects of a material, presses of an object, and sensors.
-const MOST: f64 = DatasetSettings::MOST as f64;
+/// The most objects of a material, presses of an object, and sensors: more than fit in any memory, but few enough
+/// that all presses can be counted.
+const MOST: f64 = 10_000.0;
 
 settings! {
     /// The settings of a simulated data set. By default it is the paper's: 10,000 + 1,000 samples.
@@ -103,11 +104,6 @@ settings! {
         #[serde(skip_serializing_if = "Option::is_none")]
         pub sensors: Option<BroadSensors>;
     }
-}
-
-impl DatasetSettings {
-    /// The most objects of a material, and the most presses of an object.
-    pub const MOST: u32 = 10_000;
 }
 
 impl CourseSettings {

@@ -210,6 +210,15 @@ mod tests {
     use super::*;
 
     #[test]
+    fn threads_do_not_show() {
+        let units: Vec<u32> = (0..20).collect();
+        let made = |threads| shared_out(&units, threads, |_, _| (), |&unit| vec![unit, unit]);
+        let alone = made(1);
+        assert!(alone.len() == 40 && alone.is_sorted());
+        assert_eq!(made(4), alone);
+    }
+
+    #[test]
     fn test_objects_are_paired_over_materials_but_for_the_papers_shapes() {
         let foam = (Some(Material::Foam), 5);
         let mat = (Some(Material::YogaMat), 7);

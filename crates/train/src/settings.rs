@@ -8,14 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::exit::coded;
 use hardnessd_core::exit::CONFIG;
-use hardnessd_core::range::{self, OutOfRange, Range, from_to};
+use hardnessd_core::range::{self, OutOfRange, Range, at_least, from_to};
 use hardnessd_core::settings;
 use hardnessd_core::wording;
 
 /// Any share.
 const SHARE: Range = from_to((0.0, 1.0), "");
-/// The greatest number of settings that have no other bound.
-const MOST: f64 = 1e9;
 
 /// How long a run may take.
 #[derive(
@@ -61,21 +59,21 @@ settings! {
         /// Passes over the samples: what the paper calls iterations. If the 500 of its GANs were steps, they
         /// would be six passes over the unlabelled samples. DeLiGAN's code also calls an epoch an
         /// iteration.
-        pub epochs: u32 = 200, in from_to((1.0, MOST), "");
+        pub epochs: u32 = 200, in at_least(1.0);
         /// Decay per step of the running average of the weights, of a GAN those of the discriminator. The
         /// average is evaluated and exported. With 0, the weights themselves are.
         pub averaging: f64 = 0.0, in from_to((0.0, 0.999_999), "");
         /// The rule of a step: `sgd` or `adam`.
         pub rule: Rule = Rule::Sgd;
         /// The learning rate of the first step.
-        pub learning_rate: f64 = 1e-3, in from_to((1e-9, MOST), "");
+        pub learning_rate: f64 = 1e-3, in at_least(1e-9);
         /// The schedule of the learning rate: `constant` or `cosine`.
         pub schedule: Schedule = Schedule::Constant;
         /// Adam's decay of the gradient's mean.
         pub beta1: f64 = 0.9, in from_to((0.0, 0.999_999), "");
         /// The share, times the learning rate, by which each step shrinks a kernel. Biases and the
         /// mixture's mu and sigma do not decay.
-        pub weight_decay: f64 = 0.0, in from_to((0.0, MOST), "");
+        pub weight_decay: f64 = 0.0, in at_least(0.0);
     }
 }
 
@@ -147,7 +145,7 @@ settings! {
     pub struct Settings {
         /// The force on a taxel, in newtons, that becomes 1 in the network's image. 0 N becomes -1.
         /// 10.2 N is the full scale of 8 bits of 0.04 N.
-        pub full_scale_n: f64 = 10.2, in from_to((1e-3, MOST), "N");
+        pub full_scale_n: f64 = 10.2, in at_least(1e-3);
         /// Above 0, the image is linear in log(1 + newtons / this value). With 0, it is linear in
         /// newtons.
         pub log_above_n: f64 = 0.0;

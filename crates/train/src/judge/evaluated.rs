@@ -236,23 +236,17 @@ pub struct Difference {
 impl Difference {
     /// Compares verdicts of two models on the same presses.
     pub fn of(first: &[Case], second: &[Case]) -> Self {
-        let pairs: Vec<[bool; 2]> = first
-            .iter()
-            .zip(second)
-            .map(|(first, second)| [first.is_right(), second.is_right()])
-            .collect();
+        let both = first.iter().zip(second);
+        let both = both.map(|(first, second)| [first.is_right(), second.is_right()]);
+        let pairs: Vec<[bool; 2]> = both.collect();
         let value = |[first, second]: [bool; 2]| f64::from(i8::from(second) - i8::from(first));
-        let drawn: Option<Vec<Drawn>> = first
-            .iter()
-            .zip(&pairs)
-            .map(|(case, &pair)| {
-                Some(Drawn {
-                    stratum: case.level,
-                    unit: case.unit?.1,
-                    value: value(pair),
-                })
+        let drawn = |(case, &pair): (&Case, &[bool; 2])| {
+            Some(Drawn {
+                value: value(pair),
+                ..case.drawn()?
             })
-            .collect();
+        };
+        let drawn: Option<Vec<Drawn>> = first.iter().zip(&pairs).map(drawn).collect();
         let count = |wanted| pairs.iter().filter(|&&pair| pair == wanted).count();
         Self {
             accuracy: pairs.iter().map(|&pair| value(pair)).sum::<f64>() / pairs.len() as f64,

@@ -80,10 +80,6 @@ pub(super) enum Command {
     },
 }
 
-/// The most objects of a material and presses of an object: more than fit in any memory, but few
-/// enough that all presses can be counted.
-const MOST: i64 = DatasetSettings::MOST as i64;
-
 #[derive(Debug, clap::Args)]
 pub(super) struct Simulate {
     /// New file for the data set
@@ -98,21 +94,18 @@ pub(super) struct Simulate {
     #[arg(long, default_value = "named", value_parser = named::<Materials>)]
     pub(super) materials: Materials,
     /// Objects of each training material; with broad materials, four times as many in all
-    #[arg(long, default_value_t = DatasetSettings::default().objects,
-          value_parser = clap::value_parser!(u32).range(0..=MOST))]
+    #[arg(long, default_value_t = DatasetSettings::default().objects)]
     pub(super) objects: u32,
     /// The same of each test material
-    #[arg(long, default_value_t = DatasetSettings::default().test_objects,
-          value_parser = clap::value_parser!(u32).range(0..=MOST))]
+    #[arg(long, default_value_t = DatasetSettings::default().test_objects)]
     pub(super) test_objects: u32,
     /// Presses of each object [default: 50, with --sequences 6]
     ///
     /// The first 48 are six postures under eight forces each; a smaller number takes some of these.
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MOST))]
+    #[arg(long)]
     pub(super) presses: Option<u32>,
     /// Least nominal force in newtons; the greatest is 25
-    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n,
-          value_parser = lowest_force_n)]
+    #[arg(long, hide_short_help = true, value_name = "N", default_value_t = DatasetSettings::default().lowest_force_n)]
     pub(super) lowest_force: f32,
     /// Distribution of shapes: matched (the same for all materials), wide (as matched, but radii from
     /// 8 to 60 mm, edges and points), flat (plates, bars, boxes and discs) or paper (rigid objects flat,
@@ -182,18 +175,6 @@ pub(super) struct Collect {
     /// Recordings of `record`, directories with recordings, or raw bytes back to back
     #[arg(value_name = "CAPTURE", required = true)]
     pub(super) captures: Vec<PathBuf>,
-}
-
-/// Parses a force in newtons.
-fn lowest_force_n(text: &str) -> Result<f32, String> {
-    let lowest_force_n = text.parse().map_err(|_| "expected newtons")?;
-    let settings = DatasetSettings {
-        lowest_force_n,
-        ..DatasetSettings::default()
-    };
-    let checked = settings.check_ranges();
-    checked.map_err(|error| error.problem.into_string())?;
-    Ok(lowest_force_n)
 }
 
 #[derive(Debug, clap::Args)]

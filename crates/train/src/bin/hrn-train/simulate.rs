@@ -40,6 +40,7 @@ fn asked(arguments: &Simulate) -> CourseSettings {
 
 pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let mut settings = asked(arguments);
+    settings.check().map_err(|error| coded(USAGE, error))?;
     if let Some(path) = &arguments.config {
         let text = String::from_utf8_lossy(&read(path)?).into_owned();
         let configured = simulated::configured(&settings, &text);
