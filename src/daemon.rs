@@ -27,7 +27,6 @@ mod own;
     allow(dead_code, reason = "no library in this build has a thread of its own")
 )]
 mod relay;
-mod reload;
 mod request;
 #[cfg(feature = "ros2")]
 pub mod ros2;
@@ -58,11 +57,11 @@ use self::hub::Hub;
 use self::own::Store;
 use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target};
-pub use self::reload::Reload;
+pub use self::running::Reload;
 use self::sensor::{SensorCore, SensorHandle, Sensors};
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
-use hardnessd_core::exit::{CONFIG, Coded, FAILED, IO, UNAVAILABLE};
+use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
@@ -96,9 +95,6 @@ pub enum Error {
         /// The reason its port was lost.
         reason: String,
     },
-    /// A task ended by itself, which is a fault of this program.
-    #[error("{0} stopped by itself")]
-    Stopped(&'static str),
 }
 
 impl From<NoThread> for Error {
@@ -113,7 +109,6 @@ impl Coded for Error {
             Error::Config(_) => CONFIG,
             Error::Io(_) => IO,
             Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
-            Error::Stopped(_) => FAILED,
         }
     }
 }
@@ -289,7 +284,7 @@ impl Daemon {
     ///
     /// # Errors
     ///
-    /// Fails if a task ends by itself, which is a fault of this program, or if the recording fails.
+    /// Fails if the recording fails.
     pub async fn run(
         mut self,
         shutdown: impl Future<Output = ()>,
@@ -297,9 +292,8 @@ impl Daemon {
     ) -> Result<(), Error> {
         // The log lasts until the end.
         let (mut setups, log) = reload.map(Reload::start).unzip();
-        let ended = self.serve(shutdown, &mut setups, log.as_ref()).await;
-        let recorded = self.finish().await;
-        ended.and(recorded)
+        self.serve(shutdown, &mut setups, log.as_ref()).await;
+        self.finish().await
     }
 }
 

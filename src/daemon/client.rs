@@ -3,8 +3,8 @@
 //! This is the protocol of lines, over both Unix sockets and TCP. A connection has two tasks. The
 //! writer reads the log and writes its lines, with the answers in between. It runs on the sensors'
 //! thread, so that real-time scheduling holds from a sensor's bytes to its event in the socket. The
-//! reader reads requests, and prepares or carries out what they ask for. Unless the connection has
-//! [`Access::Control`], the reader runs on the clients' thread, where requests without end delay no
+//! reader reads requests, and prepares or carries out what they ask for. Unless the connection may
+//! change something, the reader runs on the clients' thread, where requests without end delay no
 //! sensor. While the daemon carries out a command, events are still sent and the next request waits.
 
 mod requests;
@@ -18,16 +18,13 @@ use futures_util::StreamExt as _;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::net::unix::pipe::Receiver;
-use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio::task::coop::consume_budget;
 use tracing::debug;
 
-#[cfg_attr(
-    not(feature = "ros2"),
-    allow(unused_imports, reason = "no library in this build receives positions")
-)]
-pub(super) use self::requests::{set_context, try_move_arm};
+pub(super) use self::requests::set_context;
+#[cfg(feature = "ros2")]
+pub(super) use self::requests::try_move_arm;
 use super::accept::Serve;
 use super::hub::{Hub, Line, Subscriber};
 use super::lines::{LineError, Lines, lines};
@@ -38,18 +35,6 @@ use super::sensor::Sensors;
 /// The longest line that a subscriber may send (`docs/protocol.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
 
-/// The largest buffer that a connection keeps between two writes. A batch of the log fits.
-const KEPT_BYTES: usize = 64 * 1024;
-
-/// The requests that a connection may send.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Access {
-    /// Only subscriptions and queries.
-    ReadOnly,
-    /// Also commands that change something.
-    Control,
-}
-
 /// The socket of a connection, which no runtime watches. Bytes go in and out of every kind of stream
 /// socket in the same way, so from here on each is served as a Unix socket.
 fn socket_of(stream: impl AsFd) -> io::Result<StdStream> {
@@ -59,12 +44,10 @@ fn socket_of(stream: impl AsFd) -> io::Result<StdStream> {
 /// Everything that serves the connections of one listener.
 #[derive(Debug, Clone)]
 pub(crate) struct Service {
-    pub(crate) access: Access,
     pub(crate) max_clients: usize,
     pub(crate) hub: Hub,
-    pub(crate) sensors: Sensors,
-    /// The runtime of the writers.
-    pub(crate) writers: Handle,
+    /// The sensors that a connection may change. Without them, it has only subscriptions and queries.
+    pub(crate) control: Option<Sensors>,
 }
 
 impl<S: AsFd + Send + 'static> Serve<S> for Service {
@@ -104,16 +87,14 @@ async fn serve(stream: impl AsFd, service: Service) -> io::Result<()> {
     // client would wake the clients' thread.
     let input = Receiver::from_owned_fd_unchecked(output.try_clone()?.into())?;
     let joined = service.hub.join(Subscription::default()).await;
-    let joined = joined.map_err(io::Error::other)?;
     let (subscriber, now) = joined.expect("only a `since` can be refused");
     let (asked, inbox) = mpsc::channel(1);
     let writer = Writer {
         subscriber,
         output,
-        outgoing: Vec::new(),
         inbox,
     };
-    let written = service.writers.spawn(writer.run(now.greeting()));
+    let written = service.hub.thread.spawn(writer.run(now.greeting()));
     let read = read(lines(input, LONGEST_LINE_BYTES), asked, &service).await;
     // The writer ends soon after the reader.
     let written = written.await.map_err(io::Error::other)?;
@@ -142,7 +123,8 @@ async fn read(
             Some(Err(LineError::MaxChunkLengthExceeded)) => {
                 let message =
                     format!("found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one");
-                place.send(Asked::Answer(vec![requests::end(Err(message), None)]));
+                let answer = requests::answer(service, Err(message), None).await;
+                place.send(Asked::Answer(answer));
                 return Ok(());
             }
             // The writer ends when it has sent the answers so far.
@@ -152,12 +134,7 @@ async fn read(
         place.send(match request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
             // A command may take long, because it may wait for frames or for a file to be written.
-            Ok(request) => Asked::Answer(
-                requests::answer(service, request, id)
-                    .await
-                    .map_err(io::Error::other)?,
-            ),
-            Err(message) => Asked::Answer(vec![requests::end(Err(message), id)]),
+            request => Asked::Answer(requests::answer(service, request, id).await),
         });
     }
 }
@@ -175,8 +152,6 @@ fn watched(socket: &StdStream) -> io::Result<AsyncFd<BorrowedFd<'_>>> {
 struct Writer {
     subscriber: Subscriber,
     output: StdStream,
-    /// The bytes being written. One call writes a whole batch.
-    outgoing: Vec<u8>,
     inbox: mpsc::Receiver<Asked>,
 }
 
@@ -220,10 +195,9 @@ impl Writer {
     }
 
     async fn write(&mut self, lines: &[Arc<Line>]) -> io::Result<()> {
-        for line in lines {
-            self.outgoing.extend_from_slice(line.json().as_bytes());
-        }
-        let mut rest = self.outgoing.as_slice();
+        // One call writes a whole batch.
+        let batch: String = lines.iter().map(|line| line.json()).collect();
+        let mut rest = batch.as_bytes();
         while !rest.is_empty() {
             match self.output.write(rest) {
                 Ok(written) => rest = &rest[written..],
@@ -239,8 +213,6 @@ impl Writer {
         }
         // A client that reads as fast as this thread writes must not keep it from others.
         consume_budget().await;
-        self.outgoing.clear();
-        self.outgoing.shrink_to(KEPT_BYTES);
         Ok(())
     }
 }

@@ -60,23 +60,16 @@ pub(super) fn open(settings: &config::Foxglove, config: &Config) -> Result<Worke
     )
 }
 
-/// A message of a topic, with its time in nanoseconds since 1970.
-struct Message {
-    at_ns: u64,
-    bytes: Vec<u8>,
-}
-
-/// The topics and their last messages.
-struct Topics {
-    /// The channel of each topic, by the topic's full name.
-    channels: BTreeMap<String, Arc<RawChannel>>,
-    /// The last message of each topic that a late viewer gets at once.
-    last: BTreeMap<String, Message>,
+/// A topic, and its last message, if a late viewer gets it at once.
+struct Topic {
+    channel: Arc<RawChannel>,
+    last: Option<(PartialMetadata, Vec<u8>)>,
 }
 
 /// A listening server.
 struct Foxglove {
-    topics: Topics,
+    /// By the topic's full name.
+    topics: BTreeMap<String, Topic>,
     newcomers: mpsc::Receiver<(String, SinkId)>,
     server: WebSocketServerHandle,
     // A channel ends with its context, and the server with its runtime.
@@ -87,7 +80,7 @@ struct Foxglove {
 impl Foxglove {
     fn open(address: SocketAddr, robot: &str, sensors: &[String]) -> Result<Self, Error> {
         let context = Context::new();
-        let topics = Topics::new(&context, sensors).map_err(failed)?;
+        let topics = topics(&context, sensors).map_err(failed)?;
         let (queue, newcomers) = mpsc::channel(NEWCOMERS);
         let host = match address.ip() {
             IpAddr::V4(ip) => ip.to_string(),
@@ -121,28 +114,26 @@ impl Foxglove {
     }
 
     fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>) {
-        let Self {
-            mut topics,
-            mut newcomers,
-            server,
-            runtime,
-            ..
-        } = self;
-        runtime.block_on(async {
+        let (mut topics, mut newcomers) = (self.topics, self.newcomers);
+        self.runtime.block_on(async {
             loop {
                 tokio::select! {
                     lines = lines.recv() => match lines {
                         Some(lines) => {
-                            each_event("foxglove", &lines, |event, _| topics.publish(event));
+                            each_event("foxglove", &lines, |event, _| publish(event, &mut topics));
                         }
                         None => break,
                     },
-                    Some((topic, viewer)) = newcomers.recv() => topics.greet(&topic, viewer),
+                    Some((name, viewer)) = newcomers.recv() => {
+                        if let Some(Topic { channel, last: Some((meta, bytes)) }) = topics.get(&name) {
+                            channel.log_with_meta_to_sink(bytes, *meta, Some(viewer));
+                        }
+                    }
                 }
             }
             tokio::time::sleep(LAST_MESSAGES).await;
             // A timeout is not a failure: the runtime drops the remaining connections.
-            let _ = tokio::time::timeout(FAREWELL, server.stop().wait()).await;
+            let _ = tokio::time::timeout(FAREWELL, self.server.stop().wait()).await;
         });
     }
 }
@@ -151,62 +142,45 @@ fn failed(error: impl Display) -> Error {
     Error::Io(format!("publish.foxglove: {error}"))
 }
 
-impl Topics {
-    fn new(context: &Arc<Context>, sensors: &[String]) -> Result<Self, FoxgloveError> {
-        let mut channels = BTreeMap::new();
-        for sensor in sensors {
-            for topic in [
-                ros::FRAME,
-                ros::CONTACT,
-                ros::HARDNESS,
-                ros::PRESS,
-                ros::STATUS,
-            ] {
-                let name = topic.of(sensor);
-                let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
-                let channel = ChannelBuilder::new(name.clone())
-                    .message_encoding("cdr")
-                    .schema(schema)
-                    .context(context)
-                    .build_raw()?;
-                channels.insert(name, channel);
-            }
-        }
-        Ok(Self {
-            channels,
-            last: BTreeMap::new(),
-        })
-    }
-
-    fn publish(&mut self, event: &Event) {
-        for (topic, time, bytes) in ros::encode_all(event) {
-            let name = topic.of(event.sensor());
-            let at_ns = u64::try_from(time.as_nanosecond()).unwrap_or(0);
-            let message = Message { at_ns, bytes };
-            if let Some(channel) = self.channels.get(&name) {
-                message.send(channel, None);
-            }
-            if event.lasts() {
-                self.last.insert(name, message);
-            }
+fn topics(
+    context: &Arc<Context>,
+    sensors: &[String],
+) -> Result<BTreeMap<String, Topic>, FoxgloveError> {
+    let mut topics = BTreeMap::new();
+    for sensor in sensors {
+        for topic in [
+            ros::FRAME,
+            ros::CONTACT,
+            ros::HARDNESS,
+            ros::PRESS,
+            ros::STATUS,
+        ] {
+            let name = topic.of(sensor);
+            let schema = Schema::new(topic.schema, "ros2msg", topic.text().into_bytes());
+            let channel = ChannelBuilder::new(name.clone())
+                .message_encoding("cdr")
+                .schema(schema)
+                .context(context)
+                .build_raw()?;
+            let last = None;
+            topics.insert(name, Topic { channel, last });
         }
     }
-
-    /// Sends the last message of `topic` to a viewer that has just subscribed.
-    fn greet(&self, topic: &str, viewer: SinkId) {
-        if let (Some(channel), Some(message)) = (self.channels.get(topic), self.last.get(topic)) {
-            message.send(channel, Some(viewer));
-        }
-    }
+    Ok(topics)
 }
 
-impl Message {
-    /// Queues the message for one viewer, or for all. This never waits.
-    fn send(&self, channel: &RawChannel, viewer: Option<SinkId>) {
-        let meta = PartialMetadata {
-            log_time: Some(self.at_ns),
+/// Queues the messages of an event for all viewers. This never waits.
+fn publish(event: &Event, topics: &mut BTreeMap<String, Topic>) {
+    for (topic, time, bytes) in ros::encode_all(event) {
+        let Some(topic) = topics.get_mut(&topic.of(event.sensor())) else {
+            continue;
         };
-        channel.log_with_meta_to_sink(&self.bytes, meta, viewer);
+        let log_time = Some(u64::try_from(time.as_nanosecond()).unwrap_or(0));
+        let meta = PartialMetadata { log_time };
+        topic.channel.log_with_meta_to_sink(&bytes, meta, None);
+        if event.lasts() {
+            topic.last = Some((meta, bytes));
+        }
     }
 }
 

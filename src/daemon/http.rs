@@ -9,7 +9,6 @@
 mod events;
 mod host;
 mod metrics;
-mod status;
 
 use std::convert::Infallible;
 use std::fmt::Display;
@@ -31,15 +30,16 @@ use hyper::service::{Service, service_fn};
 use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use tokio::net::TcpStream;
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
 use super::client::set_context;
-use super::hub::{Closed, Hub};
+use super::hub::{Hub, Snapshot};
 use super::sensor::Sensors;
-use hardnessd_core::event::LinkState;
+use hardnessd_core::event::{Event, LinkState, Reply};
 
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
@@ -162,39 +162,61 @@ fn refusal(code: StatusCode, why: impl Display) -> Response {
     (code, format!("{why}\n")).into_response()
 }
 
-impl IntoResponse for Closed {
-    fn into_response(self) -> Response {
-        refusal(StatusCode::SERVICE_UNAVAILABLE, self)
-    }
-}
-
 fn text(content_type: &'static str, text: String) -> Response {
     ([(header::CONTENT_TYPE, content_type)], text).into_response()
 }
 
-async fn status(State(hub): State<Hub>, sets_context: bool) -> Result<Response, Closed> {
-    let now = hub.snapshot().await?;
-    Ok(text("application/json", status::json(&now, sets_context)))
+async fn status(State(hub): State<Hub>, sets_context: bool) -> Response {
+    let status = status_json(&hub.snapshot().await, sets_context);
+    text("application/json", status)
 }
 
-async fn metrics(State(hub): State<Hub>) -> Result<Response, Closed> {
-    let now = hub.snapshot().await?;
-    Ok(text(metrics::CONTENT_TYPE, metrics::encode(&now)))
+/// An object of `hello` as on a socket, `subscribers`, `sets_context` (whether the page may say what is
+/// being pressed), and a list of `sensors`. A sensor has its `status` and `last` (its last final
+/// verdict, or null) as on a socket, `last_frame_age_s` (null before the first frame) and the
+/// current `contact_threshold_n`.
+fn status_json(now: &Snapshot, sets_context: bool) -> String {
+    let read = |line: &str| -> Value {
+        serde_json::from_str(line).expect("what was written as JSON can be read as JSON")
+    };
+    let sensors = now.sensors.iter().map(|sensor| {
+        let state = &sensor.state;
+        json!({
+            "status": read(&Event::Status(state.status.clone()).to_line()),
+            "last_frame_age_s": sensor.last_frame_age.map(|age| age.as_secs_f64()),
+            // The threshold is written with the digits of the configuration, which are those of
+            // an f32.
+            "contact_threshold_n": read(&state.contact_threshold_n.to_string()),
+            "last": sensor.last.as_ref().map(|line| read(line.json())),
+        })
+    });
+    json!({
+        "hello": read(&Reply::Hello(now.hello.clone()).to_line()),
+        "sensors": sensors.collect::<Vec<Value>>(),
+        "subscribers": now.subscribers,
+        "sets_context": sets_context,
+    })
+    .to_string()
+}
+
+async fn metrics(State(hub): State<Hub>) -> Response {
+    let metrics = metrics::encode(&hub.snapshot().await);
+    text(metrics::CONTENT_TYPE, metrics)
 }
 
 /// Makes the same check as the watchdog: the sensors' thread works.
 async fn live(State(hub): State<Hub>) -> Response {
     match tokio::time::timeout(PATIENCE, hub.snapshot()).await {
-        Ok(Ok(_)) => "ok: the pipelines answer\n".into_response(),
-        _ => refusal(
+        Ok(_) => "ok: the pipelines answer\n".into_response(),
+        Err(_) => refusal(
             StatusCode::SERVICE_UNAVAILABLE,
             "the pipelines do not answer",
         ),
     }
 }
 
-async fn ready(State(hub): State<Hub>) -> Result<impl IntoResponse, Closed> {
-    let now = hub.snapshot().await?;
+async fn ready(State(hub): State<Hub>) -> impl IntoResponse {
+    let now = hub.snapshot().await;
     let mut lines = String::new();
     let mut code = StatusCode::OK;
     for sensor in &now.sensors {
@@ -205,7 +227,7 @@ async fn ready(State(hub): State<Hub>) -> Result<impl IntoResponse, Closed> {
         let state = hardnessd_core::event::name(&status.state);
         lines += &format!("{} {state}\n", status.sensor);
     }
-    Ok((code, lines))
+    (code, lines)
 }
 
 impl Serve<TcpStream> for Http {

@@ -10,18 +10,17 @@
 
 mod cursor;
 mod log;
-mod subscriber;
 mod tally;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 #[cfg(feature = "zenoh")]
-use std::{sync::mpsc, time::Duration};
+use std::{sync::mpsc::channel, time::Duration};
 
 use tokio::runtime::Handle;
+use tokio::sync::{Notify, mpsc};
 
 use self::log::Log;
 pub(crate) use self::log::{Line, SensorSnapshot, Snapshot};
-pub(crate) use self::subscriber::Subscriber;
 pub(crate) use self::tally::Series;
 use super::now;
 use super::request::Subscription;
@@ -31,16 +30,12 @@ use hardnessd_core::event::{Event, Hello};
 #[cfg(feature = "zenoh")]
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// The error that the daemon is stopping, and its sensors' thread answers no more.
-#[derive(Debug, thiserror::Error)]
-#[error("the daemon is stopping")]
-pub(crate) struct Closed;
-
 /// A handle to the log.
 #[derive(Debug, Clone)]
 pub(crate) struct Hub {
     log: Arc<Mutex<Log>>,
-    thread: Handle,
+    /// The runtime of the sensors' thread.
+    pub(super) thread: Handle,
 }
 
 impl Hub {
@@ -67,45 +62,107 @@ impl Hub {
         }
     }
 
-    /// Adds a subscriber, and returns what is true where its lines begin. The inner error is for the
-    /// subscriber.
+    /// Adds a subscriber, and returns what is true where its lines begin. The error is for the subscriber.
     pub(crate) async fn join(
         &self,
         wanted: Subscription,
-    ) -> Result<Result<(Subscriber, Snapshot), String>, Closed> {
+    ) -> Result<(Subscriber, Snapshot), String> {
         let hub = self.clone();
         self.ask(move |log| {
             let now = log.snapshot();
             let id = log.join(&wanted)?;
             let changed = log.subscribers[&id].changed.clone();
-            Ok((Subscriber::new(hub, id, changed), now))
+            Ok((Subscriber { hub, id, changed }, now))
         })
         .await
     }
 
     /// The current state of the log and of all sensors.
-    pub(crate) async fn snapshot(&self) -> Result<Snapshot, Closed> {
+    pub(crate) async fn snapshot(&self) -> Snapshot {
         self.ask(|log| log.snapshot()).await
     }
 
-    /// Like [`Hub::snapshot`], for a thread without a runtime.
+    /// Like [`Hub::snapshot`], for a thread without a runtime. `None` if the daemon is stopping.
     #[cfg(feature = "zenoh")]
-    pub(crate) fn snapshot_blocking(&self) -> Result<Snapshot, Closed> {
-        let (answer, answered) = mpsc::channel();
+    pub(crate) fn snapshot_blocking(&self) -> Option<Snapshot> {
+        let (answer, answered) = channel();
         let hub = self.clone();
         self.thread
             .spawn(async move { answer.send(hub.log().snapshot()) });
-        answered.recv_timeout(PATIENCE).map_err(|_| Closed)
+        answered.recv_timeout(PATIENCE).ok()
     }
 
-    /// Has a question answered on the sensors' thread.
+    /// Has a question answered on the sensors' thread. That thread outlives those who ask. Without it, this
+    /// never completes.
     async fn ask<T: Send + 'static>(
         &self,
         question: impl FnOnce(&mut Log) -> T + Send + 'static,
-    ) -> Result<T, Closed> {
+    ) -> T {
         let hub = self.clone();
         let answered = self.thread.spawn(async move { question(&mut hub.log()) });
-        answered.await.map_err(|_| Closed)
+        match answered.await {
+            Ok(answer) => answer,
+            Err(_) => std::future::pending().await,
+        }
+    }
+}
+
+/// A subscriber. Its cursor ends when this is dropped. It belongs to the sensors' thread.
+#[derive(Debug)]
+pub(crate) struct Subscriber {
+    hub: Hub,
+    id: u64,
+    changed: Arc<Notify>,
+}
+
+impl Subscriber {
+    /// The next lines, as soon as there are any. `None` if the log is closed and there are no more.
+    /// Cancelling the wait loses nothing.
+    pub(crate) async fn next(&mut self) -> Option<Vec<Arc<Line>>> {
+        loop {
+            {
+                // One lock, so that no line comes between the two questions.
+                let mut log = self.hub.log();
+                let lines = log.read(self.id);
+                if !lines.is_empty() {
+                    return Some(lines);
+                }
+                if log.is_closed() {
+                    return None;
+                }
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// Changes the subscription from now on.
+    pub(crate) fn subscribe(&mut self, wanted: &Subscription) -> Result<(), String> {
+        self.hub.log().subscribe(self.id, wanted)
+    }
+
+    /// Sends the lines into a channel, from the sensors' thread, until the log is closed or nobody
+    /// receives.
+    pub(crate) fn feed(mut self, lines: mpsc::Sender<Vec<Arc<Line>>>) {
+        let thread = self.hub.thread.clone();
+        thread.spawn(async move {
+            // The room comes first. So a slow receiver gets the frames that are the newest then.
+            while let Ok(room) = lines.reserve().await {
+                let next = tokio::select! {
+                    next = self.next() => next,
+                    () = lines.closed() => None,
+                };
+                match next {
+                    Some(next) => room.send(next),
+                    None => return,
+                }
+            }
+        });
+    }
+}
+
+impl Drop for Subscriber {
+    fn drop(&mut self) {
+        self.hub.log().leave(self.id);
     }
 }
 

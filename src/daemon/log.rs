@@ -1,22 +1,19 @@
-//! The log for the operator, on stderr: a line for each status, verdict and aborted press. The level
-//! `debug` also has the other events of a press.
+//! The log for the operator, on stderr: a line for each status, final verdict and aborted press.
 //!
 //! Field names are stable: they are those of the published events. `RUST_LOG` sets the level, as
 //! levels and `TARGET=LEVEL` separated by commas. Without it, the level is `info` for the daemon.
 //! Nothing here is written to stdout, which is for events.
 
 mod lines;
-mod quota;
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::io::IsTerminal;
-use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tracing::{Level, Subscriber, debug, error, info, warn};
+use tracing::{Level, Subscriber, info, warn};
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
@@ -26,14 +23,11 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Registry, reload};
 
 use self::lines::Lines;
-use self::quota::LineQuota;
 use super::Error;
 use crate::thread::NoThread;
-use hardnessd_core::event::{Event, LinkState, Phase, PressState, Tared, name, round_3};
-use hardnessd_core::judge::Unjudged;
-use hardnessd_core::port::Port;
+use hardnessd_core::allowance::Allowance;
+use hardnessd_core::event::{Event, LinkState, Phase, PressState, Status, Tared, name, round_3};
 use hardnessd_core::tare::RetareError;
-use hardnessd_core::wording;
 
 /// The `[log]` table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -173,84 +167,69 @@ where
     }
 }
 
-/// A line of this level: `warn` if something is wrong, `info` or `debug`.
-macro_rules! line {
-    ($level:expr, $($fields:tt)*) => {
-        match $level {
-            Level::WARN => warn!($($fields)*),
-            Level::INFO => info!($($fields)*),
-            _ => debug!($($fields)*),
-        }
-    };
-}
-
-/// The level of the line of an event.
-fn level_of(event: &Event) -> Level {
-    let is_wrong = match event {
-        Event::Status(status) => {
-            let is_gone = matches!(status.state, LinkState::Lost | LinkState::Stale);
-            is_gone || status.reason.is_some()
-        }
-        Event::Press(press) if press.state != PressState::Aborted => return Level::DEBUG,
-        Event::Press(_) => true,
-        Event::Hardness(verdict) if verdict.phase == Phase::Early => return Level::DEBUG,
-        Event::Hardness(_) => false,
-        Event::Frame(_) => return Level::DEBUG,
-    };
-    if is_wrong { Level::WARN } else { Level::INFO }
-}
-
-/// Writes one line for an event, but none for a frame. Lines that are only for the level `debug` have no limit.
+/// Writes a line for a status, an aborted press and a final verdict.
 pub(crate) fn event(event: &Event) {
-    match level_of(event) {
-        Level::DEBUG => line_of(event),
-        _ => limited(event.sensor(), || line_of(event)),
+    match event {
+        Event::Status(status) => limited(&status.sensor, || line_of(status)),
+        Event::Press(press) if press.state == PressState::Aborted => {
+            limited(&press.sensor, || {
+                warn!(
+                    seq = press.seq,
+                    sensor = press.sensor.as_str(),
+                    press = press.press,
+                    state = name(&press.state),
+                    reason = press.reason,
+                    frame = press.frame,
+                    frames = press.frames,
+                    "press"
+                );
+            });
+        }
+        // The numbers are rounded for the reader. The event itself has every digit.
+        Event::Hardness(verdict) if verdict.phase == Phase::Final => {
+            limited(&verdict.sensor, || {
+                info!(
+                    seq = verdict.seq,
+                    sensor = verdict.sensor.as_str(),
+                    press = verdict.press,
+                    phase = name(&verdict.phase),
+                    level = verdict.level,
+                    label = verdict.label.as_deref(),
+                    rejected = verdict.rejected.as_ref().map(name),
+                    confidence = (f64::from(verdict.confidence) * 1e4).round() / 1e4,
+                    frame = verdict.frame,
+                    force_n = round_3(verdict.force_n),
+                    contact_area_taxels = verdict.contact_area_taxels,
+                    model = verdict.model.as_str(),
+                    "hardness"
+                );
+            });
+        }
+        _ => {}
     }
 }
 
-fn line_of(event: &Event) {
-    match event {
-        Event::Status(status) => line!(
-            level_of(event),
-            seq = status.seq,
-            sensor = status.sensor.as_str(),
-            state = name(&status.state),
-            reason = status.reason.as_deref(),
-            frames = status.frames,
-            frames_damaged = status.frames_damaged,
-            frames_dropped = status.frames_dropped,
-            bytes_skipped = status.bytes_skipped,
-            "status"
-        ),
-        Event::Press(press) => line!(
-            level_of(event),
-            seq = press.seq,
-            sensor = press.sensor.as_str(),
-            press = press.press,
-            state = name(&press.state),
-            reason = press.reason,
-            frame = press.frame,
-            frames = press.frames,
-            "press"
-        ),
-        // The numbers are rounded for the reader. The event itself has every digit.
-        Event::Hardness(verdict) => line!(
-            level_of(event),
-            seq = verdict.seq,
-            sensor = verdict.sensor.as_str(),
-            press = verdict.press,
-            phase = name(&verdict.phase),
-            level = verdict.level,
-            label = verdict.label.as_deref(),
-            rejected = verdict.rejected.as_ref().map(name),
-            confidence = (f64::from(verdict.confidence) * 1e4).round() / 1e4,
-            frame = verdict.frame,
-            force_n = round_3(verdict.force_n),
-            contact_area_taxels = verdict.contact_area_taxels,
-            model = verdict.model.as_str(),
-            "hardness"
-        ),
-        Event::Frame(_) => {}
+/// Writes the line of a status: a warning if something is wrong.
+fn line_of(status: &Status) {
+    macro_rules! line {
+        ($level:ident) => {
+            $level!(
+                seq = status.seq,
+                sensor = status.sensor.as_str(),
+                state = name(&status.state),
+                reason = status.reason.as_deref(),
+                frames = status.frames,
+                frames_damaged = status.frames_damaged,
+                frames_dropped = status.frames_dropped,
+                bytes_skipped = status.bytes_skipped,
+                "status"
+            )
+        };
+    }
+    let is_gone = matches!(status.state, LinkState::Lost | LinkState::Stale);
+    match is_gone || status.reason.is_some() {
+        true => line!(warn),
+        false => line!(info),
     }
 }
 
@@ -268,19 +247,6 @@ pub(crate) fn tare(sensor: &str, outcome: &Result<Tared, RetareError>) {
             "tare"
         ),
         Err(refusal) => warn!(sensor, reason = %refusal, "tare refused"),
-    });
-}
-
-/// Logs that the model failed on a press.
-pub(crate) fn unjudged(unjudged: &Unjudged) {
-    limited(&unjudged.sensor, || {
-        error!(
-            sensor = unjudged.sensor.as_str(),
-            press = unjudged.press,
-            phase = name(&unjudged.phase),
-            reason = %unjudged.error,
-            "no verdict"
-        );
     });
 }
 
@@ -305,32 +271,32 @@ pub(crate) fn limited(cause: &str, line: impl FnOnce()) {
     line();
 }
 
-/// Logs why what somebody sent is refused.
-pub(crate) fn refused(sensor: &str, reason: &str) {
-    limited(sensor, || warn!(sensor, reason, "refused"));
+/// The time that a line takes up: 40 lines a minute. That is a press every 1.5 s.
+const LINE: Duration = Duration::from_millis(1500);
+/// Eight lines may come at once.
+const AT_ONCE: Duration = Duration::from_millis(7 * 1500);
+/// How often the number of missing lines is logged.
+const REPORT_EVERY: Duration = Duration::from_secs(60);
+
+/// The lines of one cause in the log.
+#[derive(Debug, Default)]
+struct LineQuota {
+    allowance: Allowance,
+    /// The number of lines that were left out and not reported yet, and when the first one was.
+    left_out: Option<(u64, Duration)>,
 }
 
-/// Logs that datagrams of `other` are ignored, because `sender` sends.
-pub(crate) fn other_sender(sender: SocketAddr, other: SocketAddr) {
-    limited("udp", || {
-        warn!(%sender, %other, "ignored: another sender sends for this sensor, and one at a time may");
-    });
-}
-
-/// Logs that the other end of a port is a telnet server, which changes some bytes.
-pub(crate) fn telnet(port: &Port) {
-    limited("tcp", || warn!(%port, "{}", hardnessd_core::wire::TELNET));
-}
-
-/// Logs the context that a controller reports of its work.
-pub(crate) fn context(sensor: &str, context: Option<&serde_json::Value>) {
-    limited(sensor, || {
-        info!(
-            sensor,
-            context = context.map(|context| wording::escaped(&context.to_string())),
-            "context"
-        );
-    });
+impl LineQuota {
+    /// Whether a line may be written. If so, returns how many were left out before and are to be reported.
+    fn allows(&mut self, now: Duration) -> Option<u64> {
+        if !self.allowance.allows(now, LINE, AT_ONCE) {
+            self.left_out.get_or_insert((0, now)).0 += 1;
+            return None;
+        }
+        let is_due =
+            |left_out: &mut (u64, Duration)| now.saturating_sub(left_out.1) >= REPORT_EVERY;
+        Some(self.left_out.take_if(is_due).map_or(0, |(lines, _)| lines))
+    }
 }
 
 #[cfg(test)]
@@ -356,5 +322,20 @@ mod tests {
             let expected = format!("RUST_LOG: found {asked:?}, ");
             assert!(message.starts_with(&expected), "{message}");
         }
+    }
+
+    #[test]
+    fn a_sensor_has_fewer_than_50_lines_in_any_minute() {
+        let mut quota = LineQuota::default();
+        let moments = (0..300_000).step_by(10);
+        let is_written = |ms: &u64| quota.allows(Duration::from_millis(*ms)).is_some();
+        let written: Vec<u64> = moments.filter(is_written).collect();
+        for begin in &written {
+            let minute = *begin..begin + 60_000;
+            let lines = written.iter().filter(|at| minute.contains(at)).count();
+            // One more may report those that were left out.
+            assert!(lines + 1 < 50, "{lines} from {begin} ms on");
+        }
+        assert!(written.len() > 200);
     }
 }

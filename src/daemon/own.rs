@@ -14,14 +14,14 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
-use tracing::{debug, warn};
+use tracing::warn;
 
 use super::config::directory_of_service;
 use super::log;
 use super::port::is_simulated;
 use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::judge::{OwnPresses, owner};
-use hardnessd_core::part::Part;
+use hardnessd_core::part::{Part, directory_of};
 use hardnessd_core::pipeline::Pipeline;
 
 /// The largest file that is read. Ours have a tenth of it.
@@ -38,63 +38,58 @@ struct Kept {
 
 /// The files of own presses. Without a directory, own presses last as long as the daemon.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Store {
-    directory: Option<PathBuf>,
-    changed: Option<Sender<(String, Kept)>>,
-    /// Whether the directory is the user's. It has no presses of simulated sensors, such as those of a demo.
+pub(super) struct Store(Option<Directory>);
+
+#[derive(Debug, Clone)]
+struct Directory {
+    path: PathBuf,
+    changed: Sender<(PathBuf, Kept)>,
+    /// Whether it is the user's. It has no presses of simulated sensors, such as those of a demo.
     is_of_user: bool,
 }
 
 impl Store {
     /// The store in the directory that systemd or the user's environment names.
     pub(super) fn of_environment() -> Result<Self, NoThread> {
-        if let Some(directory) = directory_of_service("STATE_DIRECTORY") {
-            return Self::in_directory(directory);
+        let service = directory_of_service("STATE_DIRECTORY").map(|path| (path, false));
+        let user = || Some((of_user(|variable| env::var_os(variable))?, true));
+        match service.or_else(user) {
+            Some((path, is_of_user)) => Self::in_directory(path, is_of_user),
+            None => Ok(Self::default()),
         }
-        let Some(directory) = of_user(|variable| env::var_os(variable)) else {
-            return Ok(Self::default());
-        };
-        Ok(Self {
-            is_of_user: true,
-            ..Self::in_directory(directory)?
-        })
     }
 
-    fn in_directory(directory: PathBuf) -> Result<Self, NoThread> {
-        let (sender, changed) = channel();
-        let own = directory.clone();
-        spawn_thread("own presses", move || write_all(&own, &changed))?;
-        Ok(Self {
-            directory: Some(directory),
-            changed: Some(sender),
-            is_of_user: false,
-        })
+    fn in_directory(path: PathBuf, is_of_user: bool) -> Result<Self, NoThread> {
+        let (changed, inbox) = channel();
+        spawn_thread("own presses", move || write_all(&inbox))?;
+        Ok(Self(Some(Directory {
+            path,
+            changed,
+            is_of_user,
+        })))
     }
 
-    /// Gives a pipeline the own presses of its sensor.
+    /// Gives a pipeline the own presses of its sensor, if they are of its calibration and model.
     pub(super) fn load(&self, pipeline: &mut Pipeline) {
-        let Some(directory) = &self.directory else {
+        let Some(directory) = &self.0 else {
             return;
         };
-        let path = file_of(directory, pipeline.sensor().name());
+        let path = directory.file_of(pipeline.sensor().name());
         match read(&path) {
             Ok(Some(kept)) if kept.owner == owner(pipeline.sensor(), pipeline.hrn()) => {
                 pipeline.take_own_presses(kept.presses);
             }
-            Ok(Some(_)) => {
-                debug!(path = %path.display(), "own presses of another calibration or model");
-            }
-            Ok(None) => {}
+            Ok(_) => {}
             Err(error) => warn!(path = %path.display(), %error, "own presses are not read"),
         }
     }
 
     /// Writes the own presses of a pipeline, soon.
     pub(super) fn save(&self, pipeline: &Pipeline) {
-        let (Some(changed), sensor) = (&self.changed, pipeline.sensor()) else {
+        let (Some(directory), sensor) = (&self.0, pipeline.sensor()) else {
             return;
         };
-        if self.is_of_user && is_simulated(&sensor.description().sensor.port) {
+        if directory.is_of_user && is_simulated(&sensor.description().sensor.port) {
             return;
         }
         let kept = Kept {
@@ -102,7 +97,14 @@ impl Store {
             presses: pipeline.own_presses().clone().for_another_start(),
         };
         // The thread ends only after all senders.
-        let _ = changed.send((sensor.name().to_owned(), kept));
+        let path = directory.file_of(sensor.name());
+        let _ = directory.changed.send((path, kept));
+    }
+}
+
+impl Directory {
+    fn file_of(&self, sensor: &str) -> PathBuf {
+        self.path.join(format!("own-{sensor}.json"))
     }
 }
 
@@ -112,10 +114,6 @@ fn of_user(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     let home = || Some(Path::new(&named("HOME")?).join(".local/state"));
     let state = named("XDG_STATE_HOME").map(PathBuf::from).or_else(home);
     Some(state?.join("hardnessd"))
-}
-
-fn file_of(directory: &Path, sensor: &str) -> PathBuf {
-    directory.join(format!("own-{sensor}.json"))
 }
 
 /// What a file holds. `None` if there is none.
@@ -131,20 +129,18 @@ fn read(path: &Path) -> anyhow::Result<Option<Kept>> {
     Ok(Some(serde_json::from_slice(&fs::read(path)?)?))
 }
 
-/// Writes what comes, until all senders are gone. Of the changes of a sensor that wait, the last one counts.
-fn write_all(directory: &Path, changed: &Receiver<(String, Kept)>) {
+/// Writes what comes, until all senders are gone. Of the changes of a file that wait, the last one counts.
+fn write_all(changed: &Receiver<(PathBuf, Kept)>) {
     while let Ok(first) = changed.recv() {
         let waiting: BTreeMap<_, _> = iter::once(first).chain(changed.try_iter()).collect();
-        for (sensor, kept) in waiting {
-            let path = file_of(directory, &sensor);
-            let written = fs::create_dir_all(directory).and_then(|()| {
+        for (path, kept) in waiting {
+            let written = fs::create_dir_all(directory_of(&path)).and_then(|()| {
                 let text = serde_json::to_vec(&kept)?;
                 Part::over(&path)?.write(&text)
             });
             if let Err(error) = written {
-                let path = path.display();
                 log::limited("own presses", || {
-                    warn!(%path, %error, "own presses are not written");
+                    warn!(path = %path.display(), %error, "own presses are not written");
                 });
             }
         }
@@ -171,7 +167,7 @@ mod tests {
     }
 
     fn store(directory: &Path) -> Store {
-        Store::in_directory(directory.to_owned()).unwrap()
+        Store::in_directory(directory.to_owned(), false).unwrap()
     }
 
     #[test]
@@ -209,7 +205,7 @@ mod tests {
         let saving = store(directory.path());
         saving.save(&first);
         drop(saving);
-        let path = file_of(directory.path(), "sensor");
+        let path = directory.path().join("own-sensor.json");
         while !path.exists() {
             std::thread::sleep(Duration::from_millis(1));
         }

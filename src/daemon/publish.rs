@@ -10,7 +10,7 @@ use tracing::info;
 
 use super::Error;
 use super::accept::{Stop, accept};
-use super::client::{Access, Service};
+use super::client::Service;
 use super::config::{Config, Unix};
 #[cfg(feature = "foxglove")]
 use super::foxglove;
@@ -75,12 +75,10 @@ impl Publishers {
     ) -> Result<Self, Error> {
         let (publish, unix) = (&config.publish, &config.publish.unix);
         let (most, ours) = (unix.max_clients, Handle::current());
-        let service = |access| Service {
-            access,
+        let service = |control| Service {
             max_clients: most,
             hub: hub.clone(),
-            sensors: sensors.clone(),
-            writers: ours.clone(),
+            control,
         };
         // None of them is served before all are open.
         let mut serving: Vec<(&Handle, Serving)> = Vec::new();
@@ -92,8 +90,8 @@ impl Publishers {
             drop(on_their_thread);
             let (mode, group) = (unix.control_mode.0, control_group(unix)?);
             let control = Socket::bind(CONTROL_KEY, &control_path, mode, group)?;
-            let events = accept(events, most, service(Access::ReadOnly), stop.clone());
-            let control = accept(control, most, service(Access::Control), stop.clone());
+            let events = accept(events, most, service(None), stop.clone());
+            let control = accept(control, most, service(Some(sensors.clone())), stop.clone());
             serving.push((clients, Box::pin(events)));
             serving.push((&ours, Box::pin(control)));
             paths.extend([("events", path), ("control", control_path)]);
@@ -102,7 +100,7 @@ impl Publishers {
         if let Some(settings) = &publish.tcp {
             let tcp = Tcp::bind("publish.tcp.listen", settings.listen)?;
             addresses.push(("tcp", tcp.address()));
-            let tcp = accept(tcp, most, service(Access::ReadOnly), stop.clone());
+            let tcp = accept(tcp, most, service(None), stop.clone());
             serving.push((clients, Box::pin(tcp)));
         }
         let mut http = None;

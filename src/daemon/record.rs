@@ -5,7 +5,6 @@
 //! is full, entries are dropped and counted, up to the sensor's next rest. A disk that fails or is full
 //! stops the recording, not the daemon. The recording continues when there is room again.
 
-mod file;
 mod worker;
 
 use std::fs::File;
@@ -16,7 +15,6 @@ use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
-use tracing::info;
 
 use self::worker::Worker;
 use super::{Error, config};
@@ -106,7 +104,7 @@ type Queued = (Job, OwnedSemaphorePermit);
 
 /// The queue to the thread.
 #[derive(Debug, Clone)]
-struct Jobs {
+pub(crate) struct Jobs {
     sender: Sender<Queued>,
     /// A permit for each byte of memory that is left.
     room: Arc<Semaphore>,
@@ -133,6 +131,11 @@ impl Jobs {
         // The recording may have ended, which is reported elsewhere.
         let _ = self.sender.send((job, taken));
         true
+    }
+
+    /// Records an event that is being published.
+    pub(crate) fn event(&self, event: &Event) {
+        self.send(Job::Event(Box::new(event.clone())));
     }
 }
 
@@ -175,14 +178,13 @@ impl Recorder {
             noted: None,
             was_busy: false,
             bytes: 0,
-            left_out: 0,
         };
         SensorRecorder(Some(Box::new(active)))
     }
 
     /// The recorder for the hub.
-    pub(crate) fn of_hub(&self) -> EventRecorder {
-        EventRecorder(Some(self.jobs.clone()))
+    pub(crate) fn of_hub(&self) -> Jobs {
+        self.jobs.clone()
     }
 
     /// Waits until there is no more to record, or the thread has ended.
@@ -192,7 +194,7 @@ impl Recorder {
     }
 
     /// Waits until the file is complete. The caller must have dropped every [`SensorRecorder`] and
-    /// [`EventRecorder`], because the thread ends when its queue has no sender left.
+    /// what the hub has of it, because the thread ends when its queue has no sender left.
     pub(crate) async fn finish(self) -> Result<(), Error> {
         drop(self.jobs);
         // If the thread panicked, the panic has been reported.
@@ -216,8 +218,6 @@ struct Active {
     was_busy: bool,
     /// The bytes of memory that the entries since that state take.
     bytes: usize,
-    /// The number of entries that came before the sensor was at rest.
-    left_out: u64,
 }
 
 impl SensorRecorder {
@@ -257,12 +257,10 @@ impl Active {
     /// replay could not use them.
     fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
         self.begin(pipeline, at);
-        if self.noted.is_none() {
-            self.left_out += 1;
-            return;
+        if self.noted.is_some() {
+            self.bytes += entry.weight();
+            self.queue(at, entry);
         }
-        self.bytes += entry.weight();
-        self.queue(at, entry);
     }
 
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
@@ -277,15 +275,7 @@ impl Active {
         let Some(state) = State::of(pipeline, &self.labels) else {
             return;
         };
-        if self.left_out > 0 {
-            let (sensor, entries) = (pipeline.sensor().name(), self.left_out);
-            info!(
-                sensor,
-                entries, "recording begins at rest: what came before is left out"
-            );
-        }
-        (self.noted, self.was_busy) = (Some(at.mono), false);
-        (self.bytes, self.left_out) = (0, 0);
+        (self.noted, self.was_busy, self.bytes) = (Some(at.mono), false, 0);
         self.queue(at, Entry::State(Box::new(state)));
     }
 
@@ -293,19 +283,6 @@ impl Active {
         let sensor = self.index;
         if !self.jobs.send(Job::Entry { sensor, at, entry }) {
             self.noted = None;
-        }
-    }
-}
-
-/// Records events. Without a recorder, it does nothing.
-#[derive(Debug, Default)]
-pub(crate) struct EventRecorder(Option<Jobs>);
-
-impl EventRecorder {
-    /// Records an event that is being published.
-    pub(crate) fn event(&self, event: &Event) {
-        if let Some(jobs) = &self.0 {
-            jobs.send(Job::Event(Box::new(event.clone())));
         }
     }
 }

@@ -3,9 +3,6 @@
 //! In: every kind of event, but only the newest frame of each sensor. Out: the same lines, in
 //! order, through a short channel. While the thread is busy, nothing waits for it but the log. When
 //! the log has moved on, a `gap` gives the number of lost events.
-//!
-//! In the other direction, a thread may pass on positions of the arm that the robot reports. They
-//! take the same path as a command of the control socket. Nothing else can be passed on.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -15,29 +12,13 @@ use tokio::sync::{mpsc, oneshot};
 use tracing::warn;
 
 use super::Error;
-use super::client;
 use super::hub::{Hub, Line};
-use super::log;
-use super::request::motion::Positions;
 use super::request::{Policy, Subscription};
-use super::sensor::Sensors;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::{Event, Kind};
 
 /// The most batches of lines that wait for the thread.
 const BATCHES: usize = 8;
-
-/// Passes positions of the arm on that came by `way`, without waiting.
-#[cfg_attr(
-    not(feature = "ros2"),
-    allow(dead_code, reason = "only ROS 2 passes them on")
-)]
-pub(super) fn pass_on(way: &'static str, sensors: &Sensors, positions: &Positions) {
-    if let Err(refused) = client::try_move_arm(sensors, positions) {
-        let sensor = positions.sensor.as_str();
-        log::limited(way, || warn!(way, sensor, %refused, "positions refused"));
-    }
-}
 
 /// Passes the events of a batch to `publish`, with their lines. A gap is logged.
 pub(super) fn each_event(
@@ -91,12 +72,11 @@ impl Worker {
             policy: Policy::LatestFrames,
             since: None,
         };
-        if let Ok(joined) = hub.join(wanted).await {
-            let (subscriber, now) = joined.expect("only a `since` can be refused");
-            // The thread may have ended already.
-            let _ = self.lines.send(now.statuses().collect()).await;
-            subscriber.feed(self.lines);
-        }
+        let joined = hub.join(wanted).await;
+        let (subscriber, now) = joined.expect("only a `since` can be refused");
+        // The thread may have ended already.
+        let _ = self.lines.send(now.statuses().collect()).await;
+        subscriber.feed(self.lines);
         let _ = self.ended.await;
     }
 }

@@ -13,6 +13,7 @@ use serde_json::{Map, Value};
 
 use self::motion::Positions;
 use hardnessd_core::event::{self, Kind};
+use hardnessd_core::wording;
 
 /// A request as it is written. The first key names it.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -177,17 +178,9 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
 
 /// The message of a value that cannot be used.
 pub(crate) fn unusable(key: &str, found: &(impl Serialize + ?Sized), expected: &str) -> String {
-    format!("{key}: found {}, expected {expected}", short(found))
-}
-
-/// The value found as JSON, cut to a length that fits in a message.
-pub(crate) fn short(found: &(impl Serialize + ?Sized)) -> String {
-    const CHARS: usize = 60;
-    let text = serde_json::to_string(found).expect("what was read as JSON can be written as JSON");
-    match text.char_indices().nth(CHARS) {
-        Some((end, _)) => format!("{}...", &text[..end]),
-        None => text,
-    }
+    let found = serde_json::to_string(found);
+    let found = found.expect("what was read as JSON can be written as JSON");
+    format!("{key}: found {}, expected {expected}", wording::cut(&found))
 }
 
 #[cfg(test)]

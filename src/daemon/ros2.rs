@@ -18,10 +18,11 @@ use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
 
 use super::Error;
+use super::client::try_move_arm;
 use super::config;
 use super::log;
-use super::relay::{Worker, each_event, pass_on};
-use super::request::motion::{Positions, ReportedTime};
+use super::relay::{Worker, each_event};
+use super::request::motion::ReportedTime;
 use super::sensor::{SensorHandle, Sensors};
 use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::ros::position::{POSITION, PointStamped};
@@ -71,8 +72,8 @@ pub(super) fn open(settings: &config::Ros2, sensors: &Sensors) -> Result<Worker,
 
 /// A node and its topics.
 struct Ros2 {
-    /// The publisher of each topic, by the sensor and by the topic's name.
-    topics: BTreeMap<(String, &'static str), Publisher<Message>>,
+    /// The publisher of each topic, by the topic's full name.
+    topics: BTreeMap<String, Publisher<Message>>,
     // The node must be dropped last, because its topics end with it.
     _node: Node,
 }
@@ -107,7 +108,7 @@ impl Ros2 {
                     settings.namespace.trim_end_matches('/')
                 );
                 let publisher = publisher(&mut node, &space, topic, &qos)?;
-                topics.insert((sensor.clone(), topic.name), publisher);
+                topics.insert(topic.of(sensor), publisher);
             }
         }
         let runtime = Builder::new_current_thread().enable_time().build()?;
@@ -124,15 +125,15 @@ impl Ros2 {
 
     fn publish(&self, event: &Event) {
         for (topic, _, bytes) in ros::encode_all(event) {
-            let sensor = event.sensor();
-            let Some(publisher) = self.topics.get(&(sensor.to_owned(), topic.name)) else {
+            let name = topic.of(event.sensor());
+            let Some(publisher) = self.topics.get(&name) else {
                 continue;
             };
             // A viewer that is too slow misses frames.
             if let Err(error) = publisher.publish(Message(bytes))
                 && event.kind() != Kind::Frame
             {
-                warn!(sensor, topic = topic.name, %error, "not published on ros2");
+                warn!(name, %error, "not published on ros2");
             }
         }
     }
@@ -153,8 +154,10 @@ async fn take_positions(sensor: String, positions: Subscription<PointStamped>, s
         };
         match taken {
             Some((at, mm)) => {
-                let (sensor, points) = (sensor.clone(), vec![(ReportedTime::Wall(at), mm)]);
-                pass_on("ros2", &sensors, &Positions { sensor, points });
+                let points = [(ReportedTime::Wall(at), mm)];
+                if let Err(refused) = try_move_arm(&sensors, &sensor, &points) {
+                    log::limited("ros2", || warn!(sensor, %refused, "positions refused"));
+                }
             }
             None => log::limited("ros2", || {
                 warn!(sensor, "found a position on ros2 without a valid time");

@@ -11,6 +11,7 @@ use std::time::Duration;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
+use tracing::{error, info, warn};
 
 use super::hub::Hub;
 use super::own::Store;
@@ -18,11 +19,12 @@ use super::record::SensorRecorder;
 use super::serial::Source;
 use super::{log, request};
 use crate::maybe;
-use hardnessd_core::event::{Event, Phase, Status, Tared};
+use hardnessd_core::event::{self, Event, Phase, Status, Tared};
 use hardnessd_core::pipeline::{Input, Pipeline, Refused};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Hrn;
+use hardnessd_core::wording;
 
 /// A command to a sensor's task.
 #[derive(Debug)]
@@ -115,7 +117,9 @@ pub(crate) async fn serve(
                 Some(Command::Take(input, reply)) => {
                     // Whoever sent it may not wait for the answer.
                     if let Err(Err(reason)) = reply.send(core.take_asked(input)) {
-                        log::refused(core.name(), &reason);
+                        log::limited(core.name(), || {
+                            warn!(sensor = core.name(), reason, "refused");
+                        });
                     }
                     continue;
                 }
@@ -145,7 +149,15 @@ pub(crate) async fn serve(
             let _ = taring.take().map(|reply| reply.send(outcome));
         }
         for failed in core.pipeline.unjudged() {
-            log::unjudged(&failed);
+            log::limited(core.name(), || {
+                error!(
+                    sensor = core.name(),
+                    press = failed.press,
+                    phase = event::name(&failed.phase),
+                    reason = %failed.error,
+                    "no verdict"
+                );
+            });
             core.unjudged += 1;
         }
         let is_final =
@@ -181,7 +193,11 @@ impl SensorCore {
         if let Input::Context(context) = &input {
             let levels = self.pipeline.hrn().card().levels.len();
             check_truth(context.as_ref(), levels)?;
-            log::context(self.name(), context.as_ref());
+            let context = context.as_ref();
+            log::limited(self.name(), || {
+                let context = context.map(|context| wording::escaped(&context.to_string()));
+                info!(sensor = self.name(), context, "context");
+            });
         }
         match self.take(input) {
             Err(Refused::Motion(back)) => Err(format!("motion.at[{}]: {back}", back.index)),

@@ -20,6 +20,7 @@ use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 use tokio_serial::SerialStream;
+use tracing::warn;
 
 use self::network::{Received, Udp};
 use self::tty::LineSettings;
@@ -32,7 +33,7 @@ use hardnessd_core::allowance::Allowance;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::port::Port;
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::wire::is_telnet;
+use hardnessd_core::wire::{TELNET, is_telnet};
 use hardnessd_core::wording;
 
 /// The pause before the first try to reopen. It doubles with each try that fails.
@@ -317,7 +318,7 @@ impl Task {
                 Err(error) => return error.to_string(),
             };
             if std::mem::take(&mut is_new) && is_telnet(&self.buffer[..bytes]) {
-                log::telnet(&self.port);
+                log::limited("tcp", || warn!(port = %self.port, "{TELNET}"));
             }
             self.pass_on(bytes).await;
         }

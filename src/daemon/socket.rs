@@ -42,27 +42,25 @@ impl Socket {
     /// before anybody can connect. `key` is the key of the path in the configuration. If the directory is
     /// missing, it is made, but no directory above it.
     pub(crate) fn bind(
-        key: &'static str,
+        key: &str,
         path: &Path,
         mode: u32,
         group: Option<Gid>,
     ) -> Result<Self, Error> {
-        let place = Place { key, path };
-        place.examine()?;
-        match DirBuilder::new().mode(0o755).create(directory_of(path)) {
-            Err(error) if error.kind() != ErrorKind::AlreadyExists => {
-                return Err(place.failed("make its directory")(error));
-            }
-            _ => {}
+        let failed = |what| move |error| failed(key, path, what, &error);
+        if check(key, path)? {
+            refuse_living(key, path)?;
+            fs::remove_file(path).map_err(failed("replace it"))?;
         }
-        if place.is_there()? {
-            place.vacant()?;
-            fs::remove_file(path).map_err(place.failed("replace it"))?;
+        let directory = directory_of(path);
+        if !directory.is_dir() {
+            let made = DirBuilder::new().mode(0o755).create(directory);
+            made.map_err(failed("make its directory"))?;
         }
         Ok(Self {
-            listener: listen(path, mode, group).map_err(place.failed("listen"))?,
+            listener: listen(path, mode, group).map_err(failed("listen"))?,
             path: path.to_owned(),
-            identity: identity(path).map_err(place.failed("find"))?,
+            identity: identity(path).map_err(failed("find"))?,
         })
     }
 }
@@ -83,87 +81,58 @@ impl Drop for Socket {
     }
 }
 
-/// Checks that a socket can be made at `path`, without making it.
-pub(crate) fn check(key: &'static str, path: &Path) -> Result<(), Error> {
-    Place { key, path }.examine()
+/// Checks that a socket can be made at `path`, without making it. Returns whether there is one, alive or dead.
+pub(crate) fn check(key: &str, path: &Path) -> Result<bool, Error> {
+    let (bytes, shown) = (path.as_os_str().len(), path.display());
+    if bytes > LONGEST_PATH_BYTES {
+        return Err(Error::Config(format!(
+            "{key}: found {shown}, {bytes} bytes, expected a path of at most {LONGEST_PATH_BYTES}"
+        )));
+    }
+    let directory = directory_of(path);
+    if !directory.is_dir() && (directory.exists() || !directory_of(directory).is_dir()) {
+        return Err(Error::Config(format!(
+            "{key}: {shown} is in no directory: make the directory, or set another path"
+        )));
+    }
+    match fs::symlink_metadata(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(failed(key, path, "look at it", &error)),
+        Ok(file) if file.file_type().is_socket() => Ok(true),
+        Ok(_) => Err(Error::Config(format!(
+            "{key}: {shown} is no socket: remove it, or set another path"
+        ))),
+    }
 }
 
-/// The path of a socket, and its key in the configuration.
-struct Place<'a> {
-    key: &'static str,
-    path: &'a Path,
+/// Fails if a process listens at `path`.
+fn refuse_living(key: &str, path: &Path) -> Result<(), Error> {
+    // A connection to a dead socket is refused. With any other result a process may listen there. The
+    // socket does not block, because a full backlog would keep a blocking connect waiting.
+    let probe = || rustix::net::connect(&socket()?, &SocketAddrUnix::new(path)?);
+    match probe() {
+        Err(Errno::CONNREFUSED | Errno::NOENT) => Ok(()),
+        Err(error @ (Errno::ACCESS | Errno::PERM)) => {
+            Err(failed(key, path, "try it", &error.into()))
+        }
+        _ => Err(Error::Io(format!(
+            "{key}: a daemon serves {} already: stop it (the package's with `sudo systemctl stop hardnessd`), \
+             or set another path",
+            path.display()
+        ))),
+    }
 }
 
-impl Place<'_> {
-    fn examine(&self) -> Result<(), Error> {
-        let Self { key, path } = self;
-        let (bytes, shown) = (path.as_os_str().len(), path.display());
-        if bytes > LONGEST_PATH_BYTES {
-            return Err(Error::Config(format!(
-                "{key}: found {shown}, {bytes} bytes, expected a path of at most {LONGEST_PATH_BYTES}"
-            )));
+/// The error of a step that the system refused.
+fn failed(key: &str, path: &Path, what: &str, error: &io::Error) -> Error {
+    let remedy = match error.kind() {
+        ErrorKind::PermissionDenied => {
+            ": set another path there, or XDG_RUNTIME_DIR to a directory of yours"
         }
-        let parent = directory_of(path);
-        let has_directory = match fs::metadata(parent) {
-            Err(error) if error.kind() == ErrorKind::NotFound => directory_of(parent).is_dir(),
-            Err(error) if error.kind() == ErrorKind::NotADirectory => false,
-            Err(error) => return Err(self.failed("find its directory")(error)),
-            Ok(parent) => parent.is_dir(),
-        };
-        if !has_directory {
-            return Err(Error::Config(format!(
-                "{key}: {shown} is in no directory: make the directory, or set another path"
-            )));
-        }
-        self.is_there().map(drop)
-    }
-
-    /// Whether there is a socket, alive or dead. Any other file there is an error.
-    fn is_there(&self) -> Result<bool, Error> {
-        let Self { key, path } = self;
-        match fs::symlink_metadata(path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
-            Err(error) => Err(self.failed("look at it")(error)),
-            Ok(file) if file.file_type().is_socket() => Ok(true),
-            Ok(_) => Err(Error::Config(format!(
-                "{key}: {} is no socket: remove it, or set another path",
-                path.display()
-            ))),
-        }
-    }
-
-    /// Fails if a process listens there.
-    fn vacant(&self) -> Result<(), Error> {
-        // A connection to a dead socket is refused. With any other result a process may listen
-        // there. The socket does not block, because a full backlog would keep a blocking connect
-        // waiting.
-        let probe = || rustix::net::connect(&socket()?, &SocketAddrUnix::new(self.path)?);
-        match probe() {
-            Err(Errno::CONNREFUSED | Errno::NOENT) => Ok(()),
-            Err(error @ (Errno::ACCESS | Errno::PERM)) => Err(self.failed("try it")(error.into())),
-            _ => Err(Error::Io(format!(
-                "{}: a daemon serves {} already: stop it (the package's with `sudo systemctl stop hardnessd`), \
-                 or set another path",
-                self.key,
-                self.path.display()
-            ))),
-        }
-    }
-
-    /// Makes the error of a step that the system refused.
-    fn failed(&self, what: &'static str) -> impl FnOnce(io::Error) -> Error {
-        move |source| {
-            let remedy = match source.kind() {
-                ErrorKind::PermissionDenied => {
-                    ": set another path there, or XDG_RUNTIME_DIR to a directory of yours"
-                }
-                _ => "",
-            };
-            let Self { key, path } = self;
-            let path = path.display();
-            Error::Io(format!("{key}: {path}: cannot {what}: {source}{remedy}"))
-        }
-    }
+        _ => "",
+    };
+    let path = path.display();
+    Error::Io(format!("{key}: {path}: cannot {what}: {error}{remedy}"))
 }
 
 fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<UnixListener> {

@@ -104,7 +104,7 @@ impl Zenoh {
                 let site = site.clone();
                 // When the daemon is stopping, a query gets no answer.
                 move |query| {
-                    if let Ok(now) = hub.snapshot_blocking() {
+                    if let Some(now) = hub.snapshot_blocking() {
                         answer(&query, &site, now);
                     }
                 }

@@ -8,9 +8,11 @@ use std::sync::Arc;
 use serde_json::Value;
 use tokio::sync::oneshot;
 
-use super::{Access, Service};
-use crate::daemon::hub::{Closed, Line};
+use super::Service;
+use crate::daemon::hub::Line;
 use crate::daemon::now;
+#[cfg(feature = "ros2")]
+use crate::daemon::request::motion::ReportedPoint;
 use crate::daemon::request::motion::{self, Positions};
 use crate::daemon::request::{self, Context, Query, Request};
 use crate::daemon::sensor::{Command, SensorHandle, Sensors};
@@ -33,23 +35,24 @@ pub(super) struct Done {
 /// The answer to a query or a command.
 pub(super) async fn answer(
     service: &Service,
-    request: Request,
+    request: Result<Request, Refused>,
     id: Option<Value>,
-) -> Result<Vec<Arc<Line>>, Closed> {
+) -> Vec<Arc<Line>> {
     let mut lines = Vec::new();
     let done = match request {
-        Request::Get(query) => {
-            let now = service.hub.snapshot().await?;
+        Ok(Request::Get(query)) => {
+            let now = service.hub.snapshot().await;
             match query {
                 Query::Status => lines.extend(now.statuses()),
                 Query::Last => lines.extend(now.sensors.into_iter().filter_map(|one| one.last)),
             }
             Ok(Done::default())
         }
-        request => change(service, request).await,
+        Ok(request) => change(service.control.as_ref(), request).await,
+        Err(unusable) => Err(unusable),
     };
     lines.push(end(done, id));
-    Ok(lines)
+    lines
 }
 
 /// The last line of an answer.
@@ -65,11 +68,10 @@ pub(super) fn end(done: Result<Done, Refused>, id: Option<Value>) -> Arc<Line> {
 }
 
 /// Carries out a request that changes something. Of all sockets, only the control socket may.
-async fn change(service: &Service, request: Request) -> Result<Done, Refused> {
-    if service.access == Access::ReadOnly {
+async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Refused> {
+    let Some(sensors) = sensors else {
         return Err("this socket changes nothing: send it to the control socket".to_owned());
-    }
-    let sensors = &service.sensors;
+    };
     let mut done = Done::default();
     match request {
         Request::Tare(sensor) => {
@@ -106,9 +108,11 @@ pub(in crate::daemon) async fn set_context(
 
 /// Passes positions of the arm on to the task of their sensor, without waiting. If the task refuses them, it
 /// logs that.
+#[cfg(feature = "ros2")]
 pub(in crate::daemon) fn try_move_arm(
     sensors: &Sensors,
-    Positions { sensor, points }: &Positions,
+    sensor: &str,
+    points: &[ReportedPoint],
 ) -> Result<(), Refused> {
     let found = find(sensors, MOTION_KEY, sensor)?;
     let (reply, _) = oneshot::channel();
@@ -139,7 +143,6 @@ fn find<'a>(sensors: &'a Sensors, key: &str, name: &str) -> Result<&'a SensorHan
     let found = sensors.iter().find(|sensor| sensor.name == name);
     found.ok_or_else(|| {
         let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
-        let (found, names) = (request::short(name), names.join(", "));
-        format!("{key}: found {found}, expected one of {names}")
+        request::unusable(key, name, &format!("one of {}", names.join(", ")))
     })
 }

@@ -13,18 +13,16 @@ use hardnessd_core::tare::RetareError;
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A service for a live sensor called "a", and the commands to the sensor.
-fn service(access: Access) -> (Service, mpsc::Receiver<Command>) {
+fn service() -> (Service, mpsc::Receiver<Command>) {
     let hub = Hub::new(hello());
     hub.log().report(state("a"));
     let (commands, inbox) = mpsc::channel(1);
     let name = "a".to_owned();
     let sensors = [SensorHandle { name, commands }].into();
     let service = Service {
-        access,
         max_clients: 1,
         hub,
-        sensors,
-        writers: Handle::current(),
+        control: Some(sensors),
     };
     (service, inbox)
 }
@@ -54,7 +52,7 @@ impl Client {
 
 #[tokio::test]
 async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
-    let (service, mut inbox) = service(Access::Control);
+    let (service, mut inbox) = service();
     let mut client = Client::connect(&service);
     for kind in ["hello", "status"] {
         assert_eq!(client.next().await["type"], kind);
@@ -77,7 +75,7 @@ async fn events_go_on_and_requests_wait_while_a_command_is_carried_out() {
 #[tokio::test(start_paused = true)]
 async fn a_client_that_reads_nothing_keeps_no_other_from_its_answers() {
     for asked in [&b"{\"get\":\"status\"}\n"[..], b"{\"subscribe\":[]}\n"] {
-        let (service, _inbox) = service(Access::ReadOnly);
+        let (service, _inbox) = service();
         let mut deaf = Client::connect(&service);
         while let Ok(written) = tokio::time::timeout(PATIENCE, deaf.output.write_all(asked)).await {
             written.unwrap();

@@ -28,32 +28,32 @@ settings! {
     }
 }
 
-/// A table with the address to listen on. The default is `PORT` of this machine alone.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default, bound = "")]
-pub struct Listen<const PORT: u16> {
-    /// The address and port to listen on.
-    pub listen: SocketAddr,
+/// A port of this machine alone.
+fn here(port: u16) -> SocketAddr {
+    SocketAddr::from(([127, 0, 0, 1], port))
 }
 
-impl<const PORT: u16> Default for Listen<PORT> {
-    fn default() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], PORT)),
-        }
+settings! {
+    /// The `[publish.tcp]` table.
+    pub struct Tcp {
+        /// The address and port to listen on.
+        pub listen: SocketAddr = here(8255);
     }
 }
 
-/// The `[publish.tcp]` table.
-pub type Tcp = Listen<8255>;
-/// The `[publish.foxglove]` table. The applications propose this port.
-pub type Foxglove = Listen<8765>;
+settings! {
+    /// The `[publish.foxglove]` table. The applications propose this port.
+    pub struct Foxglove {
+        /// The address and port to listen on.
+        pub listen: SocketAddr = here(8765);
+    }
+}
 
 settings! {
     /// The `[http]` table.
     pub struct Http {
         /// The address and port to listen on.
-        pub listen: SocketAddr = Listen::<8256>::default().listen;
+        pub listen: SocketAddr = here(8256);
         /// Whether the live page may set what is being pressed, as `object` and `level` of the context.
         pub set_context: bool = false;
     }

@@ -17,7 +17,7 @@ use hyper::StatusCode;
 use tokio::sync::mpsc;
 
 use super::refusal;
-use crate::daemon::hub::{Closed, Hub, Line};
+use crate::daemon::hub::{Hub, Line};
 use crate::daemon::request::{Policy, Since, Subscription, unusable};
 use hardnessd_core::event::Kind;
 use hardnessd_core::wording::named;
@@ -32,16 +32,17 @@ const HEARTBEAT: Duration = Duration::from_secs(3);
 const RETRY: Duration = Duration::from_secs(1);
 
 /// Answers a request.
-pub(super) async fn answer(State(hub): State<Hub>, request: Request) -> Result<Response, Closed> {
-    let wanted = match wanted(&request) {
-        Ok(wanted) => wanted,
-        Err(unusable) => return Ok(refusal(StatusCode::BAD_REQUEST, unusable)),
-    };
+pub(super) async fn answer(State(hub): State<Hub>, request: Request) -> Response {
+    let wanted = wanted(&request);
+    let subscribed = async { subscribe(&hub, wanted?).await };
+    let refused = |why| refusal(StatusCode::BAD_REQUEST, why);
+    subscribed.await.unwrap_or_else(refused)
+}
+
+/// The events of a subscription. The error is for the subscriber.
+async fn subscribe(hub: &Hub, wanted: Subscription) -> Result<Response, String> {
     let since = wanted.since.clone();
-    let (subscriber, now) = match hub.join(wanted).await? {
-        Ok(joined) => joined,
-        Err(refused) => return Ok(refusal(StatusCode::BAD_REQUEST, refused)),
-    };
+    let (subscriber, now) = hub.join(wanted).await?;
     let run = now.hello.run.clone();
     // If the connection breaks before its first event, the browser resumes from here.
     let from = match since {

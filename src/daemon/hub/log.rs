@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use super::cursor::{Cursor, Place, QUEUE};
 use super::tally::Counts;
-use crate::daemon::record::EventRecorder;
+use crate::daemon::record::Jobs;
 use crate::daemon::request::{Since, Subscription};
 use crate::daemon::sensor::SensorState;
 use crate::daemon::{log, now};
@@ -148,7 +148,7 @@ pub(crate) struct SensorSnapshot {
 #[derive(Debug)]
 pub(crate) struct Log {
     hello: Hello,
-    recorder: EventRecorder,
+    recorder: Option<Jobs>,
     /// The last [`HELD`] numbered events, and older ones within the share of their sensor.
     events: VecDeque<Entry>,
     /// The newest frame of each sensor, and those that a subscriber with a queue has not read. There are
@@ -168,7 +168,7 @@ impl Log {
     pub(super) fn new(hello: Hello) -> Self {
         Self {
             hello,
-            recorder: EventRecorder::default(),
+            recorder: None,
             events: VecDeque::new(),
             frames: VecDeque::new(),
             end: Place::default(),
@@ -198,7 +198,9 @@ impl Log {
             self.hello.seq += 1;
             event.number(self.hello.seq);
         }
-        self.recorder.event(&event);
+        if let Some(recorder) = &self.recorder {
+            recorder.event(&event);
+        }
         if kind == Kind::Frame && !self.wants_frames() {
             return;
         }
@@ -285,8 +287,8 @@ impl Log {
     }
 
     /// Passes every event on to `recorder` from now on.
-    pub(crate) fn record(&mut self, recorder: EventRecorder) {
-        self.recorder = recorder;
+    pub(crate) fn record(&mut self, recorder: Jobs) {
+        self.recorder = Some(recorder);
     }
 
     /// Changes the `hello` of new subscribers. The run and the numbers stay.
@@ -301,7 +303,7 @@ impl Log {
     /// Closes the log after its last event. Subscribers get the remaining lines, and then no more.
     pub(crate) fn close(&mut self) {
         self.is_closed = true;
-        self.recorder = EventRecorder::default();
+        self.recorder = None;
         for subscriber in self.subscribers.values() {
             subscriber.changed.notify_one();
         }

@@ -15,7 +15,6 @@ fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) 
         noted: None,
         was_busy: false,
         bytes: 0,
-        left_out: 0,
     };
     (SensorRecorder(Some(Box::new(active))), pipeline)
 }

@@ -1,7 +1,8 @@
 //! The recorder's thread, which decides which file is open, when it ends, and what to do when the
 //! disk fails.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,13 +12,13 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::file::{MB, Open, has_room};
 use super::{Job, Progress, Queued, Target};
 use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
+use hardnessd_core::part;
 use hardnessd_core::pipeline::Input;
-use hardnessd_core::recording::{self, About, Entry, Ring};
+use hardnessd_core::recording::{self, About, Entry, Ring, Writer};
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
@@ -29,6 +30,9 @@ const REPORT_EVERY: Duration = Duration::from_secs(60);
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// Before a paused recording continues, 1 / [`ROOM_SHARE`] more than the floor must be free.
 const ROOM_SHARE: u64 = 16;
+
+/// The bytes of a megabyte in the decimal sense, as in the sizes of disks.
+const MB: u64 = 1_000_000;
 
 /// The state of the thread.
 pub(super) struct Worker {
@@ -363,4 +367,84 @@ impl Worker {
 
 fn cannot_write(path: &Path, error: &recording::Error) -> Error {
     Error::Io(format!("{}: {error}", path.display()))
+}
+
+/// A file that is being written.
+struct Open {
+    path: PathBuf,
+    file: Arc<File>,
+    writer: Writer<BufWriter<Arc<File>>>,
+    since: Instant,
+}
+
+impl Open {
+    fn new(path: PathBuf, file: File, about: &About) -> Result<Self, recording::Error> {
+        let file = Arc::new(file);
+        let writer = Writer::new(BufWriter::new(file.clone()), about)?;
+        Ok(Self {
+            path,
+            file,
+            writer,
+            since: Instant::now(),
+        })
+    }
+
+    /// Makes a new file in `directory` that holds these entries, each after the index of its sensor. Its name has
+    /// `what` and the time. If this fails, no file is left, because the disk may be full.
+    fn filled<'a>(
+        directory: &Path,
+        what: &str,
+        about: &About,
+        entries: impl Iterator<Item = (usize, &'a (Stamp, Entry))>,
+    ) -> Result<Self, recording::Error> {
+        let now = jiff::Timestamp::now().strftime("%Y%m%dT%H%M%S%.3fZ");
+        let path = directory.join(format!("{what}-{now}.mcap"));
+        let file = File::create_new(&path).map_err(|error| named(&path, &error))?;
+        let fill = || {
+            let mut open = Self::new(path.clone(), file, about)?;
+            for (sensor, (at, entry)) in entries {
+                open.writer.entry(sensor, *at, entry)?;
+            }
+            open.writer.flush()?;
+            Ok(open)
+        };
+        fill().inspect_err(|_| {
+            // A file that cannot be removed stays.
+            let _ = fs::remove_file(&path);
+        })
+    }
+
+    /// Whether the next file is due: this one is full or old, or somebody has deleted or moved it.
+    fn is_over(&self, settings: &config::Record) -> bool {
+        let bytes = self.file.metadata().map_or(0, |file| file.len());
+        bytes >= settings.rotate_mb * MB
+            || self.since.elapsed() >= Duration::from_secs(settings.rotate_s)
+            || part::is_at(&self.path, &self.file).is_ok_and(|is_there| !is_there)
+    }
+
+    fn finish(self) -> Result<(), recording::Error> {
+        self.writer.finish()?;
+        Ok(())
+    }
+}
+
+/// Makes `directory` if it is missing. Fails if fewer than `floor` bytes are free on its disk.
+fn has_room(directory: &Path, floor: u64) -> io::Result<()> {
+    fs::create_dir_all(directory).map_err(|error| named(directory, &error))?;
+    let disk = rustix::fs::statvfs(directory).map_err(|error| named(directory, &error.into()))?;
+    let free = disk.f_bavail.saturating_mul(disk.f_frsize);
+    if free < floor {
+        let message = format!(
+            "{}: found {} MB free, expected at least {} (record.keep_free_mb)",
+            directory.display(),
+            free / MB,
+            floor / MB
+        );
+        return Err(io::Error::new(ErrorKind::StorageFull, message));
+    }
+    Ok(())
+}
+
+fn named(path: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }

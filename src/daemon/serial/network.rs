@@ -7,6 +7,7 @@ use std::time::Duration;
 use rustix::io::Errno;
 use tokio::net::UdpSocket;
 use tokio::time::Instant;
+use tracing::warn;
 
 use crate::daemon::log;
 use crate::daemon::tcp::keep_alive;
@@ -126,7 +127,10 @@ impl Udp {
             }
             Some(sender) if sender.is_new(stale_after) => {
                 if !std::mem::replace(&mut sender.reported, true) {
-                    log::other_sender(sender.address, address);
+                    let sender = sender.address;
+                    log::limited("udp", || {
+                        warn!(%sender, other = %address, "ignored: another sender sends for this sensor, and one at a time may");
+                    });
                 }
                 Received::Ignored
             }
