@@ -31,7 +31,7 @@ pub mod tail;
 pub mod watch;
 
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -111,6 +111,23 @@ fn open(path: &Path) -> Result<File, Failure> {
 /// The failure of a file of the command line that cannot be read.
 fn cannot_read(path: &Path) -> impl Fn(io::Error) -> Failure + '_ {
     move |error| Failure::of(NO_INPUT, format!("{}: cannot read", path.display()), error)
+}
+
+/// The text of a file of the command line.
+///
+/// # Errors
+///
+/// Fails if the file cannot be read, or has more than `most` bytes.
+fn read_text(path: &Path, most: u64) -> Result<String, Failure> {
+    let mut text = String::new();
+    let read = open(path)?.take(most + 1).read_to_string(&mut text);
+    match read.map_err(cannot_read(path))? as u64 > most {
+        true => Err(Failure::new(
+            FAILED,
+            format!("{}: found more than {most} bytes", path.display()),
+        )),
+        false => Ok(text),
+    }
 }
 
 /// Writes lines to stdout at once, and blocks until there is room for them. Do not call it on a

@@ -4,29 +4,27 @@
 //! the frames of the sensor on the arm, computed at the moments that they show. The arm stops when its
 //! controller goes, and when the sensor bears [`STOP_N`].
 
-use std::io;
+use std::fs::{self, Permissions};
+use std::io::{self, BufRead, BufReader, Read as _, Write as _};
+use std::os::unix::fs::PermissionsExt as _;
+use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::thread;
 use std::time::Duration;
 
-use futures_util::StreamExt as _;
 use serde::Deserialize;
 use serde_json::{Value, json};
-use tokio::io::AsyncWriteExt;
-use tokio::net::UnixStream;
-use tokio::sync::{mpsc, watch};
+use tempfile::TempPath;
+use tokio::sync::mpsc;
 use tokio::time::Instant;
 
+use super::exit::{Fail as _, Failure, IO};
 use super::player::Played;
-use crate::daemon;
-use crate::daemon::accept::Listener;
-use crate::daemon::lines::lines;
-use crate::daemon::socket::Socket;
-use crate::thread::NoThread;
+use super::robot::Position;
 use hardnessd_core::event::round_3;
 use hardnessd_core::range::{self, OutOfRange};
-use hardnessd_core::stderr_line;
-use hardnessd_simulator::{Rig, SequenceSettings, Touched};
+use hardnessd_simulator::{Rig, SequenceSettings};
 
 /// The time between the moment that a frame shows and its first byte: a sensor needs some to scan its
 /// taxels, and here it hides the time that a step of the physics takes.
@@ -42,24 +40,22 @@ const STOP_N: f64 = 50.0;
 /// The longest step of the physics.
 const LONGEST_STEP_S: f64 = 0.05;
 /// The longest line of a controller.
-const LONGEST_LINE_BYTES: usize = 4096;
+const LONGEST_LINE_BYTES: u64 = 4096;
 
-/// A simulated arm, at rest before its first object.
-#[derive(Debug)]
+/// A simulated arm that a controller moves.
 pub(crate) struct Arm {
-    socket: Socket,
-    state: Arc<watch::Sender<State>>,
+    /// Where the arm is at a moment, for the robot that reports it.
+    pub(crate) position: Position,
+    /// The frames of the sensor.
+    pub(crate) frames: mpsc::Receiver<Played>,
+    /// The socket, which vanishes with the arm.
+    pub(crate) socket: TempPath,
 }
 
-/// What the controller's side and the physics share.
-#[derive(Debug, Clone, Copy)]
-struct State {
+/// The arm, and the sensor on it before an object.
+struct Moved {
     leg: Leg,
-    /// The object that the controller wants, and how many it has wanted before.
-    object: u32,
-    placements: u32,
-    /// The object that is there. `None` until the first step with it.
-    touched: Option<Touched>,
+    rig: Rig,
 }
 
 /// A movement at a steady speed.
@@ -95,12 +91,6 @@ struct Order {
 }
 
 impl Order {
-    fn read(line: &[u8]) -> Result<Self, String> {
-        let order: Self = serde_json::from_slice(line).map_err(|error| error.to_string())?;
-        order.check().map_err(|error| error.to_string())?;
-        Ok(order)
-    }
-
     fn check(&self) -> Result<(), OutOfRange> {
         range::within("to_mm", self.to_mm.unwrap_or(0.0), (0.0, REACH_MM), "")?;
         let speed_mm_s = self.speed_mm_s.unwrap_or(SPEED_MM_S);
@@ -110,118 +100,98 @@ impl Order {
 }
 
 impl Arm {
-    /// Listens at `path`.
+    /// An arm at rest before its first object, whose controller connects to the new socket at `path`. Its first frame
+    /// shows the moment `start`.
     ///
     /// # Errors
     ///
-    /// Fails as [`Socket::bind`] does.
-    pub(crate) fn bind(path: &Path) -> Result<Self, daemon::Error> {
-        let state = State {
-            leg: Leg {
-                from_mm: 0.0,
-                start: Instant::now(),
-                to_mm: 0.0,
-                speed_mm_s: SPEED_MM_S,
-            },
-            object: 1,
-            placements: 0,
-            touched: None,
-        };
-        Ok(Self {
-            socket: Socket::bind("--arm", path, 0o600, None)?,
-            state: Arc::new(watch::Sender::new(state)),
-        })
-    }
-
-    /// Where the arm is at a moment, for the robot that reports it.
-    pub(crate) fn position(&self) -> impl Fn(Instant) -> Option<f64> + use<> {
-        let state = self.state.subscribe();
-        move |at| Some(state.borrow().leg.mm(at))
-    }
-
-    /// The frames of the sensor, the first of which shows the moment `start`.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the system has no thread to compute them on.
-    pub(crate) fn frames(
-        &self,
+    /// Fails if something is at `path`, or the system has no thread.
+    pub(crate) fn start(
+        path: &Path,
         settings: SequenceSettings,
         start: Instant,
-    ) -> Result<mpsc::Receiver<Played>, NoThread> {
+    ) -> Result<Self, Failure> {
+        let what = format!("--arm {}", path.display());
+        let listener = UnixListener::bind(path);
+        let listener = listener.of(format!("{what}: name a new path"), IO)?;
+        let socket = TempPath::try_from_path(path).of(&what, IO)?;
+        fs::set_permissions(path, Permissions::from_mode(0o600)).of(&what, IO)?;
+        let leg = Leg {
+            from_mm: 0.0,
+            start,
+            to_mm: 0.0,
+            speed_mm_s: SPEED_MM_S,
+        };
+        let frame_rate_hz = settings.frame_rate_hz;
+        let rig = Rig::new(settings);
+        let moved = Arc::new(Mutex::new(Moved { leg, rig }));
+        let [controlled, seen] = [&moved, &moved].map(Arc::clone);
         let (frames, played) = mpsc::channel(1);
-        let state = Arc::clone(&self.state);
-        let thread = std::thread::Builder::new();
-        thread.spawn(move || simulate(&state, settings, start, &frames))?;
-        Ok(played)
+        let started = thread::Builder::new()
+            .spawn(move || simulate(&moved, frame_rate_hz, start, &frames))
+            .and_then(|_| thread::Builder::new().spawn(move || serve(&listener, &controlled)));
+        started.of(&what, IO)?;
+        Ok(Self {
+            position: Box::new(move |at| Some(Moved::of(&seen).leg.mm(at))),
+            frames: played,
+            socket,
+        })
     }
+}
 
-    /// Obeys one controller after the other, for ever.
-    pub(crate) async fn serve(mut self) {
-        loop {
-            let served = match self.socket.accept().await {
-                Ok(controller) => self.obey(controller).await,
-                Err(error) => Err(error),
-            };
-            let now = Instant::now();
-            self.state.send_modify(|state| state.leg.stop(now));
-            if let Err(error) = served {
-                stderr_line!("warning: --arm: {error}");
-                tokio::time::sleep(SCAN).await;
-            }
-        }
+/// Obeys one controller after the other, for ever.
+fn serve(listener: &UnixListener, arm: &Mutex<Moved>) {
+    for controller in listener.incoming().flatten() {
+        // It may leave at any moment.
+        let _ = obey(&controller, arm);
+        Moved::of(arm).leg.stop(Instant::now());
     }
+}
 
-    async fn obey(&self, controller: UnixStream) -> io::Result<()> {
-        let (input, mut output) = controller.into_split();
-        let mut lines = lines(input, LONGEST_LINE_BYTES);
-        while let Some(line) = lines.next().await {
-            let line = line.map_err(io::Error::other)?;
-            let answer = match Order::read(&line) {
-                Ok(order) => self.take(order).await,
-                Err(error) => json!({"error": error}),
-            };
-            let answer = format!("{answer}\n");
-            // A controller need not wait for an answer, and may have gone.
-            if output.write_all(answer.as_bytes()).await.is_err() {
-                break;
-            }
+fn obey(mut controller: &UnixStream, arm: &Mutex<Moved>) -> io::Result<()> {
+    let mut input = BufReader::new(controller);
+    loop {
+        let mut line = Vec::new();
+        let mut rest = (&mut input).take(LONGEST_LINE_BYTES);
+        rest.read_until(b'\n', &mut line)?;
+        if line.pop() != Some(b'\n') {
+            return Ok(());
         }
-        Ok(())
+        let order = serde_json::from_slice(&line).map_err(|error| error.to_string());
+        let answer = order.and_then(|order| Moved::of(arm).take(&order));
+        let answer = answer.unwrap_or_else(|error| json!({"error": error}));
+        writeln!(controller, "{answer}")?;
+    }
+}
+
+impl Moved {
+    fn of(arm: &Mutex<Self>) -> MutexGuard<'_, Self> {
+        arm.lock().expect("a panic ends the process")
     }
 
     /// Takes an order, and answers with the state. An order that is refused changes nothing.
-    async fn take(&self, order: Order) -> Value {
+    fn take(&mut self, order: &Order) -> Result<Value, String> {
+        order.check().map_err(|error| error.to_string())?;
         let now = Instant::now();
-        let at_mm = self.state.borrow().leg.mm(now);
-        if order.object.is_some() && at_mm > 0.0 {
-            let found = format!("object: found the arm at {} mm", round_3(at_mm));
-            return json!({"error": format!("{found}, expected 0: withdraw it first")});
-        }
-        self.state.send_modify(|state| {
-            let leg = &mut state.leg;
-            *leg = Leg {
-                from_mm: leg.mm(now),
-                start: now,
-                to_mm: order.to_mm.unwrap_or(leg.to_mm),
-                speed_mm_s: order.speed_mm_s.unwrap_or(leg.speed_mm_s),
-            };
-            if let Some(object) = order.object {
-                state.object = object;
-                state.placements = state.placements.wrapping_add(1);
-                state.touched = None;
+        let at_mm = self.leg.mm(now);
+        if let Some(object) = order.object {
+            if at_mm > 0.0 {
+                let found = format!("object: found the arm at {} mm", round_3(at_mm));
+                return Err(format!("{found}, expected 0: withdraw it first"));
             }
-        });
-        let mut state = self.state.subscribe();
-        let state = *state
-            .wait_for(|state| state.touched.is_some())
-            .await
-            .expect("this arm holds the sender");
-        let touched = state.touched.expect("waited for");
-        json!({
-            "at_mm": round_3(state.leg.mm(Instant::now())),
-            "to_mm": round_3(state.leg.to_mm),
-            "speed_mm_s": state.leg.speed_mm_s,
+            self.rig.place(object);
+        }
+        self.leg = Leg {
+            from_mm: at_mm,
+            start: now,
+            to_mm: order.to_mm.unwrap_or(self.leg.to_mm),
+            speed_mm_s: order.speed_mm_s.unwrap_or(self.leg.speed_mm_s),
+        };
+        let touched = self.rig.touched();
+        Ok(json!({
+            "at_mm": round_3(at_mm),
+            "to_mm": round_3(self.leg.to_mm),
+            "speed_mm_s": self.leg.speed_mm_s,
             "truth": {
                 "object": touched.object,
                 "material": touched.material.name(),
@@ -230,48 +200,35 @@ impl Arm {
                 "force_n": round_3(touched.force_n),
                 "greatest_n": round_3(touched.greatest_n),
             },
-        })
+        }))
+    }
+
+    /// Steps the physics to a moment, `since_s` after the last one.
+    fn step(&mut self, at: Instant, since_s: f64) {
+        self.rig.move_to(self.leg.mm(at), since_s);
+        if self.rig.touched().force_n > STOP_N && self.leg.to_mm > self.leg.mm(at) {
+            self.leg.stop(at);
+        }
     }
 }
 
 /// Steps the physics in time with the clock, until nobody takes the frames. A step that comes too late
 /// is left out, with its frame, so that a frame never shows an old position.
-fn simulate(
-    state: &watch::Sender<State>,
-    settings: SequenceSettings,
-    start: Instant,
-    frames: &mpsc::Sender<Played>,
-) {
-    let period_s = 1.0 / settings.frame_rate_hz;
+fn simulate(arm: &Mutex<Moved>, frame_rate_hz: f64, start: Instant, frames: &mpsc::Sender<Played>) {
+    let period_s = 1.0 / frame_rate_hz;
     let steps_a_frame = (period_s / LONGEST_STEP_S).ceil() as u32;
     let step = Duration::from_secs_f64(period_s / f64::from(steps_a_frame));
-    let mut rig = Rig::new(settings);
-    let mut placements = 0;
     let mut last = start;
     let mut number = 0;
     loop {
         let at = start + step * number;
-        std::thread::sleep(at.saturating_duration_since(Instant::now()));
-        let wanted = *state.borrow();
-        if wanted.placements != placements {
-            placements = wanted.placements;
-            rig.place(wanted.object);
-        }
-        rig.move_to(wanted.leg.mm(at), (at - last).as_secs_f64());
+        thread::sleep(at.saturating_duration_since(Instant::now()));
+        Moved::of(arm).step(at, (at - last).as_secs_f64());
         last = at;
-        let touched = rig.touched();
-        state.send_modify(|state| {
-            if touched.force_n > STOP_N && state.leg.to_mm > state.leg.mm(at) {
-                state.leg.stop(at);
-            }
-            if state.placements == placements {
-                state.touched = Some(touched);
-            }
-        });
         if number.is_multiple_of(steps_a_frame) {
             let frame = Played {
                 number: number / steps_a_frame,
-                raw: rig.read(),
+                raw: Moved::of(arm).rig.read(),
                 approach: None,
             };
             if frames.blocking_send(frame).is_err() {

@@ -10,6 +10,7 @@ mod force;
 mod gather;
 mod taxels;
 
+use std::collections::BTreeSet;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 
@@ -192,15 +193,8 @@ fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<Strin
         let [newtons, read] = [newtons, read].map(|n| format!("{n:.3} N"));
         text += &format!("{newtons:<13} {read:<13} {error:+.1} %\n");
     }
-    let force::Fit {
-        newtons_per_count,
-        alone: [least, most],
-        exponent,
-        line_error,
-        power,
-        ..
-    } = fit;
-    let power = match power {
+    let (newtons_per_count, [least, most]) = (fit.newtons_per_count, fit.alone);
+    let power = match fit.power {
         Some((exponent, error)) => {
             format!("exponent {exponent:.2}, error {:.1} %", 100.0 * error)
         }
@@ -214,31 +208,34 @@ fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<Strin
              \n\
              [sensor.calibration]\n\
              newtons_per_count = {newtons_per_count:.5}\n\
-             exponent = {exponent:.2}\n",
-            100.0 * line_error
+             exponent = {:.2}\n",
+            100.0 * fit.line_error,
+            fit.exponent
         ))
 }
 
 /// The values, their spread and the lines for the configuration.
 fn of_arm(fit: &arm::Fit) -> String {
-    let arm::Fit {
-        presses,
-        force_n: [least_n, most_n],
-        n_per_mm,
-        delay_ms,
-        residual_mm,
-    } = fit;
-    let (arm, delay) = (n_per_mm.value, delay_ms.value);
+    let (arm, delay, [least_n, most_n]) = (fit.n_per_mm, fit.delay_ms, fit.force_n);
     format!(
-        "presses    {presses}, up to {least_n:.1} to {most_n:.1} N\n\
-         stiffness  {arm:.2} N/mm (press by press {:.2} to {:.2})\n\
-         delay      {delay:.1} ms (press by press {:.1} to {:.1})\n\
-         residual   {residual_mm:.3} mm\n\
+        "presses    {}, up to {least_n:.1} to {most_n:.1} N\n\
+         stiffness  {:.2} N/mm (press by press {:.2} to {:.2})\n\
+         delay      {:.1} ms (press by press {:.1} to {:.1})\n\
+         residual   {:.3} mm\n\
          \n\
          [sensor.arm]\n\
-         stiffness_n_per_mm = {arm:.2}\n\
-         delay_ms = {delay:.1}\n",
-        n_per_mm.least, n_per_mm.most, delay_ms.least, delay_ms.most,
+         stiffness_n_per_mm = {:.2}\n\
+         delay_ms = {:.1}\n",
+        fit.presses,
+        arm.value,
+        arm.least,
+        arm.most,
+        delay.value,
+        delay.least,
+        delay.most,
+        fit.residual_mm,
+        arm.value,
+        delay.value
     )
 }
 
@@ -261,12 +258,9 @@ fn of_taxels(
     }
     let array = sensor.layout().array();
     // Those of the sensor, and those that were dead in a recording.
-    let mut dead = sensor.calibration().dead_taxels.clone();
-    for press in &presses {
-        dead.extend(&press.calibration.dead_taxels);
-    }
-    dead.sort_unstable();
-    dead.dedup();
+    let recorded = presses.iter().map(|press| &press.calibration);
+    let known = recorded.chain([sensor.calibration()]);
+    let dead: BTreeSet<[usize; 2]> = known.flat_map(|known| known.dead_taxels.clone()).collect();
     let mut is_dead = vec![false; array.taxels()];
     for &[row, col] in &dead {
         is_dead[array.place(row, col)] = true;
@@ -303,6 +297,7 @@ fn of_taxels(
         toml::Value::from(super::as_in(config, path))
     );
     if !dead.is_empty() {
+        let dead = Vec::from_iter(dead);
         text += &format!("dead_taxels = {dead:?}\n");
     }
     Ok(text)

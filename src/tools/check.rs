@@ -6,10 +6,8 @@ use super::configuration::Configuration;
 use super::exit::{Coded, Failure};
 use crate::daemon::config::Setup;
 use crate::daemon::publish;
-use hardnessd_core::frame::Array;
 use hardnessd_core::sensor::Settings;
 use hardnessd_core::stderr_line;
-use hardnessd_core::tare;
 use hardnessd_core::verdict::Card;
 use hardnessd_core::wire::Layout;
 use hardnessd_core::wording::as_written;
@@ -92,18 +90,17 @@ const FULL_SCALES_N: (f64, f64) = (0.5, 5000.0);
 /// Warns if a taxel at full scale reads what no film bears.
 fn scale_warning(sensor: &Settings, layout: &Layout) -> Option<String> {
     let full_scale = layout.full_scale()?;
-    let tare::Settings {
-        newtons_per_count,
-        exponent,
-        ..
-    } = sensor.calibration;
-    let full_n = as_written(newtons_per_count) * f64::from(full_scale).powf(exponent.into());
+    let (scale, exponent) = (
+        &sensor.calibration.newtons_per_count,
+        sensor.calibration.exponent,
+    );
+    let full_n = as_written(*scale) * f64::from(full_scale).powf(exponent.into());
     let (least, most) = FULL_SCALES_N;
     if (least..=most).contains(&full_n) {
         return None;
     }
     Some(format!(
-        "sensor.calibration.newtons_per_count of {:?}: found {newtons_per_count}, with which \
+        "sensor.calibration.newtons_per_count of {:?}: found {scale}, with which \
          {full_scale} counts are {full_n:.3} N on a taxel, expected {least} to {most} N: measure it with \
          `hardnessd calibrate force`",
         sensor.name
@@ -114,20 +111,17 @@ fn scale_warning(sensor: &Settings, layout: &Layout) -> Option<String> {
 const PITCH_TOLERANCE_MM: f64 = 0.005;
 
 fn line_of(sensor: &Settings, layout: &Layout) -> String {
-    let Settings {
-        name,
-        port,
-        baud,
-        frame_rate_hz,
-        ..
-    } = sensor;
     let frame_bytes = match (layout.min_frame_bytes(), layout.max_frame_bytes()) {
         (shortest, longest) if shortest == longest => longest.to_string(),
         (shortest, longest) => format!("{shortest} to {longest}"),
     };
-    let Array { rows, cols } = layout.array();
     format!(
-        "sensor {name}: {port} at {baud} baud, {rows}x{cols} taxels in {frame_bytes} bytes, {frame_rate_hz} frames/s\n"
+        "sensor {}: {} at {} baud, {} taxels in {frame_bytes} bytes, {} frames/s\n",
+        sensor.name,
+        sensor.port,
+        sensor.baud,
+        layout.array(),
+        sensor.frame_rate_hz
     )
 }
 

@@ -5,14 +5,13 @@
 //! them. Times are in seconds of the sensor since its start. The seed decides which bytes and bits
 //! are hit.
 
-use std::io::Read as _;
 use std::path::Path;
 
 use serde::Deserialize;
 use toml::Spanned;
 
 use super::exit::Failure;
-use super::{cannot_read, open};
+use super::read_text;
 use hardnessd_core::exit::FAILED;
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::Layout;
@@ -144,18 +143,10 @@ impl Faults {
     ///
     /// Fails if the script cannot be read, or has a key or value that cannot be used.
     pub(crate) fn load(path: &Path, seed: u64) -> Result<Self, Failure> {
-        let mut text = String::new();
-        let read = open(path)?.take(MOST_BYTES + 1).read_to_string(&mut text);
-        read.map_err(cannot_read(path))?;
-        let faults = match text.len() as u64 > MOST_BYTES {
-            true => Err(format!("more than {MOST_BYTES} bytes")),
-            false => parse(&text),
-        };
-        let faults = faults.map_err(|why| format!("{}: {why}", path.display()));
-        Ok(Self::new(
-            faults.map_err(|why| Failure::new(FAILED, why))?,
-            seed,
-        ))
+        let faults = parse(&read_text(path, MOST_BYTES)?);
+        let faults =
+            faults.map_err(|why| Failure::new(FAILED, format!("{}: {why}", path.display())));
+        Ok(Self::new(faults?, seed))
     }
 
     /// Replaces `bytes` by those of the frame due at `time_s`, damaged as the script says, and

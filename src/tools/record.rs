@@ -115,12 +115,7 @@ pub async fn run(
         }
     };
     let (recorded, progress) = record(setup, sockets, &path, &file, labels, end).await;
-    let Progress {
-        frames,
-        tared,
-        presses,
-        ..
-    } = progress;
+    let (frames, presses) = (progress.frames, progress.presses);
     if recorded.is_err() && frames == 0 {
         // The path must be free for the next try.
         part::remove(&path, &file);
@@ -132,7 +127,7 @@ pub async fn run(
         stderr_line!("recorded {seen}, {pressed}: {shown}");
     }
     if recorded.is_ok() && presses == 0 {
-        let why = if frames > 0 && tared == 0 {
+        let why = if frames > 0 && progress.tared == 0 {
             ", because the zero was not taken: leave the sensor free at the start, and record longer"
         } else {
             ": was the sensor pressed, is it live, and is press.contact_threshold_n low enough?"

@@ -64,34 +64,26 @@ fn save(broken: File, part: &File) -> Result<Recovered, RecoverError> {
 
 /// Lines that say what was saved and what was lost.
 fn account(recovered: &Recovered) -> String {
-    let Recovered {
-        messages,
-        chunks,
-        span_ns,
-        lost,
-        messages_lost,
-        complete,
-        states,
-    } = recovered;
     let time = |ns: u64| {
         let time = Timestamp::from_nanosecond(i128::from(ns));
         time.map_or_else(|_| "?".to_owned(), |time| format!("{time:.3}"))
     };
-    let (first, last) = span_ns.map_or_else(Default::default, |(a, b)| (time(a), time(b)));
+    let span = recovered.span_ns;
+    let (first, last) = span.map_or_else(Default::default, |(a, b)| (time(a), time(b)));
+    let (messages, chunks) = (recovered.messages, recovered.chunks);
     let mut text = format!("saved {messages} messages in {chunks} chunks, {first} to {last}");
-    for (place, bytes) in lost {
+    for (place, bytes) in &recovered.lost {
         text +=
             &format!("\nlost {bytes} bytes at byte {place}: damaged, or a chunk of over 64 MiB");
     }
-    if *messages_lost > 0 {
-        text += &format!(
-            "\nlost {messages_lost} messages that cannot be read, or that nothing describes"
-        );
+    let lost = recovered.messages_lost;
+    if lost > 0 {
+        text += &format!("\nlost {lost} messages that cannot be read, or that nothing describes");
     }
-    if !complete {
+    if !recovered.complete {
         text += "\nthe end was missing: the recording was cut off, or it is still being written";
     }
-    if *states == 0 {
+    if recovered.states == 0 {
         text += "\nno state of a sensor is left: `hardnessd replay` has nothing to begin with, \
                  `hardnessd sniff` reads the bytes";
     }

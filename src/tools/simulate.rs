@@ -17,7 +17,6 @@ use super::player::{self, Pace, Player};
 use super::robot::{self, Position};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::Unix;
-use crate::maybe;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
@@ -112,21 +111,25 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let pace = Pace::new(args.fps, baud, args.speed);
     let player = Player::new(args.link.as_deref(), layout, pace, faults).of(&what, IO)?;
     let line = format!("{}\n", player.path().display());
-    let settings = sequence(&args);
-    let arm = args.arm.as_deref().map(Arm::bind).transpose().exit(IO)?;
-    let position: Position = match &arm {
-        Some(arm) => Box::new(arm.position()),
-        None => Box::new(player.position()),
+    let (settings, start) = (sequence(&args), Instant::now());
+    let arm = args.arm.as_deref();
+    let arm = arm.map(|path| Arm::start(path, settings.clone(), start));
+    let (position, frames, start, _socket): (Position, _, _, _) = match arm.transpose()? {
+        Some(arm) => (
+            arm.position,
+            arm.frames,
+            start + arm::SCAN,
+            Some(arm.socket),
+        ),
+        None => {
+            let frames = player::sequence(settings)?;
+            (Box::new(player.position()), frames, start, None)
+        }
     };
     if let Some(socket) = args.motion {
         let socket = socket.unwrap_or_else(|| Unix::default().control_path());
         robot::start(socket, position)?;
     }
-    let start = Instant::now();
-    let (frames, start) = match &arm {
-        Some(arm) => (arm.frames(settings, start)?, start + arm::SCAN),
-        None => (player::sequence(settings)?, start),
-    };
     let play = async {
         // It is no error if nobody reads the path, because the link shows it too.
         let printed = super::print_apart(line);
@@ -135,7 +138,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     };
     tokio::select! {
         played = play => played,
-        () = maybe::wait(arm.map(Arm::serve)) => Ok(()),
         () = shutdown => Ok(()),
     }
 }

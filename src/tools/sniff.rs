@@ -134,11 +134,13 @@ impl Args {
 /// Prints or writes the layout that explains the bytes.
 fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
     let path = &args.source();
-    let Args {
-        rows, cols, cell, ..
-    } = *args;
     let Captured { bytes, arrivals } = captured;
-    let found = sniff(&Capture { bytes, arrivals }, Known { rows, cols, cell });
+    let known = Known {
+        rows: args.rows,
+        cols: args.cols,
+        cell: args.cell,
+    };
+    let found = sniff(&Capture { bytes, arrivals }, known);
     let found = found.of_file(path, FAILED)?;
     if let Some(doubt) = &found.doubt {
         for ranked in [&found.best].into_iter().chain(&found.next) {
@@ -204,26 +206,20 @@ const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for
 /// The part below `[sensor.frame]`, with values where the defaults would take the sensor at rest for a touch.
 fn newtons(scale: &Scale) -> String {
     let mut text = String::new();
-    let Scale {
-        newtons_per_count,
-        tare_max_n,
-        contact_threshold_n,
-        most_counts,
-        noise_counts,
-    } = *scale;
     text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n";
-    if let Some(newtons) = newtons_per_count {
+    if let Some(newtons) = scale.newtons_per_count {
         text += &format!(
-            "newtons_per_count = {newtons:.6}  # a guess from counts up to {most_counts}: measure it with weights\n"
+            "newtons_per_count = {newtons:.6}  # a guess from counts up to {}: measure it with weights\n",
+            scale.most_counts
         );
     }
-    if let Some(most) = tare_max_n {
+    if let Some(most) = scale.tare_max_n {
         text += &format!("tare_max_n = {most:.3}  # taxels at rest differ\n");
     }
-    if let Some(threshold) = contact_threshold_n {
-        let plural = if noise_counts == 1.0 { "" } else { "s" };
+    if let Some(threshold) = scale.contact_threshold_n {
         text += &format!(
-            "\n[press]\ncontact_threshold_n = {threshold:.3}  # noise of {noise_counts} count{plural} at rest is no touch\n"
+            "\n[press]\ncontact_threshold_n = {threshold:.3}  # counts at rest vary by {}, which is no touch\n",
+            scale.noise_counts
         );
     }
     text

@@ -84,7 +84,7 @@ fn an_arm_stops_without_its_controller_and_at_a_force_and_refuses_what_it_cannot
     bench.fails(
         "simulate --arm arm.sock",
         74,
-        &["a daemon serves ", "stop it"],
+        &["name a new path", "in use"],
     );
     simulator.ends_at(Signal::TERM, 0);
     assert!(!arm.exists());

@@ -4,7 +4,7 @@
 //! never changes a result: a fresh bench gives the same bytes.
 
 use std::collections::BTreeMap;
-use std::rc::Rc;
+use std::sync::Arc;
 
 use super::block::{Block, LOCAL_NU, Standing};
 use super::contact::{Contact, Local, Problem, Solver, TOLERANCE};
@@ -86,7 +86,7 @@ pub(super) struct Bench {
     pub(super) cover: Cover,
     solvers: BTreeMap<usize, Solver>,
     layers: Vec<((f64, Base), Layer)>,
-    spectra: Vec<(Influence, Rc<[f32]>)>,
+    spectra: Vec<(Influence, Arc<[f32]>)>,
 }
 
 /// The layer that bears a load.
@@ -409,9 +409,9 @@ impl Bench {
         spectrum.iter().map(|&o| unit * o).collect()
     }
 
-    fn spectrum(&mut self, of: Influence) -> Rc<[f32]> {
+    fn spectrum(&mut self, of: Influence) -> Arc<[f32]> {
         if let Some((_, held)) = self.spectra.iter().find(|(held, _)| *held == of) {
-            return Rc::clone(held);
+            return Arc::clone(held);
         }
         let Influence { width, layer, unit } = of;
         let solvers = self.solvers.entry(width);
@@ -423,8 +423,8 @@ impl Bench {
                 convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height))
             }
         };
-        let made: Rc<[f32]> = made.into();
-        keep(&mut self.spectra, (of, Rc::clone(&made)), SPECTRA);
+        let made: Arc<[f32]> = made.into();
+        keep(&mut self.spectra, (of, Arc::clone(&made)), SPECTRA);
         made
     }
 }

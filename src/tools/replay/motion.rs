@@ -1,10 +1,9 @@
 //! The arm's positions beside raw bytes: a CSV file with the columns `time_s` and `approach_mm`.
 
-use std::io::Read;
 use std::path::Path;
 
 use crate::tools::exit::Failure;
-use crate::tools::{cannot_read, open};
+use crate::tools::read_text;
 use hardnessd_core::exit::FAILED;
 use hardnessd_core::motion::{FURTHEST_MM, Point};
 
@@ -15,13 +14,7 @@ const LONGEST_S: f64 = 1e9;
 
 /// Reads all positions of a file of the command line, in its order.
 pub(in crate::tools) fn load(path: &Path) -> Result<Vec<Point>, Failure> {
-    let mut text = String::new();
-    let read = open(path)?.take(MOST_BYTES + 1).read_to_string(&mut text);
-    read.map_err(cannot_read(path))?;
-    let points = match text.len() as u64 > MOST_BYTES {
-        true => Err(format!(" found more than {} MB", MOST_BYTES >> 20)),
-        false => parse(&text),
-    };
+    let points = parse(&read_text(path, MOST_BYTES)?);
     points.map_err(|why| Failure::new(FAILED, format!("--motion {}:{why}", path.display())))
 }
 
