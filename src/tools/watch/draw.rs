@@ -4,6 +4,7 @@
 //! live, the last frame is shown without its colours and under the state of the link, the curve
 //! ends, and no value is shown as present.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use ratatui_core::buffer::Buffer;
@@ -29,6 +30,14 @@ const GAP: u16 = 2;
 
 /// The least full scale of the map, in newtons a taxel: noise must not look like a touch.
 const LEAST_SCALE_N: f32 = 1.0;
+
+/// The totals of a status that are shown.
+const COUNTS: [&str; 4] = [
+    "frames",
+    "frames_damaged",
+    "frames_dropped",
+    "bytes_skipped",
+];
 
 /// Greys from no pressure to the greatest, for a map that is no longer current.
 const GREY: [u8; 13] = [
@@ -90,6 +99,14 @@ impl Look {
         Style::new().add_modifier(Modifier::BOLD)
     }
 
+    /// A heading, and a text beside it.
+    fn line(self, heading: &str, text: &str, style: Style) -> Line<'static> {
+        Line::from_iter([
+            span(&format!("{heading} "), self.heading()),
+            span(text, style),
+        ])
+    }
+
     /// The style of the word for a link. Other states must not look like live.
     fn link(self, link: Link) -> Style {
         let (fg, bg) = match link {
@@ -142,12 +159,8 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
         ])
         .areas(left);
         let top_n = highest_n(sensor).max(LEAST_SCALE_N);
-        let scale_line = format!("0 to {top_n:.2} N a taxel");
-        let heading = [
-            span("pressure ", look.heading()),
-            span(&scale_line, look.aside()),
-        ];
-        frame.render_widget(Line::from_iter(heading), scale);
+        let range = format!("0 to {top_n:.2} N a taxel");
+        frame.render_widget(look.line("pressure", &range, look.aside()), scale);
         let map = Rect { width: cols, ..map };
         draw_map(frame.buffer_mut(), map, sensor, top_n, link, look);
         if link != Link::Live {
@@ -217,23 +230,25 @@ fn title(view: &View, look: Look) -> Line<'static> {
 fn tabs(view: &View, now: Duration, width: usize, look: Look) -> Line<'static> {
     let tab = |(index, sensor): (usize, &Sensor)| {
         let (link, _) = view.link(Some(sensor), now);
-        let is_chosen = index == view.chosen;
-        let style = match (is_chosen, link) {
-            (true, _) => look.strong(),
-            (false, Link::Live) => look.aside(),
-            (false, _) => look.link(link),
+        let (mark, style) = match (index == view.chosen, link) {
+            (true, _) => ('>', look.strong()),
+            (false, Link::Live) => (' ', look.aside()),
+            (false, _) => (' ', look.link(link)),
         };
-        let mark = if is_chosen { '>' } else { ' ' };
         let text = format!("{mark}{} {} {}  ", index + 1, sensor.name, link.name());
         span(&text, style)
     };
-    let mut tabs: Vec<Span> = view.sensors.iter().enumerate().map(tab).collect();
-    let columns = |tabs: &[Span]| tabs.iter().map(Span::width).sum::<usize>();
-    let mut first = 0;
-    while first < view.chosen && columns(&tabs[first..=view.chosen]) > width {
-        first += 1;
+    let mut tabs: VecDeque<Span> = view.sensors.iter().enumerate().map(tab).collect();
+    let up_to_chosen = tabs.iter().take(view.chosen + 1);
+    let mut columns: usize = up_to_chosen.map(Span::width).sum();
+    for _ in 0..view.chosen {
+        if columns > width
+            && let Some(first) = tabs.pop_front()
+        {
+            columns -= first.width();
+        }
     }
-    tabs.split_off(first).into()
+    Line::from_iter(tabs)
 }
 
 /// The state of the link, the age of the last frame, and the frame rate.
@@ -263,20 +278,16 @@ fn link_line(sensor: Option<&Sensor>, link: Link, reason: Option<&str>, now: Dur
 /// The columns and rows of the largest pressure map that fits. A taxel takes half as many rows as columns,
 /// because a cell is twice as high as it is wide.
 fn map_size(sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
-    let places = (usize::from(width), 2 * usize::from(height));
-    let scale = (places.0 / sensor.cols).min(places.1 / sensor.rows);
-    let (cols, halves) = match scale {
-        // Several taxels share a place.
-        0 => {
-            let taxels = sensor
-                .cols
-                .div_ceil(places.0)
-                .max(sensor.rows.div_ceil(places.1));
-            (sensor.cols.div_ceil(taxels), sensor.rows.div_ceil(taxels))
-        }
-        _ => (scale * sensor.cols, scale * sensor.rows),
+    let (wide, high) = (usize::from(width), 2 * usize::from(height));
+    let scale = (wide / sensor.cols).min(high / sensor.rows);
+    // Several taxels share a place of a small map.
+    let shared = sensor.cols.div_ceil(wide).max(sensor.rows.div_ceil(high));
+    let places = |taxels: usize| match scale {
+        0 => taxels.div_ceil(shared),
+        _ => scale * taxels,
     };
-    (cols as u16, halves.div_ceil(2) as u16)
+    let halves = places(sensor.rows);
+    (places(sensor.cols) as u16, halves.div_ceil(2) as u16)
 }
 
 /// The greatest force on a taxel in the last frame, in newtons.
@@ -339,12 +350,6 @@ fn indexed(colour: [u8; 3]) -> Color {
 }
 
 fn counters(sensor: &Sensor, look: Look) -> Text<'static> {
-    let keys = [
-        "frames",
-        "frames_damaged",
-        "frames_dropped",
-        "bytes_skipped",
-    ];
     let line = |key: &str| {
         let count = number(&sensor.status, key);
         // A count of damage stands out if it is not 0.
@@ -355,14 +360,14 @@ fn counters(sensor: &Sensor, look: Look) -> Text<'static> {
         let name = key.replace('_', " ");
         Line::from(span(&format!("{name:<14} {count:>14}"), style))
     };
-    let counts = keys.into_iter().filter(|_| !sensor.status.is_null());
+    let counts = COUNTS.into_iter();
+    let counts = counts.filter(|_| !sensor.status.is_null());
     counts.map(line).collect()
 }
 
 fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'static> {
-    let heading = span("press ", look.heading());
     let Some((at, press)) = &sensor.press else {
-        return Line::from_iter([heading, span("none yet", look.aside())]);
+        return look.line("press", "none yet", look.aside());
     };
     let (old, number) = (age(now.saturating_sub(*at)), number(press, "press"));
     let (mut line, style) = match (press["state"].as_str().unwrap_or_default(), link) {
@@ -376,22 +381,18 @@ fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'s
     if let Some(reason) = press["reason"].as_str() {
         line += &format!(" ({reason})");
     }
-    Line::from_iter([heading, span(&line, style)])
+    look.line("press", &line, style)
 }
 
 /// The present force and contact area.
 fn force_line(sensor: &Sensor, link: Link, look: Look) -> Line<'static> {
-    let value = match (&sensor.frame, link) {
-        (Some(frame), Link::Live) => {
-            // A small negative sum is noise.
-            let force_n = frame.force_n.unwrap_or(0.0).max(0.0);
-            let taxels = frame.contact_area_taxels;
-            let present = format!("{force_n:.2} N on {taxels} taxels");
-            span(&present, look.strong())
-        }
-        _ => span("not known", look.aside()),
+    let Some(frame) = sensor.frame.as_ref().filter(|_| link == Link::Live) else {
+        return look.line("force", "not known", look.aside());
     };
-    Line::from_iter([span("force ", look.heading()), value])
+    // A small negative sum is noise.
+    let force_n = frame.force_n.unwrap_or(0.0).max(0.0);
+    let present = format!("{force_n:.2} N on {} taxels", frame.contact_area_taxels);
+    look.line("force", &present, look.strong())
 }
 
 /// The force of the last 30 s, as bars, and its scale.
@@ -429,8 +430,7 @@ fn verdicts(
     look: Look,
 ) -> Vec<Line<'static>> {
     let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
-    let heading = [span("verdicts ", look.heading()), span(&of, look.aside())];
-    let mut lines = vec![Line::from_iter(heading)];
+    let mut lines = vec![look.line("verdicts", &of, look.aside())];
     if sensor.verdicts.is_empty() {
         lines.push(span("none yet", look.aside()).into());
     }
@@ -475,9 +475,8 @@ fn verdict_line(verdict: &Value, answer: &str, old: &str, width: usize) -> Strin
 /// The keys, what a person types, or the outcome of the last command.
 fn keys(view: &View, look: Look) -> Line<'static> {
     if let Some(text) = &view.entry {
-        let ask = "pressing (a level, a name, or both; Enter): ";
-        let typed = span(&format!("{text}_"), look.strong());
-        return Line::from_iter([span(ask, look.heading()), typed]);
+        let ask = "pressing (a level, a name, or both; Enter):";
+        return look.line(ask, &format!("{text}_"), look.strong());
     }
     if let Some(said) = &view.said {
         return span(said, look.strong()).into();
