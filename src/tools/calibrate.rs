@@ -14,6 +14,7 @@ use std::collections::BTreeSet;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 
+use anyhow::ensure;
 use clap::{Args as ClapArgs, ValueEnum};
 
 use self::gather::Press;
@@ -50,7 +51,7 @@ pub struct Args {
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
     /// force: the weights, in newtons, in the order in which they are put on (1 kg is 9.81 N)
-    #[arg(long, value_name = "N", num_args = 1.., required_if_eq("what", "force"), value_parser = newtons)]
+    #[arg(long, value_name = "N", num_args = 1.., required_if_eq("what", "force"), value_parser = within(0.001, 1e6))]
     newtons: Vec<f64>,
     /// arm, taxels: presses to make, 2 to 1000 [default: arm 5, taxels 10]
     #[arg(long, value_name = "N", conflicts_with = "from", value_parser = clap::value_parser!(u64).range(2..=1000))]
@@ -86,6 +87,18 @@ const ARM_PRESSES: u64 = 5;
 const TAXEL_PRESSES: u64 = 10;
 
 impl Args {
+    fn check(&self) -> anyhow::Result<()> {
+        ensure!(
+            matches!(self.what, What::Force) || self.newtons.is_empty(),
+            "--newtons is only for `calibrate force`: leave it out"
+        );
+        ensure!(
+            matches!(self.what, What::Taxels) || self.out.is_none(),
+            "--out is only for `calibrate taxels`: leave it out"
+        );
+        Ok(())
+    }
+
     /// The number of presses to make.
     fn wanted(&self) -> u64 {
         match self.what {
@@ -109,14 +122,7 @@ pub async fn run(
     config: &Path,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    if !matches!(args.what, What::Force) && !args.newtons.is_empty() {
-        let unasked = "--newtons is only for `calibrate force`: leave it out";
-        return Err(Failure::new(USAGE, unasked));
-    }
-    if !matches!(args.what, What::Taxels) && args.out.is_some() {
-        let unasked = "--out is only for `calibrate taxels`: leave it out";
-        return Err(Failure::new(USAGE, unasked));
-    }
+    args.check().exit(USAGE)?;
     let sensor = setup.sensor_named(args.sensor.as_deref());
     let sensor = sensor.exit(USAGE)?.clone();
     // Test the output file now, before anybody presses.
@@ -163,11 +169,6 @@ fn print_next(args: &Args, seen: u64) {
         ),
         _ => stderr_line!("press {seen} of {wanted}"),
     }
-}
-
-/// A weight of the command line.
-fn newtons(text: &str) -> Result<f64, String> {
-    within(text, 0.001, 1e6)
 }
 
 /// The values of known weights, their spread and the lines for the configuration.

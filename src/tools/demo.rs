@@ -63,7 +63,8 @@ pub struct Args {
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     http: SocketAddr,
     /// Play X times as fast, 0.01 to 100
-    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    // Above 100, less than 2 ms would remain between frames, which a busy machine's timers cannot keep.
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = within(0.01, 100.0))]
     speed: f64,
     /// Print events as JSON lines on a terminal too
     #[arg(long)]
@@ -109,7 +110,12 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let player = Player::new(Some(&port), layout, pace, Faults::none()).of("pty", IO)?;
 
     let socket = place.socket();
-    let mut config = hastened(sensor, &socket, args.speed);
+    // The times of a press get shorter as its frames come faster.
+    sensor.frame_rate_hz *= args.speed;
+    let mut config = Config::new(vec![sensor]);
+    config.press.early_settle_s /= args.speed;
+    config.press.max_seconds /= args.speed;
+    config.publish.unix = config.publish.unix.at(socket.clone());
     config.http = Some(Http {
         listen: args.http,
         set_context: true,
@@ -156,26 +162,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         printed.expect("events are printed without a panic")?;
     }
     Ok(served?)
-}
-
-/// Parses `--speed`. Above 100, less than 2 ms would remain between frames, which a busy machine's
-/// timers cannot keep.
-fn speed(text: &str) -> Result<f64, String> {
-    within(text, 0.01, 100.0)
-}
-
-/// The default configuration for a sensor that plays `speed` times as fast: the times of a press
-/// are divided by `speed`.
-fn hastened(sensor: sensor::Settings, socket: &Path, speed: f64) -> Config {
-    let frame_rate_hz = sensor.frame_rate_hz * speed;
-    let mut config = Config::new(vec![sensor::Settings {
-        frame_rate_hz,
-        ..sensor
-    }]);
-    config.press.early_settle_s /= speed;
-    config.press.max_seconds /= speed;
-    config.publish.unix = config.publish.unix.at(socket.to_owned());
-    config
 }
 
 /// How long a terminal may take for the last line.

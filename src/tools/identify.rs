@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
 
+use anyhow::{Context as _, anyhow, bail, ensure};
 use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
@@ -190,18 +191,18 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
 }
 
 /// What is known of a piece, with the model's levels.
-fn piece(what: What, levels: &[Level]) -> Result<Piece, Failure> {
+fn piece(what: What, levels: &[Level]) -> anyhow::Result<Piece> {
     let level = match what {
         What::Piece(piece) => return Ok(piece),
-        What::Level(level) => level,
+        What::Level(level) => usize::from(level),
     };
-    if !(1..=levels.len()).contains(&usize::from(level)) {
-        let most = levels.len();
-        let unknown = format!("level: found {level}, expected 1 to {most}, those of the model");
-        return Err(Failure::new(FAILED, unknown));
-    }
-    let borders = Borders::of(levels).of("the model's levels", FAILED)?;
-    let range = borders.part(usize::from(level) - 1);
+    let most = levels.len();
+    ensure!(
+        (1..=most).contains(&level),
+        "level: found {level}, expected 1 to {most}, those of the model"
+    );
+    let borders = Borders::of(levels).context("the model's levels")?;
+    let range = borders.part(level - 1);
     Ok(Piece::Shore { range })
 }
 
@@ -222,9 +223,9 @@ fn of_file(
     })?;
     let what = match args.what {
         Some(what) => what,
-        None => labelled(&played.playback.labels(), path)?,
+        None => labelled(&played.playback.labels()).of_file(path, FAILED)?,
     };
-    let piece = piece(what, &hrn.card().levels)?;
+    let piece = piece(what, &hrn.card().levels).exit(FAILED)?;
     if courses.is_empty() {
         let (path, sensor) = (path.display(), sensor.name());
         let none = format!("{path}: found no press of sensor {sensor:?}, expected at least one");
@@ -252,19 +253,14 @@ fn spread(mut courses: Vec<TimeSeries>, most: usize) -> Vec<TimeSeries> {
 }
 
 /// What the labels of a recording say was pressed.
-fn labelled(labels: &Labels, path: &Path) -> Result<What, Failure> {
-    let failed = |problem: String| Failure::new(FAILED, format!("{}: {problem}", path.display()));
-    let kinds = [("reference", ""), ("shore", "shore:"), ("level", "level:")];
-    for (key, kind) in kinds {
+fn labelled(labels: &Labels) -> anyhow::Result<What> {
+    for (key, kind) in [("reference", ""), ("shore", "shore:"), ("level", "level:")] {
         if let Some(found) = labels.get(key) {
             let what = format!("{kind}{found}").parse();
-            return what
-                .map_err(|expected| failed(format!("label {key}: found {found:?}, {expected}")));
+            return what.map_err(|expected| anyhow!("label {key}: found {found:?}, {expected}"));
         }
     }
-    let unlabelled =
-        "found no label `reference`, `shore` or `level`: say what was pressed with --as";
-    Err(failed(unlabelled.to_owned()))
+    bail!("found no label `reference`, `shore` or `level`: say what was pressed with --as");
 }
 
 /// What the file holds, what is missing, and the lines of the configuration. `out` is the file's path as

@@ -38,7 +38,9 @@ pub struct Args {
     #[arg(long, value_name = "P", default_value = "jx255n", value_parser = named::<Preset>)]
     preset: Preset,
     /// Frames per second, 0.1 to 1000
-    #[arg(long, value_name = "F", default_value_t = DEFAULT_FRAME_RATE_HZ, value_parser = frame_rate_hz)]
+    // A press is computed as a whole, with as many frames as it takes to reach its force. At a rate beyond any
+    // sensor's, they would fill the memory.
+    #[arg(long, value_name = "F", default_value_t = DEFAULT_FRAME_RATE_HZ, value_parser = within(0.1, 1000.0))]
     fps: f64,
     /// Material to press: wood, rubber, plasticine, sponge, hard-plastic, foam, soft-candy, yoga-mat; repeat the
     /// option for several in turn [default: all eight]
@@ -50,7 +52,9 @@ pub struct Args {
     piece: Option<Reference>,
     /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
     /// random, 5 to 25]
-    #[arg(long = "force", value_name = "N", value_parser = force_n)]
+    // For the same reason: the softest material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N
+    // a taxel.
+    #[arg(long = "force", value_name = "N", value_parser = within(0.01, 200.0))]
     forces: Vec<f64>,
     /// Seed of everything random
     #[arg(long, value_name = "S", default_value_t = 1)]
@@ -220,27 +224,21 @@ fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
     Err(Failure::new(USAGE, problem))
 }
 
-/// Parses `--fps`. A press is computed as a whole, with as many frames as it takes to reach its
-/// force. At a rate beyond any sensor's, they would fill the memory.
-fn frame_rate_hz(text: &str) -> Result<f64, String> {
-    within(text, 0.1, 1000.0)
-}
-
-/// Parses `--force`, which is limited for the same reason as [`frame_rate_hz`]: the softest
-/// material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N a taxel.
-fn force_n(text: &str) -> Result<f64, String> {
-    within(text, 0.01, 200.0)
-}
-
-pub(super) fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
-    let number = text.parse::<f64>().ok();
-    let number = number.filter(|number| (least..=most).contains(number));
-    number.ok_or_else(|| format!("expected a number from {least} to {most}"))
+/// Parses a number in this range.
+pub(super) fn within(
+    least: f64,
+    most: f64,
+) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
+    move |text| {
+        let number = text.parse::<f64>().ok();
+        let number = number.filter(|number| (least..=most).contains(number));
+        number.ok_or_else(|| format!("expected a number from {least} to {most}"))
+    }
 }
 
 /// Parses a number above 0 that is so near to 1 that a clock can count seconds made of it.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
-    within(text, 1e-6, 1e9)
+    within(1e-6, 1e9)(text)
 }
 
 #[cfg(test)]
