@@ -217,26 +217,19 @@ fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<Strin
 
 /// The values, their spread and the lines for the configuration.
 fn of_arm(fit: &arm::Fit) -> String {
-    let (arm, delay, [least_n, most_n]) = (fit.n_per_mm, fit.delay_ms, fit.force_n);
+    let [least_n, most_n] = fit.force_n;
+    let (arm, [least_arm, most_arm]) = fit.n_per_mm;
+    let (delay, [least_delay, most_delay]) = fit.delay_ms;
     format!(
         "presses    {}, up to {least_n:.1} to {most_n:.1} N\n\
-         stiffness  {:.2} N/mm (press by press {:.2} to {:.2})\n\
-         delay      {:.1} ms (press by press {:.1} to {:.1})\n\
+         stiffness  {arm:.2} N/mm (press by press {least_arm:.2} to {most_arm:.2})\n\
+         delay      {delay:.1} ms (press by press {least_delay:.1} to {most_delay:.1})\n\
          residual   {:.3} mm\n\
          \n\
          [sensor.arm]\n\
-         stiffness_n_per_mm = {:.2}\n\
-         delay_ms = {:.1}\n",
-        fit.presses,
-        arm.value,
-        arm.least,
-        arm.most,
-        delay.value,
-        delay.least,
-        delay.most,
-        fit.residual_mm,
-        arm.value,
-        delay.value
+         stiffness_n_per_mm = {arm:.2}\n\
+         delay_ms = {delay:.1}\n",
+        fit.presses, fit.residual_mm
     )
 }
 

@@ -22,8 +22,8 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout};
 
 use self::account::Account;
-use self::place::Place;
 pub(super) use self::place::sockets;
+use self::place::{SOCKET, place};
 use super::configuration::ModelFile;
 use super::connect::{Address, Connection};
 use super::exit::{Fail, Failure};
@@ -82,8 +82,8 @@ const SEED: u64 = 2;
 ///
 /// Returns a [`Failure`] if the daemon, the pty, the socket or stdout fails.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
-    let place = Place::new().of("directory for socket and port", IO)?;
-    let port = place.port();
+    let place = place().of("directory for socket and port", IO)?;
+    let [port, socket] = ["port", SOCKET].map(|name| place.path().join(name));
     let mut sensor = sensor::Settings {
         name: "demo".to_owned(),
         ..sensor::Settings::new(port.clone())
@@ -109,7 +109,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let account = (!is_json).then(|| Account::new(&sequence));
     let player = Player::new(Some(&port), layout, pace, Faults::none()).of("pty", IO)?;
 
-    let socket = place.socket();
     // The times of a press get shorter as its frames come faster.
     sensor.frame_rate_hz *= args.speed;
     let mut config = Config::new(vec![sensor]);
@@ -134,13 +133,14 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let subscriber = Connection::open(Address::Unix(socket))?;
     let print = move || print_events(subscriber, args.presses, account);
     let mut printed = spawn_thread("events", print)?;
-    robot::start(control, Box::new(player.position()))?;
+    let start = Instant::now();
+    robot::start(control, Box::new(player.position(start)))?;
     let frames = player::sequence(sequence)?;
     // When it is dropped, the daemon stops.
     let (stop, stopped) = oneshot::channel::<()>();
     let daemon = daemon.run(stopped.map(drop), None);
     let play = async {
-        player.play(frames, Instant::now()).await.of("pty", IO)?;
+        player.play(frames, start).await.of("pty", IO)?;
         // The loss of the port ends what is printed.
         future::pending::<Result<_, Failure>>().await
     };

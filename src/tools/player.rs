@@ -56,8 +56,8 @@ pub(crate) struct Player {
     layout: Layout,
     pace: Pace,
     faults: Faults,
-    /// The motion of the arm, for the robot.
-    moving: watch::Sender<Option<Moving>>,
+    /// The path of the arm around the present moment, for the robot.
+    approach: watch::Sender<Option<Approach>>,
 }
 
 impl Player {
@@ -79,7 +79,7 @@ impl Player {
             layout,
             pace,
             faults,
-            moving: watch::Sender::new(None),
+            approach: watch::Sender::new(None),
         })
     }
 
@@ -91,11 +91,11 @@ impl Player {
             .path()
     }
 
-    /// Where the arm of a sequence is at a moment, for the robot that reports it. `None` before the
-    /// first frame.
-    pub(crate) fn position(&self) -> impl Fn(Instant) -> Option<f64> + use<> {
-        let moving = self.moving.subscribe();
-        move |at| Some((*moving.borrow())?.mm(at))
+    /// Where the arm of a sequence that begins at `start` is at a moment, for the robot that reports it. `None` before
+    /// the first frame.
+    pub(crate) fn position(&self, start: Instant) -> impl Fn(Instant) -> Option<f64> + use<> {
+        let (approach, speed) = (self.approach.subscribe(), self.pace.speed);
+        move |at| Some((*approach.borrow())?.mm((at - start).as_secs_f64() * speed))
     }
 
     /// Plays the frames, the first of them at `start`. Afterwards the port is gone.
@@ -115,13 +115,7 @@ impl Player {
             let since = self.pace.period * frame.number;
             let due = start + since;
             tokio::time::sleep_until(due).await;
-            let speed = self.pace.speed;
-            self.moving
-                .send_replace(frame.approach.map(|approach| Moving {
-                    start,
-                    speed,
-                    approach,
-                }));
+            self.approach.send_replace(frame.approach);
             let time_s = since.as_secs_f64() * self.pace.speed;
             let layout = &self.layout;
             let line = self.faults.encode(time_s, &frame.raw, layout, &mut bytes);
@@ -198,22 +192,4 @@ pub(crate) fn sequence(settings: SequenceSettings) -> Result<mpsc::Receiver<Play
         }
     })?;
     Ok(played)
-}
-
-/// The present motion of the arm.
-#[derive(Debug, Clone, Copy)]
-struct Moving {
-    /// The time of the sensor's first frame.
-    start: Instant,
-    /// Seconds of the sensor per second.
-    speed: f64,
-    /// The path of the arm around this moment.
-    approach: Approach,
-}
-
-impl Moving {
-    fn mm(&self, at: Instant) -> f64 {
-        self.approach
-            .mm((at - self.start).as_secs_f64() * self.speed)
-    }
 }

@@ -10,34 +10,15 @@ use serde_json::Value;
 use super::answer::{Answer, items, with_shore};
 use hardnessd_core::wording;
 
-/// How events are printed on stdout.
-#[derive(Debug)]
-pub(super) struct Printer {
-    is_json: bool,
-    is_terminal: bool,
-    /// The labels of the model's levels.
-    labels: Vec<String>,
-}
-
-impl Printer {
-    /// A printer for stdout as it is.
-    pub(super) fn new(is_json: bool, labels: Vec<String>) -> Self {
-        Self {
-            is_json,
-            is_terminal: io::stdout().is_terminal(),
-            labels,
-        }
-    }
-
-    /// The line of an event, newline included. `json` is its line on the wire, and `event` reads it.
-    pub(super) fn line(&self, json: String, event: impl FnOnce() -> Value) -> String {
-        let text = match (self.is_json, self.is_terminal) {
-            (false, _) => line(&event(), &self.labels),
-            (true, false) => json,
-            (true, true) => json_escaped(&json),
-        };
-        text + "\n"
-    }
+/// The line of an event on stdout, newline included. `json` is its line on the wire, and `labels` are those of the
+/// model's levels.
+pub(super) fn printed(json: &str, is_json: bool, labels: &[String]) -> String {
+    let text = match (is_json, io::stdout().is_terminal()) {
+        (false, _) => line(&serde_json::from_str(json).unwrap_or_default(), labels),
+        (true, false) => json.to_owned(),
+        (true, true) => json_escaped(json),
+    };
+    text + "\n"
 }
 
 /// The same JSON without hidden characters, for a terminal. They are inside strings only.

@@ -16,7 +16,7 @@ use clap::Args as ClapArgs;
 use super::configuration::ModelFile;
 use super::exit::Failure;
 use super::played::Played;
-use super::readable::Printer;
+use super::readable::printed;
 use super::simulate::positive;
 use crate::daemon::config::{Config, Setup};
 use hardnessd_core::event::{Event, Kind};
@@ -63,8 +63,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let path = &args.file;
     let recording = super::open(path)?;
     let levels = &setup.hrn.card().levels;
-    let labels = levels.iter().map(|level| level.label.clone()).collect();
-    let printer = Printer::new(args.json || !io::stdout().is_terminal(), labels);
+    let labels: Vec<String> = levels.iter().map(|level| level.label.clone()).collect();
+    let is_json = args.json || !io::stdout().is_terminal();
     let sensor = setup.sensors.first();
     let sensor = sensor.expect("a configuration has at least one sensor");
     let mut played = Played::open(path, recording, sensor, &setup.hrn, args.motion.as_deref())?;
@@ -79,7 +79,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         if let Some(speed) = args.speed {
             wait(start, at.mono.saturating_sub(first), speed);
         }
-        print(events, &mut seq, &printer)
+        print(events, &mut seq, is_json, &labels)
     });
     if let Some(model) = played.playback.other_model() {
         stderr_line!(
@@ -101,17 +101,18 @@ fn wait(start: Instant, since: Duration, speed: f64) {
 
 /// Prints the events that a subscriber would receive, without frames. Returns `false` if nobody
 /// reads stdout.
-fn print(events: Vec<Event>, seq: &mut u64, printer: &Printer) -> Result<bool, Failure> {
+fn print(
+    events: Vec<Event>,
+    seq: &mut u64,
+    is_json: bool,
+    labels: &[String],
+) -> Result<bool, Failure> {
     let mut lines = String::new();
     for mut event in events {
         if event.kind() != Kind::Frame {
             *seq += 1;
             event.number(*seq);
-            let line = event.to_line();
-            let json = line.trim_end();
-            lines += &printer.line(json.to_owned(), || {
-                serde_json::from_str(json).expect("an event is JSON")
-            });
+            lines += &printed(event.to_line().trim_end(), is_json, labels);
         }
     }
     super::print(lines.as_bytes())

@@ -127,7 +127,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         ),
         None => {
             let frames = player::sequence(settings)?;
-            (Box::new(player.position()), frames, start, None)
+            (Box::new(player.position(start)), frames, start, None)
         }
     };
     if let Some(socket) = args.motion {

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use super::answer;
 use super::connect::Source;
 use super::exit::Failure;
-use super::readable::Printer;
+use super::readable::printed;
 use super::simulate::positive;
 use crate::maybe;
 use crate::thread::spawn_thread;
@@ -101,7 +101,6 @@ fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
             wording::escaped(&daemon.address().to_string())
         );
     }
-    let printer = Printer::new(args.json, labels);
     let mut found = 0;
     while args.count != Some(found) {
         let line = daemon.next()?;
@@ -112,7 +111,7 @@ fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
         if !counts && kind != "gap" {
             continue;
         }
-        if !super::print(printer.line(line, || event).as_bytes())? {
+        if !super::print(printed(&line, args.json, &labels).as_bytes())? {
             return Ok(());
         }
         found += u64::from(counts);

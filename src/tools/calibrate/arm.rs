@@ -10,12 +10,7 @@ use super::gather::Press;
 use hardnessd_core::line::Sums;
 
 /// A value, and its least and greatest over single presses.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Spread {
-    pub(super) value: f64,
-    pub(super) least: f64,
-    pub(super) most: f64,
-}
+pub(super) type Spread = (f64, [f64; 2]);
 
 /// The values that presses give.
 #[derive(Debug, Clone, PartialEq)]
@@ -128,10 +123,9 @@ impl Fit {
             (delay_ms, slope(&alone, delay_ms).unwrap_or(n_per_mm))
         };
         let alone: Vec<(f64, f64)> = known.iter().map(one).collect();
-        let spread = |value: f64, of: fn(&(f64, f64)) -> f64| Spread {
-            value,
-            least: alone.iter().map(of).fold(value, f64::min),
-            most: alone.iter().map(of).fold(value, f64::max),
+        let spread = |value: f64, of: fn(&(f64, f64)) -> f64| {
+            let least = alone.iter().map(of).fold(value, f64::min);
+            (value, [least, alone.iter().map(of).fold(value, f64::max)])
         };
         let forces = known.iter().map(|press| press.force_n());
         Ok(Self {
@@ -248,13 +242,12 @@ mod tests {
                 [1.0, 1.7, 2.4, 2.0].map(|mm| press(n_per_mm, delay_ms, mm * 10.0 / n_per_mm, hz));
             let fit = Fit::of(&presses).unwrap();
             assert_eq!(fit.presses, 4);
-            assert!((fit.delay_ms.value - delay_ms).abs() < 5.0, "{fit:?}");
+            assert!((fit.delay_ms.0 - delay_ms).abs() < 5.0, "{fit:?}");
             // The cover gives way too, even at half of 24 N, which lowers the stiffness found.
-            let ratio = fit.n_per_mm.value / n_per_mm;
+            let ratio = fit.n_per_mm.0 / n_per_mm;
             assert!((0.75..1.01).contains(&ratio), "{fit:?}");
-            assert!(
-                fit.n_per_mm.least <= fit.n_per_mm.value && fit.n_per_mm.value <= fit.n_per_mm.most
-            );
+            let (value, [least, most]) = fit.n_per_mm;
+            assert!(least <= value && value <= most);
             assert!(fit.residual_mm < 0.02, "{fit:?}");
         }
     }
@@ -283,7 +276,7 @@ mod tests {
         for delay_ms in [590.0, -290.0] {
             let late = [1.7, 2.4].map(|mm| press(10.0, delay_ms, mm, 20.0));
             let fit = Fit::of(&late).unwrap();
-            assert!((fit.delay_ms.value - delay_ms).abs() < 5.0, "{fit:?}");
+            assert!((fit.delay_ms.0 - delay_ms).abs() < 5.0, "{fit:?}");
         }
         // The arm stands still while the force comes and goes.
         let mut still = [good(), good()];

@@ -11,31 +11,18 @@ use tempfile::TempDir;
 /// The first part of the name of every demonstration's directory.
 const PREFIX: &str = "hardnessd-demo-";
 
-/// The demonstration's own directory. Dropping this value removes it.
-pub(super) struct Place(TempDir);
+/// The name of the daemon's socket in it.
+pub(super) const SOCKET: &str = "events.sock";
 
-impl Place {
-    /// Makes a directory. A killed demonstration may have left one, so a part of the name is random.
-    pub(super) fn new() -> io::Result<Self> {
-        let mut named = tempfile::Builder::new();
-        let named = named
-            .prefix(PREFIX)
-            .permissions(Permissions::from_mode(0o700));
-        Ok(Self(named.tempdir_in(directory())?))
-    }
-
-    /// The link to the pty.
-    pub(super) fn port(&self) -> PathBuf {
-        self.0.path().join("port")
-    }
-
-    /// The daemon's socket.
-    pub(super) fn socket(&self) -> PathBuf {
-        self.0.path().join(SOCKET)
-    }
+/// Makes the demonstration's own directory. A killed demonstration may have left one, so a part of the name is
+/// random.
+pub(super) fn place() -> io::Result<TempDir> {
+    let mut named = tempfile::Builder::new();
+    let named = named
+        .prefix(PREFIX)
+        .permissions(Permissions::from_mode(0o700));
+    named.tempdir_in(directory())
 }
-
-const SOCKET: &str = "events.sock";
 
 /// Where demonstrations have their directories: the user's runtime directory, else that for temporary files.
 fn directory() -> PathBuf {
@@ -70,9 +57,9 @@ mod tests {
 
     #[test]
     fn each_demonstration_has_a_directory_that_only_its_user_may_open() {
-        let (place, other) = (Place::new().unwrap(), Place::new().unwrap());
-        let directory = place.0.path().to_owned();
-        assert_ne!(directory, other.0.path());
+        let (place, other) = (super::place().unwrap(), super::place().unwrap());
+        let directory = place.path().to_owned();
+        assert_ne!(directory, other.path());
         let mode = fs::metadata(&directory).unwrap().mode();
         assert_eq!(mode & 0o777, 0o700);
         drop(place);
