@@ -129,7 +129,7 @@ pub async fn run(
     let path = args.out.clone();
     let path = path.unwrap_or_else(|| config.with_file_name(GAINS));
     let out = match args.what {
-        What::Taxels => Some(Part::new(&path).of_file(&path, IO)?),
+        What::Taxels => Some(Part::new(&path).of(path.display(), IO)?),
         What::Arm | What::Force => None,
     };
     let read = {
@@ -263,7 +263,7 @@ fn of_taxels(
     let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead).exit(FAILED)?;
     let gains: Vec<f32> = fit.gains.iter().map(|gain| gain.unwrap_or(1.0)).collect();
     let bytes = npy::to_bytes(&gains, array.rows, array.cols);
-    part.write(&bytes).of_file(path, IO)?;
+    part.write(&bytes).of(path.display(), IO)?;
 
     let mut text = String::from("gains, in percent; . where no press tells of it:\n");
     for row in fit.gains.chunks(array.cols) {

@@ -28,7 +28,7 @@ use super::configuration::ModelFile;
 use super::connect::{Address, Connection};
 use super::exit::{Fail, Failure};
 use super::faults::Faults;
-use super::player::{self, Pace, Player};
+use super::player::{self, Player};
 use super::robot;
 use super::simulate::within;
 use crate::daemon::Daemon;
@@ -97,7 +97,6 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         delay_ms: (1e3 * line_s / args.speed).min(1e3),
         ..motion::Settings::default()
     };
-    let pace = Pace::new(sensor.frame_rate_hz, sensor.baud, args.speed);
     let sequence = SequenceSettings {
         seed: args.seed,
         frame_rate_hz: sensor.frame_rate_hz,
@@ -107,7 +106,16 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     };
     let is_json = args.json || !io::stdout().is_terminal();
     let account = (!is_json).then(|| Account::new(&sequence));
-    let player = Player::new(Some(&port), layout, pace, Faults::none()).of("pty", IO)?;
+    let (frame_rate_hz, baud) = (sensor.frame_rate_hz, sensor.baud);
+    let player = Player::new(
+        Some(&port),
+        layout,
+        Faults::none(),
+        frame_rate_hz,
+        baud,
+        args.speed,
+    );
+    let player = player.of("pty", IO)?;
 
     // The times of a press get shorter as its frames come faster.
     sensor.frame_rate_hz *= args.speed;

@@ -1,7 +1,6 @@
 //! The failure of a command: an error on one line, and its exit code.
 
 use std::fmt::{Debug, Display};
-use std::path::Path;
 
 use rustix::process::Signal;
 
@@ -61,9 +60,6 @@ pub(super) trait Fail<T> {
 
     /// Like [`Failure::of`].
     fn of(self, what: impl Display, code: u8) -> Result<T, Failure>;
-
-    /// Like [`Failure::of`], for a file.
-    fn of_file(self, path: &Path, code: u8) -> Result<T, Failure>;
 }
 
 impl<T, E: Into<anyhow::Error>> Fail<T> for Result<T, E> {
@@ -76,9 +72,5 @@ impl<T, E: Into<anyhow::Error>> Fail<T> for Result<T, E> {
 
     fn of(self, what: impl Display, code: u8) -> Result<T, Failure> {
         self.map_err(|error| Failure::of(code, what, error))
-    }
-
-    fn of_file(self, path: &Path, code: u8) -> Result<T, Failure> {
-        self.of(path.display(), code)
     }
 }

@@ -150,11 +150,11 @@ pub async fn run(
         );
         return Err(Failure::new(FAILED, many));
     }
-    let bytes = references::write(&all).of_file(&args.out, IO)?;
-    part.write(&bytes).of_file(&args.out, IO)?;
+    let bytes = references::write(&all).of(args.out.display(), IO)?;
+    part.write(&bytes).of(args.out.display(), IO)?;
     let tried = if all.len() <= hrn.most_references() {
         let identified = hrn.identified_by(&all);
-        identified.of_file(&args.out, FAILED)?.1
+        identified.of(args.out.display(), FAILED)?.1
     } else {
         Tried::default()
     };
@@ -176,15 +176,15 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
             let exists = "exists already: add to it with --append, or name another file";
             return Err(Failure::new(IO, format!("{} {exists}", out.display())));
         }
-        return Ok((Vec::new(), part.of_file(out, IO)?));
+        return Ok((Vec::new(), part.of(out.display(), IO)?));
     }
     // It refuses a pipe, whose reading might never end.
-    let part = Part::over(out).of_file(out, IO)?;
+    let part = Part::over(out).of(out.display(), IO)?;
     let mut bytes = Vec::new();
     let most = references::MAX_FILE_BYTES as u64 + 1;
     let read = File::open(out).and_then(|file| file.take(most).read_to_end(&mut bytes));
     match read {
-        Ok(_) => Ok((references::read(&bytes).of_file(out, FAILED)?, part)),
+        Ok(_) => Ok((references::read(&bytes).of(out.display(), FAILED)?, part)),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok((Vec::new(), part)),
         Err(error) => Err(cannot_read(out)(error)),
     }
@@ -223,7 +223,7 @@ fn of_file(
     })?;
     let what = match args.what {
         Some(what) => what,
-        None => labelled(&played.playback.labels()).of_file(path, FAILED)?,
+        None => labelled(&played.playback.labels()).of(path.display(), FAILED)?,
     };
     let piece = piece(what, &hrn.card().levels).exit(FAILED)?;
     if courses.is_empty() {

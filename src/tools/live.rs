@@ -71,7 +71,7 @@ async fn record(
     setup.config.sensors.retain(|one| one.name == sensor);
     let path = std::env::temp_dir();
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
-    let mut file = tempfile::tempfile().of_file(&path, IO)?;
+    let mut file = tempfile::tempfile().of(path.display(), IO)?;
     let mut stopped = false;
     let end = async |mut counted: watch::Receiver<Progress>| {
         let enough = async {
@@ -98,7 +98,7 @@ async fn record(
     if stopped {
         return Ok(None);
     }
-    file.rewind().of_file(&path, IO)?;
+    file.rewind().of(path.display(), IO)?;
     Ok(Some(file))
 }
 

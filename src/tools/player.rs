@@ -26,42 +26,25 @@ const SLICE: Duration = Duration::from_millis(4);
 /// The number of frames that are computed ahead.
 const AHEAD: usize = 32;
 
-/// The speed of a simulated sensor and of its line.
-#[derive(Debug, Clone)]
-pub(crate) struct Pace {
-    /// Time between frames.
-    pub(crate) period: Duration,
-    /// Bytes per second that the line carries.
-    pub(crate) bytes_per_s: f64,
-    /// Seconds of the sensor per second.
-    pub(crate) speed: f64,
-}
-
-impl Pace {
-    /// The pace of frames at `frame_rate_hz` over a line of `baud`, both multiplied by `speed`.
-    pub(crate) fn new(frame_rate_hz: f64, baud: u32, speed: f64) -> Self {
-        Self {
-            period: Duration::from_secs_f64(1.0 / (frame_rate_hz * speed)),
-            bytes_per_s: f64::from(baud) / BITS_A_BYTE * speed,
-            speed,
-        }
-    }
-}
-
 /// A simulated sensor on a pty.
 #[derive(Debug)]
 pub(crate) struct Player {
     pty: Option<Pty>,
     link: Option<PathBuf>,
     layout: Layout,
-    pace: Pace,
     faults: Faults,
+    /// Time between frames.
+    period: Duration,
+    /// Bytes per second that the line carries.
+    bytes_per_s: f64,
+    /// Seconds of the sensor per second.
+    speed: f64,
     /// The path of the arm around the present moment, for the robot.
     approach: watch::Sender<Option<Approach>>,
 }
 
 impl Player {
-    /// Makes the player and its pty.
+    /// Makes the player and its pty. Frames come at `frame_rate_hz` over a line of `baud`, both multiplied by `speed`.
     ///
     /// # Errors
     ///
@@ -69,16 +52,20 @@ impl Player {
     pub(crate) fn new(
         link: Option<&Path>,
         layout: Layout,
-        pace: Pace,
         faults: Faults,
+        frame_rate_hz: f64,
+        baud: u32,
+        speed: f64,
     ) -> io::Result<Self> {
         let pty = Some(Pty::open(link)?);
         Ok(Self {
             pty,
             link: link.map(Path::to_owned),
             layout,
-            pace,
             faults,
+            period: Duration::from_secs_f64(1.0 / (frame_rate_hz * speed)),
+            bytes_per_s: f64::from(baud) / BITS_A_BYTE * speed,
+            speed,
             approach: watch::Sender::new(None),
         })
     }
@@ -94,7 +81,7 @@ impl Player {
     /// Where the arm of a sequence that begins at `start` is at a moment, for the robot that reports it. `None` before
     /// the first frame.
     pub(crate) fn position(&self, start: Instant) -> impl Fn(Instant) -> Option<f64> + use<> {
-        let (approach, speed) = (self.approach.subscribe(), self.pace.speed);
+        let (approach, speed) = (self.approach.subscribe(), self.speed);
         move |at| Some((*approach.borrow())?.mm((at - start).as_secs_f64() * speed))
     }
 
@@ -112,11 +99,11 @@ impl Player {
         // The time at which the line is free again. A long frame delays the next one.
         let mut free = start;
         while let Some(frame) = frames.recv().await {
-            let since = self.pace.period * frame.number;
+            let since = self.period * frame.number;
             let due = start + since;
             tokio::time::sleep_until(due).await;
             self.approach.send_replace(frame.approach);
-            let time_s = since.as_secs_f64() * self.pace.speed;
+            let time_s = since.as_secs_f64() * self.speed;
             let layout = &self.layout;
             let line = self.faults.encode(time_s, &frame.raw, layout, &mut bytes);
             match line {
@@ -142,14 +129,12 @@ impl Player {
         let Some(pty) = &mut self.pty else {
             return Ok(at);
         };
-        let slice = (self.pace.bytes_per_s * SLICE.as_secs_f64())
-            .ceil()
-            .max(1.0);
+        let slice = (self.bytes_per_s * SLICE.as_secs_f64()).ceil().max(1.0);
         let mut sent = 0.0;
         for slice in bytes.chunks(slice as usize) {
             sent += slice.len() as f64;
             // A byte has arrived when its last bit has.
-            at = from + Duration::from_secs_f64(sent / self.pace.bytes_per_s);
+            at = from + Duration::from_secs_f64(sent / self.bytes_per_s);
             tokio::time::sleep_until(at).await;
             pty.write(slice)?;
         }

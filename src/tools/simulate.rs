@@ -13,7 +13,7 @@ use super::arm::{self, Arm};
 use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
 use super::live;
-use super::player::{self, Pace, Player};
+use super::player::{self, Player};
 use super::robot::{self, Position};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::Unix;
@@ -106,14 +106,14 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     };
     if let Some(path) = args.to.clone() {
         let settings = sequence(&args);
-        let work = move || record(&path, &layout, settings, faults).of_file(&path, IO);
+        let work = move || record(&path, &layout, settings, faults).of(path.display(), IO);
         return live::unless(shutdown, "record", work).await.map(drop);
     }
     let baud = baud(&args, &layout)?;
-    let link = args.link.as_ref();
+    let link = args.link.as_deref();
     let what = link.map_or("pty".to_owned(), |link| link.display().to_string());
-    let pace = Pace::new(args.fps, baud, args.speed);
-    let player = Player::new(args.link.as_deref(), layout, pace, faults).of(&what, IO)?;
+    let player = Player::new(link, layout, faults, args.fps, baud, args.speed);
+    let player = player.of(&what, IO)?;
     let line = format!("{}\n", player.path().display());
     let (settings, start) = (sequence(&args), Instant::now());
     let arm = args.arm.as_deref();

@@ -141,7 +141,7 @@ fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
         cell: args.cell,
     };
     let found = sniff(&Capture { bytes, arrivals }, known);
-    let found = found.of_file(path, FAILED)?;
+    let found = found.of(path.display(), FAILED)?;
     if let Some(doubt) = &found.doubt {
         for ranked in [&found.best].into_iter().chain(&found.next) {
             show(ranked);
@@ -233,7 +233,7 @@ fn read(path: &Path) -> Result<Captured, Failure> {
         // If there are several sensors, take the bytes of the first.
         let mut sensor = None;
         for found in Reader::new(BufReader::new(file)) {
-            let found = found.of_file(path, FAILED)?;
+            let found = found.of(path.display(), FAILED)?;
             if let Entry::Input(Input::Bytes(more)) = found.entry
                 && *sensor.get_or_insert(found.sensor.clone()) == found.sensor
             {

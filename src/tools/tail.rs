@@ -55,12 +55,6 @@ pub struct Args {
     types: Vec<Kind>,
 }
 
-fn events(found: u64, count: Option<u64>) -> String {
-    let of = count.map_or_else(String::new, |count| format!(" of {count}"));
-    let plural = if count.unwrap_or(found) == 1 { "" } else { "s" };
-    format!("{found}{of} event{plural}")
-}
-
 fn kind(name: &str) -> Result<Kind, &'static str> {
     wording::named(name).map_err(|_| "expected hardness, press, status or frame")
 }
@@ -71,7 +65,7 @@ fn kind(name: &str) -> Result<Kind, &'static str> {
 ///
 /// Returns a [`Failure`] if no daemon answers, the daemon ends, or the time limit has passed.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
-    let (count, timeout) = (args.count, args.timeout);
+    let timeout = args.timeout;
     let counted = Arc::new(AtomicU64::new(0));
     let found = counted.clone();
     let printed = spawn_thread("tail", move || print(&args, &counted))?;
@@ -81,11 +75,9 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         () = maybe::until(maybe::after(timeout)) => {}
     }
     let seconds = timeout.unwrap_or_default();
-    let events = events(found.load(Ordering::Relaxed), count);
-    Err(Failure::new(
-        FAILED,
-        format!("timed out after {seconds} s ({events})"),
-    ))
+    let found = found.load(Ordering::Relaxed);
+    let problem = format!("timed out after {seconds} s ({found} events)");
+    Err(Failure::new(FAILED, problem))
 }
 
 fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {

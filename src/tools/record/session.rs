@@ -124,13 +124,6 @@ struct Object {
     level: u8,
 }
 
-/// The verdicts on objects whose level the user named, and how many of them are right.
-#[derive(Debug, Default)]
-struct Score {
-    verdicts: u64,
-    right: u64,
-}
-
 /// Records object after object into `directory`, until the user quits or `shutdown` comes.
 ///
 /// # Errors
@@ -154,7 +147,9 @@ pub(super) async fn run(
     let mut user = User::at_terminal(shutdown)?;
     print("One recording for each object. `q` ends the session.\n");
     let levels = &setup.hrn.card().levels;
-    let (mut number, mut score, mut goes_on) = (first, Score::default(), true);
+    // The verdicts on objects whose level the user named, and how many of them are right.
+    let mut score = (0, 0);
+    let (mut number, mut goes_on) = (first, true);
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
         goes_on = record_object(&mut user, &object, setup, sockets, &mut score).await?;
@@ -165,8 +160,9 @@ pub(super) async fn run(
     let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
     print(&format!("\nrecorded {recorded} in this session\n"));
-    if score.verdicts > 0 {
-        print(&format!("{} of {} right\n", score.right, score.verdicts));
+    let (verdicts, right) = score;
+    if verdicts > 0 {
+        print(&format!("{right} of {verdicts} right\n"));
     }
     if count > 0 {
         let directory = shown(directory);
@@ -209,7 +205,7 @@ async fn record_object(
     object: &Object,
     setup: &Setup,
     sockets: Sockets,
-    score: &mut Score,
+    score: &mut (u64, u64),
 ) -> Result<bool, Failure> {
     let path = &object.path;
     let file = create(path)?;
@@ -224,8 +220,8 @@ async fn record_object(
         part::remove(path, &file);
         print("no press was recorded\n");
     } else if object.level > 0 {
-        score.verdicts += progress.verdicts;
-        score.right += progress.right;
+        score.0 += progress.verdicts;
+        score.1 += progress.right;
     }
     recorded.map(|()| goes_on)
 }
