@@ -124,11 +124,10 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
     }
 }
 
-/// It is over when a command is to end in order.
-type End<'a> = Pin<&'a mut dyn Future<Output = ()>>;
+/// The signal at which a command is to end in order.
+type End<'a> = Pin<&'a mut dyn Future<Output = process::Signal>>;
 
-/// Runs a command that serves a sensor of the configuration at `path`. At a signal, the daemon inside ends in
-/// order, and the command fails.
+/// Runs a command that serves a sensor of the configuration at `path`. A signal before its end is a failure.
 async fn attend(
     signals: Signals,
     path: &Path,
@@ -142,10 +141,7 @@ async fn attend(
         signal = &mut end => return Err(Failure::interrupted(signal)),
     };
     let _log = Log::start(setup.config.log, "warn")?;
-    let mut stopped = None;
-    let shutdown = pin!(async { stopped = Some(end.await) });
-    command(setup, shutdown).await?;
-    stopped.map_or(Ok(()), |signal| Err(Failure::interrupted(signal)))
+    command(setup, end).await
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.

@@ -9,37 +9,21 @@ use serde_json::Value;
 /// confidence, 87 to 98 % got the right level (`models/README.md`, "Accuracy").
 const CONFIDENT: f64 = 0.7;
 
-/// What a verdict says.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Answer {
-    /// Such as `firm`, `firm?` or `firm or soft`. A label may have hidden characters.
-    pub(super) text: String,
-    /// Whether the text must not look like a sure level.
-    pub(super) is_weak: bool,
-}
-
-impl Answer {
-    /// The answer of a `hardness` event. `labels` are those of the model's levels, in order.
-    pub(super) fn of(verdict: &Value, labels: &[String]) -> Self {
-        if let Some(level) = verdict["level"].as_u64() {
-            let label = verdict["label"].as_str().map(str::to_owned);
-            let text = label.unwrap_or_else(|| named(level, labels));
-            let is_weak = verdict["confidence"].as_f64().unwrap_or_default() < CONFIDENT;
-            let mark = if is_weak { "?" } else { "" };
-            return Self {
-                text: text + mark,
-                is_weak,
-            };
-        }
-        let text = match verdict["rejected"].as_str() {
-            Some("low_force") => "low force".to_owned(),
-            _ => between(verdict, labels),
-        };
-        Self {
-            text,
-            is_weak: true,
-        }
+/// What a `hardness` event says, such as `firm`, `firm?` or `firm or soft`, and whether it must not look like a sure
+/// level. `labels` are those of the model's levels, in order. A label may have hidden characters.
+pub(super) fn answer(verdict: &Value, labels: &[String]) -> (String, bool) {
+    if let Some(level) = verdict["level"].as_u64() {
+        let label = verdict["label"].as_str().map(str::to_owned);
+        let label = label.unwrap_or_else(|| named(level, labels));
+        let is_weak = verdict["confidence"].as_f64().unwrap_or_default() < CONFIDENT;
+        let mark = if is_weak { "?" } else { "" };
+        return (label + mark, is_weak);
     }
+    let text = match verdict["rejected"].as_str() {
+        Some("low_force") => "low force".to_owned(),
+        _ => between(verdict, labels),
+    };
+    (text, true)
 }
 
 /// What a verdict says, with its Shore hardness first, such as `63 +- 6 OO, firm`. The interval of 90 % lies
@@ -74,6 +58,13 @@ pub(super) fn named(level: u64, labels: &[String]) -> String {
     label.map_or_else(|| format!("level {level}"), Clone::clone)
 }
 
+/// The level of this label or number.
+pub(super) fn level_of(word: &str, labels: &[String]) -> Option<u64> {
+    let mut levels = (1..).zip(labels);
+    let known = levels.find(|(level, label)| *label == word || level.to_string() == word);
+    known.map(|(level, _)| level)
+}
+
 /// The levels that a rejected verdict lies between: its set of levels, otherwise the two likeliest.
 fn between(verdict: &Value, labels: &[String]) -> String {
     let mut levels: Vec<u64> = items(verdict, "levels").filter_map(Value::as_u64).collect();
@@ -96,6 +87,8 @@ fn between(verdict: &Value, labels: &[String]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -106,11 +99,11 @@ mod tests {
         let cases = cases["cases"].as_array().unwrap();
         assert!(!cases.is_empty());
         for case in cases {
-            let expected = Answer {
-                text: case["text"].as_str().unwrap().to_owned(),
-                is_weak: case["is_weak"].as_bool().unwrap(),
-            };
-            assert_eq!(Answer::of(&case["verdict"], &labels), expected);
+            let (text, is_weak) = answer(&case["verdict"], &labels);
+            assert_eq!(
+                (json!(text), json!(is_weak)),
+                (case["text"].clone(), case["is_weak"].clone())
+            );
         }
     }
 }

@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 use clap::{Args as ClapArgs, ValueEnum};
+use rustix::process::Signal;
 
 use self::gather::Press;
 use super::configuration::Configuration;
@@ -109,18 +110,18 @@ impl Args {
     }
 }
 
-/// Serves the sensor until there are enough presses, or reads recordings, and prints the values.
-/// Ends early, without values, when `shutdown` comes. `config` is the path of the configuration.
+/// Serves the sensor until there are enough presses, or reads recordings, and prints the values. `config` is the path
+/// of the configuration.
 ///
 /// # Errors
 ///
-/// Returns a [`Failure`] if the daemon cannot serve, a recording cannot be read, or the presses do
-/// not determine the values.
+/// Returns a [`Failure`] if the daemon cannot serve, a recording cannot be read, the presses do
+/// not determine the values, or the signal `end` comes first.
 pub async fn run(
     args: Args,
     setup: Setup,
     config: &Path,
-    shutdown: impl Future<Output = ()>,
+    end: impl Future<Output = Signal>,
 ) -> Result<(), Failure> {
     args.check().exit(USAGE)?;
     let sensor = setup.sensor_named(args.sensor.as_deref());
@@ -138,10 +139,8 @@ pub async fn run(
     };
     let (name, wanted) = (sensor.name(), args.wanted());
     let print_next = |seen| print_next(&args, seen);
-    let presses = live::gather(setup, name, wanted, &args.from, print_next, shutdown, read);
-    let Some(presses) = presses.await? else {
-        return Ok(());
-    };
+    let presses = live::gather(setup, name, wanted, &args.from, print_next, end, read);
+    let presses = presses.await?;
     let text = match out {
         None if matches!(args.what, What::Arm) => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
         None => of_force(&args.newtons, &presses, &sensor)?,

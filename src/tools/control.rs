@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use clap::{Args as ClapArgs, Subcommand};
 use serde_json::{Map, Value, json};
 
+use super::answer::{labels, level_of};
 use super::connect::{self, Connection};
 use super::exit::Failure;
 use hardnessd_core::exit::FAILED;
@@ -79,8 +80,9 @@ pub fn run(command: Command) -> Result<(), Failure> {
             let hello = daemon.meet()?;
             let mut context: Map<String, Value> = pairs.into_iter().collect();
             context.insert("sensor".to_owned(), target.sensor.into());
-            if let Some(level) = context.get_mut("level") {
-                name_level(level, &hello["model"]["levels"]);
+            let level = context.get("level").and_then(Value::as_str);
+            if let Some(level) = level.and_then(|level| level_of(level, &labels(&hello))) {
+                context.insert("level".to_owned(), level.into());
             }
             json!({"context": context})
         }
@@ -88,14 +90,6 @@ pub fn run(command: Command) -> Result<(), Failure> {
     let line = in_words(&ask(&mut daemon, request)?) + "\n";
     super::print(line.as_bytes())?;
     Ok(())
-}
-
-/// Replaces the label of one of the `levels` of a `hello` by its number.
-fn name_level(level: &mut Value, levels: &Value) {
-    let mut levels = levels.as_array().into_iter().flatten();
-    if let Some(named) = levels.find(|one| one["label"] == *level) {
-        *level = named["level"].clone();
-    }
 }
 
 /// Sends a command to a control socket, and returns the answer. Other lines come before it.
@@ -156,19 +150,5 @@ mod tests {
             assert_eq!(pair(text).unwrap().1, value, "{text}");
         }
         assert!(pair("=5").is_err() && pair("tag").is_err());
-    }
-
-    #[test]
-    fn a_level_may_be_named_by_its_label() {
-        let levels = json!([{"level": 1, "label": "hard"}, {"level": 2, "label": "firm"}]);
-        for (level, named) in [
-            (json!("firm"), json!(2)),
-            (json!(1), json!(1)),
-            (json!("2"), json!("2")),
-        ] {
-            let mut level = level;
-            name_level(&mut level, &levels);
-            assert_eq!(level, named);
-        }
     }
 }

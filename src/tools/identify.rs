@@ -13,6 +13,7 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow, bail, ensure};
 use clap::Args as ClapArgs;
+use rustix::process::Signal;
 
 use super::configuration::Configuration;
 use super::exit::{Fail, Failure};
@@ -106,18 +107,17 @@ pub fn load(path: &Path) -> Result<Setup, config::Error> {
     Setup::of(config, path)
 }
 
-/// Makes the file from recordings, or from presses that are made now. Ends early, without a file, when
-/// `shutdown` comes. `config` is the path of the configuration.
+/// Makes the file from recordings, or from presses that are made now. `config` is the path of the configuration.
 ///
 /// # Errors
 ///
-/// Returns a [`Failure`] if there are no presses, nothing says what was pressed, or a file cannot be
-/// used.
+/// Returns a [`Failure`] if there are no presses, nothing says what was pressed, a file cannot be used, or the signal
+/// `end` comes first.
 pub async fn run(
     args: Args,
     setup: Setup,
     config: &Path,
-    shutdown: impl Future<Output = ()>,
+    end: impl Future<Output = Signal>,
 ) -> Result<(), Failure> {
     let sensor = setup.sensor_named(args.sensor.as_deref());
     let sensor = sensor.exit(USAGE)?.clone();
@@ -138,11 +138,8 @@ pub async fn run(
         0 => stderr_line!("press it {wanted} times, harder each time"),
         _ => stderr_line!("press {seen} of {wanted}"),
     };
-    let made = live::gather(setup, name, wanted, &args.files, print_next, shutdown, read);
-    let Some(made) = made.await? else {
-        return Ok(());
-    };
-    all.extend(made);
+    let made = live::gather(setup, name, wanted, &args.files, print_next, end, read);
+    all.extend(made.await?);
     if all.len() > MOST_REFERENCES {
         let found = all.len();
         let many = format!(

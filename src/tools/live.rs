@@ -9,6 +9,7 @@ use std::io::Seek;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rustix::process::Signal;
 use tokio::sync::watch;
 
 use super::exit::{Fail, Failure};
@@ -24,26 +25,27 @@ use hardnessd_core::stderr_line;
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
-/// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now; `None` if `shutdown`
-/// comes first. `print_next` is that of [`record`].
+/// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now. `print_next` is that of
+/// [`record`].
+///
+/// # Errors
+///
+/// Fails as `read` does, if the sensor cannot be recorded, or if the signal `end` comes first.
 pub(super) async fn gather<T: Send + 'static>(
     setup: Setup,
     sensor: &str,
     wanted: u64,
     files: &[PathBuf],
     print_next: impl Fn(u64),
-    shutdown: impl Future<Output = ()>,
+    end: impl Future<Output = Signal>,
     read: impl Fn(File, &Path) -> Result<Vec<T>, Failure> + Send + 'static,
-) -> Result<Option<Vec<T>>, Failure> {
+) -> Result<Vec<T>, Failure> {
     if files.is_empty() {
-        let made = record(setup, sensor, wanted, print_next, shutdown).await?;
-        let Some(file) = made else {
-            return Ok(None);
-        };
-        let mut all = read(file, Path::new("what was recorded"))?;
+        let made = record(setup, sensor, wanted, print_next, end).await?;
+        let mut all = read(made, Path::new("what was recorded"))?;
         // Something else may have been pressed before the recording ended.
         all.truncate(wanted as usize);
-        return Ok(Some(all));
+        return Ok(all);
     }
     let files = files.to_vec();
     let work = move || {
@@ -53,28 +55,32 @@ pub(super) async fn gather<T: Send + 'static>(
         }
         Ok(all)
     };
-    unless(shutdown, "presses", work).await
+    // A file may be a pipe that sends nothing.
+    let done = spawn_thread("presses", work)?;
+    tokio::select! {
+        done = done => done.expect("presses are read without a panic"),
+        signal = end => Err(Failure::interrupted(signal)),
+    }
 }
 
-/// Records `wanted` presses of `sensor`; `None` if `shutdown` comes first. `print_next` is called with
-/// the number of presses so far, when the zero is taken and after each press. The other sensors of
-/// the configuration stay closed: their presses would count, and a missing one would end the
-/// command.
+/// Records `wanted` presses of `sensor`. `print_next` is called with the number of presses so far, when the zero is
+/// taken and after each press. The other sensors of the configuration stay closed: their presses would count, and a
+/// missing one would end the command.
 async fn record(
     mut setup: Setup,
     sensor: &str,
     wanted: u64,
     print_next: impl Fn(u64),
-    shutdown: impl Future<Output = ()>,
-) -> Result<Option<File>, Failure> {
+    end: impl Future<Output = Signal>,
+) -> Result<File, Failure> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
     let path = std::env::temp_dir();
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
     let mut file = tempfile::tempfile().of(path.display(), IO)?;
-    let mut stopped = false;
-    let end = async |mut counted: watch::Receiver<Progress>| {
-        let enough = async {
+    let mut stopped = None;
+    let enough = async |mut counted: watch::Receiver<Progress>| {
+        let made = async {
             stderr_line!("leave the sensor free until its zero is taken");
             // The presses at the last prompt.
             let mut shown = None;
@@ -88,29 +94,16 @@ async fn record(
             tokio::time::sleep(LAST_POSITIONS).await;
         };
         tokio::select! {
-            () = enough => {}
-            () = shutdown => stopped = true,
+            () = made => {}
+            signal = end => stopped = Some(signal),
         }
     };
     let (sockets, labels) = (Sockets::Configured, Labels::new());
-    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, end).await;
+    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, enough).await;
     recorded?;
-    if stopped {
-        return Ok(None);
+    if let Some(signal) = stopped {
+        return Err(Failure::interrupted(signal));
     }
     file.rewind().of(path.display(), IO)?;
-    Ok(Some(file))
-}
-
-/// Does what may take long on another thread; `None` if `shutdown` comes first.
-pub(super) async fn unless<T: Send + 'static>(
-    shutdown: impl Future<Output = ()>,
-    name: &str,
-    work: impl FnOnce() -> Result<T, Failure> + Send + 'static,
-) -> Result<Option<T>, Failure> {
-    let done = spawn_thread(name, work)?;
-    tokio::select! {
-        done = done => Ok(Some(done.expect("a command works without a panic")?)),
-        () = shutdown => Ok(None),
-    }
+    Ok(file)
 }

@@ -140,21 +140,15 @@ impl Drop for Pty {
 /// Makes `link` point to `device`. It replaces only what a killed simulation left: a link to a
 /// pseudo-terminal that is gone.
 fn place(device: &Path, link: &Path) -> io::Result<()> {
-    match symlink(device, link) {
-        Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
-        made => return made,
+    let was_pty = fs::read_link(link).is_ok_and(|target| target.starts_with("/dev/pts"));
+    if was_pty && !link.exists() {
+        fs::remove_file(link)?;
     }
-    let found = match fs::read_link(link) {
-        Err(_) => "a file that is no link is there: remove it, or name another path".to_owned(),
-        Ok(target) if link.exists() || !target.starts_with("/dev/pts") => format!(
-            "a link to {} is there, perhaps that of another `hardnessd simulate`: remove it, or name \
+    symlink(device, link).map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => io::Error::other(
+            "a file or a link is there, perhaps that of another `hardnessd simulate`: remove it, or name \
              another path",
-            target.display()
         ),
-        Ok(_) => {
-            fs::remove_file(link)?;
-            return symlink(device, link);
-        }
-    };
-    Err(io::Error::new(ErrorKind::AlreadyExists, found))
+        _ => error,
+    })
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::answer::{Answer, items, with_shore};
+use super::answer::{answer, items, with_shore};
 use hardnessd_core::wording;
 
 /// The line of an event on stdout, newline included. `json` is its line on the wire, and `labels` are those of the
@@ -112,7 +112,7 @@ fn press(event: &Value) -> String {
 
 fn hardness(event: &Value, labels: &[String]) -> String {
     let (press, phase) = (number(event, "press"), event["phase"].as_str());
-    let answer = with_shore(&Answer::of(event, labels).text, event);
+    let answer = with_shore(&answer(event, labels).0, event);
     let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
     let probabilities: Vec<String> = items(event, "probabilities").map(percent).collect();
     let mut line = format!(

@@ -4,7 +4,6 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::pin::pin;
 
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
@@ -12,11 +11,11 @@ use tokio::time::Instant;
 use super::arm::{self, Arm};
 use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
-use super::live;
 use super::player::{self, Player};
 use super::robot::{self, Position};
 use crate::daemon::baud::BITS_A_BYTE;
 use crate::daemon::config::Unix;
+use crate::thread::spawn_thread;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
@@ -86,28 +85,31 @@ pub struct Args {
 ///
 /// Returns a [`Failure`] if the arguments do not fit together, or the pty or a file fails.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
+    tokio::select! {
+        played = play(args) => played,
+        () = shutdown => Ok(()),
+    }
+}
+
+async fn play(args: Args) -> Result<(), Failure> {
     let layout = Layout::new(&Frame {
         preset: Some(args.preset),
         ..Frame::default()
     })
     .of("--preset", USAGE)?;
-    let mut shutdown = pin!(shutdown);
-    let faults = match args.faults.clone() {
-        Some(path) => {
-            // The script may be a pipe without a writer.
-            let seed = args.seed;
-            let load = move || Faults::load(&path, seed);
-            match live::unless(&mut shutdown, "faults", load).await? {
-                Some(faults) => faults,
-                None => return Ok(()),
-            }
-        }
-        None => Faults::none(),
-    };
+    let (script, seed) = (args.faults.clone(), args.seed);
+    // The script may be a pipe without a writer.
+    let faults = spawn_thread("faults", move || {
+        let faults = script.map(|path| Faults::load(&path, seed));
+        faults.unwrap_or_else(|| Ok(Faults::none()))
+    })?;
+    let faults = faults.await.expect("a script is read without a panic")?;
     if let Some(path) = args.to.clone() {
-        let settings = sequence(&args);
-        let work = move || record(&path, &layout, settings, faults).of(path.display(), IO);
-        return live::unless(shutdown, "record", work).await.map(drop);
+        let (settings, shown) = (sequence(&args), path.clone());
+        let work = move || record(&path, &layout, settings, faults);
+        let written = spawn_thread("record", work)?.await;
+        let written = written.expect("bytes are written without a panic");
+        return written.of(shown.display(), IO);
     }
     let baud = baud(&args, &layout)?;
     let link = args.link.as_deref();
@@ -134,16 +136,10 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
         let socket = socket.unwrap_or_else(|| Unix::default().control_path());
         robot::start(socket, position)?;
     }
-    let play = async {
-        // It is no error if nobody reads the path, because the link shows it too.
-        let printed = super::print_apart(line);
-        let played = async { player.play(frames, start).await.of(&what, IO) };
-        tokio::try_join!(printed, played).map(drop)
-    };
-    tokio::select! {
-        played = play => played,
-        () = shutdown => Ok(()),
-    }
+    // It is no error if nobody reads the path, because the link shows it too.
+    let printed = super::print_apart(line);
+    let played = async { player.play(frames, start).await.of(&what, IO) };
+    tokio::try_join!(printed, played).map(drop)
 }
 
 fn sequence(args: &Args) -> SequenceSettings {

@@ -4,7 +4,7 @@
 
 use serde_json::Value;
 
-use crate::tools::answer::{self, Answer, with_shore};
+use crate::tools::answer::{self, answer, with_shore};
 use crate::tools::score::Score;
 use hardnessd_simulator::{Pressed, SequenceSettings};
 
@@ -58,7 +58,7 @@ impl Account {
         let level = event["level"].as_u64();
         let mark = self.score.take(level, Some(pressed.level.into()));
         let (begin, columns) = (begin(event, &pressed), self.answer_columns());
-        let shown = with_shore(&Answer::of(event, &self.labels).text, event);
+        let shown = with_shore(&answer(event, &self.labels).0, event);
         let force_n = event["force_n"].as_f64().unwrap_or_default();
         let line = format!("{begin}{shown:<columns$}  {mark:<5} {force_n:4.1} N");
         let notes = answer::items(event, "notes").filter_map(Value::as_str);

@@ -15,10 +15,9 @@ use ratatui_core::text::{Line, Span, Text};
 use serde_json::Value;
 
 use super::view::{Link, Sensor, View, WINDOW, age};
-use crate::tools::answer::{Answer, items, with_shore};
+use crate::tools::answer::{answer, items, with_shore};
 use crate::tools::readable::number;
 use hardnessd_core::colour::viridis;
-use hardnessd_core::frame::Array;
 use hardnessd_core::wording;
 
 /// Pictures up to this width have no map.
@@ -158,11 +157,23 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
             Constraint::Fill(1),
         ])
         .areas(left);
-        let top_n = highest_n(sensor).max(LEAST_SCALE_N);
+        let newtons = sensor.newtons();
+        let top_n = newtons.iter().copied().fold(LEAST_SCALE_N, f32::max);
         let range = format!("0 to {top_n:.2} N a taxel");
         frame.render_widget(look.line("pressure", &range, look.aside()), scale);
         let map = Rect { width: cols, ..map };
-        draw_map(frame.buffer_mut(), map, sensor, top_n, link, look);
+        if !newtons.is_empty() {
+            let share = |n: f32| (n / top_n).min(1.0);
+            let shares: Vec<f32> = newtons.into_iter().map(share).collect();
+            draw_map(
+                frame.buffer_mut(),
+                map,
+                (sensor.rows, sensor.cols),
+                &shares,
+                link,
+                look,
+            );
+        }
         if link != Link::Live {
             let word = span(&format!(" {} ", link.name()), look.link(link));
             frame.render_widget(Line::from(word).centered(), map);
@@ -258,8 +269,8 @@ fn link_line(sensor: Option<&Sensor>, link: Link, reason: Option<&str>, now: Dur
     if link == Link::Lost && reason.is_some_and(is_unplugged) {
         line += &format!(" {UNPLUGGED_WORDS};");
     }
-    if let Some(frame) = sensor.and_then(|sensor| sensor.frame.as_ref()) {
-        let old = age(now.saturating_sub(frame.at));
+    if let Some((at, _)) = sensor.and_then(|sensor| sensor.frame.as_ref()) {
+        let old = age(now.saturating_sub(*at));
         line += &match link {
             Link::Live | Link::NoZero => format!(" frame {old} old"),
             _ => format!(" last frame {old} ago"),
@@ -290,17 +301,16 @@ fn map_size(sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
     (places(sensor.cols) as u16, halves.div_ceil(2) as u16)
 }
 
-/// The greatest force on a taxel in the last frame, in newtons.
-fn highest_n(sensor: &Sensor) -> f32 {
-    let newtons = sensor.frame.iter().flat_map(|frame| &frame.newtons);
-    newtons.copied().fold(0.0, f32::max)
-}
-
-/// The pressure map: in colours, in greys if it is no longer current, or in characters.
-fn draw_map(buffer: &mut Buffer, area: Rect, sensor: &Sensor, top_n: f32, link: Link, look: Look) {
-    let Some(frame) = &sensor.frame else { return };
-    let (rows, cols) = (sensor.rows, sensor.cols);
-    let array = Array { rows, cols };
+/// The pressure map: in colours, in greys if it is no longer current, or in characters. `shares` of the full scale are
+/// those of the taxels.
+fn draw_map(
+    buffer: &mut Buffer,
+    area: Rect,
+    (rows, cols): (usize, usize),
+    shares: &[f32],
+    link: Link,
+    look: Look,
+) {
     let (wide, high) = (usize::from(area.width), 2 * usize::from(area.height));
     // The taxels of a place: a part of one, or several.
     let taxels = |place: usize, places: usize, taxels: usize| {
@@ -309,14 +319,9 @@ fn draw_map(buffer: &mut Buffer, area: Rect, sensor: &Sensor, top_n: f32, link: 
     // The greatest of the taxels that share a place, so that no touch vanishes. The square root
     // keeps a soft touch visible beside a hard one.
     let shade = |x: usize, y: usize| {
-        let row_newtons = |row: usize| {
-            let of_row = taxels(x, wide, cols).map(move |col| array.place(row, col));
-            of_row.map(|place| frame.newtons[place])
-        };
-        let most = taxels(y, high, rows)
-            .flat_map(row_newtons)
-            .fold(0.0, f32::max);
-        (most / top_n).min(1.0).sqrt()
+        let of_row = |row: usize| &shares[row * cols..][taxels(x, wide, cols)];
+        let shared = taxels(y, high, rows).flat_map(of_row);
+        shared.copied().fold(0.0, f32::max).sqrt()
     };
     let step = |share: f32, steps: usize| ((share * steps as f32) as usize).min(steps - 1);
     let colour = |share: f32| match link {
@@ -386,12 +391,13 @@ fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'s
 
 /// The present force and contact area.
 fn force_line(sensor: &Sensor, link: Link, look: Look) -> Line<'static> {
-    let Some(frame) = sensor.frame.as_ref().filter(|_| link == Link::Live) else {
+    let Some((_, frame)) = sensor.frame.as_ref().filter(|_| link == Link::Live) else {
         return look.line("force", "not known", look.aside());
     };
     // A small negative sum is noise.
-    let force_n = frame.force_n.unwrap_or(0.0).max(0.0);
-    let present = format!("{force_n:.2} N on {} taxels", frame.contact_area_taxels);
+    let force_n = frame["force_n"].as_f64().unwrap_or(0.0).max(0.0);
+    let taxels = number(frame, "contact_area_taxels");
+    let present = format!("{force_n:.2} N on {taxels} taxels");
     look.line("force", &present, look.strong())
 }
 
@@ -435,14 +441,14 @@ fn verdicts(
         lines.push(span("none yet", look.aside()).into());
     }
     for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
-        let answer = Answer::of(verdict, &view.labels);
-        let style = match answer.is_weak {
+        let (answer, is_weak) = answer(verdict, &view.labels);
+        let style = match is_weak {
             true => look.aside(),
             false if index == 0 && link == Link::Live => look.strong(),
             false => Style::new(),
         };
         let old = age(now.saturating_sub(*at));
-        let line = verdict_line(verdict, &answer.text, &old, width);
+        let line = verdict_line(verdict, &answer, &old, width);
         lines.push(span(&line, style).into());
     }
     lines

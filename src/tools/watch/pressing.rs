@@ -5,7 +5,7 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::tools::answer::named;
+use crate::tools::answer::{level_of, named};
 use crate::tools::score::Score;
 
 /// What is being pressed.
@@ -26,14 +26,9 @@ impl Truth {
 
     /// Reads what a person typed: a level by number or label, a name, or a name and then a level.
     pub(super) fn read(text: &str, labels: &[String]) -> Self {
-        let level = |word: &str| {
-            let mut levels = (1_u64..).zip(labels);
-            let known = levels.find(|(level, label)| *label == word || level.to_string() == word);
-            known.map(|(level, _)| level)
-        };
         let text = text.trim();
         let (before, last) = text.rsplit_once(' ').unwrap_or(("", text));
-        let (object, level) = match level(last) {
+        let (object, level) = match level_of(last, labels) {
             None => (text, None),
             level => (before.trim(), level),
         };

@@ -136,8 +136,8 @@ fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
     let mut late = frame("forearm", 1.0, 5);
     late["time"] = json!(at(1_000).wall.to_string());
     take_event(&mut view, 3_500, late);
-    let frame = view.sensor().unwrap().frame.as_ref().unwrap();
-    assert_eq!(frame.at, at(1_000).mono);
+    let (moment, _) = view.sensor().unwrap().frame.as_ref().unwrap();
+    assert_eq!(*moment, at(1_000).mono);
     assert_shown(&view, 3_600, 80, &["frame 2.6 s old"]);
 }
 
@@ -417,6 +417,6 @@ fn a_frame_of_a_machine_with_another_clock_is_new() {
         event["time"] = json!(there.to_string());
         take_event(&mut view, ms, event);
     }
-    let frame = view.sensor().unwrap().frame.as_ref().unwrap();
-    assert_eq!(frame.at, at(380).mono);
+    let (moment, _) = view.sensor().unwrap().frame.as_ref().unwrap();
+    assert_eq!(*moment, at(380).mono);
 }

@@ -97,9 +97,10 @@ pub(super) struct Sensor {
     pub(super) cols: usize,
     /// The last status. Null before the first one.
     pub(super) status: Value,
-    pub(super) frame: Option<Frame>,
+    /// The last frame, and its moment.
+    pub(super) frame: Option<(Duration, Value)>,
     /// The forces of the last frames and their moments, in newtons.
-    forces: VecDeque<(Duration, f32)>,
+    forces: Vec<(Duration, f32)>,
     /// The last event of a press, and its moment.
     pub(super) press: Option<(Duration, Value)>,
     /// The verdicts and their moments, the newest first.
@@ -108,17 +109,6 @@ pub(super) struct Sensor {
     pub(super) count: Count,
     /// The context of the last press.
     context: Value,
-}
-
-/// The last frame.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Frame {
-    pub(super) at: Duration,
-    /// `[rows, cols]`, newtons a taxel.
-    pub(super) newtons: Vec<f32>,
-    /// `None` until the sensor has a zero.
-    pub(super) force_n: Option<f32>,
-    pub(super) contact_area_taxels: u64,
 }
 
 impl View {
@@ -260,10 +250,11 @@ impl View {
         let Some(sensor) = sensor else {
             return (Link::Connecting, None);
         };
-        let has_zero = |frame: &Frame| frame.force_n.is_some();
+        // Until it has one, its frames have no force.
+        let has_no_zero = |(_, frame): &(Duration, Value)| frame["force_n"].is_null();
         let text = |key: &str| sensor.status[key].as_str();
         let link = match text("state").unwrap_or_default() {
-            "live" if !sensor.frame.as_ref().is_none_or(has_zero) => Link::NoZero,
+            "live" if sensor.frame.as_ref().is_some_and(has_no_zero) => Link::NoZero,
             "live" => Link::Live,
             "stale" => Link::Stale,
             "lost" => Link::Lost,
@@ -301,27 +292,24 @@ impl Sensor {
                 self.verdicts.push_front((at, event));
                 self.verdicts.truncate(VERDICTS);
             }
-            Some("frame") => self.show(&event, at),
+            Some("frame") if items(&event, "newtons").count() == self.rows * self.cols => {
+                let is_recent = |(moment, _): &(Duration, f32)| moment.saturating_add(WINDOW) >= at;
+                self.forces.retain(is_recent);
+                let force_n = event["force_n"].as_f64();
+                self.forces
+                    .extend(force_n.map(|force_n| (at, force_n as f32)));
+                self.frame = Some((at, event));
+            }
             _ => {}
         }
     }
 
-    fn show(&mut self, event: &Value, at: Duration) {
-        let newtons = items(event, "newtons").filter_map(Value::as_f64);
-        let newtons: Vec<f32> = newtons.map(|newtons| newtons as f32).collect();
-        if newtons.len() != self.rows * self.cols {
-            return;
-        }
-        let force_n = event["force_n"].as_f64().map(|force_n| force_n as f32);
-        self.frame = Some(Frame {
-            at,
-            newtons,
-            force_n,
-            contact_area_taxels: number(event, "contact_area_taxels"),
-        });
-        self.forces
-            .retain(|(moment, _)| moment.saturating_add(WINDOW) >= at);
-        self.forces.extend(force_n.map(|force_n| (at, force_n)));
+    /// The newtons on each taxel in the last frame, `[rows, cols]`.
+    pub(super) fn newtons(&self) -> Vec<f32> {
+        let frame = self.frame.iter();
+        let newtons = frame.flat_map(|(_, frame)| items(frame, "newtons"));
+        let newtons = newtons.map(|newtons| newtons.as_f64().unwrap_or_default() as f32);
+        newtons.collect()
     }
 
     /// The greatest force in each of `spans` equal spans up to `now`. `None` where no frame came.
