@@ -8,10 +8,9 @@ use std::fs::File;
 use std::future::Future;
 use std::io::{ErrorKind, Read as _};
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
 
-use anyhow::{Context as _, anyhow, bail, ensure};
+use anyhow::{Context as _, bail};
 use clap::Args as ClapArgs;
 use rustix::process::Signal;
 
@@ -45,7 +44,7 @@ pub struct Args {
     /// What is pressed: flat:MM (a rigid flat piece, its width), ball:MM (a rigid ball, its radius),
     /// shore:OO, level:N or unknown (any everyday objects) [default: the recording's labels `reference`, `shore` or `level`]
     #[arg(long = "as", value_name = "WHAT")]
-    what: Option<What>,
+    what: Option<String>,
     /// Positions of the arm for raw bytes: CSV with the columns time_s, counted from the first whole
     /// frame, and approach_mm [default: none]
     #[arg(long, value_name = "M.csv", requires = "what")]
@@ -60,38 +59,6 @@ pub struct Args {
     /// Recordings, or raw bytes back to back [default: record presses now]
     #[arg(value_name = "FILE")]
     files: Vec<PathBuf>,
-}
-
-/// What a user knows of a piece.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum What {
-    Piece(Piece),
-    Level(u8),
-}
-
-impl FromStr for What {
-    type Err = &'static str;
-
-    fn from_str(text: &str) -> Result<Self, &'static str> {
-        let (kind, value) = text.split_once(':').unwrap_or((text, ""));
-        let value = value.trim();
-        let within = |least: f32, most: f32| {
-            let number = value.parse().ok();
-            number.filter(|number| (least..=most).contains(number))
-        };
-        let mm = within(0.1, 1000.0);
-        let what = match kind.trim() {
-            "unknown" if value.is_empty() => Some(Self::Piece(Piece::UNKNOWN)),
-            "flat" => mm.map(|width_mm| Self::Piece(Piece::Flat { width_mm })),
-            "ball" => mm.map(|radius_mm| Self::Piece(Piece::Ball { radius_mm })),
-            "shore" => within(0.0, 100.0).map(|oo| Self::Piece(Piece::Shore { range: [oo; 2] })),
-            "level" => value.parse().ok().map(Self::Level),
-            _ => None,
-        };
-        what.ok_or(
-            "expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, level:N, or unknown",
-        )
-    }
 }
 
 /// Reads the configuration at `path`. Its references need not exist yet, and do not count.
@@ -124,14 +91,17 @@ pub async fn run(
     // A file that cannot be made or added to shows before anything is pressed.
     let (mut all, part) = begin(&args)?;
     let hrn = setup.hrn.clone();
-    if args.files.is_empty() && args.what.is_none() {
+    let levels = &hrn.card().levels;
+    let what = args.what.as_deref().map(|what| piece(what, levels));
+    let what = what.transpose().of("--as", USAGE)?;
+    if args.files.is_empty() && what.is_none() {
         let unknown =
             "--as: found nothing, expected what will be pressed, such as flat:20 or ball:10";
         return Err(Failure::new(USAGE, unknown));
     }
     let read = {
         let (args, sensor, hrn) = (args.clone(), sensor.clone(), hrn.clone());
-        move |file, path: &Path| of_file(&args, file, path, &sensor, &hrn)
+        move |file, path: &Path| of_file(&args, what, file, path, &sensor, &hrn)
     };
     let (name, wanted) = (sensor.name(), args.presses);
     let print_next = |seen: u64| match seen {
@@ -187,25 +157,42 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
     }
 }
 
-/// What is known of a piece, with the model's levels.
-fn piece(what: What, levels: &[Level]) -> anyhow::Result<Piece> {
-    let level = match what {
-        What::Piece(piece) => return Ok(piece),
-        What::Level(level) => usize::from(level),
+/// The piece that a text names, with the model's levels.
+fn piece(text: &str, levels: &[Level]) -> anyhow::Result<Piece> {
+    let (kind, value) = text.split_once(':').unwrap_or((text, ""));
+    let value = value.trim();
+    let within = |least: f32, most: f32| {
+        let number = value.parse().ok();
+        number.filter(|number| (least..=most).contains(number))
     };
-    let most = levels.len();
-    ensure!(
-        (1..=most).contains(&level),
-        "level: found {level}, expected 1 to {most}, those of the model"
-    );
-    let borders = Borders::of(levels).context("the model's levels")?;
-    let range = borders.part(level - 1);
-    Ok(Piece::Shore { range })
+    let (mm, most) = (within(0.1, 1000.0), levels.len());
+    let piece = match kind.trim() {
+        "unknown" if value.is_empty() => Some(Piece::UNKNOWN),
+        "flat" => mm.map(|width_mm| Piece::Flat { width_mm }),
+        "ball" => mm.map(|radius_mm| Piece::Ball { radius_mm }),
+        "shore" => within(0.0, 100.0).map(|oo| Piece::Shore { range: [oo; 2] }),
+        "level" => {
+            let borders = Borders::of(levels).context("the model's levels")?;
+            let level = value.parse().ok();
+            let level = level.filter(|level| (1..=most).contains(level));
+            level.map(|level: usize| Piece::Shore {
+                range: borders.part(level - 1),
+            })
+        }
+        _ => None,
+    };
+    piece.with_context(|| {
+        format!(
+            "found {text:?}, expected flat:MM or ball:MM with 0.1 to 1000 mm, shore:OO with 0 to 100, level:N with 1 \
+             to {most}, or unknown"
+        )
+    })
 }
 
 /// The references of a file: of those of the command line, some presses, and of presses of now, all.
 fn of_file(
     args: &Args,
+    what: Option<Piece>,
     file: File,
     path: &Path,
     sensor: &Sensor,
@@ -218,11 +205,9 @@ fn of_file(
         courses.extend(played.playback.courses(sensor.name()));
         Ok(true)
     })?;
-    let what = match args.what {
-        Some(what) => what,
-        None => labelled(&played.playback.labels()).of(path.display(), FAILED)?,
-    };
-    let piece = piece(what, &hrn.card().levels).exit(FAILED)?;
+    let labels = played.playback.labels();
+    let labelled = || labelled(&labels, &hrn.card().levels).of(path.display(), FAILED);
+    let piece = what.map_or_else(labelled, Ok)?;
     if courses.is_empty() {
         let (path, sensor) = (path.display(), sensor.name());
         let none = format!("{path}: found no press of sensor {sensor:?}, expected at least one");
@@ -249,12 +234,11 @@ fn spread(mut courses: Vec<TimeSeries>, most: usize) -> Vec<TimeSeries> {
     places.map(|place| courses[place].clone()).collect()
 }
 
-/// What the labels of a recording say was pressed.
-fn labelled(labels: &Labels) -> anyhow::Result<What> {
+/// The piece that the labels of a recording name.
+fn labelled(labels: &Labels, levels: &[Level]) -> anyhow::Result<Piece> {
     for (key, kind) in [("reference", ""), ("shore", "shore:"), ("level", "level:")] {
         if let Some(found) = labels.get(key) {
-            let what = format!("{kind}{found}").parse();
-            return what.map_err(|expected| anyhow!("label {key}: found {found:?}, {expected}"));
+            return piece(&format!("{kind}{found}"), levels).context(format!("label {key}"));
         }
     }
     bail!("found no label `reference`, `shore` or `level`: say what was pressed with --as");
@@ -346,15 +330,26 @@ mod tests {
 
     #[test]
     fn a_text_names_a_piece() {
-        let parse = |text: &str| text.parse::<What>();
-        let flat = Piece::Flat { width_mm: 20.0 };
-        assert_eq!(parse("flat:20"), Ok(What::Piece(flat)));
-        let ball = Piece::Ball { radius_mm: 7.5 };
-        assert_eq!(parse("ball: 7.5"), Ok(What::Piece(ball)));
-        let shore = Piece::Shore { range: [63.0; 2] };
-        assert_eq!(parse("shore:63"), Ok(What::Piece(shore)));
-        assert_eq!(parse("level:2"), Ok(What::Level(2)));
-        assert_eq!(parse("unknown"), Ok(What::Piece(Piece::UNKNOWN)));
+        let level = |level, label: &str, shore: &str| Level {
+            level,
+            label: label.to_owned(),
+            shore: shore.to_owned(),
+        };
+        let levels = [level(1, "hard", ">70"), level(2, "soft", "0-70")];
+        for (text, expected) in [
+            ("flat:20", Piece::Flat { width_mm: 20.0 }),
+            ("ball: 7.5", Piece::Ball { radius_mm: 7.5 }),
+            ("shore:63", Piece::Shore { range: [63.0; 2] }),
+            (
+                "level:1",
+                Piece::Shore {
+                    range: [70.0, 100.0],
+                },
+            ),
+            ("unknown", Piece::UNKNOWN),
+        ] {
+            assert_eq!(piece(text, &levels).unwrap(), expected, "{text}");
+        }
         for text in [
             "flat",
             "flat:",
@@ -362,9 +357,10 @@ mod tests {
             "ball:nan",
             "shore:101",
             "level:x",
+            "level:3",
             "egg:3",
         ] {
-            assert!(parse(text).is_err(), "{text}");
+            assert!(piece(text, &levels).is_err(), "{text}");
         }
     }
 }

@@ -66,26 +66,25 @@ impl<'a> Played<'a> {
     ) -> Result<Self, Failure> {
         let (kind, file) = FileKind::read(file).map_err(unplayable(path))?;
         let file = BufReader::new(Box::new(file) as Box<dyn Read + 'a>);
-        let source = match kind {
+        let (source, playback) = match kind {
             FileKind::Recording if motion.is_some() => {
                 let found = format!("{}, a recording with times of its own", path.display());
                 let problem = format!("--motion: found {found}, expected raw bytes");
                 return Err(Failure::new(USAGE, problem));
             }
-            FileKind::Recording => Source::Recording(Reader::new(file)),
-            FileKind::Raw => Source::Raw {
-                file,
-                sensor: sensor.clone(),
-                motion: motion
-                    .map(motion::load)
-                    .transpose()?
-                    .unwrap_or_default()
-                    .into(),
-            },
-        };
-        let playback = match kind {
-            FileKind::Recording => Playback::new(hrn.clone()),
-            FileKind::Raw => Playback::of_bytes(sensor.clone(), hrn.clone()),
+            FileKind::Recording => (
+                Source::Recording(Reader::new(file)),
+                Playback::new(hrn.clone()),
+            ),
+            FileKind::Raw => {
+                let motion = motion.map(motion::load).transpose()?;
+                let source = Source::Raw {
+                    file,
+                    sensor: sensor.clone(),
+                    motion: motion.unwrap_or_default().into(),
+                };
+                (source, Playback::of_bytes(sensor.clone(), hrn.clone()))
+            }
         };
         Ok(Self {
             playback,

@@ -90,11 +90,7 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
             1,
             "wood.bin: found no label `reference`, `shore` or `level`",
         ),
-        (
-            "n.npz --as level:5 wood.bin",
-            1,
-            "level: found 5, expected 1 to 4",
-        ),
+        ("n.npz --as level:5 wood.bin", 2, "level:N with 1 to 4"),
         (
             "n.npz --as flat:20 still.bin",
             1,
