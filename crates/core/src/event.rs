@@ -6,7 +6,6 @@
 
 mod reply;
 
-use std::fmt::Display;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -14,7 +13,7 @@ use serde::{Serialize, Serializer};
 use serde_json::Value;
 
 pub use self::reply::{Hello, ModelCard, Reply, SensorCard, Tared};
-use crate::verdict::{ReferenceKinds, Shore};
+use crate::verdict::Shore;
 pub use crate::wording::name;
 
 /// The version of the format, as announced in `hello`.
@@ -429,9 +428,9 @@ pub struct Hardness {
     /// The slope of force against indentation at the end of loading; null if unknown.
     #[serde(serialize_with = "rounded_or_null")]
     pub stiffness_n_per_mm: Option<f64>,
-    /// The references of the sensor that the model was given.
-    #[serde(serialize_with = "as_text")]
-    pub references: ReferenceKinds,
+    /// The kinds of the references that the model was given: `none`, or some of `own`, `rigid` and `labelled`,
+    /// joined by `+`.
+    pub references: String,
     /// What the robot may do to know more; null if nothing.
     pub advice: Option<Advice>,
     /// The verdict on the object that the context names, over all its presses so far; null if it
@@ -528,10 +527,6 @@ fn millinewtons<S: Serializer>(newtons: &[f32], serializer: S) -> Result<S::Ok, 
 
 fn rounded_6<S: Serializer>(value: &f32, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64(round_6(*value))
-}
-
-fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_str(value)
 }
 
 fn millionths<S: Serializer>(values: &[f32], serializer: S) -> Result<S::Ok, S::Error> {

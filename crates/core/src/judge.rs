@@ -22,7 +22,9 @@ use crate::event::{Advice, Hardness, LinkState, Note, Phase, Rejection};
 use crate::motion::Track;
 use crate::press::{ContactFrame, FrameAt, SoFar};
 use crate::sensor::Sensor;
-use crate::verdict::{COURSE_FRAMES, Format, Hrn, ModelError, ReferenceKinds, Resampling, Verdict};
+use crate::verdict::{
+    COURSE_FRAMES, Format, Hrn, Knowledge, ModelError, References, Resampling, Verdict,
+};
 
 /// The number of frames in contact that an early verdict on the course needs.
 const FIRST_LOOK: u64 = 3;
@@ -251,8 +253,8 @@ impl Judge {
                 let ended = known.ended(press, most_frames, &sensor);
                 let course = ended.course(card.pitch_mm.into());
                 is_trained = card.range.holds(&course);
-                let own = self.kept.own.references(&hrn);
-                let judged = hrn.judge_course_with(&course, &own);
+                let references = hrn.references_with(&self.kept.own.references());
+                let judged = hrn.judge_beside(&course, &references);
                 // The press is remembered even if its verdict is missing, and its verdict stays if the
                 // press cannot be kept.
                 if phase == Phase::Final && is_felt && !peak.saturated {
@@ -261,7 +263,7 @@ impl Judge {
                         self.failed(press, phase, error);
                     }
                 }
-                judged?
+                (judged?, references)
             }
             format => {
                 card.check_array(peak.frame.array)?;
@@ -270,10 +272,11 @@ impl Judge {
                     (_, Some(_)) => peak.frame.newtons.to_vec(),
                     (_, None) => resampling.apply(&peak.frame).newtons.to_vec(),
                 };
-                (hrn.judge_taxels(&taxels)?, ReferenceKinds::NONE)
+                (hrn.judge_taxels(&taxels)?, References::NONE)
             }
         };
-        let notes = self.notes(peak, &resampling, references, is_trained);
+        let is_unknown = hrn.most_references() > 0 && references.knowledge() == Knowledge::None;
+        let notes = self.notes(peak, &resampling, is_unknown, is_trained);
         let object = name.map(|name| {
             let mut object = self.kept.objects.with(&name, &verdict);
             if phase == Phase::Final {
@@ -286,7 +289,7 @@ impl Judge {
             .as_ref()
             .map_or(in_a_row.into(), |object| object.presses);
 
-        let advice = self.advice(peak, &verdict, references, presses);
+        let advice = advice(peak, &verdict, is_unknown, presses);
         let rejected = if !is_felt || advice == Some(Advice::PressHarder) {
             Some(Rejection::LowForce)
         } else if verdict.confidence < described.model.min_confidence {
@@ -316,7 +319,7 @@ impl Judge {
             label: label.map(|level| level.label.clone()),
             rejected,
             notes,
-            references,
+            references: references.kinds(),
             advice,
             probabilities: verdict.probabilities,
             confidence: verdict.confidence,
@@ -339,34 +342,13 @@ impl Judge {
         })
     }
 
-    /// What the robot may do to know more. `presses` is how often it has pressed this object.
-    fn advice(
-        &self,
-        peak: &ContactFrame,
-        verdict: &Verdict,
-        references: ReferenceKinds,
-        presses: u64,
-    ) -> Option<Advice> {
-        if self.is_unknown(references) && peak.force_n < LEAST_UNKNOWN_N {
-            Some(Advice::PressHarder)
-        } else if verdict.confidence < ENOUGH && presses < MOST_PRESSES {
-            Some(Advice::PressAgain)
-        } else {
-            None
-        }
-    }
-
-    /// Whether the model could know this sensor, and does not.
-    fn is_unknown(&self, references: ReferenceKinds) -> bool {
-        self.hrn.most_references() > 0 && references == ReferenceKinds::NONE
-    }
-
-    /// `is_trained`: whether the model was trained on courses like this one.
+    /// `is_unknown`: whether the model could know this sensor, and does not. `is_trained`: whether it was
+    /// trained on courses like this one.
     fn notes(
         &self,
         peak: &ContactFrame,
         resampling: &Resampling,
-        references: ReferenceKinds,
+        is_unknown: bool,
         is_trained: bool,
     ) -> Vec<Note> {
         let card = self.hrn.card();
@@ -392,12 +374,29 @@ impl Judge {
             (Note::Saturated, peak.saturated),
             (Note::OutsideTraining, !is_trained),
             (Note::Resampled, is_resampled),
-            (Note::NotIdentified, self.is_unknown(references)),
+            (Note::NotIdentified, is_unknown),
             (Note::ReferencesIgnored, are_ignored),
         ]
         .into_iter()
         .filter_map(|(note, applies)| applies.then_some(note))
         .collect()
+    }
+}
+
+/// What the robot may do to know more. `is_unknown`: whether the model could know the sensor, and does not.
+/// `presses` is how often the robot has pressed this object.
+fn advice(
+    peak: &ContactFrame,
+    verdict: &Verdict,
+    is_unknown: bool,
+    presses: u64,
+) -> Option<Advice> {
+    if is_unknown && peak.force_n < LEAST_UNKNOWN_N {
+        Some(Advice::PressHarder)
+    } else if verdict.confidence < ENOUGH && presses < MOST_PRESSES {
+        Some(Advice::PressAgain)
+    } else {
+        None
     }
 }
 

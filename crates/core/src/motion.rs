@@ -66,28 +66,6 @@ pub struct StepBack {
     pub back_ms: f64,
 }
 
-/// The positions that presses from some moment on need. A recording holds no more.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct AtRest {
-    points: Vec<Point>,
-}
-
-impl AtRest {
-    /// Whether a track can be made of it. A recording may hold anything.
-    pub(crate) fn is_usable(&self) -> bool {
-        self.points.iter().all(Point::is_usable)
-    }
-}
-
-impl From<AtRest> for Track {
-    fn from(state: AtRest) -> Self {
-        let mut track = Self::default();
-        // Of points that step back, the earlier ones are forgotten.
-        let _ = track.push(&state.points);
-        track
-    }
-}
-
 /// The positions of one sensor's arm in the last minute.
 ///
 /// # Example
@@ -224,18 +202,16 @@ impl Track {
         Some(before.mm + part * (next.1.mm - before.mm))
     }
 
-    /// The points that presses from `since` on need.
+    /// The points that presses from `since` on need. A recording holds no more.
     #[must_use]
-    pub fn since(&self, since: Duration) -> AtRest {
+    pub fn since(&self, since: Duration) -> Vec<Point> {
         let since = of_arm(since, settings::DELAYS_MS.1);
         let first = self.points.partition_point(|p| p.at_ns <= since);
         // Keep the newest point, however old it is: it shows that the robot sends positions.
         let first = first
             .saturating_sub(1)
             .min(self.points.len().saturating_sub(1));
-        AtRest {
-            points: self.points.range(first..).copied().collect(),
-        }
+        self.points.range(first..).copied().collect()
     }
 }
 

@@ -26,7 +26,7 @@ use crate::judge::{EndedPress, Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
 use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
-use crate::tare::{self, Aim, Contact, RetareError, Tare};
+use crate::tare::{Aim, Contact, RetareError, Tare};
 use crate::verdict::{Hrn, TimeSeries};
 use crate::wire::{Decoded, Decoder};
 
@@ -129,13 +129,9 @@ impl Pipeline {
 
     /// The outcome of the requested tare. The next call returns `None`.
     pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
-        let sensor = self.sensor.name();
-        let tared = |tare::Retaken { old, new }| Tared {
-            sensor: sensor.to_owned(),
-            old,
-            new,
-        };
-        self.tare.ended().map(|outcome| outcome.map(tared))
+        let outcome = self.tare.ended()?;
+        let sensor = self.sensor.name().to_owned();
+        Some(outcome.map(|[old, new]| Tared { sensor, old, new }))
     }
 
     /// The number of positions since the start, and the number of them that came too late for their
@@ -225,7 +221,10 @@ impl Pipeline {
 
     fn push(&mut self, bytes: &[u8], at: Stamp) -> Vec<Event> {
         let mut events = self.tick(at);
-        self.hold(bytes, at);
+        self.decoder.push(bytes);
+        if self.clock == Clock::Arrival {
+            self.chunks.push_back((self.decoder.received(), at));
+        }
         self.link.last_bytes = Some(at.mono);
         self.drain(at.mono, &mut events);
         if self.link.is_silent() {
@@ -246,14 +245,6 @@ impl Pipeline {
             events.extend(self.status_if_changed(at));
         }
         events
-    }
-
-    /// Gives bytes to the decoder, and remembers when they came.
-    fn hold(&mut self, bytes: &[u8], at: Stamp) {
-        self.decoder.push(bytes);
-        if self.clock == Clock::Arrival {
-            self.chunks.push_back((self.decoder.received(), at));
-        }
     }
 
     /// Time has passed. A silence settles a pending frame. After a longer silence the sensor is stale.

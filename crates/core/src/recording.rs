@@ -129,7 +129,7 @@ impl RecordedSensor {
 }
 
 /// The version of the format. It rises when an older version cannot be played any more.
-pub const FORMAT: u32 = 3;
+pub const FORMAT: u32 = 4;
 
 /// A sensor and the state of its pipeline at rest. Another pipeline can continue from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -59,15 +59,6 @@ pub enum RetareError {
     NoFrames,
 }
 
-/// The offsets before and after a requested tare.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Retaken {
-    /// The offsets up to now.
-    pub old: Offsets,
-    /// The offsets from the next frame on.
-    pub new: Offsets,
-}
-
 /// Why frames of a tare count as touched.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Touch {
@@ -164,7 +155,7 @@ pub struct Tare {
     baseline: Vec<f32>,
     taking: Option<Taking>,
     /// The outcome of the requested tare, until it is fetched.
-    ended: Option<Result<Retaken, RetareError>>,
+    ended: Option<Result<[Offsets; 2], RetareError>>,
     contact: Contact,
     array: Array,
     /// The places of live taxels.
@@ -310,8 +301,8 @@ impl Tare {
         }
     }
 
-    /// The outcome of the requested tare. The next call returns `None`.
-    pub fn ended(&mut self) -> Option<Result<Retaken, RetareError>> {
+    /// The outcome of the requested tare: the offsets before it and after it. The next call returns `None`.
+    pub fn ended(&mut self) -> Option<Result<[Offsets; 2], RetareError>> {
         self.ended.take()
     }
 
@@ -417,8 +408,7 @@ impl Tare {
             (Aim::Request, None) => {
                 let old = self.offsets();
                 self.baseline = mean;
-                let new = self.offsets();
-                self.ended = Some(Ok(Retaken { old, new }));
+                self.ended = Some(Ok([old, self.offsets()]));
             }
         }
     }

@@ -34,10 +34,10 @@ pub use self::file::{are_levels, check_line};
 pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
 use self::inputs::{Input, Query};
 pub use self::probabilities::argmax;
-use self::probabilities::{largest_difference, softmax};
-pub use self::references::{
-    Knowledge, MOST_REFERENCES, PIECE, Piece, ReferenceKinds, ReferencePress, References,
-};
+use self::probabilities::largest_difference;
+pub(crate) use self::probabilities::softmax;
+pub(crate) use self::references::Reference;
+pub use self::references::{Knowledge, MOST_REFERENCES, PIECE, Piece, ReferencePress, References};
 pub use self::settings::{BuiltIn, Settings};
 pub use self::shore::{Borders, Distribution, Level, Shore};
 pub use self::tried::Tried;
@@ -276,16 +276,25 @@ impl Hrn {
             return Ok(References::NONE);
         }
         at_most(presses.len(), self.most_references(), "references")?;
-        let mut features = Vec::new();
-        for press in presses {
-            let outputs = self.run_course(&Query {
-                course: &press.course,
-                piece: Some(press.piece),
-                references: &References::NONE,
-            })?;
-            features.extend(self.numbers(&outputs, "reference")?.unwrap_or_default());
-        }
-        Ok(References::new(presses, features))
+        let presses = presses
+            .iter()
+            .map(|press| self.reference(&press.course, press.piece));
+        Ok(References::of(presses.collect::<Result<_, _>>()?))
+    }
+
+    /// What the model takes of a press on `piece`.
+    pub(crate) fn reference(
+        &self,
+        course: &TimeSeries,
+        piece: Piece,
+    ) -> Result<Reference, ModelError> {
+        let outputs = self.run_course(&Query {
+            course,
+            piece: Some(piece),
+            references: &References::NONE,
+        })?;
+        let features = self.numbers(&outputs, "reference")?;
+        Ok(Reference::new(piece, features.unwrap_or_default()))
     }
 
     /// The same model, which knows a sensor by its references.
@@ -294,13 +303,14 @@ impl Hrn {
     ///
     /// Returns an error if another model computed the references.
     pub fn identified(&self, references: References) -> Result<Self, ModelError> {
-        if !self.takes(&references) {
+        at_most(
+            references.presses.len(),
+            self.most_references(),
+            "references",
+        )?;
+        if !references.presses.iter().all(|press| self.takes(press)) {
             return Err(ModelError::new(format!(
-                "references: found {} with {} numbers, expected at most {} with {} numbers each, as this model \
-                 computes them",
-                references.count,
-                references.features.len(),
-                self.most_references(),
+                "references: found those of another model, expected {} numbers of each",
                 self.file.lengths.features
             )));
         }
@@ -310,12 +320,9 @@ impl Hrn {
         })
     }
 
-    /// Whether the model can take these references: none, or those that it computed.
-    pub(crate) fn takes(&self, references: &References) -> bool {
-        let features = self.file.lengths.features;
-        references.count == 0
-            || references.count <= self.most_references()
-                && references.features.len() == references.count * features
+    /// Whether the model may have computed this reference.
+    pub(crate) fn takes(&self, reference: &Reference) -> bool {
+        reference.features.len() == self.file.lengths.features
     }
 
     /// The references of the sensor whose presses this model judges.
@@ -336,7 +343,12 @@ impl Hrn {
         self.judge_beside(course, &self.references)
     }
 
-    /// Judges the course of a press with `own` presses of the sensor beside the known references.
+    /// The known references, and the last of the sensor's `own` presses that the model takes beside them.
+    pub fn references_with(&self, own: &References) -> References {
+        self.references.and(own, self.most_references())
+    }
+
+    /// Judges the course of a press with these references of its sensor.
     ///
     /// # Errors
     ///
@@ -345,17 +357,7 @@ impl Hrn {
     /// # Panics
     ///
     /// Panics as [`Self::judge_course`] does.
-    pub fn judge_course_with(
-        &self,
-        course: &TimeSeries,
-        own: &References,
-    ) -> Result<(Verdict, ReferenceKinds), ModelError> {
-        let references = self.references.and(own, self.most_references());
-        let verdict = self.judge_beside(course, &references)?;
-        Ok((verdict, references.kinds()))
-    }
-
-    fn judge_beside(
+    pub fn judge_beside(
         &self,
         course: &TimeSeries,
         references: &References,
@@ -366,7 +368,7 @@ impl Hrn {
             piece: None,
             references,
         })?;
-        self.verdict(&outputs, references.kinds().knowledge())
+        self.verdict(&outputs, references.knowledge())
     }
 
     /// Judges one of [`Self::checks`].

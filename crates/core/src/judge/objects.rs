@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::event::ObjectVerdict;
-use crate::verdict::{Shore, Verdict, argmax};
+use crate::verdict::{Shore, Verdict, argmax, softmax};
 
 /// The most objects that are remembered, those that were pressed last.
 const MOST_OBJECTS: usize = 64;
@@ -110,15 +110,13 @@ impl Object {
     fn verdict(self) -> ObjectVerdict {
         let divisor = (self.presses as f32).powf(ALIKE);
         let scores: Vec<f32> = self.log_sums.iter().map(|sum| sum / divisor).collect();
-        let (best, most) = argmax(&scores);
-        let shares: Vec<f32> = scores.iter().map(|score| (score - most).exp()).collect();
-        let total: f32 = shares.iter().sum();
+        let (best, _) = argmax(&scores);
         let [value, low, high, weight] = self.shore_sums;
         ObjectVerdict {
             name: self.name,
             presses: self.presses,
             level: best as u8 + 1,
-            probabilities: shares.into_iter().map(|share| share / total).collect(),
+            probabilities: softmax(&scores),
             shore: (weight > 0.0).then(|| Shore {
                 value: value / weight,
                 low: low / weight,

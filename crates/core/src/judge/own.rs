@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use super::approach::PressWithApproach;
 use crate::press::ContactFrame;
 use crate::sensor::Sensor;
-use crate::verdict::{Hrn, ModelError, Piece, ReferencePress, References, TimeSeries};
+use crate::verdict::{Hrn, ModelError, Piece, Reference, References, TimeSeries};
 
 /// The fewest presses that are used.
 const LEAST: usize = 6;
@@ -40,7 +40,7 @@ pub struct OwnPresses {
 /// A press as the model takes it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct OwnPress {
-    reference: References,
+    reference: Reference,
     /// The estimated Shore hardness, without own presses.
     shore: f32,
 }
@@ -104,7 +104,7 @@ impl OwnPresses {
         for course in courses {
             own.keep(hrn, course, most)?;
         }
-        Ok(own.references(hrn))
+        Ok(own.references())
     }
 
     /// Remembers a press that ended, and keeps it if it says something new. At most `most` are kept.
@@ -131,32 +131,25 @@ impl OwnPresses {
         let Some(shore) = hrn.judge_course(course)?.shore else {
             return Ok(());
         };
-        let reference = hrn.references(&[ReferencePress {
-            course: course.clone(),
-            piece: Piece::UNKNOWN,
-        }])?;
-        let room = most - 1;
+        let reference = hrn.reference(course, Piece::UNKNOWN)?;
         if self.model != hrn.sha256() {
             self.presses.clear();
             self.model = hrn.sha256().to_owned();
         }
-        self.presses
-            .drain(..self.presses.len().saturating_sub(room));
         let shore = shore.value;
         self.presses.push(OwnPress { reference, shore });
+        let many = self.presses.len().saturating_sub(most);
+        self.presses.drain(..many);
         Ok(())
     }
 
     /// The presses as references, if they may be used.
-    pub(super) fn references(&self, hrn: &Hrn) -> References {
+    pub(super) fn references(&self) -> References {
         if self.presses.len() < LEAST || self.spread() < LEAST_SPREAD {
             return References::NONE;
         }
-        let most = hrn.most_references();
-        let presses = self.presses.iter();
-        presses.fold(References::NONE, |all, press| {
-            all.and(&press.reference, most)
-        })
+        let presses = self.presses.iter().map(|press| press.reference.clone());
+        References::of(presses.collect())
     }
 
     /// The standard deviation of the estimated Shore hardness.
@@ -177,12 +170,10 @@ impl OwnPresses {
 
     /// The presses, if this model computed them. A recording or a file may hold anything.
     pub(super) fn of_model(self, hrn: &Hrn) -> Self {
-        let is_one = |press: &OwnPress| {
-            press.shore.is_finite() && hrn.takes(&press.reference) && press.reference.is_one()
-        };
+        let mut presses = self.presses.iter();
         let is_usable = self.model == hrn.sha256()
-            && self.presses.len() <= hrn.most_references()
-            && self.presses.iter().all(is_one);
+            && presses.len() <= hrn.most_references()
+            && presses.all(|press| press.shore.is_finite() && hrn.takes(&press.reference));
         if is_usable { self } else { Self::default() }
     }
 

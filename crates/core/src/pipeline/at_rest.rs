@@ -1,5 +1,6 @@
 //! The state of a pipeline at rest, from which another pipeline can continue.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -8,10 +9,11 @@ use serde_json::Value;
 use super::{Clock, Link, Pace, Pipeline};
 use crate::frame::{Array, Stamp};
 use crate::judge::{self, OwnPresses};
+use crate::motion::{Point, Track};
 use crate::sensor::Sensor;
+use crate::tare;
 use crate::verdict::Hrn;
 use crate::wire::{Decoder, HexBytes, Place};
-use crate::{motion, tare};
 
 /// The state of a pipeline while no press is under way. A pipeline of the same sensor that continues
 /// from it returns the same events from there on. Recordings begin with it.
@@ -24,10 +26,11 @@ pub struct AtRest {
     context: Option<Value>,
     link: Link,
     decoder: Place,
-    /// The bytes that have not become a frame yet, and when they came.
-    pending: Vec<(Stamp, HexBytes)>,
+    /// The bytes that have not become a frame yet.
+    pending: HexBytes,
+    chunks: VecDeque<(u64, Stamp)>,
     tare: tare::AtRest,
-    motion: motion::AtRest,
+    motion: Vec<Point>,
     judge: judge::Kept,
 }
 
@@ -39,11 +42,19 @@ impl AtRest {
     pub(crate) fn is_usable(&self, array: Array) -> bool {
         let (frames, presses) = (self.frames, self.presses);
         let counts = [frames, self.frames_damaged, self.pace.dropped, presses];
-        counts.iter().all(|&count| count <= self.decoder.decoded)
-            && self.decoder.skipped <= self.decoder.decoded
-            && self.decoder.decoded < MOST_BYTES
+        let Place {
+            decoded,
+            skipped,
+            framed,
+            ..
+        } = self.decoder;
+        let received = decoded.saturating_add(self.pending.0.len() as u64);
+        counts.iter().all(|&count| count <= decoded)
+            && skipped.max(framed) <= decoded
+            && received < MOST_BYTES
+            && self.chunks.iter().all(|&(end, _)| end <= received)
             && self.tare.is_usable(array)
-            && self.motion.is_usable()
+            && self.motion.iter().all(Point::is_usable)
             && self.judge.is_usable()
     }
 
@@ -62,11 +73,13 @@ impl Pipeline {
     /// The state, if no press is under way, and no tare. There is none either while a press that
     /// timed out is not released.
     pub fn at_rest(&self) -> Option<AtRest> {
-        if !self.is_at_rest() {
-            return None;
-        }
+        self.is_at_rest().then(|| self.state())
+    }
+
+    /// The state without what is under way.
+    fn state(&self) -> AtRest {
         let since = self.link.last_frame.map(|frame| frame.mono);
-        Some(AtRest {
+        AtRest {
             frames: self.frames,
             frames_damaged: self.frames_damaged,
             pace: self.pace.clone(),
@@ -74,11 +87,12 @@ impl Pipeline {
             context: self.judge.context.clone(),
             link: self.link.clone(),
             decoder: self.decoder.place(),
-            pending: self.pending(),
+            pending: HexBytes(self.decoder.pending().to_vec()),
+            chunks: self.chunks.clone(),
             tare: self.tare.at_rest(),
             motion: self.judge.track.since(since.unwrap_or_default()),
             judge: self.judge.kept.clone(),
-        })
+        }
     }
 
     /// The pipeline that judges with `hrn` from now on, as `sensor` says. `None` unless at rest: a press
@@ -89,7 +103,8 @@ impl Pipeline {
             judge: self.judge.kept_for(&hrn),
             ..self.at_rest()?
         };
-        Some(Self::resumed(sensor, hrn, state))
+        let track = self.judge.track.clone();
+        Some(Self::new(sensor, hrn, self.clock).after(state, track))
     }
 
     /// The pipeline of a sensor that begins anew with other tables. Its counters, its context and the
@@ -97,55 +112,46 @@ impl Pipeline {
     #[must_use]
     pub fn restarted(mut self, sensor: Sensor, hrn: Arc<Hrn>) -> Self {
         self.decoder.restart();
+        self.chunks.clear();
         let mut kept = self.judge.kept_for(&hrn);
         if judge::owner(&sensor, &hrn) != judge::owner(&self.sensor, self.hrn()) {
             kept.own = OwnPresses::default();
         }
-        let mut next = Self::new(sensor, hrn, self.clock);
+        let next = Self::new(sensor, hrn, self.clock);
         let place = Place {
             in_sync: next.decoder.place().in_sync,
             ..self.decoder.place()
         };
-        next.decoder = Decoder::at(next.sensor.layout().clone(), place);
-        next.tracker.presses = self.tracker.presses;
-        next.judge = next.judge.after(kept, self.judge.track, self.judge.context);
-        (next.frames, next.frames_damaged) = (self.frames, self.frames_damaged);
-        next.pace = self.pace;
-        next
+        let state = AtRest {
+            link: next.link.clone(),
+            decoder: place,
+            tare: next.tare.at_rest(),
+            judge: kept,
+            ..self.state()
+        };
+        next.after(state, self.judge.track)
     }
 
     /// A pipeline of `sensor` that continues from a usable state.
     pub(crate) fn resumed(sensor: Sensor, hrn: Arc<Hrn>, state: AtRest) -> Self {
-        let mut pipeline = Self::new(sensor, hrn, Clock::Arrival);
-        pipeline.decoder = Decoder::at(pipeline.sensor.layout().clone(), state.decoder);
-        for (at, HexBytes(bytes)) in state.pending {
-            pipeline.hold(&bytes, at);
-        }
-        pipeline.tare.resume(state.tare);
-        pipeline.tracker.presses = state.presses;
-        let track = state.motion.into();
-        pipeline.judge = pipeline.judge.after(state.judge, track, state.context);
-        pipeline.link = state.link;
-        pipeline.frames = state.frames;
-        pipeline.frames_damaged = state.frames_damaged;
-        pipeline.pace = state.pace;
-        pipeline
+        let mut track = Track::default();
+        // Of points that step back, the earlier ones are forgotten.
+        let _ = track.push(&state.motion);
+        Self::new(sensor, hrn, Clock::Arrival).after(state, track)
     }
 
-    /// The bytes that have not become a frame yet, and when they came.
-    fn pending(&self) -> Vec<(Stamp, HexBytes)> {
-        let mut pending = self.decoder.pending();
-        let mut begin = self.decoder.place().decoded;
-        let chunk = |&(end, at): &(u64, Stamp)| {
-            let length = end.saturating_sub(begin) as usize;
-            let (chunk, rest) = pending.split_at(length.min(pending.len()));
-            (pending, begin) = (rest, end.max(begin));
-            (at, HexBytes(chunk.to_vec()))
-        };
-        let chunks: Vec<_> = self.chunks.iter().map(chunk).collect();
-        chunks
-            .into_iter()
-            .filter(|(_, HexBytes(chunk))| !chunk.is_empty())
-            .collect()
+    /// This new pipeline, if it continues from a usable state and has these positions of the arm.
+    fn after(mut self, state: AtRest, track: Track) -> Self {
+        self.decoder = Decoder::at(self.sensor.layout().clone(), state.decoder);
+        self.decoder.push(&state.pending.0);
+        self.chunks = state.chunks;
+        self.tare.resume(state.tare);
+        self.tracker.presses = state.presses;
+        self.judge = self.judge.after(state.judge, track, state.context);
+        self.link = state.link;
+        self.frames = state.frames;
+        self.frames_damaged = state.frames_damaged;
+        self.pace = state.pace;
+        self
     }
 }

@@ -27,7 +27,6 @@ pub(super) struct Pace {
     /// When the last frame was dropped, if the sensor is still said to be too fast.
     last_dropped: Option<Duration>,
     /// When bytes were skipped last, if that is still said.
-    #[serde(default)]
     last_skipped: Option<Duration>,
 }
 

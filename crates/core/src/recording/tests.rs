@@ -261,7 +261,7 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
         ("/at_rest/tare/baseline/7", json!(1e39), "found other JSON"),
         (
             "/at_rest/judge/own",
-            json!({"model": "", "presses": [{"reference": {}, "shore": 1e39}]}),
+            json!({"model": "", "presses": [{"reference": {"knowledge": "own", "features": ""}, "shore": 1e39}]}),
             "found other JSON",
         ),
         (
@@ -270,7 +270,7 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
             no_state,
         ),
         ("/at_rest/tare/baseline", json!([0.0]), no_state),
-        ("/at_rest/motion/points/0", json!([0, 1e9]), no_state),
+        ("/at_rest/motion/0", json!([0, 1e9]), no_state),
         ("/at_rest/frames", json!(u64::MAX), no_state),
         ("/at_rest/presses", json!(1_u64 << 40), no_state),
     ] {

@@ -104,8 +104,11 @@ impl Input {
             Self::Mask => each(|_| 1.0),
             Self::ArmNPerMm => vec![course.arm_n_per_mm],
             Self::Piece => Piece::numbers(query.piece).to_vec(),
-            Self::References => query.references.features.clone(),
-            Self::Given => vec![1.0; query.references.count],
+            Self::References => {
+                let presses = query.references.presses.iter();
+                presses.flat_map(|press| press.features.clone()).collect()
+            }
+            Self::Given => vec![1.0; query.references.presses.len()],
             Self::Features => course.features().to_vec(),
         };
         let shape = self.shape(lengths);

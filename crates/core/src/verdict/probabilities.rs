@@ -12,7 +12,7 @@ pub fn argmax(values: &[f32]) -> (usize, f32) {
 }
 
 /// The shares of a choice with these logits.
-pub(super) fn softmax(logits: &[f32]) -> Vec<f32> {
+pub(crate) fn softmax(logits: &[f32]) -> Vec<f32> {
     let (_, largest) = argmax(logits);
     let exponentials: Vec<f32> = logits.iter().map(|logit| (logit - largest).exp()).collect();
     let sum: f32 = exponentials.iter().sum();

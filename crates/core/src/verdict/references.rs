@@ -3,7 +3,7 @@
 //! In: such presses, on the model's grid. Out: [`References`], which the model computes once and
 //! takes beside each press of the same sensor. They show it what the sensor reads of what it knows.
 
-use std::fmt;
+use std::collections::BTreeSet;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -11,6 +11,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::course::TimeSeries;
+use crate::wording::name;
 
 /// The most presses that a sensor may have as references.
 pub const MOST_REFERENCES: usize = 64;
@@ -60,9 +61,13 @@ impl Piece {
         self == Self::UNKNOWN
     }
 
-    /// Whether the piece is rigid.
-    pub fn is_rigid(self) -> bool {
-        !matches!(self, Self::Shore { .. })
+    /// What a press on the piece makes known of the sensor.
+    fn knowledge(self) -> Knowledge {
+        match self {
+            Self::Flat { .. } | Self::Ball { .. } => Knowledge::Rigid,
+            Self::UNKNOWN => Knowledge::Own,
+            Self::Shore { .. } => Knowledge::Labelled,
+        }
     }
 }
 
@@ -76,72 +81,8 @@ pub struct ReferencePress {
     pub piece: Piece,
 }
 
-/// The kinds of the references that a verdict was made with. As text it is `none`, or the kinds in the
-/// order of the fields, joined by `+`.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ReferenceKinds {
-    /// Presses of objects of which nothing is known.
-    pub own: bool,
-    /// Presses on rigid pieces.
-    pub rigid: bool,
-    /// Presses on objects of known hardness.
-    pub labelled: bool,
-}
-
-impl ReferenceKinds {
-    /// No references, or a model that takes none.
-    pub const NONE: Self = Self {
-        own: false,
-        rigid: false,
-        labelled: false,
-    };
-
-    fn of(presses: &[ReferencePress]) -> Self {
-        let has = |is: fn(Piece) -> bool| presses.iter().any(|press| is(press.piece));
-        Self {
-            own: has(Piece::is_unknown),
-            rigid: has(Piece::is_rigid),
-            labelled: has(|piece| !piece.is_rigid() && !piece.is_unknown()),
-        }
-    }
-
-    fn and(self, other: Self) -> Self {
-        Self {
-            own: self.own || other.own,
-            rigid: self.rigid || other.rigid,
-            labelled: self.labelled || other.labelled,
-        }
-    }
-
-    /// The kind whose promises a verdict keeps.
-    pub fn knowledge(self) -> Knowledge {
-        match self {
-            Self { labelled: true, .. } => Knowledge::Labelled,
-            Self { own: true, .. } => Knowledge::Own,
-            Self { rigid: true, .. } => Knowledge::Rigid,
-            Self::NONE => Knowledge::None,
-        }
-    }
-}
-
-impl fmt::Display for ReferenceKinds {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let kinds = [
-            (self.own, "own"),
-            (self.rigid, "rigid"),
-            (self.labelled, "labelled"),
-        ];
-        let words: Vec<&str> = kinds
-            .iter()
-            .filter(|kind| kind.0)
-            .map(|kind| kind.1)
-            .collect();
-        f.write_str(if words.is_empty() { "none" } else { "" })?;
-        f.write_str(&words.join("+"))
-    }
-}
-
-/// What a model knows of a sensor, as far as its promises depend on it.
+/// What a model knows of a sensor, as far as its promises depend on it. Of several references, the last one
+/// in this order counts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Knowledge {
@@ -160,21 +101,14 @@ impl Knowledge {
     pub const ALL: [Self; 4] = [Self::None, Self::Rigid, Self::Own, Self::Labelled];
 }
 
-/// A sensor's references as one model takes them. [`super::Hrn::references`] computes them.
-/// Recordings hold them, so that a replay needs no other file.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+/// A press on a known piece as one model takes it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct References {
-    kinds: ReferenceKinds,
-    /// The number of presses.
-    pub(super) count: usize,
-    /// The features of each press, one after the other. In a recording they are base64 of
-    /// little-endian f32.
+pub(crate) struct Reference {
+    pub(super) knowledge: Knowledge,
+    /// The numbers that the model keeps of the press. In a recording they are base64 of little-endian f32.
     #[serde(serialize_with = "write_features", deserialize_with = "read_features")]
     pub(super) features: Vec<f32>,
-    /// Whether there are some that are not used, because they made verdicts worse.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    ignored: bool,
 }
 
 fn write_features<S: Serializer>(features: &[f32], serializer: S) -> Result<S::Ok, S::Error> {
@@ -194,28 +128,45 @@ fn read_features<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f32>,
     Ok(features)
 }
 
+impl Reference {
+    /// A press on `piece` of which a model keeps these numbers.
+    pub(super) fn new(piece: Piece, features: Vec<f32>) -> Self {
+        Self {
+            knowledge: piece.knowledge(),
+            features,
+        }
+    }
+}
+
+/// A sensor's references as one model takes them. [`super::Hrn::references`] computes them.
+/// Recordings hold them, so that a replay needs no other file.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct References {
+    /// Each press.
+    pub(super) presses: Vec<Reference>,
+    /// Whether there are some that are not used, because they made verdicts worse.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    ignored: bool,
+}
+
 impl References {
     /// The references that a model takes without any.
     pub const NONE: Self = Self {
-        kinds: ReferenceKinds::NONE,
-        count: 0,
-        features: Vec::new(),
+        presses: Vec::new(),
         ignored: false,
     };
 
     /// References that are not used, because they made verdicts worse.
     pub const IGNORED: Self = Self {
-        kinds: ReferenceKinds::NONE,
-        count: 0,
-        features: Vec::new(),
+        presses: Vec::new(),
         ignored: true,
     };
 
-    pub(super) fn new(presses: &[ReferencePress], features: Vec<f32>) -> Self {
+    /// These presses.
+    pub(crate) fn of(presses: Vec<Reference>) -> Self {
         Self {
-            kinds: ReferenceKinds::of(presses),
-            count: presses.len(),
-            features,
+            presses,
             ignored: false,
         }
     }
@@ -223,34 +174,19 @@ impl References {
     /// These references, and as many of the last of `more` as a model takes beside them.
     #[must_use]
     pub(crate) fn and(&self, more: &Self, most: usize) -> Self {
-        let count = more.count.min(most.saturating_sub(self.count));
-        if count == 0 {
-            return self.clone();
-        }
-        let each = more.features.len() / more.count;
-        let last = &more.features[more.features.len() - count * each..];
+        let room = most.saturating_sub(self.presses.len());
+        let first = more.presses.len().saturating_sub(room);
         Self {
-            kinds: self.kinds.and(more.kinds),
-            count: self.count + count,
-            features: [&self.features, last].concat(),
+            presses: [&self.presses, &more.presses[first..]].concat(),
             ignored: self.ignored,
         }
     }
 
-    /// The references without the one at `place`. Their kinds are those of all.
+    /// The references without the one at `place`.
     pub(super) fn without(&self, place: usize) -> Self {
-        let each = self.features.len() / self.count;
-        let (before, after) = (place * each, (place + 1) * each);
-        let count = self.count - 1;
-        let features = [&self.features[..before], &self.features[after..]].concat();
-        match count {
-            0 => Self::NONE,
-            _ => Self {
-                count,
-                features,
-                ..self.clone()
-            },
-        }
+        let mut others = self.clone();
+        others.presses.remove(place);
+        others
     }
 
     /// Whether there are some that are not used, because they made verdicts worse.
@@ -258,18 +194,26 @@ impl References {
         self.ignored
     }
 
-    /// Whether it is a single press.
-    pub(crate) fn is_one(&self) -> bool {
-        self.count == 1
-    }
-
-    /// Whether there are none.
+    /// Whether there are none, not even some that are not used.
     pub fn is_none(&self) -> bool {
-        self.count == 0
+        *self == Self::NONE
     }
 
-    /// Which kinds there are.
-    pub fn kinds(&self) -> ReferenceKinds {
-        self.kinds
+    /// The knowledge whose promises a verdict keeps.
+    pub(crate) fn knowledge(&self) -> Knowledge {
+        let each = self.presses.iter().map(|press| press.knowledge);
+        each.max().unwrap_or(Knowledge::None)
+    }
+
+    /// Which kinds there are, as `hardness` publishes them: `none`, or some of `own`, `rigid` and
+    /// `labelled` in this order, joined by `+`.
+    pub fn kinds(&self) -> String {
+        let known: BTreeSet<Knowledge> = self.presses.iter().map(|press| press.knowledge).collect();
+        let order = [Knowledge::Own, Knowledge::Rigid, Knowledge::Labelled];
+        let kinds = order.iter().filter(|kind| known.contains(kind)).map(name);
+        match known.is_empty() {
+            true => name(&Knowledge::None),
+            false => kinds.collect::<Vec<_>>().join("+"),
+        }
     }
 }

@@ -29,16 +29,10 @@ pub struct Place {
     /// The number of bytes that belonged to no whole frame.
     pub skipped: u64,
     /// The number of bytes up to the end of the last whole frame, or up to the last restart, and of those
-    /// that nobody read since. A recording of an earlier version has none: it is then [`Self::decoded`].
-    #[serde(default = "all")]
+    /// that nobody read since.
     pub framed: u64,
     /// Whether the next byte follows the end of a frame.
     pub in_sync: bool,
-}
-
-/// More bytes than any that are decoded.
-fn all() -> u64 {
-    u64::MAX
 }
 
 /// Finds frames in a stream of bytes.
@@ -96,10 +90,6 @@ impl Decoder {
 
     /// A decoder that continues a stream at `place`.
     pub fn at(layout: Layout, place: Place) -> Self {
-        let place = Place {
-            framed: place.framed.min(place.decoded),
-            ..place
-        };
         Self {
             bytes: Vec::with_capacity(4 * layout.max_frame_bytes()),
             start: 0,

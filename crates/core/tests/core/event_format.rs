@@ -7,7 +7,7 @@ use std::time::Duration;
 use hardnessd_core::event::*;
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::tare::Offsets;
-use hardnessd_core::verdict::{Level, ReferenceKinds};
+use hardnessd_core::verdict::Level;
 use jiff::Timestamp;
 use serde_json::json;
 
@@ -58,7 +58,7 @@ fn hardness() -> Hardness {
         levels: None,
         course: None,
         stiffness_n_per_mm: None,
-        references: ReferenceKinds::NONE,
+        references: "none".to_owned(),
         advice: None,
         object: None,
         arrival: Duration::ZERO,

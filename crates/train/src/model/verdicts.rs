@@ -175,7 +175,8 @@ pub fn of(
                 let own = own.get(&press.sensor);
                 let none = References::NONE;
                 let own = own.map_or(&none, |own| &own[half_of(press.object)]);
-                of_sensor.judge_course_with(&presses.course(place), own)?.0
+                let references = of_sensor.references_with(own);
+                of_sensor.judge_beside(&presses.course(place), &references)?
             }
         };
         verdicts.push((place, verdict));

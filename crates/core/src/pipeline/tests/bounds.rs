@@ -159,22 +159,6 @@ fn a_sensor_whose_bytes_are_skipped_is_live_as_long_as_its_frames_come() {
 }
 
 #[test]
-fn a_recording_without_the_end_of_the_last_frame_goes_on_as_if_it_was_decoded_last() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    pipeline.opened(at(0));
-    play(&mut pipeline, 1, &vec![raw(0, 0); 5]);
-    let mut state = serde_json::to_value(pipeline.at_rest().unwrap()).unwrap();
-    let place = state["decoder"].as_object_mut().unwrap();
-    assert_eq!(place.remove("framed"), Some((5 * 790).into()));
-    let state = serde_json::from_value(state).unwrap();
-    let sensor = pipeline.sensor().clone();
-    let mut next = Pipeline::resumed(sensor, test_support::hrn(), state);
-    assert_eq!(next.at_rest(), pipeline.at_rest());
-    let events = next.tick(at(5_000));
-    assert_eq!(words(&events), ["Stale (no frame for 600 ms)"]);
-}
-
-#[test]
 fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
     let mut pipeline = pipeline(Preset::Jx255n);
     pipeline.opened(at(0));
