@@ -210,7 +210,7 @@ impl PressTracker {
             State::Idle => {
                 self.presses += 1;
                 let mut settling = Settling::default();
-                settling.push(&frame, &self.thresholds);
+                settling.push(&frame, &self.thresholds.settings);
                 self.state = State::Pressed {
                     press: Box::new(SoFar::new(self.presses, frame)),
                     settling,
@@ -221,7 +221,7 @@ impl PressTracker {
             }
             State::AwaitingRelease { released_frames } => {
                 *released_frames = if is_touched { 0 } else { *released_frames + 1 };
-                if *released_frames >= self.thresholds.end_frames {
+                if *released_frames >= self.thresholds.settings.end_frames {
                     self.state = State::Idle;
                 }
                 None
@@ -231,7 +231,7 @@ impl PressTracker {
                 settling,
                 released_frames,
             } => {
-                if settling.push(&frame, &self.thresholds) {
+                if settling.push(&frame, &self.thresholds.settings) {
                     press.is_settled = true;
                 }
                 *released_frames = if is_touched { 0 } else { *released_frames + 1 };
@@ -240,9 +240,9 @@ impl PressTracker {
                 }
                 let released_frames = *released_frames;
                 let held = at.stamp.mono.saturating_sub(press.began).as_secs_f64();
-                if released_frames >= self.thresholds.end_frames {
+                if released_frames >= self.thresholds.settings.end_frames {
                     self.end(End::Release, State::Idle)
-                } else if held >= self.thresholds.max_seconds {
+                } else if held >= self.thresholds.settings.max_seconds {
                     self.end(End::Timeout, State::AwaitingRelease { released_frames })
                 } else {
                     None
@@ -261,7 +261,7 @@ impl PressTracker {
         let State::Pressed { press, .. } = std::mem::replace(&mut self.state, next) else {
             return None;
         };
-        let is_short = end.is_judged() && press.frames < self.thresholds.min_frames;
+        let is_short = end.is_judged() && press.frames < self.thresholds.settings.min_frames;
         Some(Change::End {
             press,
             end: if is_short { End::Short } else { end },

@@ -28,10 +28,10 @@ pub(super) struct Seen {
 
 /// The press that a press tracker sees in these frames, when frames without load follow. `None`
 /// unless there is exactly one press and it ends with a release.
-pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) -> Option<Seen> {
+pub(super) fn one_press(frames: &[Frame], thresholds: &Thresholds, period_s: f64) -> Option<Seen> {
     let free = Frame::zero(frames.first()?.array);
-    let rest = std::iter::repeat_n(&free, settings.end_frames as usize);
-    let mut tracker = PressTracker::new(settings.clone());
+    let rest = std::iter::repeat_n(&free, thresholds.settings.end_frames as usize);
+    let mut tracker = PressTracker::new(thresholds.clone());
     let (mut contact, mut best) = (Vec::new(), None);
     for (number, frame) in (0_u32..).zip(frames.iter().chain(rest)) {
         let at = FrameAt {
@@ -41,7 +41,7 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
                 wall: jiff::Timestamp::UNIX_EPOCH,
             },
         };
-        let felt = ContactFrame::new(frame, settings.contact_threshold_n, at);
+        let felt = ContactFrame::new(frame, thresholds.contact_threshold_n, at);
         let area = felt.contact_area_taxels;
         match tracker.push(felt) {
             Some(Change::Begin { .. }) if best.is_some() => return None,
@@ -52,7 +52,7 @@ pub(super) fn one_press(frames: &[Frame], settings: &Thresholds, period_s: f64) 
             }) => best = Some(press.peak.moment.frame as usize),
             Some(Change::End { .. }) => return None,
         }
-        if tracker.is_pressed() && area >= settings.end_area_taxels {
+        if tracker.is_pressed() && area >= thresholds.end_area_taxels {
             contact.push(number as usize);
         }
     }

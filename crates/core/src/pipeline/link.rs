@@ -230,7 +230,7 @@ impl Pipeline {
             Port::Live { .. } => {
                 let tare = self.touch().map(|_| "tare: contact".to_owned());
                 let unreleased = || {
-                    let seconds = self.sensor.thresholds().max_seconds;
+                    let seconds = self.sensor.description().press.max_seconds;
                     let reason = || format!("not released for {seconds} s");
                     self.unreleased().map(|_| reason())
                 };

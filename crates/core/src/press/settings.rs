@@ -71,22 +71,18 @@ impl Settings {
             given.unwrap_or_else(|| ((usual * finer).round() as u32).min(most))
         };
         let begin_area_taxels = area(self.begin_area_taxels, 3.0, most);
+        let usual_n = pitch.contact_threshold_n();
         Thresholds {
-            contact_threshold_n: self
-                .contact_threshold_n
-                .unwrap_or(pitch.contact_threshold_n()),
+            contact_threshold_n: self.contact_threshold_n.unwrap_or(usual_n),
             begin_area_taxels,
             end_area_taxels: area(self.end_area_taxels, 1.0, begin_area_taxels),
-            end_frames: self.end_frames,
-            min_frames: self.min_frames,
-            max_seconds: self.max_seconds,
-            early_settle_s: self.early_settle_s,
-            early_min_force_n: self.early_min_force_n,
+            settings: self.clone(),
         }
     }
 }
 
-/// Checked [`Settings`], for the taxels of one sensor. By default they are those of the JX255N.
+/// Checked [`Settings`], with those that depend on the taxels of one sensor. By default they are those of the
+/// JX255N.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Thresholds {
     /// A taxel is in contact at or above this force.
@@ -95,16 +91,8 @@ pub struct Thresholds {
     pub begin_area_taxels: u32,
     /// Frames below this contact area release the press.
     pub end_area_taxels: u32,
-    /// The number of such frames in a row that releases it.
-    pub end_frames: u32,
-    /// A press with fewer frames in contact gets no verdict.
-    pub min_frames: u64,
-    /// A press that is held for this long ends.
-    pub max_seconds: f64,
-    /// How long the contact must have settled for an early verdict.
-    pub early_settle_s: f64,
-    /// The least total force for an early verdict.
-    pub early_min_force_n: f64,
+    /// The settings that mean the same on every array.
+    pub settings: Settings,
 }
 
 impl Default for Thresholds {

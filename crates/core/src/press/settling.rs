@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::{ContactFrame, Thresholds};
+use super::{ContactFrame, Settings};
 
 /// The latest frames whose area and force are all near the largest ones so far.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -25,7 +25,7 @@ impl Settling {
     /// Adds a frame. Returns true if area and force have stayed near their largest values so far,
     /// over at least `early_settle_s` and [`SETTLED_FRAMES`] frames, and the force is enough for a
     /// verdict.
-    pub(super) fn push(&mut self, frame: &ContactFrame, thresholds: &Thresholds) -> bool {
+    pub(super) fn push(&mut self, frame: &ContactFrame, settings: &Settings) -> bool {
         let load = Load {
             at: frame.moment.stamp.mono,
             contact_area_taxels: frame.contact_area_taxels,
@@ -44,12 +44,12 @@ impl Settling {
         if let Some(last_far) = self.near.iter().rposition(|load| !is_near(load)) {
             self.near.drain(..=last_far);
         }
-        let settle = Duration::from_secs_f64(thresholds.early_settle_s);
+        let settle = Duration::from_secs_f64(settings.early_settle_s);
         let covers = |first: &Load| load.at.saturating_sub(first.at) >= settle;
         while self.near.len() > SETTLED_FRAMES && self.near.get(1).is_some_and(covers) {
             self.near.pop_front();
         }
-        load.force_n >= thresholds.early_min_force_n
+        load.force_n >= settings.early_min_force_n
             && self.near.len() >= SETTLED_FRAMES
             && self.near.front().is_some_and(covers)
     }

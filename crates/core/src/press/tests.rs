@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use super::*;
+use crate::frame::Pitch;
 
 /// A frame of `area` taxels sharing `force_n`.
 fn frame(area: usize, force_n: f32) -> Frame {
@@ -24,10 +25,14 @@ fn contact(frame: &Frame, at: FrameAt) -> ContactFrame {
     ContactFrame::new(frame, Thresholds::default().contact_threshold_n, at)
 }
 
+fn tracker(settings: &Settings) -> PressTracker {
+    PressTracker::new(settings.check(Array::JX255N, Pitch::JX255N).unwrap())
+}
+
 /// Tracks `loads` and writes each change as a letter with its frame: b begin, s settled, e end, t
 /// timeout, x without a verdict.
-fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String {
-    let mut tracker = PressTracker::new(settings.clone());
+fn track(settings: &Settings, loads: &[(usize, f32)], rate_hz: u64) -> String {
+    let mut tracker = tracker(settings);
     let mut text = Vec::new();
     let mut was_settled = false;
     for (number, &(area, force_n)) in (0..).zip(loads) {
@@ -60,7 +65,7 @@ fn track(settings: &Thresholds, loads: &[(usize, f32)], rate_hz: u64) -> String 
     text.join(" ")
 }
 
-fn check(settings: &Thresholds, cases: &[(&[(usize, f32)], &str)]) {
+fn check(settings: &Settings, cases: &[(&[(usize, f32)], &str)]) {
     for (loads, expected) in cases {
         assert_eq!(track(settings, loads, 5), *expected, "{loads:?}");
     }
@@ -72,7 +77,7 @@ const FREE: (usize, f32) = (0, 0.0);
 #[test]
 fn a_press_runs_from_its_begin_area_to_its_release() {
     check(
-        &Thresholds::default(),
+        &Settings::default(),
         &[
             (
                 &[FREE, (2, 9.), (3, 1.), (9, 5.), (5, 3.), FREE, FREE],
@@ -96,17 +101,17 @@ fn a_press_runs_from_its_begin_area_to_its_release() {
         ],
     );
     // Frames below the end area release, though something is touched.
-    let settings = Thresholds {
-        begin_area_taxels: 5,
-        end_area_taxels: 3,
+    let settings = Settings {
+        begin_area_taxels: Some(5),
+        end_area_taxels: Some(3),
         early_settle_s: 9.0,
-        ..Thresholds::default()
+        ..Settings::default()
     };
     let few = (2, 2.);
     let loads = &[(4, 9.), TOUCH, (3, 2.), few, few, (4, 9.), TOUCH];
     check(&settings, &[(loads, "b1@1 e@4:last2 n2 peak1 b2@6")]);
     // The same holds after a timeout.
-    let settings = Thresholds {
+    let settings = Settings {
         max_seconds: 0.2,
         ..settings
     };
@@ -116,7 +121,7 @@ fn a_press_runs_from_its_begin_area_to_its_release() {
 
 #[test]
 fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
-    let mut tracker = PressTracker::new(Thresholds::default());
+    let mut tracker = tracker(&Settings::default());
     let mut ended = None;
     // In f32, the second force is greater by 7e-9 N.
     let counts = [[2_u8, 5, 6], [3, 4, 6], [0; 3], [0; 3]];
@@ -135,10 +140,10 @@ fn equal_counts_are_a_tie_however_their_newtons_are_rounded() {
 
 #[test]
 fn a_held_press_times_out_once_and_waits_for_release() {
-    let settings = Thresholds {
+    let settings = Settings {
         max_seconds: 1.0,
         early_settle_s: 9.0,
-        ..Thresholds::default()
+        ..Settings::default()
     };
     let held = [&[TOUCH; 8][..], &[FREE, TOUCH, FREE, FREE, TOUCH]].concat();
     // The release that had begun at the limit counts.
@@ -151,17 +156,17 @@ fn a_held_press_times_out_once_and_waits_for_release() {
         ],
     );
     // A press too short for a verdict at its limit is aborted.
-    let settings = Thresholds {
+    let settings = Settings {
         max_seconds: 0.4,
         min_frames: 9,
-        ..Thresholds::default()
+        ..Settings::default()
     };
     check(&settings, &[(&[TOUCH; 4], "b1@0 s@2:0 x@2:last2 n3 peak0")]);
 }
 
 #[test]
 fn a_contact_settles_within_a_taxel_or_5_percent_of_its_largest_area_and_force() {
-    let settles = |loads: &[(usize, f32)]| track(&Thresholds::default(), loads, 5).contains(" s@");
+    let settles = |loads: &[(usize, f32)]| track(&Settings::default(), loads, 5).contains(" s@");
     for (loads, expected) in [
         (&[(100, 8.), (95, 8.), (95, 8.)][..], true),
         (&[(100, 8.), (94, 8.), (94, 8.)], false),
@@ -186,7 +191,7 @@ fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
     // At 6 % a frame, every new frame makes the frame two before it too far away.
     let rising: Vec<(usize, f32)> = (0..20).map(|i| (30, 4.0 * 1.06_f32.powi(i))).collect();
     check(
-        &Thresholds::default(),
+        &Settings::default(),
         &[
             // At 5 frames/s, three frames within 5 % span 0.4 s.
             (
@@ -201,7 +206,7 @@ fn settled_contact_is_reported_once_and_never_while_the_load_rises() {
         ],
     );
     // At high rates, settling needs its time.
-    let text = track(&Thresholds::default(), &[(10, 5.0); 40], 100);
+    let text = track(&Settings::default(), &[(10, 5.0); 40], 100);
     assert_eq!(text, "b1@0 s@30:0");
 }
 
@@ -210,9 +215,9 @@ fn an_aborted_press_leaves_the_tracker_idle_and_a_loss_does_not_release_what_tim
     let push = |tracker: &mut PressTracker, number| {
         tracker.push(contact(&frame(5, 2.0), moment(number, 5)))
     };
-    let mut tracker = PressTracker::new(Thresholds {
+    let mut tracker = tracker(&Settings {
         max_seconds: 0.2,
-        ..Thresholds::default()
+        ..Settings::default()
     });
     assert_eq!(tracker.abort(End::Lost), None);
     push(&mut tracker, 0);
