@@ -182,18 +182,26 @@ impl Default for RawFrame {
     }
 }
 
-/// Prints the sum and the peak, because hundreds of numbers are unreadable in a log or a failed
-/// assertion.
 impl std::fmt::Debug for RawFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let sum: f32 = self.counts.iter().sum();
-        let peak = self.counts.iter().copied().fold(f32::MIN, f32::max);
-        f.debug_struct("RawFrame")
-            .field("array", &format_args!("{}", self.array))
-            .field("sum", &sum)
-            .field("peak", &peak)
-            .finish()
+        summary(f, "RawFrame", self.array, &self.counts)
     }
+}
+
+/// Prints the sum and the peak, because hundreds of numbers are unreadable in a log or a failed
+/// assertion.
+pub(crate) fn summary(
+    f: &mut std::fmt::Formatter<'_>,
+    name: &str,
+    array: Array,
+    taxels: &[f32],
+) -> std::fmt::Result {
+    let peak = taxels.iter().copied().fold(f32::MIN, f32::max);
+    f.debug_struct(name)
+        .field("array", &format_args!("{array}"))
+        .field("sum", &force_n(taxels))
+        .field("peak", &peak)
+        .finish()
 }
 
 impl std::fmt::Display for Array {
@@ -232,12 +240,7 @@ impl Default for Frame {
 
 impl std::fmt::Debug for Frame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let peak = self.newtons.iter().copied().fold(0.0, f32::max);
-        f.debug_struct("Frame")
-            .field("array", &format_args!("{}", self.array))
-            .field("force_n", &self.force_n())
-            .field("peak_n", &peak)
-            .finish()
+        summary(f, "Frame", self.array, &self.newtons)
     }
 }
 

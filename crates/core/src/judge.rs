@@ -201,7 +201,8 @@ impl Judge {
         PressWithApproach::new(press, phase, &self.track, delay_ms, self.speed_mm_s)
     }
 
-    /// The verdict on a press up to now.
+    /// The verdict on a press up to now. It is missing if the model fails: a model that fails on its own check
+    /// frames was refused at loading.
     fn judge(
         &mut self,
         press: &SoFar,
@@ -209,17 +210,12 @@ impl Judge {
         known: &PressWithApproach<'_>,
         now: Moment,
     ) -> Option<Hardness> {
-        let (press, peak) = (press.press, &press.peak);
-        match self.try_judge(press, phase, known, peak, now) {
-            Ok(verdict) => Some(verdict),
-            Err(error) => {
-                self.failed(press, phase, error);
-                None
-            }
-        }
+        let verdict = self.try_judge(press, phase, known, now);
+        verdict
+            .map_err(|error| self.failed(press.press, phase, error))
+            .ok()
     }
 
-    /// The model failed on a press. A model that fails on its own check frames was refused at loading.
     fn failed(&mut self, press: u64, phase: Phase, error: ModelError) {
         self.unjudged.push(Unjudged {
             sensor: self.sensor.name().to_owned(),
@@ -231,18 +227,22 @@ impl Judge {
 
     fn try_judge(
         &mut self,
-        press: u64,
+        press: &SoFar,
         phase: Phase,
         known: &PressWithApproach<'_>,
-        peak: &ContactFrame,
         now: Moment,
     ) -> Result<Hardness, ModelError> {
         let hrn = Arc::clone(&self.hrn);
         let (card, sensor) = (hrn.card(), Arc::clone(&self.sensor));
         let described = sensor.description();
         let is_of_course = matches!(hrn.format(), Format::Course { .. });
-        let peak = if is_of_course { known.best() } else { peak };
-        let resampling = resampling(&hrn, peak, &sensor);
+        let peak = match is_of_course {
+            true => known.best(),
+            false => &press.peak,
+        };
+        let press = press.press;
+        let pitch = sensor.calibration().pitch_mm;
+        let resampling = Resampling::new(&peak.frame, pitch, card.pitch_mm.into());
         let name = object_of(self.context.as_ref());
         let pressed = self.kept.own.next(name.clone(), known, &sensor);
         let in_a_row = pressed.in_a_row;
@@ -303,12 +303,9 @@ impl Judge {
         let mut levels = card.levels.iter();
         let label = levels.find(|known| Some(known.level) == level);
         // A model of frames finds the Shore hardness apart from the level.
-        let shore = verdict.shore.map(|shore| match hrn.format() {
-            Format::Frame => hrn.within(shore, verdict.level),
-            Format::Course { .. } | Format::Parts => shore,
-        });
+        let shore = verdict.shore;
+        let shore = shore.map(|shore| hrn.within(shore, verdict.level));
         let FrameAt { frame, stamp } = peak.moment;
-        let taxel_mm2 = sensor.calibration().pitch_mm.area_mm2();
         Ok(Hardness {
             seq: None,
             sensor: sensor.name().to_owned(),
@@ -325,7 +322,7 @@ impl Judge {
             confidence: verdict.confidence,
             frame,
             contact_area_taxels: peak.contact_area_taxels,
-            contact_area_mm2: f64::from(peak.contact_area_taxels) * taxel_mm2,
+            contact_area_mm2: f64::from(peak.contact_area_taxels) * pitch.area_mm2(),
             force_n: peak.force_n,
             model: hrn.sha256()[..12].to_owned(),
             state: now.state,
@@ -398,10 +395,4 @@ fn advice(
     } else {
         None
     }
-}
-
-/// How the frames of a press whose best frame is `peak` are resampled onto the model's grid.
-fn resampling(hrn: &Hrn, peak: &ContactFrame, sensor: &Sensor) -> Resampling {
-    let pitch = sensor.calibration().pitch_mm;
-    Resampling::new(&peak.frame, pitch, f64::from(hrn.card().pitch_mm))
 }

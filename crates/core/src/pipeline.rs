@@ -259,13 +259,13 @@ impl Pipeline {
         {
             self.settle(at, &mut events);
         }
-        if let Some(deadline) = self.stale_deadline()
+        if let Some((deadline, during)) = self.stale_deadline()
             && at.mono >= deadline
         {
             // Count from the last frame, so that both times come from one clock reading.
             let last_frame = self.link.last_frame.filter(|_| self.link.is_live());
             let since = last_frame.unwrap_or(at);
-            self.link.silent();
+            self.link.silent(during);
             self.tare.give_up(RetareError::NotLive);
             let wait = deadline.saturating_sub(since.mono);
             let wall = since.wall.checked_add(wait).unwrap_or(at.wall);

@@ -52,18 +52,32 @@ pub(super) fn object_of(context: Option<&Value>) -> Option<String> {
 impl Objects {
     /// The verdict on the object `name` with this press.
     pub(super) fn with(&self, name: &str, verdict: &Verdict) -> ObjectVerdict {
-        let known = self.known.iter().find(|known| known.name == name);
-        Object::after(known.cloned(), name, verdict).verdict()
+        self.after(name, verdict).verdict()
     }
 
     /// Adds the press to the object `name`.
     pub(super) fn add(&mut self, name: &str, verdict: &Verdict) {
-        let place = self.known.iter().position(|known| known.name == name);
-        let known = place.map(|place| self.known.remove(place));
-        if self.known.len() >= MOST_OBJECTS {
-            self.known.remove(0);
-        }
-        self.known.push(Object::after(known, name, verdict));
+        let object = self.after(name, verdict);
+        self.known.retain(|known| known.name != name);
+        self.known.push(object);
+        let many = self.known.len().saturating_sub(MOST_OBJECTS);
+        self.known.drain(..many);
+    }
+
+    /// The object after another press. After a change of the model, it may be known with other
+    /// levels, and then begins anew.
+    fn after(&self, name: &str, verdict: &Verdict) -> Object {
+        let levels = verdict.probabilities.len();
+        let is_same = |known: &&Object| known.name == name && known.log_sums.len() == levels;
+        let known = self.known.iter().find(is_same).cloned();
+        let mut object = known.unwrap_or_else(|| Object {
+            name: name.to_owned(),
+            presses: 0,
+            log_sums: vec![0.0; levels],
+            shore_sums: [0.0; 4],
+        });
+        object.add(verdict);
+        object
     }
 
     /// Whether the next verdicts on these objects are finite. A recording may hold anything.
@@ -78,21 +92,6 @@ impl Objects {
 }
 
 impl Object {
-    /// The object after another press. After a change of the model, it may be known with other
-    /// levels, and then begins anew.
-    fn after(known: Option<Self>, name: &str, verdict: &Verdict) -> Self {
-        let levels = verdict.probabilities.len();
-        let known = known.filter(|known| known.log_sums.len() == levels);
-        let mut object = known.unwrap_or_else(|| Self {
-            name: name.to_owned(),
-            presses: 0,
-            log_sums: vec![0.0; levels],
-            shore_sums: [0.0; 4],
-        });
-        object.add(verdict);
-        object
-    }
-
     fn add(&mut self, verdict: &Verdict) {
         self.presses = self.presses.saturating_add(1);
         for (sum, &probability) in self.log_sums.iter_mut().zip(&verdict.probabilities) {

@@ -45,10 +45,8 @@ enum Port {
     Opened { since: Duration },
     /// The last frame came at this time, or the last bytes that were skipped.
     Live { since: Duration },
-    /// The port is open, and no first frame came in time.
-    Silent,
-    /// The port is open, and silent after its last frame.
-    Stale,
+    /// The port is open, and no frame came for this time.
+    Silent { during: Duration },
 }
 
 impl Link {
@@ -115,15 +113,12 @@ impl Link {
 
     /// Whether the port is open, and silent.
     pub(super) fn is_silent(&self) -> bool {
-        matches!(self.port, Port::Silent | Port::Stale)
+        matches!(self.port, Port::Silent { .. })
     }
 
-    /// The silence has lasted until [`Self::stale_deadline`].
-    pub(super) fn silent(&mut self) {
-        self.port = match self.port {
-            Port::Opened { .. } => Port::Silent,
-            _ => Port::Stale,
-        };
+    /// No frame came for this time.
+    pub(super) fn silent(&mut self, during: Duration) {
+        self.port = Port::Silent { during };
     }
 
     /// The device is gone.
@@ -140,12 +135,12 @@ impl Link {
         self.was_lost = true;
     }
 
-    /// When a silence makes the link stale.
-    fn stale_deadline(&self, sensor: &Sensor) -> Option<Duration> {
+    /// Since when a silence lasts, and how long it may.
+    fn silence(&self, sensor: &Sensor) -> Option<(Duration, Duration)> {
         match self.port {
-            Port::Opened { since } => Some(since.saturating_add(sensor.late_after())),
-            Port::Live { since } => Some(since.saturating_add(sensor.stale_after())),
-            _ => None,
+            Port::Opened { since } => Some((since, sensor.late_after())),
+            Port::Live { since } => Some((since, sensor.stale_after())),
+            Port::Closed { .. } | Port::Silent { .. } => None,
         }
     }
 
@@ -181,10 +176,8 @@ pub(super) fn in_contact(frame: &Frame, threshold_n: f32) -> String {
 impl Pipeline {
     /// When [`Self::take`] next needs a tick, on CLOCK_MONOTONIC.
     pub fn deadline(&self) -> Option<Duration> {
-        match (self.pause_deadline(), self.stale_deadline()) {
-            (Some(pause), Some(stale)) => Some(pause.min(stale)),
-            (pause, stale) => pause.or(stale),
-        }
+        let stale = self.stale_deadline().map(|(deadline, _)| deadline);
+        self.pause_deadline().into_iter().chain(stale).min()
     }
 
     /// The current state of the link and its counters.
@@ -215,7 +208,7 @@ impl Pipeline {
             Port::Live { .. } => LinkState::Live,
             _ if self.link.was_lost => LinkState::Lost,
             Port::Closed { .. } | Port::Opened { .. } => LinkState::Connecting,
-            Port::Silent | Port::Stale => LinkState::Stale,
+            Port::Silent { .. } => LinkState::Stale,
         }
     }
 
@@ -237,12 +230,8 @@ impl Pipeline {
                 let too_fast = || self.pace.reason(self.sensor.frame_rate_hz());
                 tare.or_else(unreleased).or_else(too_fast)
             }
-            Port::Silent | Port::Stale => {
-                let silence = match self.link.port {
-                    Port::Silent => self.sensor.late_after(),
-                    _ => self.sensor.stale_after(),
-                };
-                let ms = (silence.as_nanos() as f64 / 1e5).round() / 10.0;
+            Port::Silent { during } => {
+                let ms = (during.as_nanos() as f64 / 1e5).round() / 10.0;
                 let bytes = self.decoder.problem();
                 let bytes = bytes.map(|problem| format!(", but bytes come: {problem}"));
                 Some(format!("no frame for {ms} ms{}", bytes.unwrap_or_default()))
@@ -295,11 +284,12 @@ impl Pipeline {
         Some(last_bytes.saturating_add(self.sensor.period().mul_f64(PAUSE_PERIODS)))
     }
 
-    /// When a silence makes the link stale.
-    pub(super) fn stale_deadline(&self) -> Option<Duration> {
+    /// When a silence makes the link stale, and how long it is then.
+    pub(super) fn stale_deadline(&self) -> Option<(Duration, Duration)> {
         if self.clock == Clock::FrameRate {
             return None;
         }
-        self.link.stale_deadline(&self.sensor)
+        let (since, during) = self.link.silence(&self.sensor)?;
+        Some((since.saturating_add(during), during))
     }
 }

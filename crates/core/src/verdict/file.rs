@@ -217,20 +217,16 @@ fn frame_input(
         references: 0,
         features: 0,
     };
-    let mut expected = vec![Input::Frame];
-    expected.extend(grid.map(|_| Input::Parts));
-    let found = expected
-        .iter()
-        .find(|input| *given == [(&*input.name(), Some(input.shape(lengths)))]);
-    match found {
-        Some(&input) => Ok((vec![input], lengths)),
-        None => {
-            let expected = expected.iter();
-            let expected = expected.map(|input| described(&input.name(), &input.shape(lengths)));
-            let expected: Vec<String> = expected.collect();
-            Err(unexpected(given, &expected.join(" or ")))
+    let mut expected = Vec::new();
+    for input in [Some(Input::Frame), grid.map(|_| Input::Parts)] {
+        let Some(input) = input else { continue };
+        let (name, shape) = (input.name(), input.shape(lengths));
+        expected.push(described(&name, &shape));
+        if *given == [(&*name, Some(shape))] {
+            return Ok((vec![input], lengths));
         }
     }
+    Err(unexpected(given, &expected.join(" or ")))
 }
 
 /// The inputs of a model of courses in their order, and their lengths. A model takes those that it needs,
@@ -254,15 +250,9 @@ fn course_inputs(given: &[Given<'_>]) -> Result<(Vec<Input>, Lengths), ModelErro
     };
     let shapes = given.iter().map(|(_, shape)| shape.clone());
     let is_of_course = |input: &Input| !matches!(input, Input::Frame | Input::Parts);
-    let of_references = Input::OF_REFERENCES.iter();
-    let fits = match of_references.filter(|one| inputs.contains(one)).count() {
-        0 => true,
-        3 => {
-            (1..=MOST_REFERENCES).contains(&lengths.references)
-                && NUMBERS.contains(&lengths.features)
-        }
-        _ => false,
-    };
+    let takes = Input::OF_REFERENCES.map(|input| inputs.contains(&input));
+    let are_some = (1..=MOST_REFERENCES).contains(&lengths.references);
+    let fits = takes == [are_some; 3] && (!are_some || NUMBERS.contains(&lengths.features));
     if fits
         && !inputs.is_empty()
         && inputs.iter().all(is_of_course)

@@ -44,11 +44,7 @@ impl Default for ModelFrame {
 
 impl std::fmt::Debug for ModelFrame {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let peak = self.newtons.iter().copied().fold(0.0, f32::max);
-        f.debug_struct("ModelFrame")
-            .field("force_n", &self.force_n())
-            .field("peak_n", &peak)
-            .finish()
+        frame::summary(f, "ModelFrame", Array::JX255N, &self.newtons)
     }
 }
 
