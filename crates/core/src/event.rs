@@ -324,8 +324,7 @@ pub enum Note {
     AtEdge,
     /// A taxel reads full scale.
     Saturated,
-    /// The force or the area is outside the range of the model's training. So is the pitch. With a
-    /// model of courses, also the duration, the frame rate, the speed, the depth or the arm.
+    /// The force, the area or the pitch is outside the range of the model's training.
     OutsideTraining,
     /// The sensor's taxels have another pitch than the model's, so their forces were shared out
     /// over the model's.

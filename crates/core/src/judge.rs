@@ -247,12 +247,10 @@ impl Judge {
         let pressed = self.kept.own.next(name.clone(), known, &sensor);
         let in_a_row = pressed.in_a_row;
         let is_felt = peak.force_n >= described.model.min_force_n;
-        let mut is_trained = true;
         let (verdict, references) = match hrn.format() {
             Format::Course { most_frames } => {
                 let ended = known.ended(press, most_frames, &sensor);
                 let course = ended.course(card.pitch_mm.into());
-                is_trained = card.range.holds(&course);
                 let references = hrn.references_with(&self.kept.own.references());
                 let judged = hrn.judge_beside(&course, &references);
                 // The press is remembered even if its verdict is missing, and its verdict stays if the
@@ -276,7 +274,7 @@ impl Judge {
             }
         };
         let is_unknown = hrn.most_references() > 0 && references.knowledge() == Knowledge::None;
-        let notes = self.notes(peak, &resampling, is_unknown, is_trained);
+        let notes = self.notes(peak, &resampling, is_unknown);
         let object = name.map(|name| {
             let mut object = self.kept.objects.with(&name, &verdict);
             if phase == Phase::Final {
@@ -339,15 +337,8 @@ impl Judge {
         })
     }
 
-    /// `is_unknown`: whether the model could know this sensor, and does not. `is_trained`: whether it was
-    /// trained on courses like this one.
-    fn notes(
-        &self,
-        peak: &ContactFrame,
-        resampling: &Resampling,
-        is_unknown: bool,
-        is_trained: bool,
-    ) -> Vec<Note> {
+    /// `is_unknown`: whether the model could know this sensor, and does not.
+    fn notes(&self, peak: &ContactFrame, resampling: &Resampling, is_unknown: bool) -> Vec<Note> {
         let card = self.hrn.card();
         let range = &card.range;
         // The range of areas is in taxels of the model's grid.
@@ -362,8 +353,7 @@ impl Judge {
         let [least_taxels, most_taxels] = range.contact_area_taxels;
         let is_trained = (least_n..=most_n).contains(&peak.force_n)
             && (least_taxels..=most_taxels).contains(&area)
-            && card.holds(self.sensor.calibration().pitch_mm)
-            && is_trained;
+            && card.holds(self.sensor.calibration().pitch_mm);
         let is_resampled = resampling.is_resampled() && card.grid.is_none();
         let are_ignored = self.hrn.known_references().are_ignored();
         [

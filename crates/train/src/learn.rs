@@ -12,7 +12,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::ensure;
 
-use crate::data::presses::Timed;
 use crate::net::graph::Graph;
 pub use crate::net::graph::Inputs;
 use crate::net::network::Weights;
@@ -22,7 +21,7 @@ use crate::run::history::Metrics;
 pub use crate::run::history::Taken;
 use crate::run::progress::{ensure_finite, progress_bar, report};
 use crate::settings::Training;
-use hardnessd_core::verdict::{Borders, Distribution, Extents, Knowledge, Piece, Shore, argmax};
+use hardnessd_core::verdict::{Borders, Distribution, Knowledge, Piece, Shore, argmax};
 use hardnessd_simulator::random::Stream;
 use learner::Learner;
 
@@ -64,11 +63,6 @@ pub trait Learning {
 
     /// What the logits are of.
     fn outputs(&self) -> Outputs;
-
-    /// The ranges of presses that the network has met, if it judges presses over time.
-    fn ranges(&self, _learnt: &[Timed]) -> Extents {
-        [None; 5]
-    }
 
     /// The graph of the exported file, up to the logits.
     fn graph(&self, weights: &[Weights]) -> Graph;

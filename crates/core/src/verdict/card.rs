@@ -4,97 +4,25 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::course::{Extents, TimeSeries};
+use super::course::TimeSeries;
 use super::error::ModelError;
 use super::probabilities::argmax;
 use super::references::{Knowledge, ReferencePress};
 use super::shore::{Level, Shore};
 use crate::frame::{Array, Pitch};
 
-/// The range of forces and areas in training, and for a model of format 3 the range of its presses.
-/// A verdict on a press outside it has the note `outside_training`. A range of the presses that is
-/// `None` excludes nothing.
+/// The range of forces and areas in training. A verdict on a press outside it has the note
+/// `outside_training`. Other keys, which earlier trainers wrote, are passed over.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Range {
     /// The least and the greatest total force of a training frame, in newtons.
     pub force_n: [f32; 2],
     /// The least and the greatest contact area of a training frame, in taxels.
     pub contact_area_taxels: [u32; 2],
-    /// The shortest and the longest training press, in seconds from its first to its last frame.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub duration_s: Option<[f32; 2]>,
-    /// The least and the greatest time between two frames that the model gets, in seconds: the
-    /// median of a press.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub frame_period_s: Option<[f32; 2]>,
-    /// The least and the greatest speed of the approach, in mm/s.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub speed_mm_s: Option<[f32; 2]>,
-    /// The least and the greatest approach of a training press at its furthest, in mm.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub approach_mm: Option<[f32; 2]>,
-    /// The least and the greatest stiffness of the arm, in N/mm.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub arm_n_per_mm: Option<[f32; 2]>,
     /// The least and the greatest distance between the taxels of the training sensors, in mm.
     /// `None` means that of the model's grid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pitch_mm: Option<[f32; 2]>,
-}
-
-impl Range {
-    /// The range of a model of which nothing is known: no frame is outside it.
-    pub const ANY: Self = Self {
-        force_n: [0.0, f32::MAX],
-        contact_area_taxels: [0, u32::MAX],
-        duration_s: None,
-        frame_period_s: None,
-        speed_mm_s: None,
-        approach_mm: None,
-        arm_n_per_mm: None,
-        pitch_mm: Some([0.0, f32::MAX]),
-    };
-
-    /// The ranges of the presses, in the order of [`Extents`].
-    pub fn of_presses(&self) -> Extents {
-        [
-            self.duration_s,
-            self.frame_period_s,
-            self.speed_mm_s,
-            self.approach_mm,
-            self.arm_n_per_mm,
-        ]
-    }
-
-    /// The same range of frames with these ranges of the presses.
-    #[must_use]
-    pub fn with_presses(self, ranges: Extents) -> Self {
-        let [
-            duration_s,
-            frame_period_s,
-            speed_mm_s,
-            approach_mm,
-            arm_n_per_mm,
-        ] = ranges;
-        Self {
-            duration_s,
-            frame_period_s,
-            speed_mm_s,
-            approach_mm,
-            arm_n_per_mm,
-            ..self
-        }
-    }
-
-    /// Whether a press may be one of the range of the presses. An unknown number may.
-    pub fn holds(&self, course: &TimeSeries) -> bool {
-        let pairs = self.of_presses().into_iter().zip(course.extents());
-        pairs.into_iter().all(|pair| match pair {
-            (Some([least, most]), Some([low, high])) => low <= most && least <= high,
-            _ => true,
-        })
-    }
 }
 
 /// The description of a model in its file: the `hrn.*` metadata.
@@ -114,7 +42,7 @@ pub struct Card {
     pub metrics: serde_json::Value,
     /// `hrn.validation`: the data of the validation, such as `simulated data only`.
     pub validation: String,
-    /// `hrn.range`: the forces, areas and presses in training.
+    /// `hrn.range`: the forces and areas in training.
     pub range: Range,
     /// `hrn.grid`: the array whose frames the model takes as they are. `None` for the model's own grid.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -52,54 +52,12 @@ pub struct TimeSeries {
     pub arm_n_per_mm: f32,
 }
 
-/// Five numbers of a press, each between the two of its pair: its duration in seconds, the time
-/// between two of its frames in seconds, the speed of the approach in mm/s, the approach at its
-/// furthest in mm, and the stiffness of the arm in N/mm. `None` where the number is unknown.
-pub type Extents = [Option<[f32; 2]>; 5];
-
-/// The speed of an approach is measured up to this share of the approach at its furthest. Beyond it
-/// the arm slows down, or already holds its position.
-const SPEED_SHARE: f32 = 0.9;
-
-/// The numbers of a press with these frames: the time of each since the press began, and the
-/// approach where it is known. `arm_n_per_mm` is 0 if the stiffness is unknown.
-pub fn extents(moments: &[(f32, Option<f32>)], arm_n_per_mm: f32) -> Extents {
-    let exactly = |value: f32| [value, value];
-    let last = moments.last().map(|&(time_s, _)| exactly(time_s));
-    let period = period_s(moments.iter().map(|moment| moment.0)).map(exactly);
-    let known = moments.iter().enumerate();
-    let known = known.filter_map(|(place, &(time_s, mm))| Some((place, time_s, mm?)));
-    let furthest = known.clone().map(|(.., mm)| mm).reduce(f32::max);
-    let reached = furthest
-        .filter(|&furthest| furthest > 0.0)
-        .and_then(|furthest| {
-            let mut known = known;
-            known.find(|&(_, time_s, mm)| time_s > 0.0 && mm >= SPEED_SHARE * furthest)
-        });
-    let speed = reached.map(|(place, time_s, mm)| {
-        // The arm may have stopped anywhere before the second frame, so it may have been faster.
-        let least = mm / time_s;
-        [least, if place > 1 { least } else { f32::INFINITY }]
-    });
-    let arm = (arm_n_per_mm > 0.0).then(|| exactly(arm_n_per_mm));
-    [last, period, speed, furthest.map(exactly), arm]
-}
-
 /// The median of the times between two frames.
 pub(super) fn period_s(times: impl Iterator<Item = f32> + Clone) -> Option<f32> {
     let next = times.clone().skip(1);
     let mut periods: Vec<f32> = times.zip(next).map(|(time, next)| next - time).collect();
     periods.sort_unstable_by(f32::total_cmp);
     periods.get(periods.len() / 2).copied()
-}
-
-impl TimeSeries {
-    /// The numbers that `hrn.range` may bound.
-    pub fn extents(&self) -> Extents {
-        let moment = |moment: &Sample| (moment.time_s, moment.approach_mm);
-        let moments: Vec<_> = self.moments.iter().map(moment).collect();
-        extents(&moments, self.arm_n_per_mm)
-    }
 }
 
 /// A press in the file: a list for each input, and each frame as [`sparse`] text.

@@ -381,13 +381,9 @@ fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
     let metrics = problems.keep(metadata.json("hrn.metrics", "JSON", |_| true));
     let format = format?;
     let is_of_frames = format == "1";
-    let range = "[least, greatest] of finite numbers, in format 1 those of `force_n` and `contact_area_taxels`, and \
-                 perhaps `pitch_mm`";
-    let range = problems.keep(metadata.json("hrn.range", range, |range: &Range| {
-        let of_presses = range.of_presses().into_iter().flatten();
-        let is_of_format = !is_of_frames || of_presses.clone().next().is_none();
-        is_of_format && is_range(range, of_presses)
-    }));
+    let range = "[least, greatest] of finite numbers for `force_n` and `contact_area_taxels`, and perhaps \
+                 `pitch_mm`";
+    let range = problems.keep(metadata.json("hrn.range", range, is_range));
     let grid = format!("[rows, columns], each 1 to {MOST_SIDE}, in a file of format 1");
     let grid = problems.keep(
         metadata.json_if_any("hrn.grid", &grid, |sides: &[usize; 2]| {
@@ -423,8 +419,8 @@ fn format(metadata: &Metadata<'_>) -> Result<String, ModelError> {
     }
 }
 
-fn is_range(range: &Range, of_presses: impl Iterator<Item = [f32; 2]>) -> bool {
-    let mut pairs = of_presses.chain([range.force_n]).chain(range.pitch_mm);
+fn is_range(range: &Range) -> bool {
+    let mut pairs = [range.force_n].into_iter().chain(range.pitch_mm);
     let [least, most] = range.contact_area_taxels;
     least <= most && pairs.all(|[low, high]| low.is_finite() && high.is_finite() && low <= high)
 }

@@ -129,10 +129,6 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             twice.retain(|entry| entry.key == "hrn.data");
             p.metadata_props.append(&mut twice);
         }),
-        ("in format 1 those of `force_n` and `contact_area", |p| {
-            let add = |range: &mut Value| range["duration_s"] = serde_json::json!([0.5, 2.0]);
-            edit(p, "hrn.range", add);
-        }),
         ("`hrn.pitch_mm`: found \"-1\", expected", |p| {
             set(p, "hrn.pitch_mm", "-1");
         }),
@@ -363,45 +359,4 @@ fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
     let hrn = Hrn::load(&course_model(8, &more)).unwrap();
     let verdict = hrn.judge_course(&course(8, true)).unwrap();
     assert_eq!(verdict.levels, Some(vec![2, 3]));
-}
-
-#[test]
-fn a_press_is_held_by_the_range_that_it_lies_in() {
-    let known = course(4, true);
-    // Where nothing is known of the arm, its ranges exclude nothing.
-    let mut unknown = course(4, false);
-    unknown.arm_n_per_mm = 0.0;
-    let numbers = [
-        ("duration_s", 0.6),
-        ("frame_period_s", 0.2),
-        ("speed_mm_s", 5.0),
-        ("approach_mm", 3.0),
-        ("arm_n_per_mm", 7.5),
-    ];
-    for (place, (key, number)) in numbers.into_iter().enumerate() {
-        let [low, high] = known.extents()[place].unwrap();
-        assert!((low / number - 1.0).abs() < 1e-5 && low == high, "{key}");
-        for (range, is_held) in [([0.5, 1.5], true), ([1.1, 1.5], false), ([0.5, 0.9], false)] {
-            let mut of = json!({"force_n": [0, 100], "contact_area_taxels": [1, 784]});
-            of[key] = json!(range.map(|part: f32| part * number));
-            let range: Range = serde_json::from_value(of).unwrap();
-            assert_eq!(range.holds(&known), is_held, "{range:?}");
-            assert_eq!(range.holds(&unknown), is_held || place > 1, "{range:?}");
-        }
-    }
-}
-
-#[test]
-fn an_approach_that_ends_before_the_second_frame_may_have_been_faster() {
-    let speed = |approach: &[f32]| {
-        let mut course = course(approach.len(), true);
-        for (moment, &mm) in course.moments.iter_mut().zip(approach) {
-            moment.approach_mm = Some(mm);
-        }
-        course.extents()[2]
-    };
-    assert_eq!(speed(&[0.0, 1.0, 1.0]), Some([5.0, f32::INFINITY]));
-    // An arm that stands still, or is known at the first frame alone, has no speed.
-    assert_eq!(speed(&[0.0, 0.0]), None);
-    assert_eq!(speed(&[0.0]), None);
 }

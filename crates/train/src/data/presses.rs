@@ -85,15 +85,6 @@ impl Press {
     }
 }
 
-/// When the frames of a press came, and how far the arm was then.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Timed {
-    /// Seconds since the press began, and the approach where it is known.
-    pub moments: Vec<(f32, Option<f32>)>,
-    /// Stiffness of the arm. 0 if unknown.
-    pub arm_n_per_mm: f32,
-}
-
 /// A frame of the simulated sensor, on the model's grid.
 pub fn resampled(frame: &Frame) -> ModelFrame {
     Resampling::new(frame, Pitch::JX255N, PITCH_MM).apply(frame)
@@ -348,15 +339,6 @@ impl Presses {
         let frames: Vec<(f32, Vec<f32>)> = self.rows(press).map(own).collect();
         let moments = frames.iter().map(|(time_s, frame)| (*time_s, &frame[..]));
         parts::parts(&moments.collect::<Vec<_>>())
-    }
-
-    /// The same without the frames.
-    pub fn timed(&self, press: usize) -> Timed {
-        let moment = |row: usize| (self.time_s[row], self.approach_mm[row]);
-        Timed {
-            moments: self.rows(press).map(moment).collect(),
-            arm_n_per_mm: self.all[press].arm_n_per_mm,
-        }
     }
 
     /// The frames of a press from the one that began it, as many as a model takes.

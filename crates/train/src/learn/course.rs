@@ -8,7 +8,7 @@ use burn::tensor::{Device, Tensor};
 use self::lots::Lots;
 use super::learner::Learner;
 use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
-use crate::data::presses::{Presses, Timed};
+use crate::data::presses::Presses;
 use crate::net::bins::{self, BINS};
 use crate::net::course;
 use crate::net::graph::Graph;
@@ -16,7 +16,7 @@ use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, Moment};
-use hardnessd_core::verdict::{Borders, Extents, Knowledge, ModelError, Piece};
+use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Piece};
 use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
@@ -254,10 +254,6 @@ impl Learning for Course<'_> {
 
     fn outputs(&self) -> Outputs {
         self.outputs.clone()
-    }
-
-    fn ranges(&self, learnt: &[Timed]) -> Extents {
-        self.reports.ranges(learnt)
     }
 
     /// A network that met no references in training takes none.

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::file;
 use super::verdicts::{self, Given, reference, rigid};
-use crate::data::presses::{Presses, Timed};
+use crate::data::presses::Presses;
 use crate::data::source::{Kind, Source};
 use crate::judge::evaluated::Evaluated;
 use crate::learn::calibration::Calibration;
@@ -91,16 +91,12 @@ impl Learnt<'_> {
         let graph = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
         let best = self.train.iter().map(|&press| self.presses.frame(press));
-        let mut range = range(best);
         let (format, conformal) = match graph.inputs {
             Inputs::Frame | Inputs::Parts(_) => ("1", None),
             Inputs::Features | Inputs::References => {
                 if let Some(missing) = self.calibration.missing() {
                     metrics["not_promised"] = json!(missing);
                 }
-                let learnt = self.train.iter().map(|&press| self.presses.timed(press));
-                let learnt: Vec<Timed> = learnt.collect();
-                range = range.with_presses(self.learning.ranges(&learnt));
                 ("3", self.calibration.conformal())
             }
         };
@@ -115,7 +111,7 @@ impl Learnt<'_> {
             validation: validation(&self.presses.validated()).to_owned(),
             range: Range {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
-                ..range
+                ..range(best)
             },
             grid: match graph.inputs {
                 Inputs::Parts(array) => Some(array),
@@ -248,7 +244,6 @@ fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],
         pitch_mm: None,
-        ..Range::ANY
     };
     for frame in frames {
         let (force_n, area) = (

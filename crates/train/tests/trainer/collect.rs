@@ -195,8 +195,9 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     assert_eq!(of_press, (1, Some(7), Some(95.0)));
     assert_eq!((press.split, press.arm_n_per_mm), (Split::Test, 10.0));
     assert_eq!(press.best, 3);
-    let moments = presses.timed(0).moments.into_iter();
-    let approach: Vec<f32> = moments.map(|(_, mm)| mm.unwrap().round()).collect();
+    let moments = presses.course(0).moments.into_iter();
+    let approach = moments.map(|moment| moment.approach_mm.unwrap().round());
+    let approach: Vec<f32> = approach.collect();
     assert_eq!(approach, [0.0, 1.0, 2.0, 3.0, 4.0]);
     let force_n = f64::from(press.force_n.unwrap());
     assert!((presses.frame(0).force_n() - force_n).abs() < 0.01);

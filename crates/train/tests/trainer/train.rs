@@ -327,8 +327,9 @@ fn rare_settings_of_simulated_presses_are_those_of_a_file() {
     let presses: Presses = read_one(&at.join("d.npz")).unwrap();
     assert!((6..=8).contains(&presses.all.len()));
     for press in 0..presses.all.len() {
-        let times = presses.timed(press).moments;
-        let frame_s = times[1].0 - times[0].0;
+        let moments = presses.course(press).moments;
+        let times: Vec<f32> = moments.iter().map(|moment| moment.time_s).collect();
+        let frame_s = times[1] - times[0];
         assert!(
             times.len() == 48 || (frame_s - 0.05).abs() < 1e-4,
             "{times:?}"

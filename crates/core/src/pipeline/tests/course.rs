@@ -202,28 +202,6 @@ fn levels_that_it_cannot_tell_apart_are_a_rejection() {
 }
 
 #[test]
-fn a_press_unlike_those_of_training_is_noted() {
-    let (none, outside) = (&[][..], &[Note::OutsideTraining][..]);
-    // The press takes 0.8 s. The early verdict is on its first four frames.
-    for (longest_s, early, last) in [
-        (0.5, outside, outside),
-        (0.7, none, outside),
-        (1.0, none, none),
-    ] {
-        let range = json!({
-            "force_n": [0, 100],
-            "contact_area_taxels": [1, 784],
-            "duration_s": [0.1, longest_s],
-        });
-        let mut pipeline = tared(&[("hrn.range", range)], |_| {});
-        pipeline.judge.track.push(&positions(1000, 9000)).unwrap();
-        let found = judged(&mut pipeline, |_| Vec::new());
-        let notes: Vec<&[Note]> = found.iter().map(|verdict| &verdict.notes[..]).collect();
-        assert_eq!(notes, [early, last], "{longest_s}");
-    }
-}
-
-#[test]
 fn an_early_verdict_comes_once_and_only_if_it_is_sure_and_on_enough_force() {
     // The frames 5 to 8 have 7.2 to 28.8 N.
     for (early_confidence, min_force_n, expected) in [

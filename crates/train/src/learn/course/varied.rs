@@ -2,9 +2,7 @@
 //! trained on exact reports alone would trust every report.
 
 use super::Press;
-use crate::data::presses::Timed;
 use crate::settings::ArmReports;
-use hardnessd_core::verdict::{Extents, extents};
 use hardnessd_simulator::random::Stream;
 
 /// The least number of frames of a press that is judged before its end or seen by a slower sensor.
@@ -15,12 +13,6 @@ const MOST_FRAMES_A_STEP: usize = 8;
 /// a robot may hold for half a minute. Simulated creep has times of all magnitudes alike, so a press that is
 /// drawn out is as likely as another.
 const STRETCH: (f64, f64) = (0.5, 16.0);
-/// This share of the training presses lies below a range of [`ArmReports::ranges`], and the same
-/// share above. The longest of a hundred thousand presses says little about training.
-const TAIL: f64 = 0.001;
-/// A range is at least this much wider at both ends, relatively, so that rounding does not count.
-const MARGIN: f64 = 0.01;
-
 impl ArmReports {
     /// The press as a robot might report it.
     pub(super) fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
@@ -65,73 +57,6 @@ impl ArmReports {
         }
         press
     }
-}
-
-impl ArmReports {
-    /// The ranges of the training presses as training changes them: with the robot's errors, judged
-    /// before the end, as a slower sensor sees them, and stretched. Each change counts alone, because
-    /// hardly a press has two of them to their ends. Of each number, about one in a thousand presses
-    /// lies below the range and one in a thousand above.
-    pub fn ranges(&self, presses: &[Timed]) -> Extents {
-        // Of the first frames of a press.
-        let of = |press: &Timed, frames: usize| {
-            let frames = frames.min(press.moments.len());
-            extents(&press.moments[..frames], press.arm_n_per_mm)
-        };
-        let whole = ranges_of(presses.iter().map(|press| of(press, usize::MAX)));
-        let mut ranges = vec![whole];
-        if self.early > 0.0 {
-            ranges.push(ranges_of(
-                presses.iter().map(|press| of(press, LEAST_FRAMES)),
-            ));
-        }
-        if self.slower > 0.0 {
-            ranges.push(ranges_of(presses.iter().map(|press| {
-                let step = (press.moments.len() / LEAST_FRAMES).clamp(1, MOST_FRAMES_A_STEP);
-                let [_, period, ..] = of(press, usize::MAX);
-                let slower = period.map(|ends| ends.map(|period_s| period_s * step as f32));
-                [None, slower, None, None, None]
-            })));
-        }
-        if self.stretched > 0.0 {
-            for factor in [STRETCH.0 as f32, STRETCH.1 as f32] {
-                let longer = |ends: [f32; 2]| ends.map(|time_s| time_s * factor);
-                let slower = |ends: [f32; 2]| ends.map(|mm_s| mm_s / factor);
-                let [duration, period, speed, ..] = whole;
-                let times = [duration.map(longer), period.map(longer)];
-                ranges.push([times[0], times[1], speed.map(slower), None, None]);
-            }
-        }
-        let unknown_arm = self.unknown.max(self.unknown_arm);
-        let unknown = [0.0, 0.0, self.unknown, self.unknown, unknown_arm];
-        let errors = [0.0, 0.0, self.position, self.position, self.arm];
-        std::array::from_fn(|number| {
-            let ends = ranges.iter().filter_map(|range| range[number]);
-            let joined = ends.reduce(|one, other| [one[0].min(other[0]), one[1].max(other[1])]);
-            let [least, most] = joined.filter(|_| unknown[number] < 1.0)?;
-            let error = errors[number].max(MARGIN) as f32;
-            Some([least * (1.0 - error), (most * (1.0 + error)).min(f32::MAX)])
-        })
-    }
-}
-
-/// The range of each number: between the quantiles [`TAIL`] and 1 - [`TAIL`] of the presses for
-/// which it is known.
-fn ranges_of(presses: impl Iterator<Item = Extents>) -> Extents {
-    let all: Vec<Extents> = presses.collect();
-    std::array::from_fn(|number| {
-        let known = all.iter().filter_map(|press| press[number]);
-        let known = known.filter(|[low, _]| low.is_finite());
-        let (mut lows, mut highs): (Vec<f32>, Vec<f32>) =
-            known.map(|[low, high]| (low, high)).unzip();
-        lows.sort_unstable_by(f32::total_cmp);
-        highs.sort_unstable_by(f32::total_cmp);
-        let tail = (TAIL * lows.len() as f64) as usize;
-        // Where a press only bounds a number, the other presses tell its ends.
-        let least = *highs.get(tail)?;
-        let most = *lows.get(lows.len().checked_sub(1 + tail)?)?;
-        Some([least.min(most).max(0.0), most.max(0.0)])
-    })
 }
 
 impl Press {
@@ -278,77 +203,5 @@ mod tests {
         // A quarter of the presses end early. Of the others, three in ten have a slower sensor.
         assert!((410..540).contains(&share(|p| p.moments.len() < 10)));
         assert!(drawn.iter().all(|p| p.moments.len() >= 3));
-    }
-
-    /// A press at `speed_mm_s` of ten frames, with this time between them.
-    fn pressed(speed_mm_s: f32, period_s: f32) -> Timed {
-        let moment = |place: u8| {
-            let time_s = period_s * f32::from(place);
-            (time_s, Some(speed_mm_s * time_s))
-        };
-        Timed {
-            moments: (0..10).map(moment).collect(),
-            arm_n_per_mm: 10.0,
-        }
-    }
-
-    #[test]
-    fn ranges_are_those_of_the_presses_as_training_varies_them() {
-        let [way, arm] = [Some([3.6, 3.6]), Some([10.0; 2])];
-        let [duration, period, speed] = [Some([0.45, 0.9]), Some([0.05, 0.1]), Some([4.0, 8.0])];
-        let (longer, slow) = (Some([0.225, 14.4]), Some([0.25, 16.0]));
-        let (third, first) = (Some([0.05, 0.3]), [Some([0.1, 0.9]), Some([0.8, 3.6])]);
-        for (reports, expected) in [
-            (but(|_| ()), [duration, period, speed, way, arm]),
-            // The first three frames of the faster sensor.
-            (
-                but(|of| of.early = 0.1),
-                [first[0], period, speed, first[1], arm],
-            ),
-            // Every third frame of the slower one.
-            (
-                but(|of| of.slower = 0.1),
-                [duration, third, speed, way, arm],
-            ),
-            // Sixteen times the slower one's period, and not sixteen times three.
-            (
-                but(|of| (of.slower, of.stretched) = (0.1, 0.1)),
-                [longer, Some([0.025, 1.6]), slow, way, arm],
-            ),
-            (
-                but(|of| of.unknown = 1.0),
-                [duration, period, None, None, None],
-            ),
-            (
-                but(|of| of.unknown_arm = 1.0),
-                [duration, period, speed, way, None],
-            ),
-        ] {
-            let found = reports.ranges(&[pressed(4.0, 0.1), pressed(8.0, 0.05)]);
-            for (found, expected) in found.into_iter().zip(expected) {
-                let wider = expected.map(|[low, high]: [f32; 2]| [low * 0.99, high * 1.01]);
-                let near = |(a, b): (f32, f32)| (a / b - 1.0).abs() < 1e-4;
-                let is_near = match (found, wider) {
-                    (Some(a), Some(b)) => a.into_iter().zip(b).all(near),
-                    (found, wider) => found == wider,
-                };
-                assert!(is_near, "{reports:?}: {found:?}, expected {wider:?}");
-            }
-        }
-        let errors = but(|of| (of.position, of.arm) = (0.1, 0.3));
-        let [.., speed, _, arm] = errors.ranges(&[pressed(4.0, 0.1)]);
-        assert_eq!((speed, arm), (Some([3.6, 4.4]), Some([7.0, 13.0])));
-        assert_eq!(but(|_| ()).ranges(&[]), [None; 5]);
-    }
-
-    #[test]
-    fn one_press_of_many_is_no_range() {
-        let mut presses: Vec<Timed> = (0..2000).map(|_| pressed(5.0, 0.1)).collect();
-        presses[7] = pressed(5.0, 10.0);
-        let [duration, ..] = but(|_| ()).ranges(&presses);
-        assert!(duration.unwrap()[1] < 1.0, "{duration:?}");
-        // Of a thousand presses, one is more than the tail.
-        let [duration, ..] = but(|_| ()).ranges(&presses[..999]);
-        assert!(duration.unwrap()[1] > 90.0, "{duration:?}");
     }
 }
