@@ -31,6 +31,13 @@ fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
 }
 
+/// The same after the five frames of its first tare.
+fn ready(change: impl FnOnce(&mut Description)) -> Pipeline {
+    let mut pipeline = pipeline_of(change);
+    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    pipeline
+}
+
 fn judge_by(pipeline: &mut Pipeline, hrn: Arc<Hrn>) {
     pipeline.judge = Judge::new(Arc::clone(&pipeline.sensor), hrn);
 }
@@ -82,6 +89,16 @@ fn verdicts(events: Vec<Event>) -> Vec<Hardness> {
     events.into_iter().filter_map(verdict).collect()
 }
 
+/// A press of two frames on nine taxels, and its release.
+fn short_press() -> [RawFrame; 4] {
+    [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)]
+}
+
+/// The last verdict on frames with numbers from `first` on.
+fn last_verdict(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Hardness {
+    verdicts(feed(pipeline, first, frames)).pop().unwrap()
+}
+
 /// Pushes one frame a period, with numbers from `first` on.
 fn feed(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<Event> {
     let mut events = Vec::new();
@@ -95,18 +112,6 @@ fn feed(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<Event> 
 /// The same, with the events in words.
 fn play(pipeline: &mut Pipeline, first: u64, frames: &[RawFrame]) -> Vec<String> {
     words(&feed(pipeline, first, frames))
-}
-
-#[test]
-fn a_press_gives_begin_end_and_a_final_verdict() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    assert_eq!(pipeline.opened(at(0)), None, "still connecting");
-    assert_eq!(play(&mut pipeline, 1, &vec![raw(0, 0); 5]), ["Live"]);
-    let press = [raw(4, 10), raw(9, 20), raw(5, 30), raw(0, 0), raw(0, 0)];
-    assert_eq!(
-        play(&mut pipeline, 6, &press),
-        ["Begin 1", "End 1", "Final of 6"]
-    );
 }
 
 #[test]
@@ -157,8 +162,7 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
 
 #[test]
 fn a_press_that_timed_out_is_no_reason_against_a_tare() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     let drift = raw(784 - 400, 3);
     play(&mut pipeline, 5, &vec![drift.clone(); 160]);
     assert_eq!(pipeline.retare(), Ok(()));
@@ -217,8 +221,7 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
 
 #[test]
 fn silence_is_stale_after_three_periods_and_ends_no_press() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     play(&mut pipeline, 5, &vec![raw(5, 50); 1]);
     let deadline = pipeline.deadline().unwrap();
     assert_eq!(deadline, at(1000).mono + 3 * PERIOD);
@@ -263,8 +266,7 @@ fn how_long_a_sensor_may_be_silent_never_moves_however_slowly_it_sends() {
 
 #[test]
 fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     pipeline.judge.context = Some(serde_json::json!({"tag": "x"}));
     play(&mut pipeline, 5, &vec![raw(5, 50); 2]);
     let stopped = pipeline.take(Input::Shutdown, at(1400)).unwrap();
@@ -285,8 +287,7 @@ fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
 
 #[test]
 fn a_press_is_judged_by_the_model_that_it_began_with() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     let mut described = pipeline.sensor().description().clone();
     described.model.min_force_n = 900.0;
     let (sensor, hrn) = (Sensor::new(described).unwrap(), pipeline.hrn().clone());
@@ -295,8 +296,7 @@ fn a_press_is_judged_by_the_model_that_it_began_with() {
     play(&mut pipeline, 7, &vec![raw(0, 0); 2]);
     let mut next = pipeline.with_model(sensor, hrn).unwrap();
     assert_eq!(next.at_rest(), pipeline.at_rest());
-    let press = [raw(5, 50), raw(5, 50), raw(0, 0), raw(0, 0)];
-    let verdict = verdicts(feed(&mut next, 9, &press)).pop().unwrap();
+    let verdict = last_verdict(&mut next, 9, &short_press());
     let expected = (2, Some(Rejection::LowForce));
     assert_eq!((verdict.press, verdict.rejected), expected);
 }
@@ -431,35 +431,13 @@ fn a_frame_sent_in_pieces_has_the_time_of_its_last_byte() {
 }
 
 #[test]
-fn totals_balance_with_damage() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    let mut stream = vec![1, 2, 3];
-    let mut broken = bytes(&pipeline, &raw(1, 1));
-    broken[400] ^= 1;
-    stream.extend(broken);
-    stream.extend(bytes(&pipeline, &raw(0, 0)));
-    stream.extend([0xBB, 0xAA, 0x10]);
-    pipeline.push(&stream, at(0));
-    let status = pipeline.status(at(0));
-    assert_eq!(
-        (status.frames, status.frames_damaged, status.bytes_skipped),
-        (1, 1, 793)
-    );
-    let events = pipeline.end_of_recording(None);
-    assert_eq!(words(&events), ["Lost (end of recording)"]);
-    assert_eq!(pipeline.status(at(0)).bytes_skipped, 796);
-}
-
-#[test]
 fn verdicts_below_the_thresholds_are_rejected() {
     let check = |min_force_n: f64, min_confidence: f32, expected: Option<Rejection>| {
-        let mut pipeline = pipeline_of(|described| {
+        let mut pipeline = ready(|described| {
             described.model.min_force_n = min_force_n;
             described.model.min_confidence = min_confidence;
         });
-        play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-        let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
-        let verdict = verdicts(feed(&mut pipeline, 5, &press)).pop().unwrap();
+        let verdict = last_verdict(&mut pipeline, 5, &short_press());
         assert_eq!(verdict.rejected, expected);
         assert_eq!(verdict.level.is_some(), expected.is_none());
         assert_eq!(verdict.label.is_some(), expected.is_none());
@@ -479,7 +457,7 @@ fn verdicts_below_the_thresholds_are_rejected() {
 fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     let array = Array::JX255N;
     let check = |range: [f32; 2], place: usize, count: u16, expected: &[Note]| {
-        let mut pipeline = pipeline(Preset::Jx255n);
+        let mut pipeline = ready(|_| {});
         let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
         let mut entries = file.metadata_props.iter_mut();
         let entry = entries.find(|entry| entry.key == "hrn.range").unwrap();
@@ -487,7 +465,6 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         entry.value = range.to_string();
         let hrn = Hrn::load(&file.encode_to_vec()).unwrap();
         judge_by(&mut pipeline, Arc::new(hrn));
-        play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
         let mut held = RawFrame::default();
         // Three by three taxels in the middle.
         for row in 12..15 {
@@ -495,7 +472,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         }
         held.counts[place] = f32::from(count);
         let press = [held.clone(), held, raw(0, 0), raw(0, 0)];
-        let verdict = verdicts(feed(&mut pipeline, 5, &press)).pop().unwrap();
+        let verdict = last_verdict(&mut pipeline, 5, &press);
         assert_eq!(verdict.notes, expected, "{count} at {place}, {range:?}");
     };
     let (wide, middle) = ([0.0, 100.0], array.place(12, 12));
@@ -537,8 +514,7 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
 
 #[test]
 fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     // A model whose check was not tried gives no number.
     let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     let mut weights = file.graph.as_mut().unwrap().initializer.iter_mut();
@@ -546,8 +522,8 @@ fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
     bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
     let failing = Hrn::read(&file.encode_to_vec()).unwrap();
     judge_by(&mut pipeline, Arc::new(failing));
-    let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
-    assert_eq!(play(&mut pipeline, 5, &press), ["Begin 1", "End 1"]);
+    let events = play(&mut pipeline, 5, &short_press());
+    assert_eq!(events, ["Begin 1", "End 1"]);
     let told = pipeline.unjudged();
     let [failed] = &told[..] else {
         panic!("{told:?}");
@@ -584,12 +560,9 @@ fn the_rate_is_measured_over_the_last_frames() {
 
 #[test]
 fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
-    let press = [raw(9, 50), raw(9, 50), raw(0, 0), raw(0, 0)];
+    let mut pipeline = ready(|_| {});
     let judged = |pipeline: &mut Pipeline, first: u64| {
-        let last = verdicts(feed(pipeline, first, &press)).pop();
-        let object = last.unwrap().object;
+        let object = last_verdict(pipeline, first, &short_press()).object;
         object.map(|object| (object.name, object.presses))
     };
     assert_eq!(judged(&mut pipeline, 5), None, "no object is named");

@@ -99,8 +99,7 @@ fn bytes_that_are_not_read_are_counted_and_end_the_frame_before_them() {
 
 #[test]
 fn a_press_that_is_not_released_is_said_with_its_taxels() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    play(&mut pipeline, 0, &vec![raw(0, 0); 5]);
+    let mut pipeline = ready(|_| {});
     let mut stuck = RawFrame::default();
     stuck.counts[28..56].fill(255.0);
     let events = feed(&mut pipeline, 5, &vec![stuck; 160]);

@@ -16,7 +16,7 @@ fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipel
         described.model.early_confidence = 0.8;
         change(described);
     });
-    let hrn = Hrn::load(&course_model(8, more)).unwrap();
+    let hrn = Hrn::read(&course_model(8, more)).unwrap();
     judge_by(&mut pipeline, Arc::new(hrn));
     play(&mut pipeline, 1, &vec![raw(0, 0); 5]);
     pipeline
@@ -174,7 +174,7 @@ fn positions_that_say_nothing_of_the_press_are_no_course() {
         let mut pipeline = tared(&[], |_| {});
         let _ = pipeline.judge.track.push(&positions(1000, until_ms));
         let press = [first, raw(9, 80), raw(0, 0), raw(0, 0)];
-        let last = verdicts(feed(&mut pipeline, 6, &press)).pop().unwrap();
+        let last = last_verdict(&mut pipeline, 6, &press);
         (last.frame, last.course, given(&last))
     };
     let known = Some(ApproachSource::Positions);
@@ -250,7 +250,7 @@ fn a_long_press_is_thinned() {
         .map(|n| raw(9 + usize::from(n == 50), 60))
         .collect();
     let press = [&held[..], &vec![raw(0, 0); 2]].concat();
-    let last = verdicts(feed(&mut pipeline, 6, &press)).pop().unwrap();
+    let last = last_verdict(&mut pipeline, 6, &press);
     assert_eq!(last.frame, 55);
     let frames = given(&last)[1];
     assert!(frames == 7.0 || frames == 8.0, "{frames}");
@@ -325,7 +325,7 @@ fn a_press_without_a_verdict_is_remembered() {
     // The model fails on an arm of 10 N/mm. That of its checks is at most 6 N/mm.
     let bytes = encoded(8, &[], |proto| spoil(proto, "second", 7.0, "arm_n_per_mm"));
     let mut pipeline = tared(&[], |described| described.sensor.arm.speed_mm_s = Some(5.0));
-    judge_by(&mut pipeline, Arc::new(Hrn::load(&bytes).unwrap()));
+    judge_by(&mut pipeline, Arc::new(Hrn::read(&bytes).unwrap()));
     assert_eq!(judged(&mut pipeline, |_| Vec::new()), []);
     assert!(!pipeline.unjudged().is_empty());
     assert_ne!(pipeline.judge.kept.own, OwnPresses::default());
