@@ -182,17 +182,12 @@ def npz():
 
 
 def references():
-    members = {
-        "piece": numpy.array([1, 3], dtype=numpy.uint8),
-        "piece_mm": numpy.array([20, 0], dtype=numpy.float32),
-        "shore": numpy.array([[0, 0], [61, 70]], dtype=numpy.float32),
-        "arm_n_per_mm": numpy.array([12.5, 0], dtype=numpy.float32),
-        "press": numpy.array([0, 0, 1], dtype=numpy.uint32),
-        "time_s": numpy.array([0, 0.1, 0], dtype=numpy.float32),
-        "approach_mm": numpy.array([0, 0.5, 0], dtype=numpy.float32),
-        "known": numpy.array([1, 1, 0], dtype=numpy.uint8),
-        "frames": numpy.zeros((3, 28, 28), dtype=numpy.float32),
-    }
+    flat = {"time_s": [0, 0.1], "approach_mm": [0, 0.5], "arm_n_per_mm": 12.5, "frames": ["", "AAAAAIA/"]}
+    flat["piece"] = {"flat": {"width_mm": 20.0}}
+    known = {"time_s": [0], "approach_mm": [None], "arm_n_per_mm": 0, "frames": [""]}
+    known["piece"] = {"shore": {"range": [61, 70]}}
+    texts = [json.dumps(press).encode() for press in (flat, known)]
+    members = {str(number): numpy.frombuffer(text, dtype=numpy.uint8) for number, text in enumerate(texts)}
     for name, save in (("stored", numpy.savez), ("deflated", numpy.savez_compressed)):
         out = io.BytesIO()
         save(out, **members)

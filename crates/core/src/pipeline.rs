@@ -129,7 +129,7 @@ impl Pipeline {
 
     /// The outcome of the requested tare. The next call returns `None`.
     pub fn retared(&mut self) -> Option<Result<Tared, RetareError>> {
-        let outcome = self.tare.ended()?;
+        let outcome = self.tare.outcome()?;
         let sensor = self.sensor.name().to_owned();
         Some(outcome.map(|[old, new]| Tared { sensor, old, new }))
     }

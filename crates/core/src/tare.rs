@@ -155,7 +155,7 @@ pub struct Tare {
     baseline: Vec<f32>,
     taking: Option<Taking>,
     /// The outcome of the requested tare, until it is fetched.
-    ended: Option<Result<[Offsets; 2], RetareError>>,
+    outcome: Option<Result<[Offsets; 2], RetareError>>,
     contact: Contact,
     array: Array,
     /// The places of live taxels.
@@ -226,7 +226,7 @@ impl Tare {
             settings: settings.clone(),
             baseline: vec![0.0; array.taxels()],
             taking: None,
-            ended: None,
+            outcome: None,
             contact,
             array,
             dead: dead.into_iter().map(neighbours).collect(),
@@ -288,7 +288,7 @@ impl Tare {
         if self.settings.tare_frames == 0 {
             return Err(RetareError::NoFrames);
         }
-        self.ended = None;
+        self.outcome = None;
         self.begin(Aim::Request);
         Ok(())
     }
@@ -297,13 +297,13 @@ impl Tare {
     pub fn give_up(&mut self, reason: RetareError) {
         if self.aim() == Some(Aim::Request) {
             self.taking = None;
-            self.ended = Some(Err(reason));
+            self.outcome = Some(Err(reason));
         }
     }
 
     /// The outcome of the requested tare: the offsets before it and after it. The next call returns `None`.
-    pub fn ended(&mut self) -> Option<Result<[Offsets; 2], RetareError>> {
-        self.ended.take()
+    pub fn outcome(&mut self) -> Option<Result<[Offsets; 2], RetareError>> {
+        self.outcome.take()
     }
 
     /// The baseline in force.
@@ -403,12 +403,12 @@ impl Tare {
                     again.add(raw);
                 }
             }
-            (Aim::Request, Some(_)) => self.ended = Some(Err(RetareError::Touched)),
+            (Aim::Request, Some(_)) => self.outcome = Some(Err(RetareError::Touched)),
             (Aim::First { .. }, None) => self.baseline = mean,
             (Aim::Request, None) => {
                 let old = self.offsets();
                 self.baseline = mean;
-                self.ended = Some(Ok([old, self.offsets()]));
+                self.outcome = Some(Ok([old, self.offsets()]));
             }
         }
     }

@@ -233,7 +233,7 @@ fn the_offsets_are_those_of_live_taxels_and_no_tare_is_taken_of_no_frames() {
     settings.tare_frames = 2;
     let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
     (0..2).for_each(|_| tare.observe(&raw(&[(0, 9), (1, 900)])));
-    assert_eq!(tare.ended(), None, "nobody asked for the first");
+    assert_eq!(tare.outcome(), None, "nobody asked for the first");
     let offsets = tare.offsets();
     assert_eq!((offsets.least_counts, offsets.most_counts), (2.0, 9.0));
     assert!((offsets.mean_counts - (2.0 * 782.0 + 9.0) / 783.0).abs() < 1e-4);
