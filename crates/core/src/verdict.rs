@@ -41,7 +41,6 @@ pub use self::references::{Knowledge, MOST_REFERENCES, PIECE, Piece, ReferencePr
 pub use self::settings::{BuiltIn, Settings};
 pub use self::shore::{Borders, Distribution, Level, Shore};
 pub use self::tried::Tried;
-use crate::frame::Array;
 
 /// The default model, built into the binary; `models/course.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
@@ -56,12 +55,12 @@ pub const BUILT_IN_HRN: &[u8] = include_bytes!("../../../models/hrn.onnx");
 /// The card of a model has the labels of its levels.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn, TAXELS};
 ///
-/// let hrn = Hrn::load(BUILT_IN)?;
-/// let mut frame = ModelFrame::default();
-/// frame.newtons[400..404].fill(2.0);
-/// let verdict = hrn.judge(&frame)?;
+/// let hrn = Hrn::load(BUILT_IN_HRN)?;
+/// let mut newtons = [0.0; TAXELS];
+/// newtons[400..404].fill(2.0);
+/// let verdict = hrn.judge_taxels(&newtons)?;
 /// let level = &hrn.card().levels[usize::from(verdict.level) - 1];
 /// println!("{} ({:.0} %)", level.label, 100.0 * verdict.confidence);
 /// assert_eq!(level.level, verdict.level);
@@ -114,7 +113,7 @@ impl Hrn {
     /// # Errors
     ///
     /// Returns a [`ModelError`] with all that breaks the format, or an
-    /// error as [`Hrn::judge`] if a check frame cannot be judged.
+    /// error as [`Hrn::judge_taxels`] if a check frame cannot be judged.
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
         let hrn = Self::read(bytes)?;
         hrn.reproduce_check()?;
@@ -228,32 +227,16 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`]. One of them is that the model takes another number of taxels.
+    /// Returns an error if an output is NaN or infinite, the inference library fails, or the model takes
+    /// another number of taxels.
     pub fn judge_taxels(&self, newtons: &[f32]) -> Result<Verdict, ModelError> {
         let input = self.file.inputs[0];
-        // As [`ModelFrame::pressed`].
+        // No frame is below 0, as [`ModelFrame::pressed`].
         let least = if input == Input::Frame { 0.0 } else { f32::MIN };
         let newtons: Vec<f32> = newtons.iter().map(|newtons| newtons.max(least)).collect();
         let tensor = Tensor::from_shape(&input.shape(self.file.lengths), &newtons);
         let tensor = tensor.map_err(ModelError::of_judgement)?;
         self.verdict(&self.run(tvec!(tensor.into()))?, Knowledge::None)
-    }
-
-    /// Judges one frame on the model's grid, as a press with one frame and an unknown approach.
-    ///
-    /// # Errors
-    ///
-    /// Returns an error if an output is NaN or infinite, the inference library fails, or the model takes
-    /// frames of another array.
-    pub fn judge(&self, frame: &ModelFrame) -> Result<Verdict, ModelError> {
-        self.judge_course(&TimeSeries {
-            moments: vec![Sample {
-                time_s: 0.0,
-                approach_mm: None,
-                frame: *frame,
-            }],
-            arm_n_per_mm: 0.0,
-        })
     }
 
     /// The most references that the model takes. Some models take none.
@@ -266,7 +249,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`], and one if there are more presses than the model takes.
+    /// Returns the errors of [`Self::judge_taxels`], and one if there are more presses than the model takes.
     ///
     /// # Panics
     ///
@@ -330,11 +313,12 @@ impl Hrn {
         &self.references
     }
 
-    /// Judges the course of a press. A model of format 1 judges its last frame.
+    /// Judges the course of a press.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`], and one if there are more frames than the model takes.
+    /// Returns the errors of [`Self::judge_taxels`], and one if there are more frames than the model takes, or
+    /// it takes no courses.
     ///
     /// # Panics
     ///
@@ -352,7 +336,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`].
+    /// Returns the errors of [`Self::judge_taxels`].
     ///
     /// # Panics
     ///
@@ -362,7 +346,6 @@ impl Hrn {
         course: &TimeSeries,
         references: &References,
     ) -> Result<Verdict, ModelError> {
-        self.file.card.check_array(Array::JX255N)?;
         let outputs = self.run_course(&Query {
             course,
             piece: None,
@@ -375,7 +358,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Self::judge`].
+    /// Returns the errors of [`Self::judge_taxels`].
     pub fn judge_check(&self, index: usize) -> Result<Verdict, ModelError> {
         match &*self.file.checks {
             Checks::Frames(check) => self.judge_taxels(&check.frames[index]),
@@ -396,9 +379,12 @@ impl Hrn {
             self.file.lengths.frames,
             "frames of a press",
         )?;
-        let tensor = |input: &Input| Ok(input.tensor(query, self.file.lengths)?.into());
-        let inputs: TractResult<TVec<TValue>> = self.file.inputs.iter().map(tensor).collect();
-        self.run(inputs.map_err(ModelError::of_judgement)?)
+        let mut inputs = TVec::new();
+        for input in &self.file.inputs {
+            let tensor = input.tensor(query, self.file.lengths);
+            inputs.push(tensor.map_err(ModelError::of_judgement)?.into());
+        }
+        self.run(inputs)
     }
 
     fn run(&self, inputs: TVec<TValue>) -> Result<TVec<TValue>, ModelError> {

@@ -198,8 +198,8 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
 /// The presses that are no pieces of one. Where the contact is light, it is lost and felt again.
 fn whole(presses: &Presses, places: &[usize]) -> Vec<usize> {
     let seconds = |place: &usize| {
-        let moments = presses.timed(*place).moments;
-        moments.last().map_or(0.0, |(time_s, _)| *time_s)
+        let moments = presses.course(*place).moments;
+        moments.last().map_or(0.0, |moment| moment.time_s)
     };
     let objects = presses.by_object(places).into_values();
     let whole = objects.flat_map(|mut own| {

@@ -94,7 +94,7 @@ impl OwnPresses {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Hrn::judge`].
+    /// Returns the errors of [`Hrn::judge_taxels`].
     pub fn references_of(
         hrn: &Hrn,
         courses: &[TimeSeries],

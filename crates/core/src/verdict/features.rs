@@ -130,11 +130,6 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
     ]
 }
 
-/// The number of a frame's taxels in contact, from its features.
-pub fn area(frame: &FrameFeatures) -> f32 {
-    frame[AREA].exp_m1()
-}
-
 /// The features of a frame of which only the area in taxels and the force are known.
 #[cfg(any(test, feature = "test-support"))]
 pub fn frame_of(area: f32, force_n: f32) -> FrameFeatures {

@@ -5,11 +5,12 @@
 
 use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
+use tract_onnx::tract_core::internal::bail;
 
 use super::course::{Sample, TimeSeries};
 use super::features::FEATURES;
 use super::grid::{COLS, ROWS};
-use super::parts::{self, PARTS};
+use super::parts::PARTS;
 use super::references::{PIECE, Piece, References};
 use crate::frame::Array;
 use crate::wording;
@@ -90,14 +91,9 @@ impl Input {
         let pressed = |moment: &Sample| -> Vec<f32> { moment.frame.pressed().collect() };
         let each =
             |value: fn(&Sample) -> f32| -> Vec<f32> { course.moments.iter().map(value).collect() };
-        let moments = course.moments.iter();
         let mut values = match self {
-            Self::Frame => moments.last().map_or_else(Vec::new, pressed),
-            Self::Parts => {
-                let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
-                parts::parts(&moments.collect::<Vec<_>>())
-            }
-            Self::Frames => moments.flat_map(pressed).collect(),
+            Self::Frame | Self::Parts => bail!("the model takes no courses"),
+            Self::Frames => course.moments.iter().flat_map(pressed).collect(),
             Self::TimeS => each(|moment| moment.time_s),
             Self::ApproachMm => each(|moment| moment.approach_mm.unwrap_or(0.0)),
             Self::Known => each(|moment| f32::from(u8::from(moment.approach_mm.is_some()))),

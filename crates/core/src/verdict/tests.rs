@@ -4,7 +4,8 @@ use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
-use crate::tests::course_model::{course_model, encoded, given};
+use crate::frame::Array;
+use crate::tests::course_model::{course_model, encoded};
 use crate::tests::graph::{indices, int, node, value};
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
@@ -333,21 +334,16 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
 }
 
 #[test]
-fn a_frame_alone_is_a_press_of_which_nothing_else_is_known() {
+fn a_model_takes_courses_or_frames() {
     for most in [3, 48] {
         let hrn = Hrn::read(&course_model(most, &[])).unwrap();
         assert_eq!(hrn.format(), Format::Course { most_frames: most });
     }
-    let hrn = Hrn::read(&course_model(8, &[])).unwrap();
-    let frame = course(1, false).moments[0].frame;
-    let verdict = hrn.judge(&frame).unwrap();
-    assert_eq!(given(&verdict.probabilities), [0.0, 1.0, 0.0]);
-    // A model of frames judges the last frame of a course.
     let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
-    let course = course(4, true);
-    let last = hrn.judge(&course.moments[3].frame).unwrap();
-    assert_eq!(hrn.judge_course(&course).unwrap(), last);
-    assert!(last.shore.is_some() && last.levels.is_none(), "{last:?}");
+    let error = hrn.judge_course(&course(4, true)).unwrap_err().to_string();
+    assert!(error.contains("the model takes no courses"), "{error}");
+    let verdict = hrn.judge_check(0).unwrap();
+    assert!(verdict.shore.is_some() && verdict.levels.is_none());
 }
 
 #[test]

@@ -37,7 +37,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Hrn::judge`].
+    /// Returns the errors of [`Hrn::judge_taxels`].
     ///
     /// # Panics
     ///

@@ -164,7 +164,10 @@ pub fn of(
             press.level
         );
         let verdict = match hrn.format() {
-            Format::Frame => hrn.judge(&presses.frame(place))?,
+            Format::Frame => {
+                hrn.card().check_array(Array::JX255N)?;
+                hrn.judge_taxels(&presses.frame(place).newtons)?
+            }
             Format::Parts => {
                 let grid = presses.grid().unwrap_or(Array::JX255N);
                 hrn.card().check_array(grid)?;

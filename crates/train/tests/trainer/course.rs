@@ -54,8 +54,7 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     assert_eq!(hrn.card().metrics["not_promised"], Value::Null);
     let presses = read_one(&at.join("d.npz")).unwrap();
     let mut course = presses.course(0);
-    let inspected = succeed_in(at, "inspect whole/hrn.onnx");
-    assert!(inspected.contains("\"speed_mm_s\":["), "{inspected}");
+    succeed_in(at, "inspect whole/hrn.onnx");
     let known = hrn.judge_course(&course).unwrap();
     assert!(known.shore.is_some() && known.levels.is_some());
     course
