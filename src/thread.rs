@@ -24,10 +24,14 @@ impl Coded for NoThread {
     }
 }
 
-impl From<NoThread> for io::Error {
-    fn from(error: NoThread) -> Self {
-        Self::other(error)
-    }
+/// Starts a thread that does `work`, and ends with the process.
+///
+/// # Errors
+///
+/// Fails if the system has no thread to spare.
+pub fn start(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), NoThread> {
+    let thread = thread::Builder::new().name(name.to_owned());
+    Ok(thread.spawn(work).map(drop)?)
 }
 
 /// Starts a thread that does `work`. Its result comes from the receiver. Dropping the receiver does not
@@ -41,12 +45,10 @@ pub fn spawn_thread<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<oneshot::Receiver<T>, NoThread> {
     let (done, result) = oneshot::channel();
-    thread::Builder::new()
-        .name(name.to_owned())
-        .spawn(move || {
-            // Perhaps nobody waits for the result any more.
-            let _ = done.send(work());
-        })?;
+    start(name, move || {
+        // Perhaps nobody waits for the result any more.
+        let _ = done.send(work());
+    })?;
     Ok(result)
 }
 
@@ -54,7 +56,7 @@ pub fn spawn_thread<T: Send + 'static>(
 /// after it.
 pub fn finish(patience: Duration) {
     let (free, waiting) = mpsc::channel();
-    let taken = thread::Builder::new().spawn(move || {
+    let taken = start("finish", move || {
         mem::forget(io::stdout().lock());
         // Perhaps nobody waits any more.
         let _ = free.send(());

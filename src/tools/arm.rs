@@ -127,10 +127,10 @@ impl Arm {
         let moved = Arc::new(Mutex::new(Moved { leg, rig }));
         let [controlled, seen] = [&moved, &moved].map(Arc::clone);
         let (frames, played) = mpsc::channel(1);
-        let started = thread::Builder::new()
-            .spawn(move || simulate(&moved, frame_rate_hz, start, &frames))
-            .and_then(|_| thread::Builder::new().spawn(move || serve(&listener, &controlled)));
-        started.of(&what, IO)?;
+        crate::thread::start("arm", move || {
+            simulate(&moved, frame_rate_hz, start, &frames);
+        })?;
+        crate::thread::start("controller", move || serve(&listener, &controlled))?;
         Ok(Self {
             position: Box::new(move |at| Some(Moved::of(&seen).leg.mm(at))),
             frames: played,

@@ -14,7 +14,7 @@ use tokio::time::Instant;
 use super::faults::{Faults, Line};
 use super::pty::Pty;
 use crate::daemon::baud::BITS_A_BYTE;
-use crate::thread::NoThread;
+use crate::thread::{NoThread, start};
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::Layout;
 use hardnessd_simulator::{Approach, Sequence, SequenceSettings};
@@ -159,13 +159,11 @@ pub(crate) struct Played {
 /// Fails if the system has no thread to compute them on.
 pub(crate) fn sequence(settings: SequenceSettings) -> Result<mpsc::Receiver<Played>, NoThread> {
     let (frames, played) = mpsc::channel(AHEAD);
-    std::thread::Builder::new().spawn(move || {
-        let mut sequence = Sequence::new(settings).peekable();
-        for number in 0.. {
-            let Some(frame) = sequence.next() else {
-                return;
-            };
-            let approach = sequence.peek().unwrap_or(&frame).approach;
+    start("presses", move || {
+        let mut sequence = (0..).zip(Sequence::new(settings)).peekable();
+        while let Some((number, frame)) = sequence.next() {
+            let next = sequence.peek().map(|(_, next)| next);
+            let approach = next.unwrap_or(&frame).approach;
             let frame = Played {
                 number,
                 raw: frame.raw,

@@ -35,7 +35,7 @@ pub(crate) type Position = Box<dyn Fn(Instant) -> Option<f64> + Send>;
 ///
 /// Fails if the system has no thread to spare.
 pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread> {
-    thread::Builder::new().spawn(move || {
+    crate::thread::start("robot", move || {
         let mut complained = false;
         loop {
             let Err(failure) = send(&socket, &position);
@@ -46,8 +46,7 @@ pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread>
             }
             thread::sleep(RETRY);
         }
-    })?;
-    Ok(())
+    })
 }
 
 /// Sends positions to one daemon until the daemon ends or refuses them.

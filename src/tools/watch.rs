@@ -34,7 +34,7 @@ use super::connect::{self, Address, Connection, Source};
 use super::control;
 use super::exit::{Fail, Failure};
 use crate::daemon::now;
-use crate::thread::spawn_thread;
+use crate::thread::{spawn_thread, start};
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
@@ -151,19 +151,13 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
                     daemon_at = Some(address);
                 }
                 Input::Event(event) => view.take(event, now()),
-                Input::Absence(reason) => view.lose(reason),
+                Input::Absence(reason) => view.absence = Some(reason),
                 Input::Said(outcome) => view.said = Some(outcome),
                 Input::End => return Ok(()),
             }
         }
     }
     Ok(())
-}
-
-/// Starts a thread that ends with the process.
-fn start(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), Failure> {
-    let started = thread::Builder::new().name(name.to_owned()).spawn(work);
-    started.map(drop).of("thread", IO)
 }
 
 /// Sends keys as they are pressed, until the input ends.

@@ -17,7 +17,7 @@ use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
-use crate::thread::NoThread;
+use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label};
@@ -35,14 +35,13 @@ impl User<'_> {
         shutdown: Pin<&'a mut dyn Future<Output = ()>>,
     ) -> Result<User<'a>, Failure> {
         let (sender, lines) = mpsc::channel(1);
-        let started = std::thread::Builder::new().spawn(move || {
+        start("answers", move || {
             for line in io::stdin().lines().map_while(Result::ok) {
                 if sender.blocking_send(line.trim().to_owned()).is_err() {
                     return;
                 }
             }
-        });
-        started.map_err(NoThread)?;
+        })?;
         Ok(User { lines, shutdown })
     }
 
@@ -344,15 +343,5 @@ mod tests {
                 found.map(|(shore, level)| (shore.is_some(), level.map_or(0, |level| level.level)));
             assert_eq!(found, expected, "{answer}");
         }
-    }
-
-    #[test]
-    fn a_session_goes_on_with_the_numbers_of_the_one_before() {
-        let directory = tempfile::tempdir().unwrap();
-        assert_eq!(next_number(directory.path()).unwrap(), 1);
-        for name in ["007-foam.mcap", "002-wood.mcap", "notes.txt"] {
-            fs::write(directory.path().join(name), "").unwrap();
-        }
-        assert_eq!(next_number(directory.path()).unwrap(), 8);
     }
 }

@@ -157,7 +157,7 @@ fn what_is_not_live_is_not_shown_as_present() {
         (view, word.to_owned())
     };
     let mut gone = pressed_sensor();
-    gone.lose("it closed the connection".to_owned());
+    gone.absence = Some("it closed the connection".to_owned());
     let cases = [
         lost("stale", "STALE"),
         lost("lost", "LOST"),

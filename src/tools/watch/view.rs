@@ -28,7 +28,7 @@ const VERDICTS: usize = 100;
 const ENTRY_CHARS: usize = 60;
 
 /// Everything that `watch` shows.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct View {
     /// The `hello` of the last connection. Null before the first one.
     pub(super) hello: Value,
@@ -42,7 +42,7 @@ pub(super) struct View {
     /// The outcome of the last command, until the next key.
     pub(super) said: Option<String>,
     /// Why there is no daemon. `None` while there is one.
-    absence: Option<String>,
+    pub(super) absence: Option<String>,
     /// The moment of the daemon's last line.
     last_line: Duration,
     /// Whether the daemon is on another machine, whose clock may be wrong.
@@ -115,16 +115,8 @@ impl View {
     /// A view that knows nothing yet.
     pub(super) fn new() -> Self {
         Self {
-            hello: Value::Null,
-            labels: Vec::new(),
-            sensors: Vec::new(),
-            chosen: 0,
-            entry: None,
-            said: None,
             absence: Some("connecting".to_owned()),
-            last_line: Duration::ZERO,
-            is_remote: false,
-            behind: None,
+            ..Self::default()
         }
     }
 
@@ -164,11 +156,6 @@ impl View {
         let past = past - self.behind.unwrap_or_default();
         now.mono
             .saturating_sub(Duration::try_from(past).unwrap_or_default())
-    }
-
-    /// Takes in why there is no daemon.
-    pub(super) fn lose(&mut self, reason: String) {
-        self.absence = Some(reason);
     }
 
     /// Takes in a key. The caller must carry out the order.
