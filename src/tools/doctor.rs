@@ -11,7 +11,7 @@ use std::path::Path;
 
 use clap::Args as ClapArgs;
 
-use self::checks::{User, entry, examine, field, in_the_way, ports, refused, unreachable};
+use self::checks::{access, entry, examine, field, in_the_way, ports, refused, unreachable};
 use super::absolute;
 use super::exit::Failure;
 use hardnessd_core::exit::FAILED;
@@ -38,8 +38,7 @@ pub struct Args {
 pub(super) fn obstacle(port: &Port) -> Option<String> {
     let root = Path::new("/");
     let port = absolute(port.device()?);
-    let user = User::of_this_process(root);
-    refused(root, &port).or_else(|| in_the_way(root, &port, &user).into_iter().next())
+    refused(root, &port).or_else(|| in_the_way(root, &port, access).into_iter().next())
 }
 
 /// The name of a group.
@@ -55,7 +54,6 @@ pub(super) fn group(gid: u32) -> Option<String> {
 /// Fails if there is a fault, or stdout cannot be written to.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let root = Path::new("/");
-    let user = User::of_this_process(root);
     let ports = match &args.port {
         Some(port) => vec![port.clone()],
         None => ports(root).into_iter().map(Port::Device).collect(),
@@ -71,7 +69,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let (port, faults) = match port.device().map(absolute) {
             Some(path) => {
                 let refused = refused(root, &path).map(|fault| vec![fault]);
-                let faults = refused.unwrap_or_else(|| examine(root, &path, &user));
+                let faults = refused.unwrap_or_else(|| examine(root, &path, access));
                 (Port::Device(path), faults)
             }
             None => {

@@ -7,31 +7,17 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{Access, AtFlags, CWD, accessat};
+use rustix::fs::{AtFlags, CWD, accessat};
 
 use crate::daemon::serial;
 use crate::holders::{holders, processes, under};
 use hardnessd_core::port::Port;
 
-/// The user who wants to use the port.
-#[derive(Debug, Clone)]
-pub(super) struct User {
-    pub(super) name: String,
-    /// Asks the kernel whether this user may read and write. The kernel also knows access lists and
-    /// containers.
-    pub(super) access: fn(&Path) -> io::Result<()>,
-}
+/// Asks the kernel whether this process may read and write. The kernel also knows access lists and containers.
+pub(super) type Access = fn(&Path) -> io::Result<()>;
 
-impl User {
-    pub(super) fn of_this_process(root: &Path) -> Self {
-        let uid = rustix::process::geteuid().as_raw();
-        let name = entry(root, "etc/passwd", uid).map_or(uid.to_string(), |line| field(&line, 0));
-        Self { name, access }
-    }
-}
-
-fn access(path: &Path) -> io::Result<()> {
-    let wanted = Access::READ_OK | Access::WRITE_OK;
+pub(super) fn access(path: &Path) -> io::Result<()> {
+    let wanted = rustix::fs::Access::READ_OK | rustix::fs::Access::WRITE_OK;
     Ok(accessat(CWD, path, wanted, AtFlags::EACCESS)?)
 }
 
@@ -71,8 +57,8 @@ fn is_no_tty(root: &Path, number: u64) -> bool {
 }
 
 /// All faults of `port`, an absolute path under `root`.
-pub(super) fn examine(root: &Path, port: &Path, user: &User) -> Vec<String> {
-    let mut faults = in_the_way(root, port, user);
+pub(super) fn examine(root: &Path, port: &Path, access: Access) -> Vec<String> {
+    let mut faults = in_the_way(root, port, access);
     if let Some(device) = device(root, port) {
         faults.extend(modem_manager(root, &device));
         faults.extend(latency(root, &device));
@@ -103,12 +89,12 @@ pub(super) fn unreachable(port: &Port) -> Option<String> {
     Some(format!("{}: {cure}", serial::reason(port, &error)))
 }
 
-/// The faults that keep `user` from opening `port`.
-pub(super) fn in_the_way(root: &Path, port: &Path, user: &User) -> Vec<String> {
+/// The faults that keep this process from opening `port`.
+pub(super) fn in_the_way(root: &Path, port: &Path, access: Access) -> Vec<String> {
     let Some(device) = device(root, port) else {
         return vec![format!("no such device: {}", others(&ports(root)))];
     };
-    let denied = denied(root, &device, user).into_iter();
+    let denied = denied(root, &device, access).into_iter();
     denied
         .chain(held(root, &device, std::process::id()))
         .collect()
@@ -131,12 +117,15 @@ fn others(ports: &[PathBuf]) -> String {
     format!("these are there: {}", keys.collect::<Vec<_>>().join(", "))
 }
 
-fn denied(root: &Path, device: &Path, user: &User) -> Option<String> {
+fn denied(root: &Path, device: &Path, access: Access) -> Option<String> {
     let path = under(root, device);
-    (user.access)(&path).err()?;
+    access(&path).err()?;
+    let uid = rustix::process::geteuid().as_raw();
+    let user = entry(root, "etc/passwd", uid);
+    let name = user.map_or(uid.to_string(), |line| field(&line, 0));
     let file = fs::metadata(path).ok()?;
     let (mode, gid) = (file.mode(), file.gid());
-    let (line, name, shown) = (entry(root, "etc/group", gid), &user.name, device.display());
+    let (line, shown) = (entry(root, "etc/group", gid), device.display());
     let group = line.as_ref().map_or(gid.to_string(), |line| field(line, 0));
     let is_listed = line.is_some_and(|line| field(&line, 3).split(',').any(|one| one == name));
     let cure = if gid == 0 || !allows(mode, 3) {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
-use super::checks::{User, examine, ports};
+use super::checks::{Access, examine, ports};
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
 
@@ -28,6 +28,8 @@ impl Machine {
         machine.put("sys/class/tty/ttyUSB0/device/latency_timer", "1\n");
         machine.put("proc/1/comm", "systemd\n");
         machine.put("etc/group", "root:x:0:\n");
+        let uid = rustix::process::geteuid().as_raw();
+        machine.put("etc/passwd", &format!("ada:x:{uid}:100::/:/bin/sh\n"));
         machine
     }
 
@@ -46,9 +48,8 @@ impl Machine {
         self.faults_under(port, |_| Ok(()))
     }
 
-    fn faults_under(&self, port: &str, access: fn(&Path) -> io::Result<()>) -> Vec<String> {
-        let name = "ada".to_owned();
-        examine(self.0.path(), Path::new(port), &User { name, access })
+    fn faults_under(&self, port: &str, access: Access) -> Vec<String> {
+        examine(self.0.path(), Path::new(port), access)
     }
 }
 
