@@ -1,36 +1,34 @@
-//! Finds the checksum of frames, or a plain sum of the cells that the decoder does not know.
+//! Finds the checksum of frames.
 //!
-//! In: frames with the bytes beside the cells, before them and after them. Out: what holds in nearly
-//! all of them. Each kind is tried at each place: a wrong one never holds.
+//! In: frames with the bytes beside the cells, before them and after them. Out: a checksum that holds in
+//! nearly all of them. Each kind is tried at each place: a wrong one never holds.
 
 use std::ops::Range;
 
-use hardnessd_core::wire::{Cell, Checksum};
+use hardnessd_core::wire::Checksum;
 
-use crate::columns::{Kind, number};
-use crate::numbers;
+use crate::columns::Kind;
 
-/// What holds for the bytes at `at`. Places are counted from the end of the cells.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// A checksum that each frame has. Places are counted from the end of the cells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Check {
-    pub(crate) at: Range<usize>,
-    pub(crate) what: What,
+    pub(crate) checksum: Checksum,
+    /// The place of its first byte.
+    pub(crate) at: usize,
+    /// The place from which on it covers everything: the beginning of a frame, or the end of its mark. It is
+    /// counted from the end of the cells of the frame before. `None` if it covers the cells.
+    pub(crate) begin: Option<usize>,
 }
 
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum What {
-    /// A checksum of everything from this place on, which is the beginning of a frame, or the end of its
-    /// mark. It is counted from the end of the cells of the frame before.
-    From(Checksum, usize),
-    /// A checksum of the cells.
-    Cells(Checksum),
-    /// A plain sum of the cells, which no key describes.
-    Sum,
+impl Check {
+    /// The places of its bytes.
+    pub(crate) fn places(&self) -> Range<usize> {
+        self.at..self.at + self.checksum.bytes()
+    }
 }
 
-/// The checksums, the most certain first. A plain sum of two bytes or four comes before the last two,
-/// because its lowest byte is a `sum8`.
-const LONG: [Checksum; 8] = [
+/// The checksums, the most certain first: the lowest byte of a `sum16` is a `sum8`.
+const CHECKSUMS: [Checksum; 14] = [
     Checksum::Crc32,
     Checksum::Crc32Be,
     Checksum::Crc16Modbus,
@@ -39,8 +37,8 @@ const LONG: [Checksum; 8] = [
     Checksum::Crc16CcittBe,
     Checksum::Crc16Xmodem,
     Checksum::Crc16XmodemBe,
-];
-const SHORT: [Checksum; 4] = [
+    Checksum::Sum16,
+    Checksum::Sum16Be,
     Checksum::Sum8,
     Checksum::Xor8,
     Checksum::Lrc8,
@@ -49,96 +47,47 @@ const SHORT: [Checksum; 4] = [
 
 /// The checksum that holds for `spans`: the cells of some frames, with the bytes beside them on both sides.
 /// The kinds are those of the bytes on one side.
-pub(crate) fn long(spans: &[&[u8]], beside: &[Kind]) -> Option<Check> {
-    checksum(spans, beside, &LONG)
-}
-
-/// The sum of the cells or the checksum of one byte that holds.
-pub(crate) fn short(spans: &[&[u8]], beside: &[Kind], cell: Cell) -> Option<Check> {
-    sum(spans, beside, cell).or_else(|| checksum(spans, beside, &SHORT))
-}
-
-fn checksum(spans: &[&[u8]], beside: &[Kind], checksums: &[Checksum]) -> Option<Check> {
+pub(crate) fn find(spans: &[&[u8]], beside: &[Kind]) -> Option<Check> {
     let length = beside.len();
-    for &checksum in checksums {
-        for at in (0..=length.checked_sub(checksum.bytes())?).rev() {
-            let at = at..at + checksum.bytes();
-            if beside[at.clone()]
-                .iter()
-                .all(|kind| kind.constant().is_some())
-            {
+    for checksum in CHECKSUMS {
+        for at in (0..(length + 1).saturating_sub(checksum.bytes())).rev() {
+            let check = |begin| Check {
+                checksum,
+                at,
+                begin,
+            };
+            let places = check(None).places();
+            let mut kinds = beside[places.clone()].iter();
+            if kinds.all(|kind| kind.constant().is_some()) {
                 continue;
             }
-            let holds = |from: usize, cells_only: bool| {
-                let sum = |span: &[u8]| {
+            let holds = |from: usize, end: usize| {
+                holds(spans, |span| {
                     let cells_end = span.len() - length;
-                    let end = cells_end + if cells_only { 0 } else { at.start };
-                    let found = &span[cells_end..][at.clone()];
-                    let sent = checksum.sent(&span[from..end]);
-                    let is_right = *found == sent[..checksum.bytes()];
-                    (u32::from_le_bytes(sent), is_right)
-                };
-                holds(spans, sum)
+                    let sent = checksum.sent(&span[from..cells_end + end]);
+                    let is_right = span[cells_end..][places.clone()] == sent[..checksum.bytes()];
+                    (sent, is_right)
+                })
             };
             // One of two bytes or more holds by chance nowhere. Others begin with the mark, or the cells.
-            let mut begins = (at.end..=length).filter(|&start| {
-                checksum.bytes() > 1 || start == length || beside[start].constant().is_some()
+            let mut begins = (places.end..=length).filter(|&begin| {
+                checksum.bytes() > 1 || begin == length || beside[begin].constant().is_some()
             });
-            let what = begins
-                .find(|&start| holds(start, false))
-                .map(|start| What::From(checksum, start))
-                .or_else(|| holds(length, true).then_some(What::Cells(checksum)));
-            if let Some(what) = what {
-                return Some(Check { at, what });
+            let begin = begins.find(|&begin| holds(begin, at));
+            if begin.is_some() || holds(length, 0) {
+                return Some(check(begin));
             }
         }
     }
     None
 }
 
-/// The plain sum of the cells in four bytes or two. Four, only if more than two change.
-fn sum(spans: &[&[u8]], beside: &[Kind], cell: Cell) -> Option<Check> {
-    let length = beside.len();
-    for bytes in [4, 2] {
-        for at in 0..=length.checked_sub(bytes)? {
-            let at = at..at + bytes;
-            let kinds = beside[at.clone()].iter();
-            if kinds.filter(|kind| kind.constant().is_none()).count() <= bytes / 2 {
-                continue;
-            }
-            for is_big_endian in [false, true] {
-                let sum = |span: &[u8]| {
-                    let cells_end = span.len() - length;
-                    let cells = numbers::numbers(cell, &span[length..cells_end]);
-                    let add = |sum: u32, cell: f32| sum.wrapping_add(cell as u32);
-                    let sum = cells.into_iter().fold(0, add);
-                    let found = number(&span[cells_end..][at.clone()], is_big_endian) as u32;
-                    (
-                        sum,
-                        found.wrapping_sub(sum) & (u32::MAX >> (32 - 8 * bytes)),
-                    )
-                };
-                // A sum may begin at another number than 0.
-                let begin = spans.get(spans.len() / 2).map(|span| sum(span).1);
-                let is_right = |span: &[u8]| (sum(span).0, Some(sum(span).1) == begin);
-                if holds(spans, is_right) {
-                    return Some(Check {
-                        at,
-                        what: What::Sum,
-                    });
-                }
-            }
-        }
-    }
-    None
-}
-
-/// Whether a sum holds in nearly all frames, and is not always the same.
-fn holds(spans: &[&[u8]], sum: impl Fn(&[u8]) -> (u32, bool)) -> bool {
+/// Whether a checksum holds in nearly all frames, and is not always the same.
+fn holds(spans: &[&[u8]], sent: impl Fn(&[u8]) -> ([u8; 4], bool)) -> bool {
     let mut wrong = 0;
     let mut values = Vec::new();
     for span in spans {
-        let (value, is_right) = sum(span);
+        let (value, is_right) = sent(span);
         wrong += usize::from(!is_right);
         if 10 * wrong > spans.len() {
             return false;

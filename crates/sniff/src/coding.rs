@@ -3,7 +3,7 @@
 //! In: raw bytes. Out: what was done to them, if that shows. It is asked before anything else, because
 //! frames seem to recur in such bytes too.
 
-use hardnessd_core::wire::{Framing, TELNET};
+use hardnessd_core::wire::{Framing, TELNET, is_telnet};
 
 /// Frames that end with a byte, which is escaped within them.
 struct Escaped {
@@ -58,7 +58,8 @@ const MOST_FRAMES: usize = 2000;
 
 /// What was done to `bytes`, if that shows.
 pub(crate) fn of(bytes: &[u8]) -> Option<Coding> {
-    if is_telnet(bytes) {
+    // One option may be chance.
+    if is_telnet(bytes) && is_telnet(&bytes[3..]) {
         return Some(Coding::Unreadable(TELNET));
     }
     if let Some(escaped) = ESCAPED.iter().find(|escaped| escaped.is_in(bytes)) {
@@ -153,14 +154,6 @@ fn is_cobs(bytes: &[u8]) -> bool {
 
 const ALL_ONES: u8 = 0xFF;
 
-/// Whether the bytes begin with the options of a telnet server.
-fn is_telnet(bytes: &[u8]) -> bool {
-    let options = bytes
-        .chunks(3)
-        .take_while(|option| matches!(option, [ALL_ONES, 0xFB..=0xFE, 0..=44]));
-    options.count() >= 2
-}
-
 /// Whether each FF is doubled.
 fn doubles_ff(bytes: &[u8]) -> bool {
     let runs = bytes
@@ -173,34 +166,31 @@ fn doubles_ff(bytes: &[u8]) -> bool {
 /// without a stop bit is read as 0.
 fn is_too_slow(bytes: &[u8]) -> bool {
     const STOP: u8 = 1 << 3;
-    let mut counts = [0_usize; 256];
-    bytes
-        .iter()
-        .for_each(|&byte| counts[usize::from(byte)] += 1);
-    let usual = (1..=u8::MAX).filter(|&value| counts[usize::from(value)] * 2000 >= bytes.len());
     let others = bytes.iter().filter(|&&byte| byte > 0);
-    usual.count() >= 6 && share(others, |byte| byte & STOP > 0) >= 0.98
+    usual(bytes).filter(|&value| value > 0).count() >= 6
+        && share(others, |byte| byte & STOP > 0) >= 0.98
 }
 
 /// Whether each bit is as long as several: then the first one is 0 like the start bit, and none is alone.
 fn is_too_fast(bytes: &[u8]) -> bool {
-    let mut counts = [0_usize; 256];
-    bytes
-        .iter()
-        .for_each(|&byte| counts[usize::from(byte)] += 1);
-    let values = (0..=u8::MAX).filter(|&value| counts[usize::from(value)] * 2000 >= bytes.len());
     // The bits of a byte in the order of the wire, after the start bit.
-    let is_in_runs = |value: u8| {
-        let bits = u16::from(value) << 1;
+    let is_in_runs = |value: &u8| {
+        let bits = u16::from(*value) << 1;
         let alone = (1..8).any(|at| {
             (bits >> at & 1) != (bits >> (at - 1) & 1) && (bits >> at & 1) != (bits >> (at + 1) & 1)
         });
         value & 1 == 0 && !alone
     };
-    let (mut all, mut in_runs) = (0, 0);
-    for value in values {
-        all += 1;
-        in_runs += usize::from(is_in_runs(value));
+    let all = usual(bytes).count();
+    all >= 3 && 5 * usual(bytes).filter(is_in_runs).count() >= 4 * all
+}
+
+/// The values that one byte in 2000 has, or more.
+fn usual(bytes: &[u8]) -> impl Iterator<Item = u8> {
+    let mut counts = [0_usize; 256];
+    for &byte in bytes {
+        counts[usize::from(byte)] += 1;
     }
-    all >= 3 && 5 * in_runs >= 4 * all
+    let least = bytes.len();
+    (0..=u8::MAX).filter(move |&value| counts[usize::from(value)] * 2000 >= least)
 }

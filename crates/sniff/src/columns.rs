@@ -25,12 +25,13 @@ pub(crate) struct Number {
     pub(crate) at: usize,
     /// Without high bytes that never change.
     pub(crate) bytes: usize,
-    /// Whether the high byte is first. `None` for one byte.
-    pub(crate) is_big_endian: Option<bool>,
+    is_big_endian: bool,
     /// By how much it grows in a frame.
     pub(crate) step: u64,
+    /// How many pairs of frames have about this step.
+    steady: usize,
     /// Whether it has begun again at 0. Then it has no higher bytes.
-    pub(crate) wraps: bool,
+    wraps: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -67,6 +68,9 @@ const MARK_BYTES: usize = 12;
 const QUIET: usize = 100;
 /// The longest number.
 const MOST_NUMBER_BYTES: usize = 8;
+/// Up to this length a number may have high bytes that are 0 all the time: of a u32 that counts from 0, two
+/// are until 65536 frames have come.
+const MOST_ZERO_EXTENDED: usize = 4;
 
 impl Kind {
     pub(crate) fn constant(self) -> Option<u8> {
@@ -127,11 +131,11 @@ impl Columns {
         for bytes in [1, 2, 4] {
             let places = 0..self.kinds.len();
             let both = places.flat_map(|at| [(at, false), (at, true)]);
-            let mut found: Vec<(Number, usize)> = both
+            let mut found: Vec<Number> = both
                 .filter_map(|(at, is_big_endian)| self.number(at, bytes, is_big_endian, pairs))
                 .collect();
-            found.sort_by_key(|(number, steady)| std::cmp::Reverse((number.bytes, *steady)));
-            for (number, _) in found {
+            found.sort_by_key(|number| std::cmp::Reverse((number.bytes, number.steady)));
+            for number in found {
                 let kinds = &mut self.kinds[number.at..number.at + number.bytes];
                 if !kinds.contains(&Kind::Number) {
                     kinds.fill(Kind::Number);
@@ -141,82 +145,45 @@ impl Columns {
         }
     }
 
-    /// The number at `at`, if these bytes are free and grow steadily, and how many pairs have about its
-    /// step.
+    /// The number at `at`, if these bytes are free and grow steadily.
     fn number(
         &self,
         at: usize,
         bytes: usize,
         is_big_endian: bool,
         pairs: &[Pair],
-    ) -> Option<(Number, usize)> {
+    ) -> Option<Number> {
         let kinds = self.kinds.get(at..at + bytes)?;
         // The lowest byte changes in any case.
         let lowest = if is_big_endian { bytes - 1 } else { 0 };
         if kinds.contains(&Kind::Number) || kinds[lowest] != Kind::Active {
             return None;
         }
-        let (step, mut steady) = steady_step(pairs, at, bytes, is_big_endian)?;
-        let mut number = Number {
-            at,
-            bytes,
-            is_big_endian: (bytes > 1).then_some(is_big_endian),
-            step,
-            wraps: false,
-        };
+        let mut number = Number::steady(at, bytes, is_big_endian, pairs)?;
         // A higher byte belongs to it if the longer number is as steady.
-        while number.bytes < MOST_NUMBER_BYTES {
-            let longer = [(false, number.at), (true, number.at.wrapping_sub(1))]
-                .into_iter()
-                .find_map(|(is_big_endian, at)| {
-                    let higher = if is_big_endian { at } else { at + number.bytes };
-                    if number.is_big_endian == Some(!is_big_endian)
-                        || self.kinds.get(higher) != Some(&Kind::Active)
-                    {
-                        return None;
-                    }
-                    let bytes = number.bytes + 1;
-                    let (step, more) = steady_step(pairs, at, bytes, is_big_endian)?;
-                    let longer = Number {
-                        at,
-                        bytes,
-                        is_big_endian: Some(is_big_endian),
-                        step,
-                        wraps: false,
-                    };
-                    (more >= steady).then_some((longer, more))
-                });
-            match longer {
-                Some(longer) => (number, steady) = longer,
-                None => break,
-            }
+        while number.bytes < MOST_NUMBER_BYTES
+            && self.kinds.get(number.higher()) == Some(&Kind::Active)
+            && let Some(longer) = number.longer(pairs)
+            && longer.steady >= number.steady
+        {
+            number = longer;
         }
-        let bytes = number.at..number.at + number.bytes;
-        let value =
-            |frame: &[u8]| self::number(&frame[bytes.clone()], number.is_big_endian == Some(true));
-        // Damage may make it smaller too, but not by a step.
-        let mask = u64::MAX >> (64 - 8 * number.bytes);
-        number.wraps = pairs.iter().any(|(a, b)| {
-            let (before, after) = (value(a), value(b));
-            after < before && after.wrapping_sub(before) & mask <= 2 * number.step
-        });
-        Some((number, steady))
+        Some(number)
     }
 
     /// Whether a constant byte may be a high one of a number, which is 0 as long as the number is small.
     pub(crate) fn is_high_byte(&self, at: usize) -> bool {
         let period = self.kinds.len();
-        let are_zeros = |zeros: usize, from: usize| {
-            (0..=zeros).all(|by| self.kinds[(from + by) % period] == Kind::Constant(0))
-        };
+        let is_zero = |at: &usize| self.kinds[*at] == Kind::Constant(0);
         let is_high_of = |number: &Number| {
-            let end = number.at + number.bytes;
-            // How many zeros are between them, on the side of the high bytes.
-            let after = (at + 2 * period - end) % period;
-            let before = (number.at + 2 * period - at - 1) % period;
-            let has_room = |zeros: usize| number.bytes + zeros < 4;
-            number.is_big_endian != Some(true) && has_room(after) && are_zeros(after, end)
-                || number.is_big_endian != Some(false) && has_room(before) && are_zeros(before, at)
+            let room = MOST_ZERO_EXTENDED.saturating_sub(number.bytes);
+            let after = (0..room).map(|by| (number.at + number.bytes + by) % period);
+            let before = (1..=room).map(|by| (number.at + period - by) % period);
+            let is_one_byte = number.bytes == 1;
+            (is_one_byte || !number.is_big_endian)
+                && after.take_while(is_zero).any(|zero| zero == at)
+                || (is_one_byte || number.is_big_endian)
+                    && before.take_while(is_zero).any(|zero| zero == at)
         };
         let mut numbers = self.numbers.iter().filter(|number| !number.wraps);
         numbers.any(is_high_of)
@@ -353,36 +320,55 @@ impl Columns {
     }
 }
 
-/// The step of the number at `at`, and how many pairs have about this step, if nearly all have.
-fn steady_step(
-    pairs: &[Pair],
-    at: usize,
-    bytes: usize,
-    is_big_endian: bool,
-) -> Option<(u64, usize)> {
-    if pairs.len() < 8 {
-        return None;
+impl Number {
+    /// The number in these bytes, if nearly all pairs of frames have about the same step.
+    fn steady(at: usize, bytes: usize, is_big_endian: bool, pairs: &[Pair]) -> Option<Self> {
+        let value = |frame: &[u8]| value(&frame[at..at + bytes], is_big_endian);
+        let mask = u64::MAX >> (64 - 8 * bytes);
+        let steps = pairs.iter();
+        let steps = steps.map(|(a, b)| value(b).wrapping_sub(value(a)) & mask);
+        let mut steps: Vec<u64> = steps.collect();
+        steps.sort_unstable();
+        let step = *steps.get(steps.len() / 2)?;
+        let slack = step.min((mask - step).wrapping_add(1)) / 3;
+        let is_steady = |&&other: &&u64| {
+            let off = other.wrapping_sub(step) & mask;
+            off.min((mask - off).wrapping_add(1)) <= slack
+        };
+        let steady = steps.iter().filter(is_steady).count();
+        // Damage may make it smaller too, but not by a step.
+        let wraps = pairs.iter().any(|(a, b)| {
+            let (before, after) = (value(a), value(b));
+            after < before && after.wrapping_sub(before) & mask <= 2 * step
+        });
+        (step > 0 && steps.len() >= 8 && 10 * steady >= 9 * steps.len()).then_some(Self {
+            at,
+            bytes,
+            is_big_endian,
+            step,
+            steady,
+            wraps,
+        })
     }
-    let value = |frame: &[u8]| number(&frame[at..at + bytes], is_big_endian);
-    let mask = u64::MAX >> (64 - 8 * bytes);
-    let steps: Vec<u64> = pairs
-        .iter()
-        .map(|(a, b)| value(b).wrapping_sub(value(a)) & mask)
-        .collect();
-    let mut sorted = steps.clone();
-    sorted.sort_unstable();
-    let median = sorted[sorted.len() / 2];
-    let slack = median.min((mask - median).wrapping_add(1)) / 3;
-    let is_steady = |&&step: &&u64| {
-        let off = step.wrapping_sub(median) & mask;
-        off.min((mask - off).wrapping_add(1)) <= slack
-    };
-    let steady = steps.iter().filter(is_steady).count();
-    (median > 0 && 10 * steady >= 9 * steps.len()).then_some((median, steady))
+
+    /// The place of the next higher byte.
+    fn higher(&self) -> usize {
+        if self.is_big_endian {
+            self.at.wrapping_sub(1)
+        } else {
+            self.at + self.bytes
+        }
+    }
+
+    /// The same number with the next higher byte.
+    fn longer(&self, pairs: &[Pair]) -> Option<Self> {
+        let at = self.at.min(self.higher());
+        Self::steady(at, self.bytes + 1, self.is_big_endian, pairs)
+    }
 }
 
 /// The number in these bytes.
-pub(crate) fn number(bytes: &[u8], is_big_endian: bool) -> u64 {
+fn value(bytes: &[u8], is_big_endian: bool) -> u64 {
     let join = |value: u64, &byte: &u8| value << 8 | u64::from(byte);
     if is_big_endian {
         bytes.iter().fold(0, join)

@@ -40,10 +40,8 @@ pub struct Ranked {
     /// The settings.
     pub proposal: Proposal,
     pub(crate) score: Score,
-    /// The bits if no cell has to do with those around it.
-    pub(crate) alone: Score,
-    /// The doubt about which bytes are cells.
-    pub(crate) cells: Option<String>,
+    /// The doubt that it is an array, or about which bytes are its cells.
+    pub(crate) own_doubt: Option<String>,
 }
 
 /// The reason why no layout was found.
@@ -141,18 +139,16 @@ impl Found {
 
     /// A layout whose array the bytes or the preset say.
     pub(crate) fn stated(array: Array, cell: Option<Cell>, proposal: Proposal) -> Self {
-        let none = Score {
-            presses: Vec::new(),
-            once: 0.0,
-        };
         let best = Ranked {
             array,
             cell,
             picture: Vec::new(),
             proposal,
-            score: none.clone(),
-            alone: none,
-            cells: None,
+            score: Score {
+                presses: Vec::new(),
+                once: 0.0,
+            },
+            own_doubt: None,
         };
         let doubt = best.doubt(None, true);
         Self {
@@ -223,14 +219,18 @@ impl Ranked {
                 "{taxels} numbers are too few to tell an array from others: say `{options}` if it is one"
             ));
         }
-        if !self.score.is_surely_less(&self.alone) {
-            return Some(format!(
-                "{taxels} cells beside each other do not act as neighbours do: press with one finger at several \
-                 places, or this is no array"
-            ));
-        }
-        self.cells.clone()
+        self.own_doubt.clone()
     }
+}
+
+/// The doubt that cells are an array, if it has these bits, and others if no cell has to do with those around it.
+pub(crate) fn doubt_of_cells(cells: usize, score: &Score, alone: &Score) -> Option<String> {
+    (!score.is_surely_less(alone)).then(|| {
+        format!(
+            "{cells} cells beside each other do not act as neighbours do: press with one finger at several places, \
+             or this is no array"
+        )
+    })
 }
 
 /// The bits that say which array it is: a long and narrow one is rarer.

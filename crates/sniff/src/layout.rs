@@ -10,7 +10,7 @@ use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, HexBytes, Layout, LengthField, Preset, Settings,
 };
 
-use crate::checks::What;
+use crate::checks::Check;
 use crate::columns::{Columns, Number};
 use crate::places::Place;
 
@@ -171,74 +171,32 @@ pub(crate) struct Parts<'a> {
 /// A stretch of the bytes beside the cells, counted from the end of the cells.
 type Beside = Range<usize>;
 
-/// A checksum, the place of its first byte, and where what it covers begins if it is not the cells.
-type Checked = (Checksum, usize, Option<usize>);
-
 impl Parts<'_> {
-    fn check(&self) -> Option<Checked> {
-        let check = self.place.check.as_ref()?;
-        match check.what {
-            What::From(checksum, begin) => Some((checksum, check.at.start, Some(begin))),
-            // Of several numbers a taxel, the cells that are read are not all that it covers.
-            What::Cells(checksum) if self.channels == 1 => Some((checksum, check.at.start, None)),
-            What::Cells(_) | What::Sum => None,
-        }
-    }
-
-    /// The value of a byte beside the cells, if it may belong to a mark.
-    fn constant(&self, at: usize) -> Option<u8> {
-        let beside = &self.place.beside;
-        let (after, before) = self.place.skipped();
-        let is_high = self.columns.is_high_byte(beside.get(at)?.at);
-        let may_be = (after..beside.len() - before).contains(&at) && !is_high;
-        may_be.then(|| beside[at].constant())?
-    }
-
-    /// The end of the constant bytes that begin at `from`.
-    fn constant_end(&self, from: usize) -> usize {
-        let mut places = from..;
-        places
-            .find(|&at| self.constant(at).is_none())
-            .expect("there is an end of the bytes")
-    }
-
-    /// The likeliest mark: the constant bytes with the most that are not 0.
-    pub(crate) fn mark(&self) -> Option<Beside> {
-        let begins = (0..self.place.beside.len()).filter(|&at| {
-            self.constant(at).is_some() && (at == 0 || self.constant(at - 1).is_none())
-        });
-        let runs = begins.map(|start| start..self.constant_end(start));
-        let weight = |run: &Beside| {
-            run.clone()
-                .filter(|&at| self.constant(at) != Some(0))
-                .count()
-        };
-        runs.rev().max_by_key(weight).filter(|run| weight(run) > 0)
+    /// The checksum. Of several numbers a taxel, the cells that are read are not all that it covers.
+    fn check(&self) -> Option<Check> {
+        let check = self.place.check?;
+        (check.begin.is_some() || self.channels == 1).then_some(check)
     }
 
     /// The settings for this array, the likeliest first, and whether a board has them.
-    fn settings(&self, check: Option<Checked>) -> Vec<(Settings, bool)> {
-        let begin = check
-            .and_then(|(_, _, begin)| begin)
-            .or_else(|| self.beginning());
-        let mark = match check {
-            Some((checksum, at, Some(begin))) if self.constant(begin).is_none() => {
-                at + checksum.bytes()..begin
-            }
-            Some((checksum, at, _)) => {
-                let end = at + checksum.bytes();
-                end..self.constant_end(begin.unwrap_or(end).max(end))
-            }
-            None => match self.mark() {
+    fn settings(&self, check: Option<Check>) -> Vec<(Settings, bool)> {
+        let covered = check.and_then(|check| check.begin);
+        let begin = covered.or_else(|| self.beginning());
+        let mark = match check.map(|check| check.places().end) {
+            Some(end) => match covered.filter(|&begin| self.place.constant(begin).is_none()) {
+                Some(begin) => end..begin,
+                None => end..self.place.constant_end(begin.unwrap_or(end).max(end)),
+            },
+            None => match self.place.mark() {
                 Some(mark) => mark,
                 None => return Vec::new(),
             },
         };
-        if mark.is_empty() || mark.clone().any(|at| self.constant(at).is_none()) {
+        if mark.is_empty() || mark.clone().any(|at| self.place.constant(at).is_none()) {
             return Vec::new();
         }
         // What is not constant follows the mark.
-        let begin = begin.map(|at| match self.constant(at) {
+        let begin = begin.map(|at| match self.place.constant(at) {
             None if check.is_some() => mark.start,
             _ => at,
         });
@@ -258,12 +216,6 @@ impl Parts<'_> {
         tried
     }
 
-    /// The numbers of bytes between the mark and the cells, and between the cells and the mark.
-    pub(crate) fn around(&self) -> Option<(usize, usize)> {
-        let mark = self.mark()?;
-        Some((self.place.beside.len() - mark.end, mark.start))
-    }
-
     /// The place beside the cells at which a frame begins.
     fn beginning(&self) -> Option<usize> {
         let period = self.columns.kinds.len();
@@ -274,9 +226,9 @@ impl Parts<'_> {
 
     /// The settings for a frame that begins at `split` within the mark. No key is left to its
     /// default.
-    fn of_split(&self, mark: &Beside, split: usize, check: Option<Checked>) -> Settings {
+    fn of_split(&self, mark: &Beside, split: usize, check: Option<Check>) -> Settings {
         let values =
-            |range: Beside| -> Vec<u8> { range.filter_map(|at| self.constant(at)).collect() };
+            |range: Beside| -> Vec<u8> { range.filter_map(|at| self.place.constant(at)).collect() };
         let (tail, mut sync) = (values(mark.start..split), values(split..mark.end));
         let bytes = self.place.bytes as u16;
         let fields = [
@@ -298,8 +250,8 @@ impl Parts<'_> {
         // The other numbers of the first taxel and of the last one are skipped too.
         let number = self.cell.bytes();
         let header = self.place.beside.len() - mark.end + self.channel * number;
-        let footer =
-            check.map_or(mark.start, |(_, at, _)| at) + (self.channels - 1 - self.channel) * number;
+        let footer = check.map_or(mark.start, |check| check.at)
+            + (self.channels - 1 - self.channel) * number;
         Settings {
             sync: Some(HexBytes(sync)),
             tail: (!tail.is_empty()).then_some(HexBytes(tail)),
@@ -308,14 +260,15 @@ impl Parts<'_> {
             cell: Some(self.cell),
             stride_bytes: (self.channels > 1).then_some(self.channels * number),
             footer_bytes: (footer > 0).then_some(footer),
-            checksum: Some(check.map_or(Checksum::None, |(checksum, ..)| checksum)),
-            checksum_over: match check {
-                Some((_, _, None)) => Some(ChecksumOver::Cells),
-                Some((_, _, Some(begin))) if self.constant(begin).is_none() => {
-                    Some(ChecksumOver::AfterSync)
-                }
-                _ => None,
-            },
+            checksum: Some(check.map_or(Checksum::None, |check| check.checksum)),
+            checksum_over: check.and_then(|check| match check.begin {
+                None => Some(ChecksumOver::Cells),
+                Some(begin) => self
+                    .place
+                    .constant(begin)
+                    .is_none()
+                    .then_some(ChecksumOver::AfterSync),
+            }),
             rows: Some(self.array.rows),
             cols: Some(self.array.cols),
             ..Settings::default()
@@ -326,7 +279,7 @@ impl Parts<'_> {
         let period = self.columns.kinds.len();
         let number = |number: &Number| {
             let at = (number.at + 2 * period - self.place.start - self.place.bytes) % period;
-            let is_after = at < self.mark().map_or(0, |mark| mark.start);
+            let is_after = at < self.place.mark().map_or(0, |mark| mark.start);
             let place = if is_after {
                 format!("{} after the last cell", bytes(at))
             } else {
@@ -360,15 +313,7 @@ impl Parts<'_> {
                 bytes(unknown)
             ));
         }
-        if let Some(check) = &self.place.check
-            && matches!(check.what, What::Sum)
-        {
-            let size = bytes(check.at.len());
-            remarks.push(format!(
-                "a sum of the cells takes {size}: no key describes it, so it is skipped"
-            ));
-        }
-        let is_checked_from_mark = matches!(self.check(), Some((_, _, Some(_))));
+        let is_checked_from_mark = self.check().is_some_and(|check| check.begin.is_some());
         if !is_checked_from_mark && self.beginning().is_none() {
             remarks.push(
                 "whether the mark begins a frame or ends it does not show here: record from the moment the sensor is \

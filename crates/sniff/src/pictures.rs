@@ -219,12 +219,6 @@ impl Pictures {
 
     /// The picture with the strongest press.
     pub(crate) fn strongest(&self) -> &[f32] {
-        let energy = |picture: &&Vec<f32>| {
-            picture
-                .iter()
-                .map(|value| f64::from(value.abs()))
-                .sum::<f64>()
-        };
         let all = self.presses.iter().flatten().map(|picture| &picture.change);
         all.max_by(|a, b| energy(a).total_cmp(&energy(b)))
             .map_or(&[], Vec::as_slice)
@@ -279,6 +273,11 @@ impl Pictures {
             }
         })
     }
+}
+
+/// How much the cells of a picture change.
+pub(crate) fn energy(picture: &[f32]) -> f64 {
+    picture.iter().map(|change| f64::from(change.abs())).sum()
 }
 
 /// The middle value of each cell.

@@ -3,6 +3,8 @@
 //! In: what each byte of a frame is. Out: [`Place`]s with the bits of what is beside the cells. Cells
 //! are anywhere in the period, and beside them is a mark.
 
+use std::ops::Range;
+
 use crate::checks::Check;
 use crate::columns::{Columns, Kind};
 use crate::model::{
@@ -19,7 +21,7 @@ pub(crate) struct Place {
     pub(crate) bytes: usize,
     /// What the other bytes are, from the last cell to the first cell of the next frame.
     pub(crate) beside: Vec<Beside>,
-    /// What holds for the bytes beside the cells.
+    /// The checksum among the bytes beside the cells.
     pub(crate) check: Option<Check>,
 }
 
@@ -29,6 +31,8 @@ pub(crate) struct Beside {
     /// Its place, counted from where the frames begin.
     pub(crate) at: usize,
     pub(crate) kind: Kind,
+    /// Whether it may be a high byte of a number.
+    pub(crate) is_high: bool,
     /// Whether it is likelier a part of a mark than a cell that never changes.
     pub(crate) is_marking: bool,
 }
@@ -38,8 +42,17 @@ impl Beside {
         self.kind.constant()
     }
 
+    /// Whether it looks like a cell at rest, or like a high byte.
     fn is_resting(&self) -> bool {
         self.constant().is_some() && !self.is_marking
+    }
+
+    fn bits(&self) -> f64 {
+        if self.is_high {
+            EXPECTED_BITS
+        } else {
+            constant_bits(self.kind)
+        }
     }
 }
 
@@ -56,11 +69,14 @@ const MOST_BITS: f64 = 72.0;
 pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
     let period = columns.kinds.len();
     let numbers: usize = columns.numbers.iter().map(|number| number.bytes).sum();
+    let all: Vec<Beside> = (0..period).map(|at| beside(columns, at)).collect();
     let mut found: Vec<(f64, Place)> = Vec::new();
     for length in 1..=MOST_BESIDE.min(period.saturating_sub(FEWEST_BYTES)) {
         let shorter = found.len();
         for start in 0..period {
-            let beside = beside(columns, start, length);
+            let beside: Vec<Beside> = (0..length)
+                .map(|by| all[(start + period - length + by) % period])
+                .collect();
             let here = beside
                 .iter()
                 .filter(|beside| beside.kind == Kind::Number)
@@ -87,20 +103,15 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
     places.take(most).map(|(_, place)| place).collect()
 }
 
-/// The `length` bytes that end where the cells start.
-fn beside(columns: &Columns, start: usize, length: usize) -> Vec<Beside> {
-    let period = columns.kinds.len();
-    let of = |at: usize| {
-        let at = (start + period - length + at) % period;
-        let (kind, resting) = (columns.kinds[at], columns.resting(2).bits[at]);
-        let is_high = columns.is_high_byte(at);
-        Beside {
-            at,
-            kind,
-            is_marking: kind.constant().is_some() && !is_high && resting > constant_bits(kind),
-        }
-    };
-    (0..length).map(of).collect()
+fn beside(columns: &Columns, at: usize) -> Beside {
+    let (kind, resting) = (columns.kinds[at], columns.resting(2).bits[at]);
+    let is_high = columns.is_high_byte(at);
+    Beside {
+        at,
+        kind,
+        is_high,
+        is_marking: kind.constant().is_some() && !is_high && resting > constant_bits(kind),
+    }
 }
 
 fn constant_bits(kind: Kind) -> f64 {
@@ -115,19 +126,12 @@ impl Place {
     /// The bits of what is coded once: the constant bytes beside the cells and in them, and that there
     /// are unknown bytes.
     pub(crate) fn bits(&self, columns: &Columns, cell_bytes: usize) -> f64 {
-        let field = self.length_field();
-        let of = |(index, beside): (usize, &Beside)| {
-            if columns.is_high_byte(beside.at) {
-                return EXPECTED_BITS;
-            }
-            match field {
-                Some(end) if end == index + 1 => EXPECTED_BITS,
-                Some(end) if end == index + 2 => 0.0,
-                _ => constant_bits(beside.kind),
-            }
-        };
-        let constants: f64 = self.beside.iter().enumerate().map(of).sum();
-        let is_padding = |beside: &&Beside| beside.is_resting() && !columns.is_high_byte(beside.at);
+        let constants: f64 = self.beside.iter().map(Beside::bits).sum();
+        let field = self.length_field().map_or(0.0, |end| {
+            let of_mark: f64 = self.beside[end - 2..end].iter().map(Beside::bits).sum();
+            of_mark - EXPECTED_BITS
+        });
+        let is_padding = |beside: &&Beside| beside.is_resting() && !beside.is_high;
         let (after, before) = self.skipped();
         let mut sides = [
             self.beside[..after].iter().rfind(is_padding),
@@ -144,46 +148,62 @@ impl Place {
                 .map(|beside| resting.bits[beside.at])
                 .sum::<f64>();
         let is_restless = |kind: &Kind| *kind == Kind::Restless;
-        let restless = columns
-            .kinds
-            .iter()
-            .filter(|kind| is_restless(kind))
-            .count()
-            - self
-                .beside
-                .iter()
-                .filter(|beside| is_restless(&beside.kind))
-                .count();
-        let in_cells = in_cells + RESTLESS_TAXEL_BITS * restless as f64;
-        let of = |beside: &Beside| {
-            if beside.kind == Kind::Active {
-                UNKNOWN_TAXEL_BITS
-            } else {
-                UNKNOWN_BITS
-            }
+        let restless = columns.kinds.iter().copied().filter(is_restless).count();
+        let restless_beside = self.beside.iter().map(|beside| beside.kind);
+        let restless = restless - restless_beside.filter(is_restless).count();
+        let of = |beside: &Beside| match beside.kind {
+            Kind::Active => UNKNOWN_TAXEL_BITS,
+            _ => UNKNOWN_BITS,
         };
-        constants + in_cells + skipped + self.unknown().map(of).sum::<f64>()
+        let unknown: f64 = self.unknown().map(of).sum();
+        constants - field + in_cells + RESTLESS_TAXEL_BITS * restless as f64 + skipped + unknown
     }
 
     /// How many constant bytes beside the cells look like cells at rest, and are nothing else.
-    pub(crate) fn resting(&self, columns: &Columns) -> usize {
+    pub(crate) fn resting(&self) -> usize {
         let field = self.length_field().map_or(0..0, |end| end - 2..end);
         let beside = self.beside.iter().enumerate();
         let resting = beside.filter(|(index, beside)| {
-            beside.is_resting() && !field.contains(index) && !columns.is_high_byte(beside.at)
+            beside.is_resting() && !beside.is_high && !field.contains(index)
         });
         resting.count()
     }
 
+    /// The value of a byte beside the cells, if it may belong to a mark.
+    pub(crate) fn constant(&self, at: usize) -> Option<u8> {
+        let (after, before) = self.skipped();
+        let may_be = (after..self.beside.len() - before).contains(&at) && !self.beside[at].is_high;
+        may_be.then(|| self.beside[at].constant())?
+    }
+
+    /// The end of the constant bytes that begin at `from`.
+    pub(crate) fn constant_end(&self, from: usize) -> usize {
+        let mut places = from..;
+        places
+            .find(|&at| self.constant(at).is_none())
+            .expect("there is an end of the bytes")
+    }
+
+    /// The likeliest mark: the constant bytes with the most that are not 0.
+    pub(crate) fn mark(&self) -> Option<Range<usize>> {
+        let begins = (0..self.beside.len()).filter(|&at| {
+            self.constant(at).is_some() && (at == 0 || self.constant(at - 1).is_none())
+        });
+        let runs = begins.map(|start| start..self.constant_end(start));
+        let weight = |run: &Range<usize>| {
+            run.clone()
+                .filter(|&at| self.constant(at) != Some(0))
+                .count()
+        };
+        runs.rev().max_by_key(weight).filter(|run| weight(run) > 0)
+    }
+
     /// The bytes that change in an unknown way.
     pub(crate) fn unknown(&self) -> impl Iterator<Item = &Beside> {
-        let checked = self.check.as_ref().map_or(0..0, |check| check.at.clone());
-        let changes = |kind: Kind| matches!(kind, Kind::Active | Kind::Restless);
-        let unknown = self
-            .beside
-            .iter()
-            .enumerate()
-            .filter(move |(at, beside)| changes(beside.kind) && !checked.contains(at));
+        let checked = self.check.map_or(0..0, |check| check.places());
+        let unknown = self.beside.iter().enumerate().filter(move |(at, beside)| {
+            matches!(beside.kind, Kind::Active | Kind::Restless) && !checked.contains(at)
+        });
         unknown.map(|(_, beside)| beside)
     }
 
@@ -202,7 +222,7 @@ impl Place {
             .take_while(|beside| beside.is_resting())
             .count();
         let length = self.beside.len();
-        let checked = self.check.as_ref().map_or(length, |check| check.at.start);
+        let checked = self.check.map_or(length, |check| check.at);
         let field_end = self.length_field().unwrap_or(0);
         let before = if self.is_mark_of_words() { 0 } else { before };
         (after.min(checked), before.min(length - field_end))

@@ -8,16 +8,18 @@ use hardnessd_core::wire::Cell;
 
 use crate::Capture;
 use crate::cells::Cells;
-use crate::checks::{self, Check};
+use crate::checks;
 use crate::columns::{Columns, Kind};
-use crate::found::{Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
+use crate::found::{
+    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, is_too_large, name_bits,
+};
 use crate::layout::{Parts, Proposal};
 use crate::model::{
     self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, Score, UNUSED_DIGIT_BITS,
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
-use crate::pictures::{Pictures, Presses, middle, some};
+use crate::pictures::{Pictures, Presses, energy, middle, some};
 use crate::places::{Place, places};
 
 /// The longest side that is tried, so that an array that is too large is found.
@@ -47,9 +49,6 @@ const INTERLEAVED_BITS: f64 = 60.0;
 const MAYBE_INTERLEAVED: f64 = 0.9;
 /// The number of frames that a checksum is tried on.
 const CHECKED: usize = 40;
-/// The bytes on each side of a mark that may be a checksum, and the most marks that are tried.
-const NEAR_MARK: usize = 16;
-const MOST_MARKS: usize = 8;
 /// The share of the packets whose number follows the one before.
 const COUNTING_SHARE: f64 = 0.95;
 
@@ -123,9 +122,7 @@ pub(crate) fn in_frames(
     }
     let begin = frames.beginning(&capture.pauses());
     let frames = &frames.inner();
-    let mut columns = Columns::new(frames);
-    mark_checksum(frames, &mut columns);
-    let columns = &columns;
+    let columns = &Columns::new(frames);
     let frames = &frames.retained(|frame| columns.is_whole(frame));
     if !columns.kinds.contains(&Kind::Active) {
         return Err(Failure::no_press(period));
@@ -153,7 +150,7 @@ pub(crate) fn in_frames(
     };
     let mut places: Vec<Place> = places
         .into_iter()
-        .map(|place| search.checked(place, checks::long))
+        .map(|place| search.checked(place))
         .collect();
     places.sort_by(|a, b| a.bits(columns, 2).total_cmp(&b.bits(columns, 2)));
     places.truncate(most);
@@ -271,9 +268,6 @@ impl Search<'_> {
                     continue;
                 }
                 let count = place.bytes / format.bytes();
-                let place = self.checked(place.clone(), |spans, kinds| {
-                    checks::short(spans, kinds, format.cell)
-                });
                 let Some(pictures) = self.pictures(&self.coarse, &place, format) else {
                     continue;
                 };
@@ -299,9 +293,9 @@ impl Search<'_> {
         found
     }
 
-    /// Finds what holds for the bytes beside the cells.
-    fn checked(&self, place: Place, holding: impl Fn(&[&[u8]], &[Kind]) -> Option<Check>) -> Place {
-        if place.check.is_some() || place.unknown().next().is_none() {
+    /// Finds the checksum among the bytes beside the cells.
+    fn checked(&self, place: Place) -> Place {
+        if place.unknown().next().is_none() {
             return place;
         }
         let indices: Vec<usize> = (0..self.frames.len()).collect();
@@ -311,7 +305,7 @@ impl Search<'_> {
         let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
         let kinds: Vec<Kind> = place.beside.iter().map(|beside| beside.kind).collect();
         Place {
-            check: holding(&spans, &kinds),
+            check: checks::find(&spans, &kinds),
             ..place
         }
     }
@@ -332,29 +326,6 @@ impl Search<'_> {
             if format.channels == 1 && interleaved(&pictures, *array, INTERLEAVED).is_some() {
                 score.once += INTERLEAVED_BITS;
             }
-        }
-    }
-
-    fn parts<'a>(
-        &'a self,
-        candidate: &'a Candidate,
-        begin: Option<usize>,
-        channel: usize,
-    ) -> Parts<'a> {
-        let Candidate {
-            array,
-            format,
-            ref place,
-            ..
-        } = *candidate;
-        Parts {
-            columns: self.columns,
-            place,
-            array,
-            cell: format.cell,
-            channels: format.channels,
-            channel,
-            begin,
         }
     }
 
@@ -393,65 +364,77 @@ impl Search<'_> {
             let channels: Vec<Pictures> = pictures.split(format.channels).collect();
             let of_channel = channels.iter().enumerate();
             let (channel, strongest) = of_channel
-                .max_by(|(_, a), (_, b)| energy(a.strongest()).total_cmp(&energy(b.strongest())))
+                .map(|(channel, pictures)| (channel, pictures.strongest()))
+                .max_by(|(_, a), (_, b)| energy(a).total_cmp(&energy(b)))
                 .expect("a taxel has a number");
-            let parts = self.parts(candidate, begin, channel);
+            let parts = Parts {
+                columns: self.columns,
+                place: &candidate.place,
+                array,
+                cell: format.cell,
+                channels: format.channels,
+                channel,
+                begin,
+            };
             let Some(proposal) = Proposal::of(&parts, bytes) else {
                 continue;
             };
-            let mut score = candidate.score.clone();
-            let mut cells = None;
-            if proposal.is_board {
-                // A known board has a known mark.
-                let mark = parts.mark().map_or(0, |mark| mark.len());
-                score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
-            } else if !known.is_complete() {
-                let others = || self.other_cells(candidate, candidates());
-                cells = several_numbers(&pictures, array, format).or_else(others);
-            }
             let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
             let alone = self.score(&candidate.place, format, array, &pictures, &alone);
+            let mut score = candidate.score.clone();
+            if proposal.is_board {
+                // A known board has a known mark.
+                let mark = candidate.place.mark().map_or(0, |mark| mark.len());
+                score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
+            }
+            let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
+            if !proposal.is_board && !known.is_complete() {
+                own_doubt = own_doubt
+                    .or_else(|| several_numbers(&pictures, array, format))
+                    .or_else(|| other_cells(candidate, candidates()));
+            }
             tried.push((array, format));
             ranked.push(Ranked {
                 array,
-                cell: Some(parts.cell),
-                picture: strongest.strongest().to_vec(),
+                cell: Some(format.cell),
+                picture: strongest.to_vec(),
                 proposal,
                 score,
-                alone,
-                cells,
+                own_doubt,
             });
         }
         Found::among(ranked, known.is_complete()).ok_or(Failure::no_array(self.frames.period()))
     }
+}
 
-    /// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
-    /// cells.
-    fn other_cells<'a>(
-        &self,
-        best: &Candidate,
-        mut candidates: impl Iterator<Item = &'a Candidate>,
-    ) -> Option<String> {
-        let is_other = |other: &&Candidate| {
-            other.format == best.format
-                && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
-                && !best.score.is_surely_before(&other.score)
-        };
-        let around = |candidate: &Candidate| self.parts(candidate, None, 0).around();
-        if let Some(other) = candidates.find(is_other)
-            && let Some(((before, after), (other_before, other_after))) =
-                around(best).zip(around(other))
-        {
-            return Some(format!(
-                "which bytes are cells: {before} bytes are between the mark and them and {after} behind them, or \
-                 {other_before} and {other_after}; press the first taxels and the last"
-            ));
-        }
-        let resting = best.place.resting(self.columns);
-        (resting > MOST_RESTING).then(|| {
-            format!("{resting} bytes beside the cells look like cells at rest: press the edges too")
-        })
+/// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
+/// cells.
+fn other_cells<'a>(
+    best: &Candidate,
+    mut candidates: impl Iterator<Item = &'a Candidate>,
+) -> Option<String> {
+    let is_other = |other: &&Candidate| {
+        other.format == best.format
+            && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
+            && !best.score.is_surely_before(&other.score)
+    };
+    let around = |place: &Place| {
+        let mark = place.mark()?;
+        Some((place.beside.len() - mark.end, mark.start))
+    };
+    if let Some(other) = candidates.find(is_other)
+        && let Some(((before, after), (other_before, other_after))) =
+            around(&best.place).zip(around(&other.place))
+    {
+        return Some(format!(
+            "which bytes are cells: {before} bytes are between the mark and them and {after} behind them, or \
+             {other_before} and {other_after}; press the first taxels and the last"
+        ));
     }
+    let resting = best.place.resting();
+    (resting > MOST_RESTING).then(|| {
+        format!("{resting} bytes beside the cells look like cells at rest: press the edges too")
+    })
 }
 
 /// The presses by the numbers of frames, where bytes alone show none: the low bytes of floats and of signed
@@ -502,48 +485,6 @@ fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
             .map(|sum| (sum * 16.0) as u32)
             .collect(),
     )
-}
-
-/// How much the cells of a picture change.
-fn energy(picture: &[f32]) -> f64 {
-    picture.iter().map(|change| f64::from(change.abs())).sum()
-}
-
-/// Marks the bytes of a checksum near a mark: they are no cells, even if they seem to change as cells do.
-fn mark_checksum(frames: &Frames, columns: &mut Columns) {
-    let period = frames.period();
-    if frames.len() == 0 || period < 2 * NEAR_MARK {
-        return;
-    }
-    let indices: Vec<usize> = (0..frames.len()).collect();
-    let indices = some(&indices, CHECKED);
-    let is_marking = |at: usize| {
-        columns.kinds[at]
-            .constant()
-            .is_some_and(|value| value != 0 && columns.resting(2).bits[at] > CONSTANT_BITS)
-    };
-    let runs = (0..period)
-        .filter(|&at| is_marking(at) && !is_marking((at + 1) % period))
-        .take(MOST_MARKS);
-    let found = runs.collect::<Vec<usize>>().into_iter().find_map(|mark| {
-        let first = (mark + period + 1 - NEAR_MARK) % period;
-        let kinds: Vec<Kind> = (0..2 * NEAR_MARK)
-            .map(|by| columns.kinds[(first + by) % period])
-            .collect();
-        let span = |&index: &usize| frames.from(index, first, period + 2 * NEAR_MARK);
-        let spans: Vec<&[u8]> = indices.iter().map(span).collect();
-        let check = checks::long(&spans, &kinds)
-            .filter(|check| matches!(check.what, checks::What::From(..)))?;
-        Some(
-            check
-                .at
-                .map(|at| (first + at) % period)
-                .collect::<Vec<usize>>(),
-        )
-    });
-    for at in found.into_iter().flatten() {
-        columns.kinds[at] = Kind::Restless;
-    }
 }
 
 /// The bits of each press that no shape changes.

@@ -7,7 +7,9 @@ use std::collections::BTreeMap;
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::{Preset, Settings, is_separator};
 
-use crate::found::{Failure, Found, Known, LEAST_FRAMES, Ranked, is_too_large, name_bits};
+use crate::found::{
+    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, is_too_large, name_bits,
+};
 use crate::layout::Proposal;
 use crate::model::{self, Score};
 use crate::pictures::{Pictures, Presses, middle};
@@ -201,21 +203,20 @@ fn in_order(
         presses,
         once: name_bits(array),
     };
-    let alone: Vec<f64> = model::alone(&pictures)
-        .iter()
-        .map(|press| press.iter().sum())
-        .collect();
+    let alone = model::alone(&pictures);
+    let alone: Vec<f64> = alone.iter().map(|press| press.iter().sum()).collect();
     let arrays: Vec<Array> = known.arrays(cells, cells).collect();
     let readable = arrays.iter().filter(|&&array| !is_too_large(array));
     let ranked = readable.filter_map(|&array| {
+        let proposal = Proposal::decoded(settings(array), true, bytes)?;
+        let own = score(array, model::rows(&pictures, array.cols, 1));
         Some(Ranked {
             array,
             cell: None,
             picture: pictures.strongest().to_vec(),
-            proposal: Proposal::decoded(settings(array), true, bytes)?,
-            score: score(array, model::rows(&pictures, array.cols, 1)),
-            alone: score(array, alone.clone()),
-            cells: None,
+            proposal,
+            own_doubt: doubt_of_cells(cells, &own, &score(array, alone.clone())),
+            score: own,
         })
     });
     let is_given = known.rows.is_some() && known.cols.is_some();
