@@ -23,7 +23,8 @@ mod layout;
 mod decoder;
 
 pub use self::checksum::{Checksum, ChecksumOver};
-pub use self::decoder::{Damage, Decoded, Decoder, Place, TELNET, is_telnet};
+pub use self::decoder::{Decoded, Decoder, Place, TELNET, is_telnet};
 pub use self::layout::Layout;
+pub use self::scan::Damage;
 pub use self::settings::{Cell, Framing, HexBytes, LengthField, Order, Packets, Preset, Settings};
 pub use self::text::is_separator;

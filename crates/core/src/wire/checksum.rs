@@ -56,43 +56,35 @@ enum Method {
 }
 
 impl Checksum {
+    /// The number of bytes on the wire, whether the high one comes first, and the method.
+    fn parts(self) -> (usize, bool, Method) {
+        match self {
+            Checksum::None => (0, false, Method::Sum),
+            Checksum::Sum8 => (1, false, Method::Sum),
+            Checksum::Xor8 => (1, false, Method::Xor),
+            Checksum::Lrc8 => (1, false, Method::Negated),
+            Checksum::Sum16 => (2, false, Method::Sum),
+            Checksum::Sum16Be => (2, true, Method::Sum),
+            Checksum::Crc8 => (1, false, Method::Crc(&CRC8)),
+            Checksum::Crc16Modbus => (2, false, Method::Crc(&MODBUS)),
+            Checksum::Crc16ModbusBe => (2, true, Method::Crc(&MODBUS)),
+            Checksum::Crc16Ccitt => (2, false, Method::Crc(&CCITT)),
+            Checksum::Crc16CcittBe => (2, true, Method::Crc(&CCITT)),
+            Checksum::Crc16Xmodem => (2, false, Method::Crc(&XMODEM)),
+            Checksum::Crc16XmodemBe => (2, true, Method::Crc(&XMODEM)),
+            Checksum::Crc32 => (4, false, Method::Crc(&CRC32)),
+            Checksum::Crc32Be => (4, true, Method::Crc(&CRC32)),
+        }
+    }
+
     /// The number of bytes that the checksum takes on the wire.
     pub fn bytes(self) -> usize {
-        match self {
-            Checksum::None => 0,
-            Checksum::Sum8 | Checksum::Xor8 | Checksum::Lrc8 | Checksum::Crc8 => 1,
-            Checksum::Crc32 | Checksum::Crc32Be => 4,
-            _ => 2,
-        }
-    }
-
-    fn is_big_endian(self) -> bool {
-        matches!(
-            self,
-            Checksum::Sum16Be
-                | Checksum::Crc16ModbusBe
-                | Checksum::Crc16CcittBe
-                | Checksum::Crc16XmodemBe
-                | Checksum::Crc32Be
-        )
-    }
-
-    fn method(self) -> Method {
-        match self {
-            Checksum::None | Checksum::Sum8 | Checksum::Sum16 | Checksum::Sum16Be => Method::Sum,
-            Checksum::Lrc8 => Method::Negated,
-            Checksum::Xor8 => Method::Xor,
-            Checksum::Crc8 => Method::Crc(&CRC8),
-            Checksum::Crc16Modbus | Checksum::Crc16ModbusBe => Method::Crc(&MODBUS),
-            Checksum::Crc16Ccitt | Checksum::Crc16CcittBe => Method::Crc(&CCITT),
-            Checksum::Crc16Xmodem | Checksum::Crc16XmodemBe => Method::Crc(&XMODEM),
-            Checksum::Crc32 | Checksum::Crc32Be => Method::Crc(&CRC32),
-        }
+        self.parts().0
     }
 
     /// The checksum of `bytes` as it is sent. Only the first [`Self::bytes`] of the result count.
     pub fn sent(self, bytes: &[u8]) -> [u8; 4] {
-        let method = self.method();
+        let (_, _, method) = self.parts();
         let begin = match method {
             Method::Crc(crc) => crc.init,
             Method::Sum | Method::Negated | Method::Xor => 0,
@@ -103,12 +95,13 @@ impl Checksum {
 
     /// The checksum of bytes with this state after the last one, as it is sent.
     fn finished(self, state: u32) -> [u8; 4] {
-        let sum = match self.method() {
+        let (bytes, is_big_endian, method) = self.parts();
+        let sum = match method {
             Method::Sum | Method::Xor => state,
             Method::Negated => state.wrapping_neg(),
             Method::Crc(crc) => crc.finished(state),
         };
-        match (self.bytes(), self.is_big_endian()) {
+        match (bytes, is_big_endian) {
             (0, _) => [0; 4],
             (bytes, true) => (sum << (32 - 8 * bytes)).to_be_bytes(),
             (bytes, false) => (sum & (u32::MAX >> (32 - 8 * bytes))).to_le_bytes(),
@@ -259,7 +252,7 @@ impl<'a> Sums<'a> {
             self.end = stretch.end;
             return self.checksum.sent(&self.bytes[stretch]);
         }
-        let method = self.checksum.method();
+        let (_, _, method) = self.checksum.parts();
         for at in self.states.len() - 1..stretch.end {
             let after = method.after(self.states[at], self.bytes[at]);
             self.states.push(after);
@@ -313,7 +306,7 @@ mod tests {
     fn check_values_are_those_of_the_crc_catalogue() {
         for (checksum, expected) in CHECKED {
             let sent = checksum.sent(b"123456789");
-            let found = match checksum.is_big_endian() {
+            let found = match checksum.parts().1 {
                 true => u32::from_be_bytes(sent),
                 false => u32::from_le_bytes(sent),
             };

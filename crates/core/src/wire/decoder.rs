@@ -3,14 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::layout::Layout;
-use super::scan::{Context, Scan};
+use super::scan::{Context, Damage, Scan};
 use super::text::Lines;
 use crate::frame::RawFrame;
-
-/// The mark of a dropped candidate frame. The candidate had a valid sync, but its length, its tail,
-/// its checksum or the header after it was wrong.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Damage;
 
 /// A whole frame, and the place in the stream where it ended.
 #[derive(Debug, Clone, PartialEq)]

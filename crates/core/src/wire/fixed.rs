@@ -15,8 +15,7 @@ use std::ops::Range;
 
 use super::cells::Cells;
 use super::checksum::{Checksum, ChecksumOver, Sums};
-use super::decoder::Damage;
-use super::scan::{Context, Scan};
+use super::scan::{Context, Damage, Scan};
 use super::settings::{Cell, Framing, HexBytes, LengthField, Packets, Settings};
 use crate::frame::{Array, RawFrame};
 use crate::range::{self, OutOfRange};

@@ -2,6 +2,11 @@
 
 use crate::frame::RawFrame;
 
+/// The mark of a dropped candidate frame. The candidate had a valid sync, but its length, its tail,
+/// its checksum or the header after it was wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Damage;
+
 /// The answer of a search: what the first bytes are.
 pub(super) struct Scan {
     /// The number of bytes. Without any, more must come to know.
