@@ -14,10 +14,6 @@ const MANY: usize = 10;
 const LITTLE: usize = 4;
 /// One of so many numbers that wraps is no damage.
 const WRAPS: usize = 1000;
-/// A number that jumps so often in so many pairs of frames is not damaged, nor are all of them together.
-const OFTEN: usize = 4;
-const OFTEN_IN_ALL: usize = 20;
-const PAIRS: usize = 200;
 /// The fewest bytes that show whether bytes are parts of longer numbers.
 const FEWEST_PARTS: usize = 64;
 /// The high half of a number of 24 bits is smaller.
@@ -34,12 +30,8 @@ pub(crate) struct Cells<'a> {
 }
 
 impl<'a> Cells<'a> {
-    /// Whether they may be taxels of so many numbers of this type. Of a type that the user knows, only the
-    /// sign is asked.
-    pub(crate) fn may_be(&self, cell: Cell, channels: usize, is_known: bool) -> bool {
-        if is_known {
-            return !is_signed(cell) || self.has_negative(cell);
-        }
+    /// Whether they may be taxels of so many numbers of this type.
+    pub(crate) fn may_be(&self, cell: Cell, channels: usize) -> bool {
         let wraps = self.wraps(cell, channels);
         let is_sign_right = match is_signed(cell) {
             true => wraps || self.has_negative(cell),
@@ -94,26 +86,7 @@ impl<'a> Cells<'a> {
             let is_jump = |&(a, b): &(&f32, &f32)| (a - b).abs() > half;
             jumps += a.iter().zip(&b).filter(is_jump).count();
         }
-        jumps * WRAPS > all || self.jumps_alone(cell)
-    }
-
-    /// Whether numbers are often large for a moment, alone among small ones: they are about 0 and have a sign. A
-    /// press is large in several taxels, and damage is rare and at another place each time.
-    fn jumps_alone(&self, cell: Cell) -> bool {
-        let range = 2.0_f32.powi(8 * cell.bytes() as i32);
-        let is_small = |number: f32| number < 0.1 * range;
-        let mut jumps = vec![0; self.bytes / cell.bytes()];
-        for (before, now) in self.frames.pairs().take(PAIRS) {
-            let [before, now] =
-                [before, now].map(|index| numbers::numbers(cell, self.of_frame(index)));
-            for at in 1..now.len().saturating_sub(1) {
-                let is_alone = [before[at], now[at - 1], now[at + 1]]
-                    .into_iter()
-                    .all(is_small);
-                jumps[at] += usize::from(now[at] > 0.9 * range && is_alone);
-            }
-        }
-        jumps.iter().sum::<usize>() >= OFTEN_IN_ALL || jumps.into_iter().any(|jumps| jumps >= OFTEN)
+        jumps * WRAPS > all
     }
 
     /// Whether numbers are parts of longer ones: of four bytes in a row one is nearly always the same, or of

@@ -44,55 +44,39 @@ pub struct Ranked {
     pub(crate) own_doubt: Option<String>,
 }
 
-/// The reason why no layout was found.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{words}")]
-pub struct Failure {
-    words: String,
-    /// Of several failures, the one with the highest rank says most.
-    pub(crate) rank: u8,
+/// The reason why no layout was found. The later ones say more.
+#[derive(Debug, Clone, PartialEq, PartialOrd, thiserror::Error)]
+pub enum Failure {
+    /// In so many bytes.
+    #[error("nothing recurs in {0} bytes: try another --baud, or listen for longer")]
+    NotPeriodic(usize),
+    /// Frames of so many bytes.
+    #[error(
+        "{0} bytes recur, but they hold no array with a mark: press the sensor at several places meanwhile, try \
+         another --baud, and say --rows, --cols and --cell if you know them"
+    )]
+    NoArray(usize),
+    /// Frames of so many bytes.
+    #[error(
+        "frames of {0} bytes, but nothing presses the sensor: sniff again, and press it at several places"
+    )]
+    NoPress(usize),
+    /// The array is larger than any that the daemon reads.
+    #[error("found an array of about {rows}x{cols} taxels, expected at most 64x64")]
+    #[allow(missing_docs, reason = "the names say all")]
+    TooLarge { rows: usize, cols: usize },
+    /// No other failure is looked for beside this one.
+    #[error("{0}")]
+    Sure(String),
 }
 
 impl Failure {
-    /// The rank of a failure beside which no other is looked for.
-    pub(crate) const SURE: u8 = 4;
-
     pub(crate) fn sure(words: impl Into<String>) -> Self {
-        Self {
-            words: words.into(),
-            rank: Self::SURE,
-        }
+        Self::Sure(words.into())
     }
 
-    /// The array is larger than any that the daemon reads.
     pub(crate) fn too_large(Array { rows, cols }: Array) -> Self {
-        let words = format!("found an array of about {rows}x{cols} taxels, expected at most 64x64");
-        Self { words, rank: 3 }
-    }
-
-    /// Frames of one length, but nothing presses.
-    pub(crate) fn no_press(frame_bytes: usize) -> Self {
-        let words = format!(
-            "frames of {frame_bytes} bytes, but nothing presses the sensor: sniff again, and press it at several \
-             places"
-        );
-        Self { words, rank: 2 }
-    }
-
-    /// Frames of one length without an array.
-    pub(crate) fn no_array(frame_bytes: usize) -> Self {
-        let words = format!(
-            "{frame_bytes} bytes recur, but they hold no array with a mark: press the sensor at several places \
-             meanwhile, try another --baud, and say --rows, --cols and --cell if you know them"
-        );
-        Self { words, rank: 1 }
-    }
-
-    /// Nothing recurs.
-    pub(crate) fn not_periodic(bytes: usize) -> Self {
-        let words =
-            format!("nothing recurs in {bytes} bytes: try another --baud, or listen for longer");
-        Self { words, rank: 0 }
+        Self::TooLarge { rows, cols }
     }
 }
 

@@ -124,13 +124,13 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
 fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
     let bytes = capture.bytes;
     let mut open = None;
-    let mut failure = Failure::not_periodic(bytes.len());
+    let mut failure = Failure::NotPeriodic(bytes.len());
     for period in period::periods(bytes) {
         match search::in_frames(&period::Frames::new(bytes, &period), capture, known) {
             Ok(found) if found.doubt.is_none() => return Ok(found),
             Ok(found) => open = open.or(Some(found)),
-            Err(sure) if sure.rank == Failure::SURE => return Err(sure),
-            Err(other) if other.rank > failure.rank => failure = other,
+            Err(sure @ Failure::Sure(_)) => return Err(sure),
+            Err(other) if other > failure => failure = other,
             Err(_) => {}
         }
     }

@@ -164,24 +164,18 @@ fn best_prediction<const N: usize>(
 }
 
 /// The bits of each press in its later frames, whatever the shape of the array and how many numbers a taxel
-/// has: by the number that is before each at the best distance.
+/// has: by the number that is before each.
 pub(crate) fn later(pictures: &Pictures) -> Vec<f64> {
-    let at_distance = |distance: usize| {
-        best_prediction(pictures, false, |picture| {
-            let mut sums = [0.0_f64; LATER];
-            for at in pictures.changing() {
-                let bits = later_bits(pictures, picture, at, distance);
-                sums.iter_mut()
-                    .zip(bits)
-                    .for_each(|(sum, bits)| *sum += f64::from(bits));
-            }
-            sums
-        })
-    };
-    let total = |presses: &Vec<f64>| presses.iter().sum::<f64>();
-    let all = (0..=MOST_CHANNELS).map(at_distance);
-    all.min_by(|a, b| total(a).total_cmp(&total(b)))
-        .expect("there are distances")
+    best_prediction(pictures, false, |picture| {
+        let mut sums = [0.0_f64; LATER];
+        for at in pictures.changing() {
+            let bits = later_bits(pictures, picture, at);
+            sums.iter_mut()
+                .zip(bits)
+                .for_each(|(sum, bits)| *sum += f64::from(bits));
+        }
+        sums
+    })
 }
 
 /// Predictions of a cell in a later frame: it stays, or it grows by as much, or by the same factor, as those
@@ -192,22 +186,10 @@ fn later_bits(
     pictures: &Pictures,
     Picture { change, before }: &Picture,
     at: usize,
-    distance: usize,
 ) -> [f32; LATER] {
     let near = |of: &[f32]| {
-        let west = if distance > 0 && at >= distance {
-            of[at - distance]
-        } else {
-            0.0
-        };
-        (
-            west,
-            if distance > 0 && at >= 2 * distance {
-                west + of[at - 2 * distance]
-            } else {
-                west
-            },
-        )
+        let back = |by: usize| at.checked_sub(by).map_or(0.0, |at| of[at]);
+        (back(1), back(1) + back(2))
     };
     let ((west, wide), (west_before, wide_before)) = (near(change), near(before));
     let factor = if wide_before == 0.0 {
@@ -267,7 +249,7 @@ pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
     let mut bits = alone(pictures);
     for (bits, press) in bits.iter_mut().zip(&pictures.presses) {
         for at in pictures.changing() {
-            let later = |picture| f64::from(later_bits(pictures, picture, at, 1)[0]);
+            let later = |picture| f64::from(later_bits(pictures, picture, at)[0]);
             bits[at] += press.iter().map(later).sum::<f64>();
         }
     }

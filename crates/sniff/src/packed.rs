@@ -26,7 +26,7 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
         *lengths.entry(frame.len()).or_default() += 1;
     }
     let usual = lengths.into_iter().max_by_key(|&(_, count)| count);
-    let (usual, _) = usual.ok_or(Failure::not_periodic(bytes.len()))?;
+    let (usual, _) = usual.ok_or(Failure::NotPeriodic(bytes.len()))?;
     let mut marked = Vec::new();
     let mut arrivals = Vec::new();
     for (index, frame) in frames
@@ -51,7 +51,7 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
         Some(Ranked { proposal, ..ranked })
     };
     let ranked = [Some(best), next].into_iter().flatten().filter_map(packed);
-    Found::among(ranked.collect(), known.is_complete()).ok_or(Failure::no_array(usual))
+    Found::among(ranked.collect(), known.is_complete()).ok_or(Failure::NoArray(usual))
 }
 
 /// The proposal for the packed bytes.

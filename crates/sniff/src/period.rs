@@ -147,19 +147,18 @@ impl<'a> Frames<'a> {
 
     /// The frames whose cells may reach over their ends, because enough bytes are before and behind them.
     pub(crate) fn inner(&self) -> Self {
-        let is_inner =
-            |start: &usize| *start >= self.period && start + 2 * self.period <= self.bytes.len();
-        Self {
-            starts: self.starts.iter().copied().filter(is_inner).collect(),
-            ..*self
-        }
+        self.of(|start| start >= self.period && start + 2 * self.period <= self.bytes.len())
     }
 
     /// The frames that `are` so.
     pub(crate) fn retained(&self, are: impl Fn(&[u8]) -> bool) -> Self {
-        let whole = |start: &usize| are(&self.bytes[*start..][..self.period]);
+        self.of(|start| are(&self.bytes[start..][..self.period]))
+    }
+
+    fn of(&self, is_kept: impl Fn(usize) -> bool) -> Self {
+        let starts = self.starts.iter().copied();
         Self {
-            starts: self.starts.iter().copied().filter(whole).collect(),
+            starts: starts.filter(|&start| is_kept(start)).collect(),
             ..*self
         }
     }

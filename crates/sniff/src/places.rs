@@ -58,7 +58,8 @@ impl Beside {
 
 /// The most bytes beside the cells.
 const MOST_BESIDE: usize = 40;
-/// The most places with as many bytes beside the cells: constant cells all over a frame look like a mark.
+/// The most places with as many bytes beside the cells. Constant cells all over a frame look like a mark, such
+/// as the high halves of numbers below 0: the places beside them would crowd out the right one.
 const MOST_OF_LENGTH: usize = 8;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;

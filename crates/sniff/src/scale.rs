@@ -2,11 +2,12 @@
 //!
 //! In: a layout and all the bytes. Out: guesses for `[sensor.calibration]` and `[press]`.
 
-use hardnessd_core::frame::{Pitch, RawFrame};
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::tare::{self, NEWTONS_PER_COUNT};
 use hardnessd_core::wire::Settings;
 
 use crate::layout::decode;
+use crate::pictures::middle;
 
 /// What to write beside the layout. What is `None` may be left out.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -25,7 +26,8 @@ pub struct Scale {
 
 /// One in so many frames is quiet, that with the smallest change.
 const QUIET: usize = 4;
-/// A tare at rest has at most so many times the noise of a usual quiet one.
+/// A tare at rest has at most so many times the noise of a usual quiet one, by chance or by drift. In a press the
+/// noise is many times as large. All tares at rest must pass, not only most.
 const CALM: f32 = 2.5;
 /// As many taxels in contact begin a press, and as many may be touched in a tare.
 const TAXELS: usize = 3;
@@ -43,78 +45,64 @@ const LEAST_PRESS_N: f32 = 1.0;
 impl Scale {
     /// The scale for the frames in `bytes`.
     pub fn of(settings: &Settings, bytes: &[u8]) -> Self {
-        let mut frames: Vec<RawFrame> = Vec::new();
+        let mut frames: Vec<Vec<f32>> = Vec::new();
         decode(settings, bytes, |frame| {
             if frames.len() < MOST_FRAMES {
-                frames.push(frame);
+                frames.push(frame.counts.into_vec());
             }
         });
-        Self::of_frames(&frames)
-    }
-
-    fn of_frames(frames: &[RawFrame]) -> Self {
-        let Some(first) = frames.first() else {
+        if frames.is_empty() {
             return Self::default();
-        };
-        let taxels = first.counts.len();
-        let middle = |of: &[&RawFrame], taxel: usize| {
-            let mut counts: Vec<f32> = of.iter().map(|frame| frame.counts[taxel]).collect();
-            counts.sort_by(f32::total_cmp);
-            counts[counts.len() / 2]
-        };
-        let change = |frame: &&RawFrame, rest: &[f32]| -> f64 {
-            let taxels = frame.counts.iter().zip(rest);
+        }
+        // Most frames may be pressed, but hardly at the same taxel.
+        let rest = middle(&frames);
+        let change = |frame: &Vec<f32>| -> f64 {
+            let taxels = frame.iter().zip(&rest);
             taxels
                 .map(|(count, rest)| f64::from((count - rest).abs()))
                 .sum()
         };
-        // Most frames may be pressed, but hardly at the same taxel.
-        let all: Vec<&RawFrame> = frames.iter().collect();
-        let rest: Vec<f32> = (0..taxels).map(|taxel| middle(&all, taxel)).collect();
-        let mut changes: Vec<f64> = all.iter().map(|frame| change(frame, &rest)).collect();
-        let by_place = changes.clone();
-        changes.sort_by(f64::total_cmp);
-        let quiet_change = changes[changes.len() / QUIET];
-        let quiet: Vec<&RawFrame> = all
-            .iter()
-            .zip(by_place)
-            .filter(|(_, change)| *change <= quiet_change)
-            .map(|(frame, _)| *frame)
-            .collect();
-        let rest: Vec<f32> = (0..taxels).map(|taxel| middle(&quiet, taxel)).collect();
+        let changes: Vec<f64> = frames.iter().map(change).collect();
+        let mut sorted = changes.clone();
+        sorted.sort_by(f64::total_cmp);
+        let most = sorted[sorted.len() / QUIET];
+        let quiet = frames.iter().zip(changes);
+        let quiet = quiet.filter(|(_, change)| *change <= most);
+        let quiet: Vec<Vec<f32>> = quiet.map(|(frame, _)| frame.clone()).collect();
+        let rest = middle(&quiet);
         // Damage makes one taxel of a frame larger.
-        let most_counts = all
+        let most_counts = frames
             .iter()
-            .map(|frame| third(frame.counts.to_vec()))
+            .map(|frame| third(frame.clone()))
             .fold(f32::MIN, f32::max);
-        let above = |frame: &&RawFrame| {
-            let taxels = frame.counts.iter().zip(&rest);
+        let above = |frame: &Vec<f32>| {
+            let taxels = frame.iter().zip(&rest);
             third(
                 taxels
                     .map(|(count, rest)| (count - rest).max(0.0))
                     .collect(),
             )
         };
-        let press = all.iter().map(above).fold(0.0, f32::max);
+        let press = frames.iter().map(above).fold(0.0, f32::max);
         // What the third largest taxel varies by while a tare is taken.
-        let varies = |frames: &[&RawFrame]| {
+        let varies = |tare: &[Vec<f32>]| {
             let of_taxel = |taxel: usize| {
-                let counts = frames.iter().map(|frame| frame.counts[taxel]);
+                let counts = tare.iter().map(|frame| frame[taxel]);
                 counts.clone().fold(f32::MIN, f32::max) - counts.fold(f32::MAX, f32::min)
             };
-            third((0..taxels).map(of_taxel).collect())
+            third((0..rest.len()).map(of_taxel).collect())
         };
         let mut quiet_noises: Vec<f32> = quiet.chunks(TARE_FRAMES).map(varies).collect();
         quiet_noises.sort_by(f32::total_cmp);
         let usual = quiet_noises[quiet_noises.len() / 2];
         // The largest, so that every tare at rest passes. In a press it is larger still.
-        let tares = all.chunks(TARE_FRAMES).map(varies);
+        let tares = frames.chunks(TARE_FRAMES).map(varies);
         let noise = tares
             .filter(|noise| *noise <= CALM * usual)
             .fold(usual, f32::max);
         let mut sorted = rest.clone();
         sorted.sort_by(f32::total_cmp);
-        let median = sorted[taxels / 2];
+        let median = sorted[sorted.len() / 2];
         let offset = third(rest.iter().map(|rest| (rest - median).max(0.0)).collect());
 
         let (threshold, tare_max) = (
@@ -122,8 +110,7 @@ impl Scale {
             tare::Settings::default().tare_max_n,
         );
         // Counts that are finer than a byte get fewer newtons: full scale is as many as that of a byte.
-        let is_whole = |frame: &RawFrame| frame.counts.iter().all(|count| count.fract() == 0.0);
-        let full_scale = match frames.iter().all(is_whole) {
+        let full_scale = match frames.iter().flatten().all(|count| count.fract() == 0.0) {
             true => (most_counts.max(255.0) + 1.0).log2().ceil().exp2() - 1.0,
             // Volts, newtons and their like.
             false => most_counts.max(press),

@@ -196,7 +196,7 @@ fn in_order(
     let most = changes.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
     let activity = changes.iter().map(|change| (change / most * 1e6) as u32);
     let activity: Vec<u32> = activity.collect();
-    let presses = Presses::of(&activity).ok_or(Failure::no_press(bytes.len() / frames.len()))?;
+    let presses = Presses::of(&activity).ok_or(Failure::NoPress(bytes.len() / frames.len()))?;
     let pictures =
         Pictures::of(&presses, |index| frames[index].clone()).expect("words were numbers");
     let score = |array: Array, presses| Score {
