@@ -5,6 +5,8 @@
 
 use std::ops::Range;
 
+use hardnessd_core::wire::Checksum;
+
 use crate::checks::Check;
 use crate::columns::{Columns, Kind};
 use crate::model::{
@@ -158,6 +160,21 @@ impl Place {
         };
         let unknown: f64 = self.unknown().map(of).sum();
         constants - field + in_cells + RESTLESS_TAXEL_BITS * restless as f64 + skipped + unknown
+    }
+
+    /// The place with this checksum. A sum of two bytes may be the low half of one of four: zeros that are next
+    /// to its high byte are no cells then.
+    pub(crate) fn with(mut self, check: Option<Check>) -> Self {
+        let of_sum = check.map_or(0..0, |check| match check.checksum {
+            Checksum::Sum16 => check.at + 2..check.at + 4,
+            Checksum::Sum16Be => check.at.saturating_sub(2)..check.at,
+            _ => 0..0,
+        });
+        for beside in self.beside.iter_mut().take(of_sum.end).skip(of_sum.start) {
+            beside.is_high |= beside.constant() == Some(0);
+        }
+        self.check = check;
+        self
     }
 
     /// How many constant bytes beside the cells look like cells at rest, and are nothing else.

@@ -305,10 +305,7 @@ impl Search<'_> {
         let span = |&index: &usize| self.frames.from(index, first, period + length);
         let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
         let kinds: Vec<Kind> = place.beside.iter().map(|beside| beside.kind).collect();
-        Place {
-            check: checks::find(&spans, &kinds),
-            ..place
-        }
+        place.with(checks::find(&spans, &kinds))
     }
 
     fn look_closely(&self, candidate: &mut Candidate) {
