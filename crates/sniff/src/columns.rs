@@ -40,15 +40,9 @@ pub(crate) struct Columns {
     /// The most frequent value of each byte.
     pub(crate) rest: Vec<u8>,
     pub(crate) numbers: Vec<Number>,
-    /// Its bytes as cells that never change, for cells of 1, 2 and 4 bytes.
-    pub(crate) resting: [Resting; 3],
-}
-
-/// The bits of each byte as a cell that never changes. 0 for bytes that change.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Resting {
-    pub(crate) bits: Vec<f64>,
-    pub(crate) total: f64,
+    /// The bits of each byte as a cell, of those that hardly look like one, and of all of them.
+    pub(crate) cell_bits: Vec<f64>,
+    pub(crate) all_cell_bits: f64,
 }
 
 /// Two frames that follow each other.
@@ -117,11 +111,13 @@ impl Columns {
             kinds: kinds.collect(),
             rest,
             numbers: Vec::new(),
-            resting: Default::default(),
+            cell_bits: Vec::new(),
+            all_cell_bits: 0.0,
         };
         columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
-        columns.find_resting(frames);
+        columns.cell_bits = columns.cell_bits(frames);
+        columns.all_cell_bits = columns.cell_bits.iter().sum();
         columns
     }
 
@@ -237,17 +233,12 @@ impl Columns {
         }
     }
 
-    /// What is known of bytes as cells of so many bytes that never change.
-    pub(crate) fn resting(&self, cell_bytes: usize) -> &Resting {
-        &self.resting[cell_bytes.ilog2().min(2) as usize]
-    }
-
-    fn find_resting(&mut self, frames: &Frames) {
+    fn cell_bits(&self, frames: &Frames) -> Vec<f64> {
         let is_still = self.still(frames);
         let period = self.kinds.len();
-        // The bytes near a byte at multiples of a distance. Constant ones that are close may be of the same
-        // mark.
-        let near = |at: usize, first: usize, step: usize| -> Vec<Near> {
+        // The bytes near a byte at even distances, so that high bytes are compared with high bytes. Constant
+        // ones that are close may be of the same mark.
+        let near = |at: usize| -> Vec<Near> {
             let is_cell = |distance: usize, other: usize| match self.kinds[other] {
                 Kind::Active => true,
                 Kind::Constant(_) => distance > MARK_BYTES,
@@ -258,7 +249,7 @@ impl Columns {
                 is_still: is_still[other],
                 is_constant: self.kinds[other].constant().is_some(),
             };
-            let distances = (first..=(period / 2).min(FARTHEST)).step_by(step);
+            let distances = (2..=(period / 2).min(FARTHEST)).step_by(2);
             let sides = distances.flat_map(|distance| {
                 [
                     (distance, (at + distance) % period),
@@ -268,21 +259,12 @@ impl Columns {
             let near = sides.filter(|&(distance, other)| is_cell(distance, other));
             near.map(|(_, other)| of(other)).take(NEAR).collect()
         };
-        let bits = |at: usize, cell_bytes: usize| match (self.kinds[at], cell_bytes) {
-            // Of cells of one byte those at odd distances are like those at even ones.
-            (Kind::Constant(value), 1) => {
-                model::resting(value, &near(at, 1, 2)).max(model::resting(value, &near(at, 2, 2)))
-            }
-            (Kind::Constant(value), step) => model::resting(value, &near(at, step, step)),
-            _ => 0.0,
+        let bits = |at: usize| match self.kinds[at] {
+            Kind::Constant(value) => model::resting(value, &near(at)),
+            Kind::Restless => model::RESTLESS_TAXEL_BITS,
+            Kind::Number | Kind::Active => 0.0,
         };
-        self.resting = [1, 2, 4].map(|cell_bytes| {
-            let bits: Vec<f64> = (0..period).map(|at| bits(at, cell_bytes)).collect();
-            Resting {
-                total: bits.iter().sum(),
-                bits,
-            }
-        });
+        (0..period).map(bits).collect()
     }
 
     /// Whether each byte is always the same where nothing presses.

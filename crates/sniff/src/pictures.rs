@@ -88,16 +88,6 @@ impl Presses {
     pub(crate) fn rest(&self) -> impl Iterator<Item = usize> + '_ {
         self.rest.iter().copied()
     }
-
-    /// About `most` of the presses with one picture each, for a first look.
-    pub(crate) fn coarse(&self, most: usize) -> Self {
-        let middle = |press: &Vec<usize>| vec![press[press.len() / 2]];
-        let presses: Vec<Vec<usize>> = self.presses.iter().map(middle).collect();
-        Self {
-            presses: some(&presses, most),
-            rest: some(&self.rest, 5),
-        }
-    }
 }
 
 /// About `most` of `of`, from all over it.

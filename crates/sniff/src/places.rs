@@ -10,8 +10,7 @@ use hardnessd_core::wire::Checksum;
 use crate::checks::Check;
 use crate::columns::{Columns, Kind};
 use crate::model::{
-    CONSTANT_BITS, EXPECTED_BITS, RESTLESS_TAXEL_BITS, SKIPPED_BITS, UNKNOWN_BITS,
-    UNKNOWN_TAXEL_BITS, ZERO_BITS,
+    CONSTANT_BITS, EXPECTED_BITS, SKIPPED_BITS, UNKNOWN_BITS, UNKNOWN_TAXEL_BITS, ZERO_BITS,
 };
 
 /// A stretch of each frame that may be the cells.
@@ -93,7 +92,7 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
                 beside,
                 check: None,
             };
-            found.push((place.bits(columns, 2), place));
+            found.push((place.bits(columns), place));
         }
         found[shorter..].sort_by(|a, b| a.0.total_cmp(&b.0));
         found.truncate(shorter + MOST_OF_LENGTH);
@@ -107,7 +106,7 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
 }
 
 fn beside(columns: &Columns, at: usize) -> Beside {
-    let (kind, resting) = (columns.kinds[at], columns.resting(2).bits[at]);
+    let (kind, resting) = (columns.kinds[at], columns.cell_bits[at]);
     let is_high = columns.is_high_byte(at);
     Beside {
         at,
@@ -128,7 +127,7 @@ fn constant_bits(kind: Kind) -> f64 {
 impl Place {
     /// The bits of what is coded once: the constant bytes beside the cells and in them, and that there
     /// are unknown bytes.
-    pub(crate) fn bits(&self, columns: &Columns, cell_bytes: usize) -> f64 {
+    pub(crate) fn bits(&self, columns: &Columns) -> f64 {
         let constants: f64 = self.beside.iter().map(Beside::bits).sum();
         let field = self.length_field().map_or(0.0, |end| {
             let of_mark: f64 = self.beside[end - 2..end].iter().map(Beside::bits).sum();
@@ -143,23 +142,17 @@ impl Place {
                 .find(is_padding),
         ];
         let skipped = SKIPPED_BITS * sides.iter_mut().flatten().count() as f64;
-        let resting = columns.resting(cell_bytes);
-        let in_cells = resting.total
-            - self
-                .beside
-                .iter()
-                .map(|beside| resting.bits[beside.at])
-                .sum::<f64>();
-        let is_restless = |kind: &Kind| *kind == Kind::Restless;
-        let restless = columns.kinds.iter().copied().filter(is_restless).count();
-        let restless_beside = self.beside.iter().map(|beside| beside.kind);
-        let restless = restless - restless_beside.filter(is_restless).count();
+        let beside = self
+            .beside
+            .iter()
+            .map(|beside| columns.cell_bits[beside.at]);
+        let in_cells = columns.all_cell_bits - beside.sum::<f64>();
         let of = |beside: &Beside| match beside.kind {
             Kind::Active => UNKNOWN_TAXEL_BITS,
             _ => UNKNOWN_BITS,
         };
         let unknown: f64 = self.unknown().map(of).sum();
-        constants - field + in_cells + RESTLESS_TAXEL_BITS * restless as f64 + skipped + unknown
+        constants - field + in_cells + skipped + unknown
     }
 
     /// The place with this checksum. A sum of two bytes may be the low half of one of four: zeros that are next

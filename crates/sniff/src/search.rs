@@ -31,17 +31,14 @@ const FEWEST_PLACES: usize = 24;
 const PLACE_BYTES: usize = 60_000;
 /// What is left out at the ends of the cells to tell formats.
 const MARGIN: usize = 16;
-/// How many bytes are looked at first.
-const COARSE_BYTES: usize = 32_000;
 /// The most bytes of a mark that look like cells at rest.
 const MOST_RESTING: usize = 4;
 /// As many arrays are decoded: the mark of a known board counts only then.
 const RANKED: usize = 6;
 /// So many times as many places are tried for a checksum.
 const UNCHECKED: usize = 3;
-/// The most formats at a place, and the most arrays that are looked at closely.
+/// The most formats at a place.
 const MOST_FORMATS: usize = 8;
-const MOST_ARRAYS: usize = 40;
 /// Where a cell is so much more like one of the next but one than like its neighbour, a taxel has several
 /// numbers, and one number for each takes so many bits more.
 const INTERLEAVED: f64 = 0.7;
@@ -75,9 +72,12 @@ impl Format {
 /// difference is less than such a `share`.
 fn interleaved(pictures: &Pictures, array: Array, share: f64) -> Option<usize> {
     let differs = |by: usize| model::difference(pictures, array.cols, by);
-    (2..=MOST_CHANNELS).find(|by| {
-        array.cols.is_multiple_of(*by) && array.cols >= 3 * by && differs(*by) < share * differs(1)
-    })
+    let mut numbers = (2..=MOST_CHANNELS)
+        .filter(|by| array.cols.is_multiple_of(*by) && array.cols >= 3 * by)
+        .peekable();
+    numbers.peek()?;
+    let neighbours = differs(1);
+    numbers.find(|&by| differs(by) < share * neighbours)
 }
 
 /// The doubt that what looks like several columns is several numbers of a taxel.
@@ -107,7 +107,6 @@ struct Search<'a> {
     frames: &'a Frames<'a>,
     columns: &'a Columns,
     presses: Presses,
-    coarse: Presses,
     /// By press, the bits of each byte on its own.
     alone: Vec<Vec<f64>>,
 }
@@ -146,7 +145,6 @@ pub(crate) fn in_frames(
     let search = Search {
         frames,
         columns,
-        coarse: presses.coarse((COARSE_BYTES / period).clamp(4, 16)),
         presses,
         alone,
     };
@@ -154,13 +152,9 @@ pub(crate) fn in_frames(
         .into_iter()
         .map(|place| search.checked(place))
         .collect();
-    places.sort_by(|a, b| a.bits(columns, 2).total_cmp(&b.bits(columns, 2)));
+    places.sort_by(|a, b| a.bits(columns).total_cmp(&b.bits(columns)));
     places.truncate(most);
-    let mut candidates = search.candidates(places, known);
-    for candidate in &mut candidates {
-        search.look_closely(candidate);
-    }
-    candidates.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
+    let candidates = search.candidates(places, known);
     search.rank(&candidates, begin, capture.bytes, known)
 }
 
@@ -195,7 +189,7 @@ impl Search<'_> {
                 .zip(&self.alone)
                 .map(|(bits, alone)| bits + beside(alone))
                 .collect(),
-            once: place.bits(self.columns, format.cell.bytes())
+            once: place.bits(self.columns)
                 + name_bits(array)
                 + format.name_bits()
                 + UNUSED_DIGIT_BITS * f64::from(unused),
@@ -220,7 +214,7 @@ impl Search<'_> {
         };
         for cell in CELLS.into_iter().filter(is_allowed) {
             let single = Format { cell, channels: 1 };
-            let Some(pictures) = self.pictures(&self.coarse, place, single) else {
+            let Some(pictures) = self.pictures(&self.presses, place, single) else {
                 continue;
             };
             let later = later(&pictures).iter().sum::<f64>();
@@ -249,7 +243,7 @@ impl Search<'_> {
         found.into_iter().map(|(_, format)| format).collect()
     }
 
-    /// The likeliest arrays at all places.
+    /// The arrays at all places, the likeliest first.
     fn candidates(&self, places: Vec<Place>, known: Known) -> Vec<Candidate> {
         // Which formats are likely depends on where a number of four bytes begins.
         let mut formats: [Option<Vec<Format>>; 4] = [const { None }; 4];
@@ -269,7 +263,7 @@ impl Search<'_> {
                     continue;
                 }
                 let count = place.bytes / format.bytes();
-                let Some(pictures) = self.pictures(&self.coarse, &place, format) else {
+                let Some(pictures) = self.pictures(&self.presses, &place, format) else {
                     continue;
                 };
                 let later = later(&pictures);
@@ -279,7 +273,11 @@ impl Search<'_> {
                         continue;
                     }
                     let bits = added(model::rows(&pictures, array.cols, format.channels), &later);
-                    let score = self.score(&place, format, array, &pictures, &bits);
+                    let mut score = self.score(&place, format, array, &pictures, &bits);
+                    if format.channels == 1 && interleaved(&pictures, array, INTERLEAVED).is_some()
+                    {
+                        score.once += INTERLEAVED_BITS;
+                    }
                     found.push(Candidate {
                         array,
                         format,
@@ -290,7 +288,6 @@ impl Search<'_> {
             }
         }
         found.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
-        found.truncate(MOST_ARRAYS);
         found
     }
 
@@ -306,25 +303,6 @@ impl Search<'_> {
         let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
         let kinds: Vec<Kind> = place.beside.iter().map(|beside| beside.kind).collect();
         place.with(checks::find(&spans, &kinds))
-    }
-
-    fn look_closely(&self, candidate: &mut Candidate) {
-        let Candidate {
-            array,
-            format,
-            place,
-            score,
-        } = candidate;
-        if let Some(pictures) = self.pictures(&self.presses, place, *format) {
-            let bits = added(
-                model::rows(&pictures, array.cols, format.channels),
-                &later(&pictures),
-            );
-            *score = self.score(place, *format, *array, &pictures, &bits);
-            if format.channels == 1 && interleaved(&pictures, *array, INTERLEAVED).is_some() {
-                score.once += INTERLEAVED_BITS;
-            }
-        }
     }
 
     /// Decodes the likeliest candidates.
