@@ -23,7 +23,7 @@ use super::exit::{Fail as _, Failure, IO};
 use super::player::Played;
 use super::robot::Position;
 use hardnessd_core::event::round_3;
-use hardnessd_core::range::{self, OutOfRange};
+use hardnessd_core::range::{self, OutOfRange, from_to};
 use hardnessd_simulator::{Rig, SequenceSettings};
 
 /// The time between the moment that a frame shows and its first byte: a sensor needs some to scan its
@@ -92,9 +92,8 @@ struct Order {
 
 impl Order {
     fn check(&self) -> Result<(), OutOfRange> {
-        range::within("to_mm", self.to_mm.unwrap_or(0.0), (0.0, REACH_MM), "")?;
-        let speed_mm_s = self.speed_mm_s.unwrap_or(SPEED_MM_S);
-        range::within("speed_mm_s", speed_mm_s, (0.1, FASTEST_MM_S), "")?;
+        from_to((0.0, REACH_MM), "").check("to_mm", &self.to_mm)?;
+        from_to((0.1, FASTEST_MM_S), "").check("speed_mm_s", &self.speed_mm_s)?;
         range::check("object", 0, self.object != Some(0), "a number from 1")
     }
 }

@@ -287,11 +287,11 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::verdict::{ModelFrame, Sample, TAXELS};
+    use hardnessd_core::verdict::{ModelFrame, Moment, TAXELS};
 
     fn press(newtons: f32) -> TimeSeries {
         TimeSeries {
-            moments: vec![Sample {
+            moments: vec![Moment {
                 time_s: 0.0,
                 approach_mm: None,
                 frame: ModelFrame {

@@ -60,22 +60,6 @@ pub fn check(
     }
 }
 
-/// Checks that a number is from `least` to `most`. `unit` follows these in the message.
-///
-/// # Errors
-///
-/// Returns [`OutOfRange`] if the number is less or more, or no number.
-pub fn within<T: PartialOrd + Debug + Display>(
-    key: &str,
-    found: T,
-    (least, most): (T, T),
-    unit: &str,
-) -> Result<(), OutOfRange> {
-    let fits = (&least..=&most).contains(&&found);
-    let expected = format!("{least} to {most} {unit}");
-    check(key, found, fits, expected.trim_end())
-}
-
 /// The range of a number in a table of settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {

@@ -7,7 +7,7 @@
 use std::io::Cursor;
 
 use crate::npz::{Reader, Unexpected, Writer};
-use crate::verdict::{COURSE_FRAMES, MOST_REFERENCES, Piece, ReferencePress, Sample, TAXELS};
+use crate::verdict::{COURSE_FRAMES, MOST_REFERENCES, Moment, Piece, ReferencePress, TAXELS};
 use crate::wording::cut;
 
 /// The newtons on a taxel, without the sign.
@@ -75,7 +75,7 @@ fn is_usable(press: &ReferencePress) -> bool {
         Piece::Flat { width_mm: mm } | Piece::Ball { radius_mm: mm } => mm > 0.0 && mm <= MOST_MM,
         Piece::Shore { range } => range.is_sorted() && range[0] >= 0.0 && range[1] <= 100.0,
     };
-    let is_sample = |moment: &Sample| {
+    let is_sample = |moment: &Moment| {
         (0.0..=MOST_S).contains(&moment.time_s)
             && moment.approach_mm.is_none_or(|mm| mm.abs() <= 1e6)
             && moment.frame.newtons.iter().all(|n| n.abs() <= MOST_N)
@@ -107,7 +107,7 @@ mod tests {
             let mut frame = ModelFrame::default();
             frame.newtons[400..403].fill(0.25 * (place + 1) as f32);
             frame.newtons[403] = -0.0125;
-            Sample {
+            Moment {
                 time_s: 0.05 * place as f32,
                 approach_mm: (place != 2).then_some(0.5 * place as f32),
                 frame,

@@ -27,7 +27,7 @@ use tract_onnx::prelude::*;
 pub use self::card::{
     Card, Check, CheckedCourse, Checks, Conformal, CourseCheck, Format, Limits, Range, TAIL,
 };
-pub use self::course::{COURSE_FRAMES, Sample, TimeSeries};
+pub use self::course::{COURSE_FRAMES, Moment, TimeSeries};
 pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
 use self::file::File;
 pub use self::file::{are_levels, check_line};

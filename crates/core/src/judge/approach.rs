@@ -10,7 +10,7 @@ use crate::motion::{self, SPEEDS_MM_S, Track};
 use crate::press::{ContactFrame, Phases, SoFar, thinned};
 use crate::sensor::Sensor;
 use crate::verdict::parts::parts;
-use crate::verdict::{Resampling, Sample, TimeSeries};
+use crate::verdict::{Moment, Resampling, TimeSeries};
 
 /// The slope is fitted from this share of loading's last force on, so that it is the slope of the
 /// deepest part.
@@ -28,8 +28,8 @@ pub struct EndedPress {
     pub sensor: String,
     /// The press's number.
     pub press: u64,
-    /// Seconds since the press began, the approach where it is known, and the frame in the sensor's grid.
-    pub moments: Vec<(f32, Option<f32>, Arc<Frame>)>,
+    /// Its frames in the sensor's grid.
+    pub moments: Vec<Moment<Arc<Frame>>>,
     /// The place of the best frame among them.
     pub best: usize,
     /// Stiffness of the arm. 0 if it or the approach is unknown.
@@ -41,15 +41,12 @@ pub struct EndedPress {
 impl EndedPress {
     /// The press on a model's grid, with taxels `grid_mm` apart.
     pub fn course(&self, grid_mm: f64) -> TimeSeries {
-        let (.., best) = &self.moments[self.best];
+        let best = &self.moments[self.best].frame;
         let resampling = Resampling::new(best, self.pitch, grid_mm);
-        let sample = |(time_s, approach_mm, frame): &(f32, Option<f32>, Arc<Frame>)| Sample {
-            time_s: *time_s,
-            approach_mm: *approach_mm,
-            frame: resampling.apply(frame),
-        };
+        let moments = self.moments.iter();
+        let moments = moments.map(|moment| moment.map(|frame| resampling.apply(frame)));
         TimeSeries {
-            moments: self.moments.iter().map(sample).collect(),
+            moments: moments.collect(),
             arm_n_per_mm: self.arm_n_per_mm,
         }
     }
@@ -57,7 +54,7 @@ impl EndedPress {
     /// The press on the array's own grid, for a model of parts.
     pub(super) fn parts(&self) -> Vec<f32> {
         let moments = self.moments.iter();
-        let moments = moments.map(|(time_s, _, frame)| (*time_s, &frame.newtons[..]));
+        let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
         parts(&moments.collect::<Vec<_>>())
     }
 }
@@ -132,9 +129,11 @@ impl<'a> PressWithApproach<'a> {
         let begin = self.frames[0].moment.stamp.mono;
         let moment = |&place: &usize| {
             let ContactFrame { moment, frame, .. } = self.frames[place];
-            let since = moment.stamp.mono.saturating_sub(begin);
-            let approach_mm = self.approach_mm[place].map(|mm| mm as f32);
-            (since.as_secs_f32(), approach_mm, Arc::clone(frame))
+            Moment {
+                time_s: moment.stamp.mono.saturating_sub(begin).as_secs_f32(),
+                approach_mm: self.approach_mm[place].map(|mm| mm as f32),
+                frame: Arc::clone(frame),
+            }
         };
         let is_known = self.source != ApproachSource::None;
         let arm_n_per_mm = sensor.arm().stiffness_n_per_mm.filter(|_| is_known);

@@ -1,7 +1,7 @@
 //! The thresholds that begin and end a press.
 
 use crate::frame::{Array, Pitch};
-use crate::range::{OutOfRange, above_0, from_to, within};
+use crate::range::{OutOfRange, above_0, from_to};
 
 /// The largest number of a key, which is beyond any press.
 const LARGEST: f64 = 1e6;
@@ -55,8 +55,8 @@ impl Settings {
         self.check_ranges()?;
         let thresholds = self.thresholds(array, pitch);
         let (begin, end) = (thresholds.begin_area_taxels, thresholds.end_area_taxels);
-        within("begin_area_taxels", begin, (1, array.taxels() as u32), "")?;
-        within("end_area_taxels", end, (1, begin), "")?;
+        from_to((1.0, array.taxels() as f64), "").check("begin_area_taxels", &begin)?;
+        from_to((1.0, begin.into()), "").check("end_area_taxels", &end)?;
         Ok(thresholds)
     }
 

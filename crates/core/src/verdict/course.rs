@@ -9,15 +9,26 @@ use crate::frame::sparse;
 /// The fewest and the most frames that a model of courses may take.
 pub const COURSE_FRAMES: (usize, usize) = (3, 48);
 
-/// One frame of a press.
+/// One moment of a press, with its frame: on the model's grid, in the sensor's own, or as features.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sample {
+pub struct Moment<F = ModelFrame> {
     /// The seconds since the frame that began the press.
     pub time_s: f32,
     /// How far the arm went since the frame that began the press. `None` if it is unknown.
     pub approach_mm: Option<f32>,
-    /// The taxels of the frame.
-    pub frame: ModelFrame,
+    /// The frame.
+    pub frame: F,
+}
+
+impl<F> Moment<F> {
+    /// The moment with what `change` makes of its frame.
+    pub fn map<G>(&self, change: impl FnOnce(&F) -> G) -> Moment<G> {
+        Moment {
+            time_s: self.time_s,
+            approach_mm: self.approach_mm,
+            frame: change(&self.frame),
+        }
+    }
 }
 
 /// A press over time.
@@ -27,12 +38,12 @@ pub struct Sample {
 /// The built-in model judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame, Sample, TimeSeries};
+/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame, Moment, TimeSeries};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
 ///     let mut frame = ModelFrame::default();
 ///     frame.newtons[400..404].fill(newtons);
-///     Sample { time_s, approach_mm: Some(approach_mm), frame }
+///     Moment { time_s, approach_mm: Some(approach_mm), frame }
 /// };
 /// let course = TimeSeries {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
@@ -47,7 +58,7 @@ pub struct Sample {
 #[serde(into = "Written", try_from = "Written")]
 pub struct TimeSeries {
     /// The frames in contact, from the one that began the press, ascending in time.
-    pub moments: Vec<Sample>,
+    pub moments: Vec<Moment>,
     /// The stiffness of the arm. 0 if it is unknown.
     pub arm_n_per_mm: f32,
 }
@@ -98,7 +109,7 @@ impl TryFrom<Written> for TimeSeries {
             let newtons = sparse::read(frame, TAXELS);
             let newtons = newtons.map_err(|error| format!("a frame of a press: {error}"))?;
             let newtons = newtons.try_into().expect("as many as were asked for");
-            Ok::<_, String>(Sample {
+            Ok::<_, String>(Moment {
                 time_s,
                 approach_mm,
                 frame: ModelFrame { newtons },

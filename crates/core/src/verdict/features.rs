@@ -7,7 +7,7 @@
 
 use std::ops::Range;
 
-use super::course::{Sample, TimeSeries, period_s};
+use super::course::{Moment, TimeSeries, period_s};
 use super::grid::{COLS, ModelFrame, ROWS};
 use crate::line;
 use crate::press::Phases;
@@ -212,28 +212,6 @@ impl Moments {
     }
 }
 
-/// A frame of a press as features take it: its own features, seconds since the press began, and the
-/// approach where it is known.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Moment {
-    /// The features of the frame.
-    pub frame: FrameFeatures,
-    /// Seconds since the frame that began the press.
-    pub time_s: f32,
-    /// The approach of the arm since that frame.
-    pub approach_mm: Option<f32>,
-}
-
-impl From<&Sample> for Moment {
-    fn from(moment: &Sample) -> Self {
-        Self {
-            frame: of_frame(&moment.frame),
-            time_s: moment.time_s,
-            approach_mm: moment.approach_mm,
-        }
-    }
-}
-
 impl TimeSeries {
     /// The features of the press.
     ///
@@ -241,8 +219,8 @@ impl TimeSeries {
     ///
     /// Panics if the course has no frame.
     pub fn features(&self) -> [f32; FEATURES] {
-        let moments: Vec<Moment> = self.moments.iter().map(Moment::from).collect();
-        of_press(&moments, self.arm_n_per_mm)
+        let moments = self.moments.iter().map(|moment| moment.map(of_frame));
+        of_press(&moments.collect::<Vec<_>>(), self.arm_n_per_mm)
     }
 }
 
@@ -251,7 +229,7 @@ impl TimeSeries {
 /// # Panics
 ///
 /// Panics if there is no frame.
-pub fn of_press(moments: &[Moment], arm_n_per_mm: f32) -> [f32; FEATURES] {
+pub fn of_press(moments: &[Moment<FrameFeatures>], arm_n_per_mm: f32) -> [f32; FEATURES] {
     let press = Press::new(moments, arm_n_per_mm);
     let mut row = Vec::with_capacity(FEATURES);
     row.extend(press.moments[press.top].frame);
@@ -272,7 +250,7 @@ fn length(mm: f32) -> f32 {
 
 /// A press with what all features need.
 struct Press<'a> {
-    moments: &'a [Moment],
+    moments: &'a [Moment<FrameFeatures>],
     forces_n: Vec<f32>,
     /// The frame of the largest area, and that of the greatest force.
     best: usize,
@@ -285,7 +263,7 @@ struct Press<'a> {
 }
 
 impl<'a> Press<'a> {
-    fn new(moments: &'a [Moment], arm_n_per_mm: f32) -> Self {
+    fn new(moments: &'a [Moment<FrameFeatures>], arm_n_per_mm: f32) -> Self {
         let forces_n: Vec<f32> = moments
             .iter()
             .map(|moment| force_n(&moment.frame).max(1e-3))
@@ -549,7 +527,7 @@ mod tests {
 
     /// A ball on an elastic half space, on an arm of 10 N/mm: loaded in 20 steps, held for 10 while the
     /// force falls by a tenth, and unloaded.
-    fn ball() -> Vec<Moment> {
+    fn ball() -> Vec<Moment<FrameFeatures>> {
         let moment = |step: u8, depth_mm: f32, share: f32| {
             let force_n = 5.0 * depth_mm.powf(1.5);
             Moment {
@@ -601,7 +579,7 @@ mod tests {
                 time_s: period_s * place as f32,
                 approach_mm,
             };
-            let moments: Vec<Moment> = rows.iter().enumerate().map(moment).collect();
+            let moments: Vec<_> = rows.iter().enumerate().map(moment).collect();
             let features = of_press(&moments, arm_n_per_mm);
             prop_assert!(features.iter().all(|x| x.is_finite()), "{features:?}");
         }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::bail;
 
-use super::course::{Sample, TimeSeries};
+use super::course::{Moment, TimeSeries};
 use super::features::FEATURES;
 use super::grid::{COLS, ROWS};
 use super::parts::PARTS;
@@ -88,9 +88,9 @@ impl Input {
     /// The tensor of this input for `query`. Places after the last frame or reference are 0.
     pub(super) fn tensor(self, query: &Query, lengths: Lengths) -> TractResult<Tensor> {
         let course = query.course;
-        let pressed = |moment: &Sample| -> Vec<f32> { moment.frame.pressed().collect() };
+        let pressed = |moment: &Moment| -> Vec<f32> { moment.frame.pressed().collect() };
         let each =
-            |value: fn(&Sample) -> f32| -> Vec<f32> { course.moments.iter().map(value).collect() };
+            |value: fn(&Moment) -> f32| -> Vec<f32> { course.moments.iter().map(value).collect() };
         let mut values = match self {
             Self::Frame | Self::Parts => bail!("the model takes no courses"),
             Self::Frames => course.moments.iter().flat_map(pressed).collect(),

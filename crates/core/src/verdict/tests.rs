@@ -61,7 +61,7 @@ fn course(length: usize, approach: bool) -> TimeSeries {
     let moments = (0..length).map(|place| {
         let mut frame = ModelFrame::default();
         frame.newtons[500..510].fill(0.3 * (1 + place) as f32);
-        Sample {
+        Moment {
             time_s: 0.2 * place as f32,
             approach_mm: approach.then_some(place as f32),
             frame,

@@ -6,7 +6,7 @@ use super::scan::{Context, Scan};
 use super::settings::Settings;
 use super::text::{self, Lines};
 use crate::frame::{Array, RawFrame};
-use crate::range::{OutOfRange, check, within};
+use crate::range::{OutOfRange, check, from_to};
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -97,7 +97,7 @@ impl Layout {
                 let expected = "none for cells with a sign, of 32 bits or of floats";
                 OutOfRange::new("mask", mask, expected)
             })?;
-            within("mask", mask, (1, bits), "for this cell")?;
+            from_to((1.0, bits.into()), "for this cell").check("mask", &mask)?;
         }
         // A text has no widest number, so it can only be inverted by a mask that is written.
         let mask = keys.mask.or(bits.filter(|_| invert && !is_text));

@@ -14,7 +14,7 @@ use std::path::Path;
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, ModelFrame, ROWS, Resampling, Sample, TimeSeries, parts,
+    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, ROWS, Resampling, TimeSeries, parts,
 };
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Reference, Split};
 
@@ -300,7 +300,7 @@ impl Presses {
 
     /// The course of a press as the daemon would give it to a model: from the frame that began it.
     pub fn course(&self, press: usize) -> TimeSeries {
-        let moment = |row: usize| Sample {
+        let moment = |row: usize| Moment {
             time_s: self.time_s[row],
             approach_mm: self.approach_mm[row],
             frame: self.frames.frame(row),

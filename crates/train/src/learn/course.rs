@@ -15,8 +15,8 @@ use crate::net::graph::Graph;
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
-use hardnessd_core::verdict::features::{self, FEATURES, Moment};
-use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Piece};
+use hardnessd_core::verdict::features::{self, FEATURES, FrameFeatures};
+use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Moment, Piece};
 use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
@@ -32,7 +32,7 @@ const STAGE: &str = "course";
 #[derive(Debug, Clone, PartialEq)]
 pub struct Press {
     /// Features, time and approach of each frame, from the one that began the press.
-    pub moments: Vec<Moment>,
+    pub moments: Vec<Moment<FrameFeatures>>,
     /// Stiffness of the arm in N/mm; 0 if unknown.
     pub arm_n_per_mm: f32,
     /// The hardness level, 1..=L, or 0 if unlabelled.
@@ -49,10 +49,11 @@ pub struct Press {
 
 /// All presses of the data, each from the frame that began it.
 pub fn prepared(presses: &Presses) -> Vec<Press> {
+    let features = |moment: &Moment| moment.map(features::of_frame);
     let prepare = |place: usize| {
         let (course, press) = (presses.course(place), &presses.all[place]);
         Press {
-            moments: course.moments.iter().map(Moment::from).collect(),
+            moments: course.moments.iter().map(features).collect(),
             arm_n_per_mm: course.arm_n_per_mm,
             level: press.level,
             shore: press.shore,

@@ -250,7 +250,7 @@ impl Recording {
         let level = said("level").and_then(Value::as_u64);
         let level = level.and_then(|level| u8::try_from(level).ok());
         let is_level = |level: &u8| usize::from(*level) <= MOST_LEVELS;
-        let (.., best) = &ended.moments[ended.best];
+        let best = &ended.moments[ended.best].frame;
         let name = name_of(&self.path);
         let press = Press {
             level: level.filter(is_level).unwrap_or(0),

@@ -274,7 +274,8 @@ fn shuffled<'a>(order: &'a mut [usize], count: usize, stream: &mut Stream) -> &'
 mod tests {
     use super::*;
     use crate::data::source::papers_levels;
-    use hardnessd_core::verdict::features::{Moment, frame_of};
+    use hardnessd_core::verdict::Moment;
+    use hardnessd_core::verdict::features::frame_of;
 
     #[test]
     fn no_reference_is_a_press_of_an_object_that_is_judged() {

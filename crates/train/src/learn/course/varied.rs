@@ -117,7 +117,8 @@ fn at(reported: &[(f32, f32)], time_s: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::verdict::features::{Moment, frame_of};
+    use hardnessd_core::verdict::Moment;
+    use hardnessd_core::verdict::features::frame_of;
 
     fn press() -> Press {
         let moment = |n: u8| Moment {
