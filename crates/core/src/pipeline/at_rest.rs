@@ -28,6 +28,7 @@ pub struct AtRest {
     decoder: Place,
     /// The bytes that have not become a frame yet.
     pending: HexBytes,
+    /// The ends of recent chunks in the stream, and when they came.
     chunks: VecDeque<(u64, Stamp)>,
     tare: tare::AtRest,
     motion: Vec<Point>,
