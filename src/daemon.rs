@@ -125,8 +125,6 @@ pub enum Sockets {
 /// A daemon that has started: its sockets answer, and its ports are being opened.
 pub struct Daemon {
     setup: Setup,
-    /// The token of this run.
-    run: String,
     hub: Hub,
     sensors: Sensors,
     /// The tasks of the sensors.
@@ -196,7 +194,7 @@ impl Daemon {
 
     fn start_with(setup: Setup, target: Option<Target>) -> Result<Self, Error> {
         let run = run_token().map_err(|error| Error::Io(format!("/dev/urandom: {error}")))?;
-        let hello = hello(&setup, run.clone());
+        let hello = hello(&setup, run);
         raise_descriptors();
         realtime::lock_memory();
         let hub = Hub::new(hello.clone());
@@ -232,7 +230,6 @@ impl Daemon {
         let cores = parts.map(core).collect();
         let mut daemon = Self {
             setup,
-            run,
             hub,
             sensors,
             tasks: JoinSet::new(),
@@ -243,7 +240,7 @@ impl Daemon {
             listening,
         };
         daemon.start_sensors(cores);
-        daemon.announce();
+        daemon.announce(&hello.run);
         systemd::ready();
         Ok(daemon)
     }
@@ -260,11 +257,11 @@ impl Daemon {
         }
     }
 
-    fn announce(&self) {
+    fn announce(&self, run: &str) {
         info!(
             version = env!("CARGO_PKG_VERSION"),
             robot = self.setup.config.robot.as_str(),
-            run = self.run,
+            run,
             model = short(&self.setup),
             validation = self.setup.hrn.card().validation.as_str(),
             "started"
@@ -300,14 +297,9 @@ impl Daemon {
 /// Raises the soft limit of file descriptors to the hard limit, because every subscriber takes one.
 /// Nothing in this process fails on descriptors above 1,023.
 fn raise_descriptors() {
-    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
-    let raised = Rlimit {
-        current: maximum,
-        maximum,
-    };
-    if current != maximum
-        && let Err(error) = setrlimit(Resource::Nofile, raised)
-    {
+    let limit = getrlimit(Resource::Nofile);
+    let current = limit.maximum;
+    if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current, ..limit }) {
         debug!(%error, "the limit of file descriptors stays as it is");
     }
 }

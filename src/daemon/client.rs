@@ -130,7 +130,7 @@ async fn read(
             // The writer ends when it has sent the answers so far.
             None => return Ok(()),
         };
-        let request::Line { id, request } = request::parse(&line);
+        let (id, request) = request::parse(&line);
         place.send(match request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
             // A command may take long, because it may wait for frames or for a file to be written.

@@ -39,7 +39,7 @@ use super::accept::{Serve, Stop, stopped};
 use super::client::set_context;
 use super::hub::{Hub, Snapshot};
 use super::sensor::Sensors;
-use hardnessd_core::event::{Event, LinkState, Reply};
+use hardnessd_core::event::{self, Event, LinkState, Reply, Status};
 
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
@@ -93,7 +93,9 @@ impl Http {
         let mut routes = Router::new()
             .route("/", get(async || page))
             .route("/events", get(events::answer))
-            .route("/api/status", get(async move |hub| status(hub, sets_context).await))
+            .route("/api/status", get(async move |State(hub): State<Hub>| {
+                text("application/json", status(&hub.snapshot().await, sets_context))
+            }))
             .route("/metrics", get(metrics))
             .route("/livez", get(live))
             .route("/readyz", get(ready))
@@ -107,8 +109,11 @@ impl Http {
             let set = post(async move |headers, body| context(&sensors, headers, body).await);
             routes = routes.route("/api/context", set.layer(DefaultBodyLimit::max(BODY_BYTES)));
         }
-        let routes = routes.method_not_allowed_fallback(async || {
-            let message = "method not allowed: use GET or HEAD, and POST for /api/context alone";
+        let routes = routes.method_not_allowed_fallback(async move || {
+            let message = match sets_context {
+                true => "method not allowed: use GET or HEAD, and POST for /api/context alone",
+                false => "method not allowed: this server is read-only: use GET or HEAD",
+            };
             refusal(StatusCode::METHOD_NOT_ALLOWED, message)
         });
         Self {
@@ -166,16 +171,11 @@ fn text(content_type: &'static str, text: String) -> Response {
     ([(header::CONTENT_TYPE, content_type)], text).into_response()
 }
 
-async fn status(State(hub): State<Hub>, sets_context: bool) -> Response {
-    let status = status_json(&hub.snapshot().await, sets_context);
-    text("application/json", status)
-}
-
 /// An object of `hello` as on a socket, `subscribers`, `sets_context` (whether the page may say what is
 /// being pressed), and a list of `sensors`. A sensor has its `status` and `last` (its last final
 /// verdict, or null) as on a socket, `last_frame_age_s` (null before the first frame) and the
 /// current `contact_threshold_n`.
-fn status_json(now: &Snapshot, sets_context: bool) -> String {
+fn status(now: &Snapshot, sets_context: bool) -> String {
     let read = |line: &str| -> Value {
         serde_json::from_str(line).expect("what was written as JSON can be read as JSON")
     };
@@ -217,17 +217,13 @@ async fn live(State(hub): State<Hub>) -> Response {
 
 async fn ready(State(hub): State<Hub>) -> impl IntoResponse {
     let now = hub.snapshot().await;
-    let mut lines = String::new();
-    let mut code = StatusCode::OK;
-    for sensor in &now.sensors {
-        let status = &sensor.state.status;
-        if status.state != LinkState::Live {
-            code = StatusCode::SERVICE_UNAVAILABLE;
-        }
-        let state = hardnessd_core::event::name(&status.state);
-        lines += &format!("{} {state}\n", status.sensor);
-    }
-    (code, lines)
+    let statuses = || now.sensors.iter().map(|sensor| &sensor.state.status);
+    let code = match statuses().all(|status| status.state == LinkState::Live) {
+        true => StatusCode::OK,
+        false => StatusCode::SERVICE_UNAVAILABLE,
+    };
+    let line = |status: &Status| format!("{} {}\n", status.sensor, event::name(&status.state));
+    (code, statuses().map(line).collect::<String>())
 }
 
 impl Serve<TcpStream> for Http {

@@ -125,7 +125,7 @@ impl Publishers {
         }
         #[cfg(feature = "zenoh")]
         if let Some(settings) = &publish.zenoh {
-            let worker = zenoh::open(settings, config, hub, sensors)?;
+            let worker = zenoh::open(settings, config, hub)?;
             serving.push((clients, Box::pin(worker.serve(hub.clone()))));
         }
         for (way, path) in paths {

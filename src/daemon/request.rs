@@ -134,30 +134,12 @@ impl TryFrom<Map<String, Value>> for Context {
     }
 }
 
-/// A line that was read.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Line {
-    /// The `id` to echo in the answer.
-    pub(crate) id: Option<Value>,
-    /// The request, or the reason the line cannot be used, in words.
-    pub(crate) request: Result<Request, String>,
-}
-
-/// Reads one line, without its newline.
-pub(crate) fn parse(line: &[u8]) -> Line {
-    let mut fields: Map<String, Value> = match serde_json::from_slice(line) {
-        Ok(fields) => fields,
-        Err(error) => {
-            return Line {
-                id: None,
-                request: Err(format!("found no JSON object ({error})")),
-            };
-        }
-    };
-    let id = fields.remove("id");
-    Line {
-        id,
-        request: request(fields),
+/// Reads one line, without its newline. Returns the `id` to echo in the answer, and the request, or the reason
+/// the line cannot be used, in words.
+pub(crate) fn parse(line: &[u8]) -> (Option<Value>, Result<Request, String>) {
+    match serde_json::from_slice::<Map<String, Value>>(line) {
+        Ok(mut fields) => (fields.remove("id"), request(fields)),
+        Err(error) => (None, Err(format!("found no JSON object ({error})"))),
     }
 }
 
@@ -191,7 +173,7 @@ mod tests {
     fn a_context_is_kept_as_it_came_and_neither_long_nor_deep() {
         let context = |more: &str| {
             let line = format!(r#"{{"context":{{"sensor":"forearm"{more}}}}}"#);
-            match parse(line.as_bytes()).request {
+            match parse(line.as_bytes()).1 {
                 Ok(Request::Context(Context { context, .. })) => Ok(context),
                 other => Err(other.unwrap_err()),
             }
@@ -248,13 +230,13 @@ mod tests {
             ),
             (r#""motion":{"sensor":"a"}"#, "motion: missing field `at`"),
         ] {
-            let read = parse(format!(r#"{{{fields},"id":"a"}}"#).as_bytes());
-            let message = read.request.unwrap_err();
+            let (id, request) = parse(format!(r#"{{{fields},"id":"a"}}"#).as_bytes());
+            let message = request.unwrap_err();
             assert!(message.contains(found), "{message}");
-            assert_eq!(read.id, Some(Value::from("a")));
+            assert_eq!(id, Some(Value::from("a")));
         }
         for line in [&b"{\"get\":"[..], b"[1]", b"{\"id\":1}", b"\xff\xfe", b""] {
-            assert!(parse(line).request.is_err());
+            assert!(parse(line).1.is_err());
         }
     }
 }

@@ -77,9 +77,7 @@ impl Daemon {
         // All end first, because a sensor that starts may have the port of another one.
         let stopped = (0..former.sensors.len()).filter(|&at| !self.setup.is_same(&former, at));
         let mut stopped = self.stop(stopped.collect()).await;
-        self.hub
-            .log()
-            .describe(hello(&self.setup, self.run.clone()));
+        self.hub.log().describe(hello(&self.setup, String::new()));
         let mut anew = Vec::new();
         for (index, sensor) in self.setup.sensors.iter().enumerate() {
             let hrn = self.setup.hrn_of(sensor.name()).clone();

@@ -6,7 +6,6 @@
 //! daemon. The session talks only to addresses that the configuration names. Nothing that comes in
 //! changes anything.
 
-use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::sync::Arc;
 
@@ -14,7 +13,6 @@ use tokio::sync::mpsc;
 use tracing::{info, warn};
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait};
@@ -23,7 +21,6 @@ use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
 use super::relay::{Worker, each_event};
-use super::sensor::Sensors;
 use hardnessd_core::event::{self, Event, Kind, Reply};
 
 /// Opens a session as `settings` say, with keys below `tactile/SITE`.
@@ -32,12 +29,7 @@ use hardnessd_core::event::{self, Event, Kind, Reply};
 ///
 /// Fails if the daemon cannot listen on an address, or the library fails. A peer that cannot be
 /// reached is not an error, because the library tries again.
-pub(super) fn open(
-    settings: &config::Zenoh,
-    config: &Config,
-    hub: &Hub,
-    sensors: &Sensors,
-) -> Result<Worker, Error> {
+pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Result<Worker, Error> {
     // Try the addresses here first, because the library's error is a page long and names paths of
     // its sources.
     for endpoint in &settings.listen {
@@ -51,11 +43,11 @@ pub(super) fn open(
     let site = settings.site(&config.robot).to_owned();
     let (listen, connect) = (&settings.listen, &settings.connect);
     info!(way = "zenoh", site, ?listen, ?connect, "publishing");
-    let (settings, hub, sensors) = (settings.clone(), hub.clone(), sensors.clone());
+    let (settings, hub) = (settings.clone(), hub.clone());
     Worker::start(
         "zenoh",
         move || {
-            let opened = Zenoh::open(&settings, site, &sensors, hub);
+            let opened = Zenoh::open(&settings, site, hub);
             opened.map_err(|error| Error::Io(format!("publish.zenoh: {error}")))
         },
         Zenoh::work,
@@ -64,40 +56,16 @@ pub(super) fn open(
 
 /// An open session.
 struct Zenoh {
-    publishers: BTreeMap<String, Publisher<'static>>,
     site: String,
     // Dropping one of these ends it. The session must be dropped last.
     _queries: Queryable<()>,
     _alive: LivelinessToken,
-    _session: Session,
+    session: Session,
 }
 
 impl Zenoh {
-    fn open(
-        settings: &config::Zenoh,
-        site: String,
-        sensors: &Sensors,
-        hub: Hub,
-    ) -> Result<Self, zenoh::Error> {
+    fn open(settings: &config::Zenoh, site: String, hub: Hub) -> Result<Self, zenoh::Error> {
         let session = zenoh::open(configuration(settings)?).wait()?;
-        let mut publishers = BTreeMap::new();
-        for sensor in sensors.iter() {
-            for kind in Kind::ALL {
-                let key = key(&site, &sensor.name, kind);
-                // A frame is soon out of date. Any other event may wait for the network a while,
-                // because nothing else waits for this thread.
-                let publisher = session
-                    .declare_publisher(key.clone())
-                    .encoding(Encoding::APPLICATION_JSON)
-                    .congestion_control(match kind {
-                        Kind::Frame => CongestionControl::Drop,
-                        _ => CongestionControl::Block,
-                    })
-                    .express(kind == Kind::Hardness)
-                    .wait()?;
-                publishers.insert(key, publisher);
-            }
-        }
         let queries = session
             .declare_queryable(format!("tactile/{site}/**"))
             .callback({
@@ -115,11 +83,10 @@ impl Zenoh {
             .declare_token(format!("tactile/{site}"))
             .wait()?;
         Ok(Self {
-            publishers,
             site,
             _queries: queries,
             _alive: alive,
-            _session: session,
+            session,
         })
     }
 
@@ -130,11 +97,20 @@ impl Zenoh {
     }
 
     fn publish(&self, event: &Event, line: &Line) {
-        let key = key(&self.site, event.sensor(), event.kind());
-        let Some(publisher) = self.publishers.get(&key) else {
-            return;
-        };
-        if let Err(error) = publisher.put(text(line)).wait() {
+        let kind = event.kind();
+        let key = key(&self.site, event.sensor(), kind);
+        // A frame is soon out of date. Any other event may wait for the network a while, because nothing else
+        // waits for this thread.
+        let put = self
+            .session
+            .put(key.as_str(), text(line))
+            .encoding(Encoding::APPLICATION_JSON)
+            .congestion_control(match kind {
+                Kind::Frame => CongestionControl::Drop,
+                _ => CongestionControl::Block,
+            })
+            .express(kind == Kind::Hardness);
+        if let Err(error) = put.wait() {
             warn!(key, %error, "not published on zenoh");
         }
     }

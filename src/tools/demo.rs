@@ -122,7 +122,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let mut config = Config::new(vec![sensor]);
     config.press.early_settle_s /= args.speed;
     config.press.max_seconds /= args.speed;
-    config.publish.unix = config.publish.unix.at(socket.clone());
+    config.publish.unix.path = Some(socket.clone());
     config.http = Some(Http {
         listen: args.http,
         set_context: true,

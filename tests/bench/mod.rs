@@ -22,6 +22,7 @@ use hardnessd_core::frame::RawFrame;
 use hardnessd_core::recording::{Found, Reader};
 use hardnessd_core::wire::{Layout, Settings};
 pub use http::{Answer, HTTP, answer, ask, get, open};
+use pair::Pair;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -399,6 +400,24 @@ impl Daemon {
     pub fn logged(&mut self, part: &str) -> String {
         self.log.until(&[part])
     }
+}
+
+/// Writes at the sensor's end of a cable. Until the other end is opened, there is room for 4 kB.
+pub fn write_all(cable: &Pair, mut bytes: &[u8]) {
+    while !bytes.is_empty() {
+        bytes = &bytes[rustix::io::write(&cable.master, bytes).unwrap()..];
+    }
+}
+
+/// Waits until everything that was written is read.
+pub fn drain(cable: &Pair) {
+    // Written bytes reach the device a moment later.
+    let mut empty = 0;
+    wait_for("a reader", || {
+        let is_empty = rustix::io::ioctl_fionread(&cable.device).unwrap() == 0;
+        empty = if is_empty { empty + 1 } else { 0 };
+        empty > 10
+    });
 }
 
 pub fn wait_for(what: &str, mut there: impl FnMut() -> bool) {

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, frame, sensor, wait_for};
+use crate::bench::{Bench, Daemon, Subscriber, drain, frame, sensor, wait_for, write_all};
 use rustix::fs::{FlockOperation, flock};
 use serde_json::{Value, json};
 
@@ -52,11 +52,8 @@ impl Cable {
         now
     }
 
-    fn write(&self, mut bytes: &[u8]) {
-        let master = &self.pair.as_ref().unwrap().master;
-        while !bytes.is_empty() {
-            bytes = &bytes[rustix::io::write(master, bytes).unwrap()..];
-        }
+    fn write(&self, bytes: &[u8]) {
+        write_all(self.pair.as_ref().unwrap(), bytes);
     }
 
     /// Writes frames at their pace.
@@ -67,17 +64,8 @@ impl Cable {
         }
     }
 
-    /// Waits until everything is read.
     fn drain(&self) {
-        let device = &self.pair.as_ref().unwrap().device;
-        // Written bytes reach the device a moment later.
-        let mut empty = 0;
-        wait_for("a reader", || {
-            std::thread::sleep(Duration::from_millis(2));
-            let is_empty = rustix::io::ioctl_fionread(device).unwrap() == 0;
-            empty = if is_empty { empty + 1 } else { 0 };
-            empty > 10
-        });
+        drain(self.pair.as_ref().unwrap());
     }
 
     /// Sends frames without load until the sensor is live: the daemon drops what came before the port was opened.

@@ -19,7 +19,7 @@ use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, sensor, wait_for};
+use crate::bench::{Bench, Daemon, Subscriber, drain, sensor, wait_for, write_all};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
@@ -115,7 +115,7 @@ impl Player {
             }
             self.press(press, FAULTS.get(fault).copied().unwrap_or_default());
         }
-        self.drain();
+        drain(&self.pair);
         self
     }
 
@@ -159,7 +159,7 @@ impl Player {
     fn unplug(&mut self, frame: &[u8]) {
         let part = self.stream.below(frame.len());
         self.write(&frame[..part]);
-        self.drain();
+        drain(&self.pair);
         let losses = self.link.losses.load(Relaxed);
         fs::remove_file(&self.port).unwrap();
         // Open the new pty before the old one is closed, so that its name is a different one.
@@ -185,24 +185,10 @@ impl Player {
     }
 
     /// Writes when the next frame is due.
-    fn write(&mut self, mut bytes: &[u8]) {
+    fn write(&mut self, bytes: &[u8]) {
         sleep(self.due.saturating_duration_since(Instant::now()));
         self.due += PERIOD;
-        while !bytes.is_empty() {
-            // Until the other end is opened, there is room for 4 kB.
-            bytes = &bytes[rustix::io::write(&self.pair.master, bytes).unwrap()..];
-        }
-    }
-
-    /// Waits until everything is read.
-    fn drain(&self) {
-        let mut empty = 0;
-        wait_for("the reader", || {
-            // Written bytes reach the device a moment later.
-            let is_read = rustix::io::ioctl_fionread(&self.pair.device).unwrap() == 0;
-            empty = if is_read { empty + 1 } else { 0 };
-            empty > 3
-        });
+        write_all(&self.pair, bytes);
     }
 }
 

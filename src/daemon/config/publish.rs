@@ -124,7 +124,7 @@ settings! {
         /// Whether the daemon opens its Unix sockets.
         pub enabled: bool = true;
         /// The path of the socket. [`Unix::path`] has the default.
-        pub(super) path: Option<PathBuf>;
+        pub path: Option<PathBuf>;
         /// The permissions of the socket's file.
         pub mode: Mode = Mode(0o660);
         /// The path of the control socket. The default is `control.sock` beside the other socket.
@@ -164,15 +164,6 @@ impl Unix {
     pub fn control_path(&self) -> PathBuf {
         let beside = || self.path().with_file_name("control.sock");
         self.control_path.clone().unwrap_or_else(beside)
-    }
-
-    /// The same settings with the socket at `path`.
-    #[must_use]
-    pub fn at(self, path: PathBuf) -> Self {
-        Self {
-            path: Some(path),
-            ..self
-        }
     }
 }
 

@@ -54,13 +54,10 @@ async fn subscribe(hub: &Hub, wanted: Subscription) -> Result<Response, String> 
     let hello = greeting.next().expect("a greeting begins with hello");
     let hello = event(&run, from, &hello).retry(RETRY);
     // The statuses grow with the number of sensors. All that follows waits in the log.
-    let (lines, batches) = mpsc::channel(1);
+    let (lines, mut batches) = mpsc::channel(1);
     subscriber.feed(lines);
-    let batches = stream::unfold(batches, async |mut batches: mpsc::Receiver<Vec<_>>| {
-        let batch = batches.recv().await?;
-        Some((stream::iter(batch), batches))
-    });
-    let lines = stream::iter(greeting).chain(batches.flatten());
+    let batches = stream::poll_fn(move |context| batches.poll_recv(context));
+    let lines = stream::iter(greeting).chain(batches.flat_map(stream::iter));
     let events = lines.map(move |line: Arc<Line>| event(&run, line.seq(), &line));
     let events = stream::iter([hello]).chain(events).map(Ok::<_, Infallible>);
     let beat = KeepAlive::new().interval(HEARTBEAT);

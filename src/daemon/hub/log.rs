@@ -417,10 +417,8 @@ impl Log {
         }
         cursor.forget_had(&self.events);
         let held = [&self.events, &self.frames].into_iter();
-        let ahead = held.flat_map(|held| {
-            let first = held.partition_point(|entry| cursor.has_passed(entry));
-            held.range(first..)
-        });
+        let is_ahead = |entry: &&Entry| !cursor.has_passed(entry);
+        let ahead = held.flat_map(|held| held.iter().rev().take_while(is_ahead));
         let mut entries: Vec<&Entry> = ahead.filter(|entry| cursor.wants(entry)).collect();
         // The newest first, because it replaces those of its kind and sensor where only the newest counts.
         entries.sort_unstable_by_key(|entry| Reverse(entry.before.total()));

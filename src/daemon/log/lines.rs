@@ -9,25 +9,27 @@
 use std::io::{self, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
-use std::time::Duration;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::{Duration, Instant};
 
 use tracing_subscriber::fmt::MakeWriter;
 
 /// The most lines that wait, about 150 kB.
 const WAITING: usize = 1024;
 
-enum Message {
-    Line(Vec<u8>),
-    /// A request for an answer as soon as all earlier lines are written.
-    Flush(SyncSender<()>),
-}
-
 /// The queue to the thread. Clones share it.
 #[derive(Clone)]
 pub(super) struct Lines {
-    thread: SyncSender<Message>,
-    lost: Arc<AtomicU64>,
+    thread: SyncSender<Vec<u8>>,
+    counts: Arc<Counts>,
+}
+
+#[derive(Default)]
+struct Counts {
+    /// The number of lines that wait.
+    waiting: AtomicU64,
+    /// The number of lines that were dropped and not reported yet.
+    lost: AtomicU64,
 }
 
 impl Lines {
@@ -37,43 +39,33 @@ impl Lines {
     ///
     /// Fails if the system cannot make the thread.
     pub(super) fn start() -> io::Result<Self> {
-        let (thread, messages) = mpsc::sync_channel(WAITING);
-        let lost = Arc::new(AtomicU64::new(0));
-        let lines = Self {
-            thread,
-            lost: Arc::clone(&lost),
-        };
+        let (thread, lines) = sync_channel(WAITING);
+        let counts = Arc::new(Counts::default());
+        let of_thread = Arc::clone(&counts);
         std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write(&messages, &lost))?;
-        Ok(lines)
+            .spawn(move || write(&lines, &of_thread))?;
+        Ok(Self { thread, counts })
     }
 
     /// Waits until all lines are written, but not longer than `patience`.
     pub(super) fn flush(&self, patience: Duration) {
-        let (written, answer) = mpsc::sync_channel(1);
-        // When the queue is full, no program reads the log, so waiting is of no use.
-        if self.thread.try_send(Message::Flush(written)).is_ok() {
-            let _ = answer.recv_timeout(patience);
+        let end = Instant::now() + patience;
+        while self.counts.waiting.load(Ordering::Acquire) > 0 && Instant::now() < end {
+            std::thread::sleep(Duration::from_millis(1));
         }
     }
 }
 
-fn write(messages: &Receiver<Message>, lost: &AtomicU64) {
-    while let Ok(message) = messages.recv() {
+fn write(lines: &Receiver<Vec<u8>>, counts: &Counts) {
+    for line in lines {
         // A write that fails cannot be logged: stderr is closed.
-        match message {
-            Message::Line(line) => {
-                let _ = io::stderr().write_all(&line);
-                let lines = lost.swap(0, Ordering::Relaxed);
-                if lines > 0 {
-                    let _ = writeln!(io::stderr(), "log: {lines} lines lost: read too slowly");
-                }
-            }
-            Message::Flush(written) => {
-                let _ = written.try_send(());
-            }
+        let _ = io::stderr().write_all(&line);
+        let lost = counts.lost.swap(0, Ordering::Relaxed);
+        if lost > 0 {
+            let _ = writeln!(io::stderr(), "log: {lost} lines lost: read too slowly");
         }
+        counts.waiting.fetch_sub(1, Ordering::Release);
     }
 }
 
@@ -88,8 +80,10 @@ impl<'a> MakeWriter<'a> for Lines {
 /// The formatter writes each line in one call.
 impl Write for &Lines {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        if let Err(TrySendError::Full(_)) = self.thread.try_send(Message::Line(line.to_vec())) {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+        self.counts.waiting.fetch_add(1, Ordering::Relaxed);
+        if self.thread.try_send(line.to_vec()).is_err() {
+            self.counts.waiting.fetch_sub(1, Ordering::Relaxed);
+            self.counts.lost.fetch_add(1, Ordering::Relaxed);
         }
         Ok(line.len())
     }
