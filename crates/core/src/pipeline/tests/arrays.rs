@@ -51,11 +51,7 @@ fn verdict(array: Array, pitch: Pitch) -> Hardness {
     let (before, after) = (vec![free.clone(); 5], vec![free; 2]);
     let frames = [before, vec![held; 4], after].concat();
     let events = feed(&mut pipeline, 0, &frames);
-    let shown = events.iter().rev().find_map(|event| match event {
-        Event::Frame(frame) => Some(frame),
-        _ => None,
-    });
-    let shown = shown.unwrap();
+    let shown = shown(&events).last().unwrap();
     assert_eq!((shown.rows, shown.cols), (array.rows, array.cols));
     assert_eq!(shown.newtons.len(), array.taxels());
     verdicts(events).pop().unwrap()

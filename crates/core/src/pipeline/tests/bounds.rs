@@ -2,13 +2,6 @@
 
 use super::*;
 
-fn status(events: &[Event]) -> Option<&Status> {
-    events.iter().rev().find_map(|event| match event {
-        Event::Status(status) => Some(status),
-        _ => None,
-    })
-}
-
 #[test]
 fn frames_above_twice_the_rate_are_dropped_counted_and_said_once() {
     let mut pipeline = pipeline(Preset::Jx255n);
@@ -35,14 +28,7 @@ fn frames_above_twice_the_rate_are_dropped_counted_and_said_once() {
         "{status:?}"
     );
     // The numbers of the frames have no gap.
-    let numbers: Vec<u64> = events
-        .iter()
-        .filter_map(|event| match event {
-            Event::Frame(frame) => Some(frame.frame),
-            _ => None,
-        })
-        .collect();
-    assert!(numbers.iter().copied().eq(0..taken));
+    assert!(shown(&events).map(|frame| frame.frame).eq(0..taken));
     // At its rate, nothing is dropped any more, and ten seconds later that is said.
     let mut events = Vec::new();
     for ms in (60_000..80_000).step_by(200) {
@@ -109,9 +95,8 @@ fn a_press_that_is_not_released_is_said_with_its_taxels() {
         "{:?}",
         words(&events)
     );
-    let status = status(&events).unwrap();
     assert_eq!(
-        status.detail.as_deref(),
+        status_of(&events).detail.as_deref(),
         Some(
             "taxels [1, 0], [1, 1], [1, 2], [1, 3] and 24 more: if nothing touches them, take a tare, \
              or put them into dead_taxels"

@@ -44,13 +44,11 @@ fn play_at_2_hz(
         }
         let bytes = bytes(pipeline, &raw);
         let events = pipeline.push(&bytes, at(500 * half));
-        for event in &events {
-            if let Event::Frame(frame) = event {
-                let mut newtons = frame.newtons.clone();
-                newtons.sort_by(f32::total_cmp);
-                let loaded = newtons[newtons.len() - TOUCHED.len()..].iter();
-                most_n = most_n.max(loaded.map(|&n| f64::from(n)).sum::<f64>() / 12.0);
-            }
+        for frame in shown(&events) {
+            let mut newtons = frame.newtons.clone();
+            newtons.sort_by(f32::total_cmp);
+            let loaded = newtons[newtons.len() - TOUCHED.len()..].iter();
+            most_n = most_n.max(loaded.map(|&n| f64::from(n)).sum::<f64>() / 12.0);
         }
         published.extend(words(&events));
     }
@@ -100,10 +98,7 @@ fn a_gap_and_a_busy_sensor_do_not_speed_it_up() {
     let mut pipeline = following(true);
     let raised = even(1);
     let bytes = bytes(&pipeline, &raised);
-    let newtons = |events: Vec<Event>| match events.into_iter().next_back() {
-        Some(Event::Frame(frame)) => frame.newtons[0],
-        other => panic!("{other:?}"),
-    };
+    let newtons = |events: Vec<Event>| shown(&events).last().unwrap().newtons[0];
     // An hour without a frame is one step. Twenty frames within a second are no further step.
     newtons(pipeline.push(&bytes, at(HOUR * 1000)));
     for ms in 0..18 {

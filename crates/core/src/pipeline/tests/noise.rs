@@ -15,13 +15,6 @@ fn feel(array: &mut NoisyArray, newtons_per_count: f32, forces_n: &[f64]) -> Vec
     feed(&mut pipeline, 0, &frames.collect::<Vec<_>>())
 }
 
-fn shown(events: &[Event]) -> impl Iterator<Item = &FrameEvent> {
-    events.iter().filter_map(|event| match event {
-        Event::Frame(frame) => Some(frame),
-        _ => None,
-    })
-}
-
 #[test]
 fn an_array_at_rest_has_no_force_and_no_press_whatever_its_noise() {
     for noise in NOISES {
