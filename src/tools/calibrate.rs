@@ -153,20 +153,18 @@ pub async fn run(
 /// Says on stderr what to do next, after `seen` presses.
 fn print_next(args: &Args, seen: u64) {
     let wanted = args.wanted();
-    match (args.what, seen) {
-        (What::Force, _) => match args.newtons.get(seen as usize) {
-            Some(newtons) => {
-                stderr_line!("put {newtons} N on the sensor, wait until it rests, and take it off");
-            }
-            None => stderr_line!("done"),
-        },
-        (What::Arm, 0) => stderr_line!(
+    match (args.what, args.newtons.get(seen as usize)) {
+        (What::Force, Some(newtons)) => {
+            stderr_line!("put {newtons} N on the sensor, wait until it rests, and take it off");
+        }
+        (What::Force, None) => stderr_line!("done"),
+        _ if seen > 0 => stderr_line!("press {seen} of {wanted}"),
+        (What::Arm, _) => stderr_line!(
             "press something rigid {wanted} times, while the robot tells where its arm is"
         ),
-        (What::Taxels, 0) => stderr_line!(
+        (What::Taxels, _) => stderr_line!(
             "lay a bag of air or water on the whole array, and press it through a plate {wanted} times"
         ),
-        _ => stderr_line!("press {seen} of {wanted}"),
     }
 }
 

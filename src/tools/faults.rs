@@ -211,20 +211,16 @@ fn parse(text: &str) -> Result<Vec<Fault>, String> {
 /// The middle of a frame of the simulated array, as another array has it. Taxels that the simulated
 /// one lacks read 0.
 fn middle(raw: &RawFrame, array: Array) -> RawFrame {
-    let mut cut = RawFrame::zero(array);
-    let place = |own: usize, side: usize, other: usize| {
-        (own + other / 2)
-            .checked_sub(side / 2)
-            .filter(|&at| at < other)
+    let from = |own: usize, side: usize, other: usize| {
+        let place = (own + other / 2).checked_sub(side / 2);
+        place.filter(|&place| place < other)
     };
-    for row in 0..array.rows {
-        for col in 0..array.cols {
-            let from_row = place(row, array.rows, raw.array.rows);
-            let from_col = place(col, array.cols, raw.array.cols);
-            if let (Some(from_row), Some(from_col)) = (from_row, from_col) {
-                let count = raw.counts[raw.array.place(from_row, from_col)];
-                cut.counts[array.place(row, col)] = count;
-            }
+    let mut cut = RawFrame::zero(array);
+    for (place, count) in cut.counts.iter_mut().enumerate() {
+        let (row, col) = array.position(place);
+        let row = from(row, array.rows, raw.array.rows);
+        if let (Some(row), Some(col)) = (row, from(col, array.cols, raw.array.cols)) {
+            *count = raw.counts[raw.array.place(row, col)];
         }
     }
     cut

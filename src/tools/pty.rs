@@ -8,7 +8,6 @@ pub(crate) mod pair;
 
 use std::fs;
 use std::io::{self, ErrorKind};
-use std::os::fd::OwnedFd;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -30,9 +29,7 @@ const LINGER: Duration = Duration::from_millis(500);
 /// A pseudo-terminal, and the link to its device.
 #[derive(Debug)]
 pub(crate) struct Pty {
-    master: OwnedFd,
-    device: OwnedFd,
-    path: PathBuf,
+    pair: Pair,
     link: Option<PathBuf>,
     written: u64,
     /// The number of bytes that had been read when a reader last made progress, and the time of
@@ -47,12 +44,8 @@ impl Pty {
     ///
     /// Fails if the system has no pair to give, or `link` is there and is not a killed simulation's.
     pub(crate) fn open(link: Option<&Path>) -> io::Result<Self> {
-        let Pair {
-            master,
-            device,
-            path,
-        } = Pair::raw()?;
-        rustix::io::ioctl_fionbio(&master, true)?;
+        let pair = Pair::raw()?;
+        rustix::io::ioctl_fionbio(&pair.master, true)?;
         let (ws_xpixel, ws_ypixel) = SIMULATED;
         let mark = Winsize {
             ws_row: 0,
@@ -60,16 +53,13 @@ impl Pty {
             ws_xpixel,
             ws_ypixel,
         };
-        rustix::termios::tcsetwinsize(&device, mark)?;
+        rustix::termios::tcsetwinsize(&pair.device, mark)?;
         if let Some(link) = link {
-            place(&path, link)?;
+            place(&pair.path, link)?;
         }
-        let link = link.map(Path::to_owned);
         Ok(Self {
-            master,
-            device,
-            path,
-            link,
+            pair,
+            link: link.map(Path::to_owned),
             written: 0,
             read: (0, Instant::now()),
         })
@@ -77,7 +67,7 @@ impl Pty {
 
     /// Path of the device that a reader opens.
     pub(crate) fn path(&self) -> &Path {
-        &self.path
+        &self.pair.path
     }
 
     /// Writes as much as there is room for, and returns how many bytes that is. On a line without a
@@ -88,7 +78,7 @@ impl Pty {
     /// Fails if the system reports an error other than a full buffer.
     pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.forget_unread()?;
-        match rustix::io::write(&self.master, bytes) {
+        match rustix::io::write(&self.pair.master, bytes) {
             Ok(written) => {
                 self.written += written as u64;
                 Ok(written)
@@ -99,13 +89,13 @@ impl Pty {
     }
 
     fn forget_unread(&mut self) -> io::Result<()> {
-        let unread = rustix::io::ioctl_fionread(&self.device)?;
+        let unread = rustix::io::ioctl_fionread(&self.pair.device)?;
         let read = self.written.saturating_sub(unread);
         if read > self.read.0 || unread == 0 {
             self.read = (read, Instant::now());
         } else if self.read.1.elapsed() > ABSENT {
-            rustix::termios::tcflush(&self.device, QueueSelector::IFlush)?;
-            rustix::termios::ioctl_tiocnxcl(&self.device)?;
+            rustix::termios::tcflush(&self.pair.device, QueueSelector::IFlush)?;
+            rustix::termios::ioctl_tiocnxcl(&self.pair.device)?;
             self.read = (self.written, Instant::now());
         }
         Ok(())
@@ -119,7 +109,7 @@ impl Pty {
         let mut empty = 0;
         while empty < 10 && Instant::now() < end {
             tokio::time::sleep(Duration::from_millis(5)).await;
-            let is_empty = rustix::io::ioctl_fionread(&self.device)? == 0;
+            let is_empty = rustix::io::ioctl_fionread(&self.pair.device)? == 0;
             empty = if is_empty { empty + 1 } else { 0 };
         }
         Ok(())
@@ -130,7 +120,7 @@ impl Drop for Pty {
     fn drop(&mut self) {
         // Another process may have put its own link there meanwhile.
         if let Some(link) = &self.link
-            && fs::read_link(link).is_ok_and(|target| target == self.path)
+            && fs::read_link(link).is_ok_and(|target| target == self.pair.path)
         {
             let _ = fs::remove_file(link);
         }

@@ -16,7 +16,7 @@ use tokio::sync::watch;
 
 use super::configuration::Configuration;
 use super::doctor;
-use super::exit::Failure;
+use super::exit::{Fail as _, Failure};
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
@@ -139,11 +139,7 @@ pub async fn run(
 
 /// Makes the file of a recording. A file that exists is left alone.
 fn create(path: &Path) -> Result<File, Failure> {
-    let created = File::create_new(path);
-    created.map_err(|error| {
-        let problem = format!("{}: {error}: name a new file", path.display());
-        Failure::new(IO, problem)
-    })
+    File::create_new(path).of(format!("{}: name a new file", path.display()), IO)
 }
 
 /// Records into `file`, which is at `path`, until `end` is over or no sensor is left. Returns what the file holds too.
@@ -169,12 +165,11 @@ pub(super) async fn record(
     let progress = *counted.borrow();
     match recorded {
         Err(daemon::Error::Unavailable { sensor, reason }) => {
-            let mut known = sensors.iter();
+            let known = sensors.into_iter().find(|known| known.name == sensor);
             let port = known
-                .find(|known| known.name == sensor)
-                .map(|known| &known.port);
-            let port = port.expect("a missing sensor is one of the configuration");
-            let obstacle = doctor::obstacle(port).unwrap_or(reason);
+                .expect("a missing sensor is one of the configuration")
+                .port;
+            let obstacle = doctor::obstacle(&port).unwrap_or(reason);
             let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
             let failure = Failure::new(UNAVAILABLE, problem);
             (Err(failure), Progress::default())

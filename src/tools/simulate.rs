@@ -206,18 +206,21 @@ fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
     const USUAL: [u32; 7] = [
         115_200, 230_400, 460_800, 921_600, 1_000_000, 2_000_000, 4_000_000,
     ];
-    let fps = args.fps;
-    let needed = |bytes: usize| (fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
+    let needed = |bytes: usize| (args.fps * bytes as f64 * BITS_A_BYTE).ceil() as u32;
     let shortest = layout.min_frame_bytes();
-    let (needed, most) = (needed(shortest), needed(layout.max_frame_bytes()));
+    let (least, most) = (needed(shortest), needed(layout.max_frame_bytes()));
     let usual = USUAL.into_iter().find(|&usual| usual >= most);
-    let baud = args.baud.or(usual).unwrap_or(most);
-    if baud >= needed {
-        return Ok(baud);
+    match args.baud.or(usual).unwrap_or(most) {
+        baud if baud >= least => Ok(baud),
+        baud => {
+            let expected = format!(
+                "at least {least} for {} frames/s of {shortest} bytes",
+                args.fps
+            );
+            let problem = format!("--baud: found {baud}, expected {expected}");
+            Err(Failure::new(USAGE, problem))
+        }
     }
-    let carries = format!("expected at least {needed} to carry {fps} frames/s of {shortest} bytes");
-    let problem = format!("--baud: found {baud}, {carries}");
-    Err(Failure::new(USAGE, problem))
 }
 
 /// Parses a number in this range.

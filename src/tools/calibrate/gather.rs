@@ -71,15 +71,13 @@ pub(super) fn presses(
         Ok(true)
     })?;
     let taxels = sensor.layout().array().taxels();
-    let frames = gathered.presses.iter().flat_map(|press| &press.frames);
-    match frames.map(Vec::len).find(|&found| found != taxels) {
-        Some(found) => {
-            let path = path.display();
-            let other = format!("{path}: found frames of {found} taxels, expected {taxels}");
-            Err(Failure::new(FAILED, other))
-        }
-        None => Ok(gathered.presses),
+    let mut frames = gathered.presses.iter().flat_map(|press| &press.frames);
+    if let Some(other) = frames.find(|frame| frame.len() != taxels) {
+        let (path, found) = (path.display(), other.len());
+        let other = format!("{path}: found frames of {found} taxels, expected {taxels}");
+        return Err(Failure::new(FAILED, other));
     }
+    Ok(gathered.presses)
 }
 
 /// The presses and the state of reading so far.

@@ -99,17 +99,15 @@ impl User<'_> {
         }
         let level = level.map_or(0, |level| level.level);
         let path = directory.join(format!("{number:03}-{}.mcap", slug(&name)));
-        let known = [
-            ("object", Some(number.to_string())),
-            ("name", Some(name)),
-            ("level", Some(level.to_string())),
-            ("shore", shore),
-        ];
-        let known = known.into_iter();
-        let labels = known.filter_map(|(key, value)| Some((key.to_owned(), value?)));
+        let mut labels = Labels::from([
+            ("object".to_owned(), number.to_string()),
+            ("name".to_owned(), name),
+            ("level".to_owned(), level.to_string()),
+        ]);
+        labels.extend(shore.map(|shore| ("shore".to_owned(), shore)));
         Some(Object {
             path,
-            labels: labels.collect(),
+            labels,
             level,
         })
     }
