@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::{ArgGroup, Args as ClapArgs};
-use hardnessd_sniff::{Arrival, Capture, Found, Known, Proposal, Ranked, Scale, sniff};
+use hardnessd_sniff::{Capture, Found, Known, Proposal, Ranked, Scale, sniff};
 
 use super::exit::{Fail, Failure};
 use super::simulate::positive;
@@ -73,31 +73,13 @@ pub struct Args {
 /// The most bytes that are examined, from the beginning: 20,000 frames of the JX255N.
 const MOST_BYTES: usize = 16 << 20;
 
-/// Bytes with the times of their arrival, if these are known.
-#[derive(Debug, Default)]
-struct Captured {
-    bytes: Vec<u8>,
-    arrivals: Vec<Arrival>,
-}
-
-impl Captured {
-    fn take(&mut self, bytes: &[u8], time: Duration) {
-        let arrival = Arrival {
-            at: self.bytes.len(),
-            time_s: time.as_secs_f64(),
-        };
-        self.arrivals.push(arrival);
-        self.bytes.extend_from_slice(bytes);
-    }
-
-    /// The frames in a second. `None` if the times are unknown, or too short to tell.
-    fn frame_rate_hz(&self, frames: u64) -> Option<f64> {
-        let (first, last) = (self.arrivals.first()?, self.arrivals.last()?);
-        let seconds = last.time_s - first.time_s;
-        // The duration is not exact enough for more digits.
-        let hz = (frames.saturating_sub(1) as f64 / seconds * 10.0).round() / 10.0;
-        (seconds >= LEAST_SECONDS).then_some(hz.max(0.1))
-    }
+/// The frames in a second. `None` if the times are unknown, or too short to tell.
+fn frame_rate_hz(captured: &Capture, frames: u64) -> Option<f64> {
+    let arrivals = &captured.arrivals;
+    let seconds = arrivals.last()?.time_s - arrivals.first()?.time_s;
+    // The duration is not exact enough for more digits.
+    let hz = (frames.saturating_sub(1) as f64 / seconds * 10.0).round() / 10.0;
+    (seconds >= LEAST_SECONDS).then_some(hz.max(0.1))
 }
 
 /// The shortest time that a frame rate is counted in.
@@ -132,15 +114,14 @@ impl Args {
 }
 
 /// Prints or writes the layout that explains the bytes.
-fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
+fn propose(args: &Args, captured: &Capture) -> Result<(), Failure> {
     let path = &args.source();
-    let Captured { bytes, arrivals } = captured;
     let known = Known {
         rows: args.rows,
         cols: args.cols,
         cell: args.cell,
     };
-    let found = sniff(&Capture { bytes, arrivals }, known);
+    let found = sniff(captured, known);
     let found = found.of(path.display(), FAILED)?;
     if let Some(doubt) = &found.doubt {
         for ranked in [&found.best].into_iter().chain(&found.next) {
@@ -150,13 +131,13 @@ fn propose(args: &Args, captured: &Captured) -> Result<(), Failure> {
         return Err(Failure::new(FAILED, message));
     }
     let proposal = &found.best.proposal;
-    let frame = toml(path, bytes.len(), &found, proposal);
+    let frame = toml(path, captured.bytes.len(), &found, proposal);
     let Some(out) = &args.out else {
         super::print(frame.as_bytes())?;
         return Ok(());
     };
-    let rate = captured.frame_rate_hz(proposal.frames);
-    let scale = Scale::of(&proposal.settings, bytes);
+    let rate = frame_rate_hz(captured, proposal.frames);
+    let scale = Scale::of(&proposal.settings, &captured.bytes);
     let text = configuration(args, rate) + &frame + &newtons(&scale) + PAGE;
     let written = Part::new(out).and_then(|part| part.write(text.as_bytes()));
     written.of(format!("--out {}", out.display()), IO)?;
@@ -225,10 +206,10 @@ fn newtons(scale: &Scale) -> String {
     text
 }
 
-fn read(path: &Path) -> Result<Captured, Failure> {
+fn read(path: &Path) -> Result<Capture, Failure> {
     let unreadable = cannot_read(path);
     let (kind, file) = FileKind::read(super::open(path)?).map_err(&unreadable)?;
-    let mut captured = Captured::default();
+    let mut captured = Capture::default();
     if kind == FileKind::Recording {
         // If there are several sensors, take the bytes of the first.
         let mut sensor = None;
@@ -237,7 +218,7 @@ fn read(path: &Path) -> Result<Captured, Failure> {
             if let Entry::Input(Input::Bytes(more)) = found.entry
                 && *sensor.get_or_insert(found.sensor.clone()) == found.sensor
             {
-                captured.take(&more, found.at.mono);
+                captured.take(&more, found.at.mono.as_secs_f64());
             }
             if captured.bytes.len() >= MOST_BYTES {
                 break;
@@ -256,7 +237,7 @@ fn read(path: &Path) -> Result<Captured, Failure> {
 const STALE_AFTER: Duration = Duration::from_secs(1);
 
 /// The bytes that come from the port in `seconds`. Fewer if the port is lost.
-async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failure> {
+async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Capture, Failure> {
     let settings = serial::Settings {
         stale_after: STALE_AFTER,
         start: Vec::new(),
@@ -266,7 +247,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
         bytes_per_s: f64::INFINITY,
     };
     let mut source = serial::open(port, baud, &[settings]).remove(0);
-    let mut captured = Captured::default();
+    let mut captured = Capture::default();
     let mut lost = None;
     let begin = Instant::now();
     // If the duration is too long to count, listening ends when the port is lost or enough bytes
@@ -279,7 +260,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Captured, Failur
                     let port = escaped(&port.to_string());
                     stderr_line!("listening at {port} for {seconds} s: press the sensor");
                 }
-                Input::Bytes(read) => captured.take(&read, begin.elapsed()),
+                Input::Bytes(read) => captured.take(&read, begin.elapsed().as_secs_f64()),
                 Input::Unavailable(reason) | Input::Lost(reason) => {
                     lost = Some(reason);
                     return;

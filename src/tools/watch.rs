@@ -65,7 +65,7 @@ const QUESTIONS: Duration = Duration::from_secs(1);
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// How long the terminal may take for the last bytes.
-const LAST_BYTES: Duration = Duration::from_millis(200);
+const LAST_BYTES: Duration = Duration::from_millis(500);
 
 /// What a picture shows, or what changes it.
 enum Input {

@@ -31,12 +31,12 @@ pub use layout::Proposal;
 pub use scale::Scale;
 
 /// Bytes of a sensor.
-#[derive(Debug, Clone, Copy)]
-pub struct Capture<'a> {
+#[derive(Debug, Clone, Default)]
+pub struct Capture {
     /// The bytes, in order.
-    pub bytes: &'a [u8],
+    pub bytes: Vec<u8>,
     /// When bytes came, in order. Empty if that is not known.
-    pub arrivals: &'a [Arrival],
+    pub arrivals: Vec<Arrival>,
 }
 
 /// The arrival of some bytes.
@@ -48,7 +48,14 @@ pub struct Arrival {
     pub time_s: f64,
 }
 
-impl Capture<'_> {
+impl Capture {
+    /// Takes bytes that came at this moment, in seconds.
+    pub fn take(&mut self, bytes: &[u8], time_s: f64) {
+        let at = self.bytes.len();
+        self.arrivals.push(Arrival { at, time_s });
+        self.bytes.extend_from_slice(bytes);
+    }
+
     /// Where bytes came after a pause. Between the parts of a frame the pauses are much shorter.
     fn pauses(&self) -> Vec<usize> {
         let gap = |pair: &[Arrival]| pair[1].time_s - pair[0].time_s;
@@ -71,7 +78,7 @@ impl Capture<'_> {
 ///
 /// Returns a [`Failure`] if nothing that the daemon could read is in the bytes.
 pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
-    let bytes = capture.bytes;
+    let bytes = &capture.bytes[..];
     if bytes.is_empty() {
         return Err(Failure::sure(
             "nothing arrives: check the wiring, or the sensor sends only on a request (`request` and `start` of \
@@ -122,7 +129,7 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
 
 /// The layouts of frames of one length.
 fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
-    let bytes = capture.bytes;
+    let bytes = &capture.bytes[..];
     let mut open = None;
     let mut failure = Failure::NotPeriodic(bytes.len());
     for period in period::periods(bytes) {

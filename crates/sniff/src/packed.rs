@@ -9,7 +9,7 @@ use hardnessd_core::wire::{Framing, HexBytes, Settings};
 
 use crate::found::{Failure, Found, Known, Ranked};
 use crate::layout::Proposal;
-use crate::{Arrival, Capture, in_periods};
+use crate::{Capture, in_periods};
 
 /// What no sensor sends.
 const MARK: [u8; 8] = [0xA5, 0xC3, 0x96, 0x3C, 0xD2, 0xE1, 0x69, 0xB4];
@@ -27,24 +27,11 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
     }
     let usual = lengths.into_iter().max_by_key(|&(_, count)| count);
     let (usual, _) = usual.ok_or(Failure::NotPeriodic(bytes.len()))?;
-    let mut marked = Vec::new();
-    let mut arrivals = Vec::new();
-    for (index, frame) in frames
-        .iter()
-        .filter(|frame| frame.len() == usual)
-        .enumerate()
-    {
-        arrivals.push(Arrival {
-            at: marked.len(),
-            time_s: index as f64,
-        });
-        marked.extend(MARK);
-        marked.extend(frame);
+    let mut capture = Capture::default();
+    let usual_frames = frames.iter().filter(|frame| frame.len() == usual);
+    for (index, frame) in usual_frames.enumerate() {
+        capture.take(&[&MARK[..], frame].concat(), index as f64);
     }
-    let capture = Capture {
-        bytes: &marked,
-        arrivals: &arrivals,
-    };
     let Found { best, next, .. } = in_periods(&capture, known)?;
     let packed = |ranked: Ranked| {
         let proposal = without_mark(ranked.proposal, framing, bytes)?;

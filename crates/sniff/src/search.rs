@@ -155,7 +155,7 @@ pub(crate) fn in_frames(
     places.sort_by(|a, b| a.bits(columns).total_cmp(&b.bits(columns)));
     places.truncate(most);
     let candidates = search.candidates(places, known);
-    search.rank(&candidates, begin, capture.bytes, known)
+    search.rank(&candidates, begin, &capture.bytes, known)
 }
 
 impl Search<'_> {

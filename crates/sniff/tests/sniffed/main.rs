@@ -45,13 +45,11 @@ fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
 const LOST: usize = 6;
 
 fn of(bytes: &[u8], known: Known) -> Result<Found, Failure> {
-    sniff(
-        &Capture {
-            bytes,
-            arrivals: &[],
-        },
-        known,
-    )
+    let capture = Capture {
+        bytes: bytes.to_vec(),
+        ..Capture::default()
+    };
+    sniff(&capture, known)
 }
 
 /// Whether the sensor at rest passes for no touch with this scale, and its presses are felt.
@@ -180,13 +178,14 @@ fn pauses_tell_a_header_from_a_tail() {
     });
     assert!(length > 700);
     let arrivals: Vec<Arrival> = arrivals.collect();
-    let found = |arrivals: &[Arrival]| {
+    let found = |arrivals: Vec<Arrival>| {
+        let bytes = bytes.to_vec();
         let found = sniff(&Capture { bytes, arrivals }, Known::default()).unwrap();
         found.best.proposal
     };
-    assert_eq!(found(&arrivals).toml(), "preset = \"jq-tail\"\n");
+    assert_eq!(found(arrivals).toml(), "preset = \"jq-tail\"\n");
     assert!(
-        found(&[])
+        found(Vec::new())
             .remarks
             .iter()
             .any(|remark| remark.contains("switched on"))
