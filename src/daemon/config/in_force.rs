@@ -87,40 +87,30 @@ mod tests {
                     [[sensor]]\nname = \"own\"\nport = \"/dev/ttyACM1\"\n\
                     frame = { sync = \"A5\" }\n[press]\nmax_seconds = 5.0\n";
         std::fs::write(&path, text).unwrap();
-        let lines = Setup::load(&path, None).unwrap().in_force();
+        let setup = Setup::load(&path, None).unwrap();
+        let lines = setup.in_force();
         let (first, own) = lines.split_once("name = \"own\"").unwrap();
-        for line in [
-            "baud = 115200  # default",
-            "stale_after_ms = 600.0  # default",
-            "preset = \"jq\"  # written",
-            "sync = \"AA 55 03 99\"  # preset jq",
-            "length = \"none\"  # default",
-            "rows = 9  # written",
-            "newtons_per_count = 0.04  # default",
+        for (part, line) in [
+            (first, "baud = 115200  # default"),
+            (first, "stale_after_ms = 600.0  # default"),
+            (first, "preset = \"jq\"  # written"),
+            (first, "sync = \"AA 55 03 99\"  # preset jq"),
+            (first, "length = \"none\"  # default"),
+            (first, "rows = 9  # written"),
+            (first, "newtons_per_count = 0.04  # default"),
+            (own, "preset = \"none\"  # default"),
+            (own, "sync = \"A5\"  # written"),
+            (own, "checksum = \"none\"  # default"),
+            (own, "rows = 28  # default"),
+            (own, "max_seconds = 5.0  # written"),
+            (own, "contact_threshold_n = 0.07  # default"),
+            (own, "mode = \"0660\"  # default"),
         ] {
-            assert!(first.contains(&format!("{line}\n")), "{line} in {first}");
-        }
-        for line in [
-            "preset = \"none\"  # default",
-            "sync = \"A5\"  # written",
-            "checksum = \"none\"  # default",
-            "rows = 28  # default",
-        ] {
-            assert!(own.contains(&format!("{line}\n")), "{line} in {own}");
-        }
-        for line in [
-            "max_seconds = 5.0  # written",
-            "contact_threshold_n = 0.07  # default",
-            "mode = \"0660\"  # default",
-        ] {
-            assert!(lines.contains(&format!("{line}\n")), "{line} in {lines}");
+            assert!(part.contains(&format!("{line}\n")), "{line} in {part}");
         }
         // It is a configuration again, and the same one.
         let again: Config = toml::from_str(&lines).unwrap();
         let again = Setup::of(again, Path::new("again")).unwrap();
-        assert_eq!(
-            again.sensors[1].layout(),
-            Setup::load(&path, None).unwrap().sensors[1].layout()
-        );
+        assert_eq!(again.sensors[1].layout(), setup.sensors[1].layout());
     }
 }

@@ -36,7 +36,6 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    let named = "bidirectional characters";
     for (text, expected) in [
         (
             "[[sensor]]\nname = \"b\"",
@@ -92,42 +91,31 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             "{text:?}: {expected:?} not in {error:?}"
         );
     }
-    let robot = format!("robot = \"\\u202Eevil\"\n{LEAST}");
-    let error = load(&robot).unwrap_err();
-    assert!(
-        error.contains("robot: found \"\\u{202e}evil\"") && error.contains(named),
-        "{error}"
-    );
-    let error = load("[log]").unwrap_err();
-    assert!(
-        error.contains("no sensor: add a [[sensor]] with a port"),
-        "{error}"
-    );
-}
-
-#[test]
-fn single_brackets_are_named_as_such() {
-    let problem = load("[sensor]\nport = \"p\"\n").unwrap_err();
-    assert!(
-        problem.ends_with("hardnessd.toml: write [[sensor]], not [sensor]: there may be several"),
-        "{problem}"
-    );
-}
-
-#[test]
-fn a_name_that_is_too_long_is_refused_without_being_repeated() {
     let long = "a".repeat(300);
     for (text, expected) in [
         (
-            format!("[[sensor]]\nport = \"p\"\nname = \"{long}\""),
+            format!("robot = \"\\u202Eevil\"\n{LEAST}"),
+            "robot: found \"\\u{202e}evil\", expected a name without control or bidirectional",
+        ),
+        (
+            "[log]".to_owned(),
+            "no sensor: add a [[sensor]] with a port",
+        ),
+        (
+            "[sensor]\nport = \"p\"\n".to_owned(),
+            "hardnessd.toml: write [[sensor]], not [sensor]: there may be several",
+        ),
+        (
+            format!("{LEAST}name = \"{long}\""),
             "sensor.name: found 300 characters, expected at most 64",
         ),
         (
-            format!("robot = \"{long}\"\n[[sensor]]\nport = \"p\""),
+            format!("robot = \"{long}\"\n{LEAST}"),
             "robot: found 300 characters, expected a name of at most 255",
         ),
     ] {
         let error = load(&text).unwrap_err();
+        // A name that is too long is not repeated.
         assert!(error.contains(expected) && error.len() < 200, "{error}");
     }
 }
