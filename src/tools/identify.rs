@@ -165,11 +165,10 @@ fn piece(text: &str, levels: &[Level]) -> anyhow::Result<Piece> {
         let number = value.parse().ok();
         number.filter(|number| (least..=most).contains(number))
     };
-    let (mm, most) = (within(0.1, 1000.0), levels.len());
+    let most = levels.len();
     let piece = match kind.trim() {
         "unknown" if value.is_empty() => Some(Piece::UNKNOWN),
-        "flat" => mm.map(|width_mm| Piece::Flat { width_mm }),
-        "ball" => mm.map(|radius_mm| Piece::Ball { radius_mm }),
+        "flat" | "ball" => Piece::rigid(text),
         "shore" => within(0.0, 100.0).map(|oo| Piece::Shore { range: [oo; 2] }),
         "level" => {
             let borders = Borders::of(levels).context("the model's levels")?;

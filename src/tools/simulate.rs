@@ -19,9 +19,10 @@ use crate::thread::spawn_thread;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
+use hardnessd_core::verdict::Piece;
 use hardnessd_core::wire::{Layout, Preset, Settings as Frame};
 use hardnessd_core::wording::named;
-use hardnessd_simulator::{Material, Reference, Sequence, SequenceSettings};
+use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Clone, ClapArgs)]
@@ -48,7 +49,7 @@ pub struct Args {
     /// Rigid piece to press in place of the materials, for `identify`: flat:MM (its width) or ball:MM (its radius),
     /// 1 to 100 mm
     #[arg(long, value_name = "PIECE", conflicts_with_all = ["materials", "arm"], value_parser = piece)]
-    piece: Option<Reference>,
+    piece: Option<Piece>,
     /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
     /// random, 5 to 25]
     // For the same reason: the softest material takes minutes to bear 1,000 N, and the sensor shows no more than 10 N
@@ -159,15 +160,14 @@ fn sequence(args: &Args) -> SequenceSettings {
 }
 
 /// A rigid piece of the command line.
-fn piece(text: &str) -> Result<Reference, String> {
-    let expected = || "expected flat:MM or ball:MM with 1 to 100 mm".to_owned();
-    let (kind, mm) = text.split_once(':').ok_or_else(expected)?;
-    let mm: f32 = mm.parse().map_err(|_| expected())?;
-    match kind {
-        _ if !(1.0..=100.0).contains(&mm) => Err(expected()),
-        "flat" => Ok(Reference::Flat { width_mm: mm }),
-        "ball" => Ok(Reference::Ball { radius_mm: mm }),
-        _ => Err(expected()),
+fn piece(text: &str) -> Result<Piece, &'static str> {
+    match Piece::rigid(text) {
+        Some(piece @ (Piece::Flat { width_mm: mm } | Piece::Ball { radius_mm: mm }))
+            if (1.0..=100.0).contains(&mm) =>
+        {
+            Ok(piece)
+        }
+        _ => Err("expected flat:MM or ball:MM with 1 to 100 mm"),
     }
 }
 

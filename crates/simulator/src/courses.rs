@@ -10,7 +10,6 @@ use super::dataset::HIGHEST_FORCE_N;
 use super::motion::Arm;
 use super::object::{POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen};
-use super::rigid::Reference;
 use super::sensor::{Film, Sensor};
 use super::settings::{CourseSettings, SensorDesigns};
 use super::solved::SolvedPress;
@@ -19,7 +18,7 @@ use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
 use hardnessd_core::press::thinned;
-use hardnessd_core::verdict::{COURSE_FRAMES, Resampling};
+use hardnessd_core::verdict::{COURSE_FRAMES, Piece, Resampling};
 
 impl CourseSettings {
     fn has_broad_sensors(&self) -> bool {
@@ -62,7 +61,7 @@ pub struct LabelledCourse {
     /// Number of the sensor, unique in the data set. 0 if the sensors have no numbers.
     pub sensor: u32,
     /// The rigid piece that was pressed.
-    pub reference: Option<Reference>,
+    pub reference: Option<Piece>,
     /// The labels.
     pub labels: Labels,
 }

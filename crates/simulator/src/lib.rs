@@ -43,7 +43,6 @@ pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::Shapes;
 pub use rig::{Rig, Touched};
-pub use rigid::Reference;
 pub use sensor::SensorProfile;
 pub use sequence::{Pressed, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns};

@@ -7,6 +7,7 @@ use super::sensor::{Film, Sensor};
 use super::substance::{Creep, Law, Substance, Texture};
 use super::texture::Patch;
 use crate::random::Stream;
+use hardnessd_core::verdict::Piece;
 
 /// Width of the flat piece, mm.
 pub(super) const FLAT_MM: f64 = 20.0;
@@ -21,26 +22,16 @@ const PLACES: u64 = 3;
 /// How long a weight lies before it is read, s.
 const WEIGHT_S: f64 = 2.0;
 
-/// A rigid piece whose form is known.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Reference {
-    /// A flat round face of this width across.
-    Flat {
-        /// The width.
-        width_mm: f32,
-    },
-    /// A ball of this radius.
-    Ball {
-        /// The radius.
-        radius_mm: f32,
-    },
-}
-
 /// The face of a piece that an arm presses.
-pub(super) fn face(piece: Reference) -> Face {
+///
+/// # Panics
+///
+/// Panics if the piece is not a rigid one.
+pub(super) fn face(piece: Piece) -> Face {
     match piece {
-        Reference::Flat { width_mm } => Face::flat(0.5 * f64::from(width_mm), TILT_DEG),
-        Reference::Ball { radius_mm } => Face::ball(radius_mm.into()),
+        Piece::Flat { width_mm } => Face::flat(0.5 * f64::from(width_mm), TILT_DEG),
+        Piece::Ball { radius_mm } => Face::ball(radius_mm.into()),
+        Piece::Shore { .. } => unreachable!("a rigid piece has a form"),
     }
 }
 

@@ -11,13 +11,14 @@ use super::material::{Body, Material};
 use super::motion::{Approach, Arm, Motion};
 use super::object::{self, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen, draw_patch};
-use super::rigid::{self, Reference};
+use super::rigid;
 use super::sensor::{ARRAY, Design, Film, Sensor, SensorProfile};
 use super::solved::SolvedPress;
 use super::subject::harder_and_harder;
 use super::tracked::one_press;
 use crate::random::Stream;
 use hardnessd_core::frame::RawFrame;
+use hardnessd_core::verdict::Piece;
 
 /// The settings of a sequence: what to press, how often and how hard.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,7 +36,7 @@ pub struct SequenceSettings {
     /// The number of presses; `None` for an endless sequence.
     pub presses: Option<u32>,
     /// The rigid piece to press in place of the objects.
-    pub piece: Option<Reference>,
+    pub piece: Option<Piece>,
 }
 
 impl Default for SequenceSettings {

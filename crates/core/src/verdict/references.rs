@@ -51,6 +51,17 @@ impl Piece {
         }
     }
 
+    /// The rigid piece that a text names: `flat:MM` or `ball:MM`, with 0.1 to 1000 mm.
+    pub fn rigid(text: &str) -> Option<Self> {
+        let (form, mm) = text.split_once(':')?;
+        let mm: Option<f32> = mm.trim().parse().ok();
+        match (form.trim(), mm.filter(|mm| (0.1..=1000.0).contains(mm))?) {
+            ("flat", width_mm) => Some(Self::Flat { width_mm }),
+            ("ball", radius_mm) => Some(Self::Ball { radius_mm }),
+            _ => None,
+        }
+    }
+
     /// An object of which nothing is known.
     pub const UNKNOWN: Self = Self::Shore {
         range: [0.0, 100.0],

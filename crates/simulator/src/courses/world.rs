@@ -9,11 +9,12 @@ use super::{ARM_N_PER_MM, LabelledCourse, Plan, Reading};
 use crate::material::Split;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
-use crate::rigid::{self, FLAT_MM, Reference};
+use crate::rigid::{self, FLAT_MM};
 use crate::sensor::{Design, Sensor};
 use crate::settings::{BroadSensors, CourseSettings, DatasetSettings, SensorDesigns};
 use crate::solved::SolvedPress;
 use crate::subject::{Labels, Subject, Unit, shared_out, units};
+use hardnessd_core::verdict::Piece;
 
 /// Presses of each rigid piece on each sensor.
 const REFERENCES: u32 = 5;
@@ -186,7 +187,7 @@ impl<'a> Station<'a> {
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
     fn references(&mut self, objects: u32) -> Vec<Option<LabelledCourse>> {
         let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
-        let pieces = [Reference::Flat { width_mm }, Reference::Ball { radius_mm }];
+        let pieces = [Piece::Flat { width_mm }, Piece::Ball { radius_mm }];
         let mut made = Vec::new();
         for (piece, reference) in (0_u32..).zip(pieces) {
             let labels = Labels {

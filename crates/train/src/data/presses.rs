@@ -14,9 +14,9 @@ use std::path::Path;
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, ROWS, Resampling, TimeSeries, parts,
+    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TimeSeries, parts,
 };
-use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Reference, Split};
+use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Split};
 
 pub use self::file::{Layout, meta, write};
 use self::frames::Frames;
@@ -46,7 +46,7 @@ pub struct Press {
     /// The number of the sensor. 0 if the data have one sensor, or do not name them.
     pub sensor: u32,
     /// The rigid piece that was pressed to show what the sensor reads. Such a press has no level.
-    pub reference: Option<Reference>,
+    pub reference: Option<Piece>,
     /// The recording and the number of the press in it, to read. Only recordings have it.
     pub name: Option<String>,
     /// The newtons of the array before the touch, without a zero taken: the sensor's own unloaded state. Only

@@ -235,7 +235,7 @@ mod tests {
         let mut presses = presses((0..120).map(|n| ((n / 30) as u8 + 1, n / 2, n)));
         let references = (0..120).map(|sensor| Press {
             sensor,
-            reference: Some(hardnessd_simulator::Reference::Flat { width_mm: 20.0 }),
+            reference: Some(hardnessd_core::verdict::Piece::Flat { width_mm: 20.0 }),
             ..Press::default()
         });
         presses.all.extend(references);

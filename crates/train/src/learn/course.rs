@@ -17,7 +17,6 @@ use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, FrameFeatures};
 use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Moment, Piece};
-use hardnessd_simulator::Reference;
 use hardnessd_simulator::random::Stream;
 
 mod lots;
@@ -59,18 +58,10 @@ pub fn prepared(presses: &Presses) -> Vec<Press> {
             shore: press.shore,
             object: press.object,
             sensor: press.sensor,
-            piece: press.reference.map(piece),
+            piece: press.reference,
         }
     };
     (0..presses.all.len()).map(prepare).collect()
-}
-
-/// A rigid piece as references name it.
-pub fn piece(reference: Reference) -> Piece {
-    match reference {
-        Reference::Flat { width_mm } => Piece::Flat { width_mm },
-        Reference::Ball { radius_mm } => Piece::Ball { radius_mm },
-    }
 }
 
 impl Press {

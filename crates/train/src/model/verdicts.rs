@@ -6,7 +6,6 @@ use anyhow::ensure;
 
 use crate::data::presses::Presses;
 use crate::judge::evaluated::{Case, cases};
-use crate::learn::course::piece;
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
 use hardnessd_core::verdict::{Format, Hrn, Piece, ReferencePress, References, TimeSeries};
@@ -40,7 +39,7 @@ impl Given {
 pub fn rigid(presses: &Presses, sensor: u32, given: Given) -> Vec<(usize, Piece)> {
     let of_sensor = presses.all.iter().enumerate();
     let pieces = of_sensor.filter(|(_, press)| press.sensor == sensor);
-    let pieces = pieces.filter_map(|(place, press)| Some((place, piece(press.reference?))));
+    let pieces = pieces.filter_map(|(place, press)| Some((place, press.reference?)));
     let is_ball = |(_, piece): &(usize, Piece)| matches!(piece, Piece::Ball { .. });
     let (balls, flats): (Vec<_>, Vec<_>) = pieces.partition(is_ball);
     // The simulator presses harder each time, so presses that lie apart differ in force.

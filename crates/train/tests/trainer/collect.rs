@@ -8,8 +8,8 @@ use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Labels, MAGIC};
 use hardnessd_core::sensor::Description;
 use hardnessd_core::test_support::of_a_labelled_press;
-use hardnessd_core::verdict::{Card, Hrn};
-use hardnessd_simulator::{Reference, Split};
+use hardnessd_core::verdict::{Card, Hrn, Piece};
+use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Press, Presses, meta, read_one};
 use hrn_train::data::source::Kind;
 use hrn_train::run::disk;
@@ -239,8 +239,8 @@ fn the_sensor_and_the_rigid_piece_of_a_press_are_kept() {
     let expected = [
         (1, 0, None),
         (2, 1, None),
-        (0, 1, Some(Reference::Ball { radius_mm: 6.0 })),
-        (0, 0, Some(Reference::Flat { width_mm: 20.0 })),
+        (0, 1, Some(Piece::Ball { radius_mm: 6.0 })),
+        (0, 0, Some(Piece::Flat { width_mm: 20.0 })),
     ];
     assert!(found.eq(expected), "{all:?}");
     assert_eq!(

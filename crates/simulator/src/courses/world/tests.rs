@@ -45,7 +45,7 @@ fn sensors_have_their_references() {
         let kinds = presses.iter().map(|press| match press.reference {
             Some(reference) => {
                 assert!(press.labels.level == 0 && press.labels.shore.is_nan());
-                1 + usize::from(matches!(reference, Reference::Ball { .. }))
+                1 + usize::from(matches!(reference, Piece::Ball { .. }))
             }
             None => 0,
         });

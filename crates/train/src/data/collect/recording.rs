@@ -18,8 +18,7 @@ use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{Borders, COLS, Hrn, ROWS, sha256_hex};
-use hardnessd_simulator::Reference;
+use hardnessd_core::verdict::{Borders, COLS, Hrn, Piece, ROWS, sha256_hex};
 
 /// The moment of raw bytes, whose times come from the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {
@@ -106,7 +105,7 @@ impl Recording {
         new: u32,
     ) -> anyhow::Result<()> {
         let expected = "flat:MM or ball:MM with 0.1 to 1000 mm";
-        let reference = self.label("reference", expected, reference)?;
+        let reference = self.label("reference", expected, Piece::rigid)?;
         ensure!(
             reference.is_none() || presses.are_over_time(),
             "label reference: collect presses of rigid pieces with --sequences"
@@ -307,17 +306,6 @@ impl Recording {
 pub(super) fn name_of(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default();
     name.to_string_lossy().into_owned()
-}
-
-/// The rigid piece that a label names, as `identify` does.
-fn reference(label: &str) -> Option<Reference> {
-    let (form, mm) = label.split_once(':')?;
-    let mm: Option<f32> = mm.parse().ok().filter(|mm| (0.1..=1000.0).contains(mm));
-    match (form, mm?) {
-        ("flat", width_mm) => Some(Reference::Flat { width_mm }),
-        ("ball", radius_mm) => Some(Reference::Ball { radius_mm }),
-        _ => None,
-    }
 }
 
 /// The level that a label names or numbers.

@@ -14,8 +14,10 @@ use crate::data::source::{Kind, MOST_LEVELS, SIMULATOR, Source};
 use crate::exit::unreadable;
 use hardnessd_core::frame::Array;
 use hardnessd_core::npz::{ANY, Element, Reader, Unexpected, Writer, within};
-use hardnessd_core::verdict::{COLS, COURSE_FRAMES, Level, ROWS, TAXELS, are_levels, sha256_hex};
-use hardnessd_simulator::{BroadSensors, Reference, Split};
+use hardnessd_core::verdict::{
+    COLS, COURSE_FRAMES, Level, Piece, ROWS, TAXELS, are_levels, sha256_hex,
+};
+use hardnessd_simulator::{BroadSensors, Split};
 
 /// Forces beyond any sensor's, and low enough that sums of squares stay finite.
 const FORCES: RangeInclusive<f32> = -1e6..=1e6;
@@ -182,8 +184,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
                     "that of each reference",
                 ));
             }
-            (1, Some(width_mm)) => Some(Reference::Flat { width_mm }),
-            (_, Some(radius_mm)) => Some(Reference::Ball { radius_mm }),
+            (1, Some(width_mm)) => Some(Piece::Flat { width_mm }),
+            (_, Some(radius_mm)) => Some(Piece::Ball { radius_mm }),
         };
         if level[number] > 0 && piece.is_some() {
             let found = format!("{} of press {number}, a reference", level[number]);
@@ -336,9 +338,9 @@ pub fn write<W: Write + Seek>(
     let is_known = |press: &Press| press.sensor > 0 || press.reference.is_some();
     if all.iter().any(is_known) {
         let piece = |press: &Press| match press.reference {
-            None => (0, 0.0),
-            Some(Reference::Flat { width_mm }) => (1, width_mm),
-            Some(Reference::Ball { radius_mm }) => (2, radius_mm),
+            None | Some(Piece::Shore { .. }) => (0, 0.0),
+            Some(Piece::Flat { width_mm }) => (1, width_mm),
+            Some(Piece::Ball { radius_mm }) => (2, radius_mm),
         };
         add(&mut npz, "sensor", all, None, |press| Some(press.sensor))?;
         let reference = |press: &Press| Some(piece(press).0);

@@ -51,8 +51,8 @@ fn courses() -> Presses {
     let courses = hardnessd_simulator::courses(&settings, 2, |_, _| ());
     let mut presses = Presses::of_courses(courses.iter().flatten());
     for (place, reference) in [
-        (1, Reference::Flat { width_mm: 20.0 }),
-        (3, Reference::Ball { radius_mm: 7.5 }),
+        (1, Piece::Flat { width_mm: 20.0 }),
+        (3, Piece::Ball { radius_mm: 7.5 }),
     ] {
         let press = &mut presses.all[place];
         (press.level, press.reference) = (0, Some(reference));
