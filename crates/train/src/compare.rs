@@ -30,6 +30,7 @@ use crate::run::Run;
 use crate::run::disk::{lock, refuse_foreign, write_whole};
 use crate::settings::Profile;
 use hardnessd_core::trial;
+use hardnessd_simulator::Split;
 use sets::{FRESH_OBJECTS, TestSet};
 
 /// A recipe that is no row of the tables.
@@ -224,9 +225,10 @@ fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
         sets::PAPER_SPLIT: null,
     });
     let mut objects = String::new();
-    for set in sets {
-        let cases = verdicts::of(&hrn, &set.presses, &set.places, Given::USUAL)?;
-        entry[set.name] = serde_json::to_value(Evaluated::of(&cases, &hrn.card().levels))?;
+    for (set, presses) in sets {
+        let places: Vec<usize> = presses.labelled(Split::Test).collect();
+        let cases = verdicts::of(&hrn, presses, &places, Given::USUAL)?;
+        entry[set] = serde_json::to_value(Evaluated::of(&cases, &hrn.card().levels))?;
         let mut counts = BTreeMap::<(u8, u32), (u64, u64)>::new();
         for case in cases {
             let Some(object) = case.object else {
@@ -237,11 +239,10 @@ fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
             *all += 1;
         }
         for ((level, object), (right, all)) in counts {
-            let geometry = match set.name {
+            let geometry = match *set {
                 "matched" => (object % FRESH_OBJECTS).to_string(),
                 _ => String::new(),
             };
-            let set = set.name;
             let _ = writeln!(
                 objects,
                 "{name},{set},{level},{object},{geometry},{right},{all}"

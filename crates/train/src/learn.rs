@@ -62,7 +62,9 @@ pub trait Learning {
     ) -> Vec<Vec<f32>>;
 
     /// What the logits are of.
-    fn outputs(&self) -> Outputs;
+    fn outputs(&self) -> Outputs {
+        Outputs::Levels
+    }
 
     /// The graph of the exported file, up to the logits.
     fn graph(&self, weights: &[Weights]) -> Graph;

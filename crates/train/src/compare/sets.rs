@@ -27,25 +27,8 @@ const FRESH: [(&str, u64, Shapes); 2] = [
     ("matched", 2_019_002, Shapes::Matched),
 ];
 
-/// Labelled presses to judge.
-#[derive(Debug)]
-pub(super) struct TestSet {
-    /// The key of the set in the results.
-    pub(super) name: &'static str,
-    pub(super) presses: Presses,
-    /// The presses to judge.
-    pub(super) places: Vec<usize>,
-}
-
-impl TestSet {
-    fn of(name: &'static str, presses: Presses) -> Self {
-        Self {
-            name,
-            places: presses.labelled(Split::Test).collect(),
-            presses,
-        }
-    }
-}
+/// The key of a set in the results, and presses whose labelled test presses are judged.
+pub(super) type TestSet = (&'static str, Presses);
 
 /// All sets. The simulated ones are kept in `directory`. The first set is left out if the data have no
 /// labelled test presses.
@@ -70,8 +53,8 @@ pub(super) fn all(
         true => Layout::OverTime,
         false => Layout::Frames,
     };
-    let mut sets = vec![TestSet::of(PAPER_SPLIT, presses)];
-    sets.retain(|own| !own.places.is_empty());
+    let mut sets = vec![(PAPER_SPLIT, presses)];
+    sets.retain(|(_, own)| own.labelled(Split::Test).next().is_some());
     for (name, seed, shapes) in FRESH {
         let usual = CourseSettings::default();
         let objects = DatasetSettings {
@@ -97,10 +80,7 @@ pub(super) fn all(
             sensors: Some(sensors).filter(|_| layout == Layout::OverTime),
             ..usual
         };
-        sets.push(TestSet::of(
-            name,
-            simulated(directory, name, &settings, layout)?,
-        ));
+        sets.push((name, simulated(directory, name, &settings, layout)?));
     }
     Ok(sets)
 }

@@ -9,7 +9,7 @@ use burn::tensor::{Device, Tensor};
 
 use super::hrn::{Frames, Hrn};
 use super::learner::Learner;
-use super::{Learning, Outputs, Plan, Question, Taken};
+use super::{Learning, Plan, Question, Taken};
 use crate::data::presses::Presses;
 use crate::net::generator;
 use crate::net::graph::Graph;
@@ -191,10 +191,6 @@ impl Learning for Gan<'_> {
     ) -> Vec<Vec<f32>> {
         let (hrn, weights) = self.recogniser(weights);
         hrn.judge(&weights, questions, vary)
-    }
-
-    fn outputs(&self) -> Outputs {
-        Outputs::Levels
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor};
 
 use super::learner::Learner;
-use super::{Learning, Outputs, Plan, Question, Taken, share_right};
+use super::{Learning, Plan, Question, Taken, share_right};
 use crate::data::augment;
 use crate::data::presses::Presses;
 use crate::net::graph::Graph;
@@ -172,10 +172,6 @@ impl Learning for Hrn<'_> {
             rows.extend(numbers(&logits).chunks(self.on.levels).map(<[f32]>::to_vec));
         }
         rows
-    }
-
-    fn outputs(&self) -> Outputs {
-        Outputs::Levels
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {

@@ -10,7 +10,7 @@ use std::slice;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
+use super::{Inputs, Learning, Plan, Question, Taken, share_right};
 use crate::data::presses::Presses;
 use crate::net::graph::{Graph, RAW};
 use crate::net::network::{Weights, dense, numbers};
@@ -234,10 +234,6 @@ impl Learning for Regression<'_> {
         let rows = Tensor::from_data(TensorData::new(rows, shape), self.device);
         let logits = numbers(&dense(&weights[0], "levels", rows));
         logits.chunks(self.levels).map(<[f32]>::to_vec).collect()
-    }
-
-    fn outputs(&self) -> Outputs {
-        Outputs::Levels
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {
