@@ -55,8 +55,6 @@ pub(super) struct Contact {
     pub(super) approach_mm: f64,
     /// a = sqrt(A / pi) of the contact area A, mm.
     pub(super) radius_mm: f64,
-    /// Iterations used.
-    pub(super) iterations: u32,
     /// Whether the tolerance was met.
     pub(super) converged: bool,
 }
@@ -117,19 +115,17 @@ impl Solver {
         let mut contact = Contact {
             approach_mm: 0.0,
             radius_mm: contact_radius(pressure_mpa, area),
-            iterations: 0,
             converged: false,
         };
         let (mut restart, mut is_displacement_known, mut rz_before) = (true, false, 1.0);
-        while contact.iterations < MAX_ITERATIONS {
-            contact.iterations += 1;
+        for iteration in 1..=MAX_ITERATIONS {
             if !is_displacement_known {
                 let out = &mut self.displacement;
                 problem.displace(&mut self.convolver, pressure_mpa, out);
             }
             // Late in the solve, single cells at the rim switch on and off. The radius must not
             // follow them.
-            if contact.iterations < 30 {
+            if iteration < 30 {
                 contact.radius_mm = contact_radius(pressure_mpa, area);
             }
 
@@ -205,8 +201,7 @@ impl Solver {
                 }
             }
             restart = is_loaded;
-            is_displacement_known =
-                !(is_clipped || is_loaded || contact.iterations.is_multiple_of(25));
+            is_displacement_known = !(is_clipped || is_loaded || iteration.is_multiple_of(25));
             if is_displacement_known {
                 for (u, &response) in self.displacement.iter_mut().zip(&self.response) {
                     *u -= step * response;

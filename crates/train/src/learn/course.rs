@@ -16,7 +16,7 @@ use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::settings::{ArmReports, Settings, Training};
 use hardnessd_core::verdict::features::{self, FEATURES, FrameFeatures};
-use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Moment, Piece};
+use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Moment, TimeSeries};
 use hardnessd_simulator::random::Stream;
 
 mod lots;
@@ -27,44 +27,24 @@ const JUDGED_AT_ONCE: usize = 16;
 /// The name of the stage.
 const STAGE: &str = "course";
 
-/// A press, prepared for training.
+/// What a press felt like.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Press {
+pub struct Felt {
     /// Features, time and approach of each frame, from the one that began the press.
     pub moments: Vec<Moment<FrameFeatures>>,
     /// Stiffness of the arm in N/mm; 0 if unknown.
     pub arm_n_per_mm: f32,
-    /// The hardness level, 1..=L, or 0 if unlabelled.
-    pub level: u8,
-    /// The measured Shore OO hardness, if any.
-    pub shore: Option<f32>,
-    /// The number of the object, if it is known.
-    pub object: Option<u32>,
-    /// The number of the sensor.
-    pub sensor: u32,
-    /// The piece, if it is a rigid one.
-    pub piece: Option<Piece>,
 }
 
-/// All presses of the data, each from the frame that began it.
-pub fn prepared(presses: &Presses) -> Vec<Press> {
-    let features = |moment: &Moment| moment.map(features::of_frame);
-    let prepare = |place: usize| {
-        let (course, press) = (presses.course(place), &presses.all[place]);
-        Press {
+impl Felt {
+    fn of(course: &TimeSeries) -> Self {
+        let features = |moment: &Moment| moment.map(features::of_frame);
+        Self {
             moments: course.moments.iter().map(features).collect(),
             arm_n_per_mm: course.arm_n_per_mm,
-            level: press.level,
-            shore: press.shore,
-            object: press.object,
-            sensor: press.sensor,
-            piece: press.reference,
         }
-    };
-    (0..presses.all.len()).map(prepare).collect()
-}
+    }
 
-impl Press {
     /// The features of the press.
     pub fn features(&self) -> [f32; FEATURES] {
         features::of_press(&self.moments, self.arm_n_per_mm)
@@ -83,8 +63,11 @@ impl Press {
 /// The network, and what it learns from.
 #[derive(Debug)]
 pub struct Course<'a> {
+    presses: &'a Presses,
+    /// What each of them felt like.
+    felt: Vec<Felt>,
     held_out: &'a [usize],
-    lots: Lots,
+    lots: Lots<'a>,
     standard: Standard,
     /// The share of each bin that lies in each level.
     parts: Tensor<2>,
@@ -103,7 +86,7 @@ impl<'a> Course<'a> {
     ///
     /// Fails if the levels are no parts of the scale of Shore hardness.
     pub fn new(
-        presses: &Presses,
+        presses: &'a Presses,
         (train, held_out): (&'a [usize], &'a [usize]),
         settings: &Settings,
         seed: u64,
@@ -111,16 +94,19 @@ impl<'a> Course<'a> {
     ) -> Result<Self, ModelError> {
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
-        let prepared = prepared(presses);
-        let rows = train.iter().map(|&place| prepared[place].features());
+        let felt = (0..presses.all.len()).map(|place| Felt::of(&presses.course(place)));
+        let felt: Vec<Felt> = felt.collect();
+        let rows = train.iter().map(|&place| felt[place].features());
         let rows: Vec<[f32; FEATURES]> = rows.collect();
         let mut counts = vec![0; levels];
-        for &place in train {
-            counts[usize::from(prepared[place].level) - 1] += 1;
+        for press in presses.of(train) {
+            counts[usize::from(press.level) - 1] += 1;
         }
         Ok(Self {
+            presses,
+            felt,
             held_out,
-            lots: Lots::of(prepared.into(), borders.clone(), train),
+            lots: Lots::of(presses, borders.clone(), train),
             standard: Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice)),
             parts: bins::parts(&borders, levels, device),
             outputs: Outputs::Bins {
@@ -148,7 +134,7 @@ impl<'a> Course<'a> {
         // With a stream, presses have the robot's errors, as training presses have them. References are
         // whole presses.
         let mut inputs = |place: usize, reports: &ArmReports| {
-            let press = &self.lots.presses[place];
+            let press = &self.felt[place];
             let press = match vary.as_deref_mut() {
                 Some(stream) => &reports.varied(press, stream),
                 None => press,
@@ -172,12 +158,11 @@ impl Learning for Course<'_> {
     }
 
     fn plan(&self) -> Plan {
-        let level = |&press: &usize| (press, self.lots.presses[press].level);
         Plan {
             sides: vec![Learner::fresh(self.initial.clone(), self.training)],
             // A sample of an epoch is a group of presses.
             samples: self.lots.tickets(),
-            held_out: self.held_out.iter().map(level).collect(),
+            held_out: self.presses.with_levels(self.held_out),
             batch: (self.training.batch / lots::GROUP).max(1),
             training: self.training,
             seed: self.seed,
@@ -193,11 +178,8 @@ impl Learning for Course<'_> {
         for &ticket in tickets {
             let question = self.lots.draw(ticket, &mut stream);
             groups.push(self.group(&question, Some(&mut stream)));
-            let presses = question
-                .presses
-                .iter()
-                .map(|&place| &self.lots.presses[place]);
-            labels.extend(presses.map(|press| match press.piece {
+            let presses = self.presses.of(&question.presses);
+            labels.extend(presses.map(|press| match press.reference {
                 // A rigid piece is harder than any object.
                 Some(_) => (1, None),
                 None => (press.level, press.shore),

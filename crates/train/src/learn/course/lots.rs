@@ -6,9 +6,8 @@
 //! whatever a robot has.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use super::Press;
+use crate::data::presses::Presses;
 use crate::learn::Question;
 use hardnessd_core::verdict::{Borders, Knowledge, Piece};
 use hardnessd_simulator::random::Stream;
@@ -82,24 +81,23 @@ struct Lot {
 
 /// The presses to learn from, by sensor.
 #[derive(Debug)]
-pub(super) struct Lots {
-    /// All presses of the data.
-    pub(super) presses: Arc<[Press]>,
+pub(super) struct Lots<'a> {
+    presses: &'a Presses,
     borders: Borders,
     lots: Vec<Lot>,
 }
 
-impl Lots {
+impl<'a> Lots<'a> {
     /// Sorts the presses `train` by their sensors. Presses on rigid pieces count for these sensors,
     /// whatever their split.
-    pub(super) fn of(presses: Arc<[Press]>, borders: Borders, train: &[usize]) -> Self {
+    pub(super) fn of(presses: &'a Presses, borders: Borders, train: &[usize]) -> Self {
         let mut lots = BTreeMap::<u32, Lot>::new();
         for &place in train {
-            let lot = lots.entry(presses[place].sensor).or_default();
+            let lot = lots.entry(presses.all[place].sensor).or_default();
             lot.presses.push(place);
         }
-        for (place, press) in presses.iter().enumerate() {
-            let form = match press.piece {
+        for (place, press) in presses.all.iter().enumerate() {
+            let form = match press.reference {
                 Some(Piece::Flat { .. }) => 0,
                 Some(Piece::Ball { .. }) => 1,
                 Some(Piece::Shore { .. }) | None => continue,
@@ -117,7 +115,7 @@ impl Lots {
 
     /// The same of other presses.
     pub(super) fn with(&self, places: &[usize]) -> Self {
-        Self::of(self.presses.clone(), self.borders.clone(), places)
+        Self::of(self.presses, self.borders.clone(), places)
     }
 
     /// Whether a sensor has presses that may serve as references.
@@ -188,7 +186,7 @@ impl Lots {
         if !lot.is_identified() {
             return references;
         }
-        let object = |place: &usize| self.presses[*place].object;
+        let object = |place: &usize| self.presses.all[*place].object;
         let is_judged = |other: &usize| judged.iter().any(|own| object(own) == object(other));
         let others = others.iter().copied().filter(|other| !is_judged(other));
         let mut others: Vec<usize> = others.collect();
@@ -197,7 +195,11 @@ impl Lots {
                 if stream.uniform() < FORM {
                     let count = 1 + stream.below(MOST_RIGID);
                     for &place in shuffled(&mut form.clone(), count, stream) {
-                        references.extend(self.presses[place].piece.map(|piece| (place, piece)));
+                        references.extend(
+                            self.presses.all[place]
+                                .reference
+                                .map(|piece| (place, piece)),
+                        );
                     }
                 }
             }
@@ -205,7 +207,7 @@ impl Lots {
         if kinds.labelled && !others.is_empty() {
             let count = 1 + stream.below(MOST_LABELLED.min(others.len()));
             for place in others.drain(..count) {
-                let press = &self.presses[place];
+                let press = &self.presses.all[place];
                 let range = match press.shore {
                     Some(shore) if stream.uniform() < MEASURED => [shore; 2],
                     _ => self.borders.part(usize::from(press.level) - 1),
@@ -228,7 +230,7 @@ impl Lots {
     fn lopsided(&self, others: &[usize], count: usize, stream: &mut Stream) -> Vec<usize> {
         let mut of_level = BTreeMap::<u8, Vec<usize>>::new();
         for &place in others {
-            let of_level = of_level.entry(self.presses[place].level).or_default();
+            let of_level = of_level.entry(self.presses.all[place].level).or_default();
             of_level.push(place);
         }
         // The cube of an exponential variate is at times far above its mean.
@@ -273,46 +275,37 @@ fn shuffled<'a>(order: &'a mut [usize], count: usize, stream: &mut Stream) -> &'
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::presses::Press;
     use crate::data::source::papers_levels;
-    use hardnessd_core::verdict::Moment;
-    use hardnessd_core::verdict::features::frame_of;
 
     #[test]
     fn no_reference_is_a_press_of_an_object_that_is_judged() {
         // Two presses of each of 20 objects, and two of a rigid piece.
-        let press = |number: u32, piece| Press {
-            moments: vec![Moment {
-                frame: frame_of(9.0, 5.0),
-                time_s: 0.0,
-                approach_mm: None,
-            }],
-            arm_n_per_mm: 0.0,
+        let press = |number: u32| Press {
             level: 2,
             shore: Some(65.0),
             object: Some(number / 2),
-            sensor: 0,
-            piece,
+            reference: (number >= 40).then_some(Piece::Ball { radius_mm: 10.0 }),
+            ..Press::default()
         };
-        let mut presses: Vec<Press> = (0..40).map(|number| press(number, None)).collect();
-        let ball = Some(Piece::Ball { radius_mm: 10.0 });
-        presses.extend((40..42).map(|number| press(number, ball)));
+        let mut presses = Presses::default();
+        presses.all = (0..42).map(press).collect();
         let train: Vec<usize> = (0..40).collect();
         let borders = Borders::of(&papers_levels()).unwrap();
-        let lots = Lots::of(presses.into(), borders, &train);
-        let presses = &lots.presses;
+        let lots = Lots::of(&presses, borders, &train);
         let (mut labelled, mut own) = (0, 0);
         for seed in 0..200 {
             let mut stream = Stream::new(seed, "lots");
             let drawn = lots.draw(0, &mut stream);
             for &(place, piece) in &drawn.references {
-                let reference = &presses[place];
-                let is_same = |&judged: &usize| match reference.piece {
+                let reference = &presses.all[place];
+                let is_same = |&judged: &usize| match reference.reference {
                     Some(_) => judged == place,
-                    None => presses[judged].object == reference.object,
+                    None => presses.all[judged].object == reference.object,
                 };
                 assert!(!drawn.presses.iter().any(is_same), "seed {seed}");
                 own += u32::from(piece.is_unknown());
-                labelled += u32::from(reference.piece.is_none() && !piece.is_unknown());
+                labelled += u32::from(reference.reference.is_none() && !piece.is_unknown());
             }
         }
         assert!(labelled > 100, "{labelled} labelled references");

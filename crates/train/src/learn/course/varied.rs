@@ -1,7 +1,7 @@
 //! Errors in what a robot reports. Training presses get these errors, because a network that was
 //! trained on exact reports alone would trust every report.
 
-use super::Press;
+use super::Felt;
 use crate::settings::ArmReports;
 use hardnessd_simulator::random::Stream;
 
@@ -15,7 +15,7 @@ const MOST_FRAMES_A_STEP: usize = 8;
 const STRETCH: (f64, f64) = (0.5, 16.0);
 impl ArmReports {
     /// The press as a robot might report it.
-    pub(super) fn varied(&self, press: &Press, stream: &mut Stream) -> Press {
+    pub(super) fn varied(&self, press: &Felt, stream: &mut Stream) -> Felt {
         let mut press = press.clone();
         if stream.uniform() < self.slower {
             press.slow_down(stream);
@@ -59,7 +59,7 @@ impl ArmReports {
     }
 }
 
-impl Press {
+impl Felt {
     /// Keeps every k-th frame, from a randomly chosen first one. The first frame kept becomes the
     /// press's begin, from which times and the approach count.
     fn slow_down(&mut self, stream: &mut Stream) {
@@ -120,20 +120,15 @@ mod tests {
     use hardnessd_core::verdict::Moment;
     use hardnessd_core::verdict::features::frame_of;
 
-    fn press() -> Press {
+    fn press() -> Felt {
         let moment = |n: u8| Moment {
             frame: frame_of(9.0, 1.0),
             time_s: 0.1 * f32::from(n),
             approach_mm: Some(0.5 * f32::from(n)),
         };
-        Press {
+        Felt {
             moments: (0..10).map(moment).collect(),
             arm_n_per_mm: 10.0,
-            level: 1,
-            shore: Some(80.0),
-            object: None,
-            sensor: 0,
-            piece: None,
         }
     }
 
@@ -196,10 +191,10 @@ mod tests {
     #[test]
     fn shares_are_kept_and_an_early_press_has_three_frames() {
         let mut stream = Stream::new(2, "reports");
-        let drawn: Vec<Press> = (0..1000)
+        let drawn: Vec<Felt> = (0..1000)
             .map(|_| ArmReports::default().varied(&press(), &mut stream))
             .collect();
-        let share = |is: fn(&Press) -> bool| drawn.iter().filter(|press| is(press)).count();
+        let share = |is: fn(&Felt) -> bool| drawn.iter().filter(|press| is(press)).count();
         assert!((240..360).contains(&share(|p| p.moments[0].approach_mm.is_none())));
         // A quarter of the presses end early. Of the others, three in ten have a slower sensor.
         assert!((410..540).contains(&share(|p| p.moments.len() < 10)));
