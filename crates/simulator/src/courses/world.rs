@@ -11,7 +11,7 @@ use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
 use crate::rigid::{self, FLAT_MM};
 use crate::sensor::{Design, Sensor};
-use crate::settings::{BroadSensors, CourseSettings, DatasetSettings, SensorDesigns};
+use crate::settings::{BroadSensors, CourseSettings, SensorDesigns};
 use crate::solved::SolvedPress;
 use crate::subject::{Labels, Subject, Unit, shared_out, units};
 use hardnessd_core::verdict::Piece;
@@ -31,36 +31,6 @@ const WRONG_SHARE: f64 = 0.5;
 /// The most by which the reported stiffness of a sensor's arm is off, relatively.
 const ARM_ERROR: f64 = 0.15;
 
-/// One cover with the objects that are pressed on it.
-struct Place {
-    split: Split,
-    number: u32,
-    /// Number of the cover over both splits.
-    index: u32,
-    units: Vec<Unit>,
-}
-
-impl BroadSensors {
-    /// The covers that objects are pressed on.
-    fn places(&self, of: &DatasetSettings) -> Vec<Place> {
-        let units = units(of);
-        let train = (0..self.covers.min(of.objects)).map(|n| (Split::Train, self.covers, n));
-        let test = 0..self.test_covers.min(of.test_objects);
-        let test = test.map(|n| (Split::Test, self.test_covers, n));
-        let places = (0..).zip(train.chain(test));
-        let places = places.map(|(index, (split, covers, number))| {
-            let is_on = |unit: &&Unit| unit.split == split && unit.number % covers == number;
-            Place {
-                split,
-                number,
-                index,
-                units: units.iter().filter(is_on).copied().collect(),
-            }
-        });
-        places.collect()
-    }
-}
-
 impl CourseSettings {
     /// The names that a press's `material` indexes.
     pub fn material_names(&self) -> Vec<&'static str> {
@@ -77,22 +47,34 @@ pub(super) fn courses(
     threads: usize,
     progress: impl Fn(usize, usize) + Sync,
 ) -> Vec<Option<LabelledCourse>> {
-    let places = sensors.places(&settings.objects);
-    let objects = units(&settings.objects).len() as u32;
-    shared_out(&places, threads, progress, |place| {
-        let mut station = Station::draw(settings, sensors, place);
-        let mut made = station.references(objects);
-        for &unit in &place.units {
-            made.extend(station.object(unit));
-        }
-        made
-    })
+    let of = &settings.objects;
+    let units = units(of);
+    let train = (0..sensors.covers.min(of.objects)).map(|n| (Split::Train, sensors.covers, n));
+    let test = 0..sensors.test_covers.min(of.test_objects);
+    let test = test.map(|n| (Split::Test, sensors.test_covers, n));
+    let covers: Vec<_> = (0..).zip(train.chain(test)).collect();
+    shared_out(
+        &covers,
+        threads,
+        progress,
+        |&(index, (split, count, number))| {
+            let mut station = Station::draw(settings, sensors, (split, number), index);
+            let mut made = station.references(units.len() as u32);
+            let is_on = |unit: &&Unit| unit.split == split && unit.number % count == number;
+            for &unit in units.iter().filter(is_on) {
+                made.extend(station.object(unit));
+            }
+            made
+        },
+    )
 }
 
 /// One cover on its arm, with the electronics under it.
 struct Station<'a> {
     settings: &'a CourseSettings,
-    place: &'a Place,
+    split: Split,
+    /// Number of the cover over both splits.
+    index: u32,
     draws: Stream,
     bench: Bench,
     arm_n_per_mm: f64,
@@ -132,12 +114,17 @@ impl Electronics {
 }
 
 impl<'a> Station<'a> {
-    fn draw(settings: &'a CourseSettings, sensors: &BroadSensors, place: &'a Place) -> Self {
-        let name = match place.split {
+    fn draw(
+        settings: &'a CourseSettings,
+        sensors: &BroadSensors,
+        (split, number): (Split, u32),
+        index: u32,
+    ) -> Self {
+        let name = match split {
             Split::Train => "train covers",
             Split::Test => "test covers",
         };
-        let draws = Stream::new(settings.objects.seed, name).child(place.number.into());
+        let draws = Stream::new(settings.objects.seed, name).child(number.into());
         let mut own = draws.child(0);
         let is_broad = sensors.designs == SensorDesigns::Broad;
         // Drawn for every design, so that what is drawn after it does not depend on the design.
@@ -163,7 +150,7 @@ impl<'a> Station<'a> {
                 sensor.newtons_per_count *= wrong as f32;
             }
             Electronics {
-                number: place.index * sensors.electronics + k,
+                number: index * sensors.electronics + k,
                 sensor,
                 period_s: 1.0 / log_even(settings.frame_rate_hz, &mut own),
                 arm_factor: 1.0 + own.range(-ARM_ERROR, ARM_ERROR),
@@ -171,7 +158,8 @@ impl<'a> Station<'a> {
         };
         Self {
             settings,
-            place,
+            split,
+            index,
             arm_n_per_mm,
             ball_mm: log_even(BALL_MM, &mut own),
             electronics: (0..sensors.electronics).map(electronics).collect(),
@@ -192,9 +180,9 @@ impl<'a> Station<'a> {
         for (piece, reference) in (0_u32..).zip(pieces) {
             let labels = Labels {
                 level: 0,
-                object: objects + 2 * self.place.index + piece,
+                object: objects + 2 * self.index + piece,
                 material: self.settings.material_names().len() as u8 - 1,
-                split: self.place.split,
+                split: self.split,
                 shore: f32::NAN,
             };
             for press in 0..REFERENCES {

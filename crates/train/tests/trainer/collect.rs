@@ -340,59 +340,23 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     desk.write("archive.npz", "PK\x03\x04");
     desk.recording("wrong.mcap", "level=99");
     desk.write("taken.npz", "somebody's");
-    for (out, arguments, code, part) in [
-        (
-            "own.npz",
-            "foam.bin",
-            2,
-            "has no label `level`: give its level with --level",
-        ),
-        ("own.npz", "--level 17 foam.bin", 2, "17"),
-        ("own.npz", "--level 1 none.mcap", 66, "none.mcap"),
-        (
-            "own.npz",
-            "--level 1 foreign.mcap",
-            1,
-            "found no state of a sensor",
-        ),
-        (
-            "own.npz",
-            "archive.npz",
-            1,
-            "is a data set, not a recording",
-        ),
-        (
-            "own.npz",
-            "wrong.mcap",
-            1,
-            "label level: found \"99\", expected the name",
-        ),
-        (
-            "own.npz",
-            "empty",
-            1,
-            "empty: no recording is in this directory",
-        ),
-        (
-            "own.npz",
-            "--level 1 --config none.toml foam.bin",
-            66,
-            "none.toml",
-        ),
-        (
-            "taken.npz",
-            "--level 1 foam.bin",
-            74,
-            "--append adds to a data set: ",
-        ),
-        (
-            "/dev/null",
-            "--append --level 1 foam.bin",
-            66,
-            "/dev/null: found a device",
-        ),
-    ] {
-        desk.assert_refused(out, arguments, code, part);
+    // The data set, the rest of the command, its exit code, and what it says.
+    let cases = "
+        own.npz | foam.bin | 2 | has no label `level`: give its level with --level
+        own.npz | --level 17 foam.bin | 2 | 17
+        own.npz | --level 1 none.mcap | 66 | none.mcap
+        own.npz | --level 1 foreign.mcap | 1 | found no state of a sensor
+        own.npz | archive.npz | 1 | is a data set, not a recording
+        own.npz | wrong.mcap | 1 | label level: found \"99\", expected the name
+        own.npz | empty | 1 | empty: no recording is in this directory
+        own.npz | --level 1 --config none.toml foam.bin | 66 | none.toml
+        taken.npz | --level 1 foam.bin | 74 | --append adds to a data set:
+        /dev/null | --append --level 1 foam.bin | 66 | /dev/null: found a device";
+    for case in cases.trim().lines() {
+        let [out, arguments, code, part] = case.trim().split(" | ").collect::<Vec<_>>()[..] else {
+            panic!("{case}");
+        };
+        desk.assert_refused(out, arguments, code.parse().unwrap(), part);
     }
 }
 

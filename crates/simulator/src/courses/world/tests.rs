@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::super::courses;
 use super::*;
-use crate::settings::Materials;
+use crate::settings::{DatasetSettings, Materials};
 
 #[test]
 fn sensors_have_their_references() {
