@@ -54,11 +54,16 @@ impl Socket {
         }
         let directory = directory_of(path);
         if !directory.is_dir() {
-            let made = DirBuilder::new().mode(0o755).create(directory);
-            made.map_err(failed("make its directory"))?;
+            match DirBuilder::new().mode(0o755).create(directory) {
+                // Another process of this user began at the same moment.
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+                made => made.map_err(failed("make its directory"))?,
+            }
         }
         Ok(Self {
-            listener: listen(path, mode, group).map_err(failed("listen"))?,
+            listener: listen(path, mode, group)
+                .and_then(UnixListener::from_std)
+                .map_err(failed("listen"))?,
             path: path.to_owned(),
             identity: identity(path).map_err(failed("find"))?,
         })
@@ -90,6 +95,11 @@ pub(crate) fn check(key: &str, path: &Path) -> Result<bool, Error> {
         )));
     }
     let directory = directory_of(path);
+    if let Err(error) = fs::metadata(directory)
+        && error.kind() == ErrorKind::PermissionDenied
+    {
+        return Err(failed(key, path, "find its directory", &error));
+    }
     if !directory.is_dir() && (directory.exists() || !directory_of(directory).is_dir()) {
         return Err(Error::Config(format!(
             "{key}: {shown} is in no directory: make the directory, or set another path"
@@ -135,7 +145,8 @@ fn failed(key: &str, path: &Path, what: &str, error: &io::Error) -> Error {
     Error::Io(format!("{key}: {path}: cannot {what}: {error}{remedy}"))
 }
 
-fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<UnixListener> {
+/// Listens at a new socket of this mode and group. Its calls do not block.
+pub(crate) fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<StdListener> {
     let socket = socket()?;
     rustix::net::bind(&socket, &SocketAddrUnix::new(path)?)?;
     // Until the socket listens, connections are refused. So nobody comes in before the file has its
@@ -145,7 +156,7 @@ fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<UnixListener
     }
     fs::set_permissions(path, Permissions::from_mode(mode))?;
     rustix::net::listen(&socket, BACKLOG)?;
-    UnixListener::from_std(StdListener::from(socket))
+    Ok(StdListener::from(socket))
 }
 
 /// The group of this name or number. The system's other lists of groups, such as LDAP, are not read.

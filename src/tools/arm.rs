@@ -4,9 +4,7 @@
 //! the frames of the sensor on the arm, computed at the moments that they show. The arm stops when its
 //! controller goes, and when the sensor bears [`STOP_N`].
 
-use std::fs::{self, Permissions};
 use std::io::{self, BufRead, BufReader, Read as _, Write as _};
-use std::os::unix::fs::PermissionsExt as _;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -22,13 +20,17 @@ use tokio::time::Instant;
 use super::exit::{Fail as _, Failure, IO};
 use super::player::Played;
 use super::robot::Position;
+use crate::daemon::socket;
 use hardnessd_core::event::round_3;
 use hardnessd_core::range::{self, OutOfRange, from_to};
+use hardnessd_core::stderr_line;
 use hardnessd_simulator::{Rig, SequenceSettings};
 
 /// The time between the moment that a frame shows and its first byte: a sensor needs some to scan its
 /// taxels, and here it hides the time that a step of the physics takes.
 pub(crate) const SCAN: Duration = Duration::from_millis(10);
+/// The pause after a controller could not connect, for example because there are too many open files.
+const RETRY: Duration = Duration::from_millis(100);
 
 /// The greatest position, in mm.
 const REACH_MM: f64 = 30.0;
@@ -111,10 +113,11 @@ impl Arm {
         start: Instant,
     ) -> Result<Self, Failure> {
         let what = format!("--arm {}", path.display());
-        let listener = UnixListener::bind(path);
+        // Nobody else may connect, not even for a moment.
+        let listener = socket::listen(path, 0o600, None);
         let listener = listener.of(format!("{what}: name a new path"), IO)?;
+        listener.set_nonblocking(false).of(&what, IO)?;
         let socket = TempPath::try_from_path(path).of(&what, IO)?;
-        fs::set_permissions(path, Permissions::from_mode(0o600)).of(&what, IO)?;
         let leg = Leg {
             from_mm: 0.0,
             start,
@@ -140,10 +143,18 @@ impl Arm {
 
 /// Obeys one controller after the other, for ever.
 fn serve(listener: &UnixListener, arm: &Mutex<Moved>) {
-    for controller in listener.incoming().flatten() {
-        // It may leave at any moment.
-        let _ = obey(&controller, arm);
-        Moved::of(arm).leg.stop(Instant::now());
+    for controller in listener.incoming() {
+        match controller {
+            Ok(controller) => {
+                // It may leave at any moment.
+                let _ = obey(&controller, arm);
+                Moved::of(arm).leg.stop(Instant::now());
+            }
+            Err(error) => {
+                stderr_line!("warning: --arm: {error}");
+                thread::sleep(RETRY);
+            }
+        }
     }
 }
 

@@ -6,13 +6,13 @@
 
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, BufRead, BufReader, ErrorKind, Read as _, Write as _};
+use std::io::{self, BufRead, BufReader, ErrorKind, Write as _};
 use std::net::TcpStream;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args as ClapArgs;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
@@ -220,24 +220,41 @@ impl Connection {
     ///
     /// Fails if the connection has ended, or the line is longer than a daemon may send.
     pub(super) fn next_within(&mut self, patience: Duration) -> Result<Option<String>, Failure> {
-        let patience = patience.max(Duration::from_millis(1));
-        let set = set_socket_timeout(self.input.get_ref(), Timeout::Recv, Some(patience));
-        set.map_err(|error| self.broke(error.into()))?;
-        let room = LONGEST_LINE_BYTES - self.begun.len();
-        let mut rest = (&mut self.input).take(room as u64);
-        match rest.read_until(b'\n', &mut self.begun) {
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
-            Err(error) => Err(self.broke(error)),
-            Ok(_) if self.begun.pop_if(|last| *last == b'\n').is_some() => {
+        let end = Instant::now() + patience;
+        loop {
+            let left = end.saturating_duration_since(Instant::now());
+            let left = left.max(Duration::from_millis(1));
+            let set = set_socket_timeout(self.input.get_ref(), Timeout::Recv, Some(left));
+            set.map_err(|error| self.broke(error.into()))?;
+            let come = match self.input.fill_buf() {
+                Ok(come) => come,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return Ok(None),
+                Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+                Err(error) => return Err(self.broke(error)),
+            };
+            if come.is_empty() {
+                return Err(self.failed("the daemon closed the connection"));
+            }
+            let newline = come.iter().position(|&byte| byte == b'\n');
+            let of_line = &come[..newline.unwrap_or(come.len())];
+            if self.begun.len() + of_line.len() > LONGEST_LINE_BYTES {
+                return Err(self.failed(format_args!(
+                    "closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
+                     daemon sends"
+                )));
+            }
+            self.begun.extend_from_slice(of_line);
+            let taken = of_line.len() + usize::from(newline.is_some());
+            self.input.consume(taken);
+            if newline.is_some() {
                 let line = String::from_utf8_lossy(&self.begun).into_owned();
                 self.begun.clear();
-                Ok(Some(line))
+                return Ok(Some(line));
             }
-            Ok(_) if self.begun.len() == LONGEST_LINE_BYTES => Err(self.failed(format_args!(
-                "closed the connection: a line is longer than {LONGEST_LINE_BYTES} bytes, which no \
-                 daemon sends"
-            ))),
-            Ok(_) => Err(self.failed("the daemon closed the connection")),
+            // A peer that sends a byte now and then has no more time than a silent one.
+            if Instant::now() >= end {
+                return Ok(None);
+            }
         }
     }
 

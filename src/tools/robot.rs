@@ -59,10 +59,12 @@ fn send(socket: &PathBuf, position: &Position) -> Result<Infallible, Failure> {
     let mut points: Vec<(u64, f64)> = Vec::with_capacity(POINTS);
     loop {
         thread::sleep(STEP);
-        let Some(mm) = position(Instant::now()) else {
+        // The position may have to wait for the simulation, and is that of this moment.
+        let (at, mono) = (Instant::now(), now().mono);
+        let Some(mm) = position(at) else {
             continue;
         };
-        let mono_ns = u64::try_from(now().mono.as_nanos()).unwrap_or(u64::MAX);
+        let mono_ns = u64::try_from(mono.as_nanos()).unwrap_or(u64::MAX);
         points.push((mono_ns, mm));
         if points.len() == POINTS {
             let motion = json!({"motion": {"sensor": sensor, "at": points}});

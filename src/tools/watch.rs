@@ -3,7 +3,7 @@
 //! It is a subscriber like any other. `follow` connects, asks for the totals once a second, and connects
 //! again when the daemon goes away. `view` keeps what is known, and `draw` draws it. This file connects
 //! them with the keys and the clock. Each has a thread of its own, so a terminal that accepts no bytes (Ctrl-S, a
-//! slow ssh) does not delay the end.
+//! slow ssh) does not delay the end at a signal. The keys wait for it.
 
 mod draw;
 mod pressing;

@@ -151,6 +151,10 @@ fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol()
         let listening = std::thread::spawn(move || {
             let (mut stream, _) = listener.accept().unwrap();
             stream.write_all(line.as_bytes()).unwrap();
+            // A byte now and then is no hello either.
+            while line.is_empty() && stream.write_all(b"7").is_ok() {
+                std::thread::sleep(std::time::Duration::from_secs(1));
+            }
             // Wait until the client disconnects.
             let _ = stream.read_to_end(&mut Vec::new());
         });

@@ -306,6 +306,7 @@ impl Hrn {
     /// Whether the model may have computed this reference.
     pub(crate) fn takes(&self, reference: &Reference) -> bool {
         reference.features.len() == self.file.lengths.features
+            && reference.knowledge != Knowledge::None
     }
 
     /// The references of the sensor whose presses this model judges.

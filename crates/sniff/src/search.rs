@@ -33,6 +33,8 @@ const PLACE_BYTES: usize = 60_000;
 const MARGIN: usize = 16;
 /// The most bytes of a mark that look like cells at rest.
 const MOST_RESTING: usize = 4;
+/// At most so many of the likeliest candidates are decoded. Noise has thousands that all fail.
+const MOST_CANDIDATES: usize = 40;
 /// As many arrays are decoded: the mark of a known board counts only then.
 const RANKED: usize = 6;
 /// So many times as many places are tried for a checksum.
@@ -288,6 +290,7 @@ impl Search<'_> {
             }
         }
         found.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
+        found.truncate(MOST_CANDIDATES);
         found
     }
 
