@@ -277,30 +277,25 @@ enum Hand {
 }
 
 impl Hand {
-    /// Writes a number. Returns what a reader finds.
-    fn write(self, number: f64, out: &mut Vec<u8>) -> f32 {
+    /// A number as it is sent, and what a reader finds.
+    fn sent(self, number: f64) -> (Vec<u8>, f32) {
         let float = number as f32;
-        let whole = number.round();
+        let whole = number.round() as i16;
         match self {
-            Hand::F32le => out.extend(float.to_le_bytes()),
-            Hand::F32be => out.extend(float.to_be_bytes()),
-            Hand::I16le => out.extend((whole as i16).to_le_bytes()),
-            Hand::I16be => out.extend((whole as i16).to_be_bytes()),
-            Hand::I32le => out.extend((whole as i32).to_le_bytes()),
-            Hand::I8 => out.extend((whole as i8).to_le_bytes()),
-            Hand::U8 => out.push(whole as u8),
+            Hand::F32le => (float.to_le_bytes().to_vec(), float),
+            Hand::F32be => (float.to_be_bytes().to_vec(), float),
+            Hand::I16le => (whole.to_le_bytes().to_vec(), whole.into()),
+            Hand::I16be => (whole.to_be_bytes().to_vec(), whole.into()),
+            Hand::I32le => {
+                let whole = number.round() as i32;
+                (whole.to_le_bytes().to_vec(), whole as f32)
+            }
+            Hand::I8 => (vec![(whole as i8).cast_unsigned()], (whole as i8).into()),
+            Hand::U8 => (vec![whole as u8], (whole as u8).into()),
             Hand::Volts => {
                 let text = format!("{number:.3}");
-                out.extend(text.bytes());
-                out.push(b',');
-                return text.parse().unwrap();
+                (format!("{text},").into_bytes(), text.parse().unwrap())
             }
-        }
-        match self {
-            Hand::F32le | Hand::F32be => float,
-            Hand::I8 => f32::from(whole as i8),
-            Hand::U8 => f32::from(whole as u8),
-            _ => whole as f32,
         }
     }
 }
@@ -360,7 +355,9 @@ pub(crate) fn hand(seed: u64) -> Case {
                     0.3 * stream.normal()
                 };
                 let number = begin + scale * (f64::from(count) * share + noise);
-                read.counts[place] = of.write(number, &mut packet);
+                let (bytes, found) = of.sent(number);
+                packet.extend(bytes);
+                read.counts[place] = found;
             }
         }
         for (all, read) in found.iter_mut().zip(read) {

@@ -22,23 +22,11 @@ fn decoded(settings: &Settings, bytes: &[u8]) -> Vec<RawFrame> {
         .collect()
 }
 
-/// The number of frames in `of` that are outside the longest sequence of frames that `of` and
-/// `among` have in common.
+/// The number of frames in `of` that are not among the others, or of which there are more.
 fn missing(of: &[RawFrame], among: &[RawFrame]) -> usize {
-    let mut common = vec![0; among.len() + 1];
-    for frame in of {
-        let mut before = 0;
-        for (index, other) in among.iter().enumerate() {
-            let longest = common[index + 1];
-            common[index + 1] = if frame == other {
-                before + 1
-            } else {
-                longest.max(common[index])
-            };
-            before = longest;
-        }
-    }
-    of.len() - common[among.len()]
+    let is_missing = |frame: &&RawFrame| !among.contains(frame);
+    let others = of.iter().filter(is_missing).count();
+    others.max(of.len().saturating_sub(among.len()))
 }
 
 /// Frames that may differ: those at the ends of the stream, and beside damage.
