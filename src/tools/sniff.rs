@@ -27,7 +27,7 @@ use hardnessd_core::recording::{Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::stderr_line;
 use hardnessd_core::wire::Cell;
-use hardnessd_core::wording::escaped;
+use hardnessd_core::wording::{escaped, name, named};
 
 /// What `--help` says below the options.
 const MORE: &str = "\
@@ -342,14 +342,13 @@ fn toml(path: &Path, bytes: usize, found: &Found, proposal: &Proposal) -> String
 
 fn array_in_words(ranked: &Ranked) -> String {
     match ranked.cell {
-        Some(cell) => format!("{} {}", ranked.array, hardnessd_sniff::cell_name(cell)),
+        Some(cell) => format!("{} {}", ranked.array, name(&cell)),
         None => format!("{} decimals", ranked.array),
     }
 }
 
 fn cell(text: &str) -> Result<Cell, String> {
-    let known = toml::Value::String(text.to_owned()).try_into();
-    known.map_err(|_| "expected a name such as u8, i16le or f32be".to_owned())
+    named(text).map_err(|_| "expected a name such as u8, i16le or f32be".to_owned())
 }
 
 fn side(text: &str) -> Result<usize, String> {

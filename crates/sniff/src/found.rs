@@ -2,6 +2,7 @@
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::Cell;
+use hardnessd_core::wording::name;
 
 use crate::layout::Proposal;
 use crate::model::Score;
@@ -148,19 +149,12 @@ impl Found {
     }
 }
 
-/// The name of a type of cells in a configuration.
-pub fn cell_name(cell: Cell) -> String {
-    let name = toml::Value::try_from(cell).ok();
-    name.and_then(|name| name.as_str().map(str::to_owned))
-        .expect("a type of cells is written as its name")
-}
-
 impl Ranked {
     /// The options that choose this array.
     pub fn options(&self) -> String {
         let array = format!("--rows {} --cols {}", self.array.rows, self.array.cols);
         match self.cell {
-            Some(cell) => format!("{array} --cell {}", cell_name(cell)),
+            Some(cell) => format!("{array} --cell {}", name(&cell)),
             None => array,
         }
     }

@@ -135,23 +135,19 @@ fn board(layout: &Layout) -> Option<Settings> {
     let of = BOARDS
         .iter()
         .filter(|(_, arrays)| arrays.is_empty() || arrays.contains(&(rows, cols)));
-    let presets = of.flat_map(|&(preset, _)| {
+    let mut presets = of.flat_map(|&(preset, _)| {
         let named = Settings {
             preset: Some(preset),
             ..Settings::default()
         };
-        [
-            named.clone(),
-            Settings {
-                rows: Some(rows),
-                cols: Some(cols),
-                ..named
-            },
-        ]
+        let with_sides = Settings {
+            rows: Some(rows),
+            cols: Some(cols),
+            ..named.clone()
+        };
+        [named, with_sides]
     });
-    presets
-        .into_iter()
-        .find(|settings| Layout::new(settings).as_ref() == Ok(layout))
+    presets.find(|settings| Layout::new(settings).as_ref() == Ok(layout))
 }
 
 /// The parts of a frame of an array.
@@ -167,9 +163,6 @@ pub(crate) struct Parts<'a> {
     /// Where in the period a frame begins, if that is known.
     pub(crate) begin: Option<usize>,
 }
-
-/// A stretch of the bytes beside the cells, counted from the end of the cells.
-type Beside = Range<usize>;
 
 impl Parts<'_> {
     /// The checksum. Of several numbers a taxel, the cells that are read are not all that it covers.
@@ -224,11 +217,12 @@ impl Parts<'_> {
         (at <= self.place.beside.len()).then_some(at)
     }
 
-    /// The settings for a frame that begins at `split` within the mark. No key is left to its
-    /// default.
-    fn of_split(&self, mark: &Beside, split: usize, check: Option<Check>) -> Settings {
-        let values =
-            |range: Beside| -> Vec<u8> { range.filter_map(|at| self.place.constant(at)).collect() };
+    /// The settings for a frame that begins at `split` within the mark. Places are counted from the end of the
+    /// cells. No key is left to its default.
+    fn of_split(&self, mark: &Range<usize>, split: usize, check: Option<Check>) -> Settings {
+        let values = |range: Range<usize>| -> Vec<u8> {
+            range.filter_map(|at| self.place.constant(at)).collect()
+        };
         let (tail, mut sync) = (values(mark.start..split), values(split..mark.end));
         let bytes = self.place.bytes as u16;
         let fields = [

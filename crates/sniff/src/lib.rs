@@ -26,7 +26,7 @@ mod packed;
 use hardnessd_core::wire::{Cell, Layout, Preset, Settings};
 
 use coding::Coding;
-pub use found::{Failure, Found, Known, Ranked, cell_name};
+pub use found::{Failure, Found, Known, Ranked};
 pub use layout::Proposal;
 pub use scale::Scale;
 
