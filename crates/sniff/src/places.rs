@@ -64,8 +64,6 @@ const MOST_BESIDE: usize = 40;
 const MOST_OF_LENGTH: usize = 8;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;
-/// Places that need this many more bits than the best one are left out.
-const MOST_BITS: f64 = 72.0;
 
 /// The `most` likeliest places, the likeliest first.
 pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
@@ -98,11 +96,8 @@ pub(crate) fn places(columns: &Columns, most: usize) -> Vec<Place> {
         found.truncate(shorter + MOST_OF_LENGTH);
     }
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let least = found.first().map_or(0.0, |(bits, _)| *bits);
-    let places = found
-        .into_iter()
-        .take_while(|(bits, _)| *bits <= least + MOST_BITS);
-    places.take(most).map(|(_, place)| place).collect()
+    found.truncate(most);
+    found.into_iter().map(|(_, place)| place).collect()
 }
 
 fn beside(columns: &Columns, at: usize) -> Beside {
