@@ -332,7 +332,13 @@ impl Pipeline {
                         events.extend(self.status_if_changed(stamp));
                     }
                 }
-                Err(_damage) => self.frames_damaged += 1,
+                Err(_damage) => {
+                    self.frames_damaged += 1;
+                    if self.clock == Clock::FrameRate {
+                        // The frames of a file follow each other without a pause.
+                        self.decoder.resync();
+                    }
+                }
             }
         }
         let decoded = self.decoder.place().decoded;

@@ -8,7 +8,7 @@ use std::io::Cursor;
 
 use crate::npz::{Reader, Unexpected, Writer};
 use crate::verdict::{COURSE_FRAMES, MOST_REFERENCES, Moment, Piece, ReferencePress, TAXELS};
-use crate::wording::cut;
+use crate::wording::{cut, escaped};
 
 /// The newtons on a taxel, without the sign.
 const MOST_N: f32 = 1e6;
@@ -40,6 +40,10 @@ pub enum Error {
 /// [`MOST_REFERENCES`].
 pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
     let mut file = Reader::new(bytes, MOST_PRESS_BYTES)?;
+    if !file.has("0") {
+        let expected = "a press: make the file with `hardnessd identify`";
+        return Err(Unexpected::new("0", "none", expected).into());
+    }
     let mut presses = vec![read_press(&mut file, "0")?];
     loop {
         let array = presses.len().to_string();
@@ -59,7 +63,7 @@ fn read_press(file: &mut Reader<'_>, array: &str) -> Result<ReferencePress, Unex
     let text: Vec<u8> = file.read(array, &[], 1..=MOST_PRESS_BYTES)?;
     let unexpected = |found: &str| {
         let expected = "a press as `hardnessd identify` writes it";
-        Unexpected::new(array, cut(found), expected)
+        Unexpected::new(array, cut(&escaped(found)), expected)
     };
     let press = serde_json::from_slice(&text);
     let press: ReferencePress = press.map_err(|error| unexpected(&error.to_string()))?;
@@ -152,7 +156,10 @@ mod tests {
         for (bytes, expected) in [
             (b"PK".to_vec(), "found no .npz file"),
             (good[..good.len() / 2].to_vec(), "found no .npz file"),
-            (of(&[]), "array `0`: found none, expected u8 [1 to "),
+            (
+                of(&[]),
+                "expected a press: make the file with `hardnessd identify`",
+            ),
             (
                 of(&vec![press(1, flat(1.0)); 65]),
                 "array `64`: found one more, expected at most 64",
@@ -163,6 +170,7 @@ mod tests {
             (of(&[press(4, flat(f32::NAN))]), "array `0`: found invalid"),
             (of(&[strong]), "that no press has"),
             (text(b"{}"), "array `0`: found missing field"),
+            (text(br#"{"a\nb": 1}"#), "array `0`: found missing field"),
             // A packed file may hold a thousand times its size.
             (text(&vec![b' '; 1 << 20]), "an array of shape [1048576]"),
         ] {

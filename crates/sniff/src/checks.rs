@@ -92,7 +92,9 @@ fn holds(spans: &[&[u8]], sent: impl Fn(&[u8]) -> ([u8; 4], bool)) -> bool {
         if 10 * wrong > spans.len() {
             return false;
         }
-        values.push(value);
+        if is_right {
+            values.push(value);
+        }
     }
     values.sort_unstable();
     values.dedup();

@@ -45,8 +45,8 @@ pub struct Ranked {
     pub(crate) own_doubt: Option<String>,
 }
 
-/// The reason why no layout was found. The later ones say more.
-#[derive(Debug, Clone, PartialEq, PartialOrd, thiserror::Error)]
+/// The reason why no layout was found.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Failure {
     /// In so many bytes.
     #[error("nothing recurs in {0} bytes: try another --baud, or listen for longer")]
@@ -72,6 +72,17 @@ pub enum Failure {
 }
 
 impl Failure {
+    /// How much it says.
+    pub(crate) fn rank(&self) -> u8 {
+        match self {
+            Self::NotPeriodic(_) => 0,
+            Self::NoArray(_) => 1,
+            Self::NoPress(_) => 2,
+            Self::TooLarge { .. } => 3,
+            Self::Sure(_) => 4,
+        }
+    }
+
     pub(crate) fn sure(words: impl Into<String>) -> Self {
         Self::Sure(words.into())
     }

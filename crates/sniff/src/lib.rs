@@ -137,7 +137,8 @@ fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
             Ok(found) if found.doubt.is_none() => return Ok(found),
             Ok(found) => open = open.or(Some(found)),
             Err(sure @ Failure::Sure(_)) => return Err(sure),
-            Err(other) if other > failure => failure = other,
+            // The likeliest length comes first.
+            Err(other) if other.rank() > failure.rank() => failure = other,
             Err(_) => {}
         }
     }

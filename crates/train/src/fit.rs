@@ -250,7 +250,7 @@ mod tests {
     fn a_press_much_shorter_than_its_objects_others_is_left_out() {
         let mut presses = Presses::default();
         // The objects are pressed in turn.
-        for lengths in [[20, 5, 1], [21, 5, 1], [9, 5, 1], [40, 2, 1]] {
+        for lengths in [[20, 8, 1], [21, 8, 1], [6, 8, 1], [40, 3, 1]] {
             for (object, length) in (0..).zip(lengths) {
                 let press = Press {
                     level: 1,

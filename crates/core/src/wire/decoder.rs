@@ -112,12 +112,17 @@ impl Decoder {
         self.bytes.extend_from_slice(bytes);
     }
 
+    /// Tells the decoder that the next byte begins a frame, if a pause would show it.
+    pub(crate) fn resync(&mut self) {
+        self.place.in_sync |= self.layout.is_in_sync_after_pause();
+    }
+
     /// Tells the decoder that the input ended or paused for half a period. A complete frame that
     /// only waited for the next header is then whole.
     pub fn settle(&mut self) {
         self.settled = true;
         if self.pending().is_empty() {
-            self.place.in_sync |= self.layout.is_in_sync_after_pause();
+            self.resync();
         }
     }
 

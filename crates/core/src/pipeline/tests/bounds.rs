@@ -1,6 +1,7 @@
 //! A sensor that sends too much, and one whose press never ends.
 
 use super::*;
+use crate::wire::Cell;
 
 #[test]
 fn frames_above_twice_the_rate_are_dropped_counted_and_said_once() {
@@ -159,18 +160,43 @@ fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
 }
 
 #[test]
-fn a_file_of_bare_frames_begins_with_a_frame() {
+fn the_bare_frames_of_a_file_follow_each_other_also_after_a_damaged_one() {
     let mut described = Description::default();
     described.sensor.frame.preset = Some(Preset::None);
+    described.sensor.frame.cell = Some(Cell::F32le);
     described.sensor.frame.rows = Some(4);
     described.sensor.frame.cols = Some(4);
     let sensor = Sensor::new(described).unwrap();
-    let frames = |clock, bytes: &[u8]| {
+    let frames = |clock, cells: &[f32]| {
         let mut pipeline = Pipeline::new(sensor.clone(), test_support::hrn(), clock);
-        pipeline.push(bytes, at(0));
-        pipeline.status(at(0)).frames
+        let bytes: Vec<u8> = cells.iter().flat_map(|cell| cell.to_le_bytes()).collect();
+        pipeline.push(&bytes, at(0));
+        let status = pipeline.status(at(0));
+        (status.frames, status.frames_damaged)
     };
-    assert_eq!(frames(Clock::FrameRate, &[7; 16 * 9]), 9);
+    let mut cells = [7.0; 16 * 9];
+    assert_eq!(frames(Clock::FrameRate, &cells), (9, 0));
+    cells[16 * 3 + 5] = f32::NAN;
+    assert_eq!(frames(Clock::FrameRate, &cells), (8, 1));
+    cells[2] = f32::INFINITY;
+    assert_eq!(frames(Clock::FrameRate, &cells), (7, 2));
     // On a line, only a pause or a request shows where a frame begins.
-    assert_eq!(frames(Clock::Arrival, &[7; 16 * 9]), 0);
+    assert_eq!(frames(Clock::Arrival, &cells), (0, 0));
+}
+
+#[test]
+fn totals_balance_with_damage() {
+    let mut pipeline = pipeline(Preset::Jx255n);
+    let mut stream = vec![1, 2, 3];
+    let mut broken = bytes(&pipeline, &raw(1, 1));
+    broken[400] ^= 1;
+    stream.extend(broken);
+    stream.extend(bytes(&pipeline, &raw(0, 0)));
+    stream.extend([0xBB, 0xAA, 0x10]);
+    pipeline.push(&stream, at(0));
+    let status = pipeline.status(at(0));
+    let totals = (status.frames, status.frames_damaged, status.bytes_skipped);
+    assert_eq!(totals, (1, 1, 793));
+    pipeline.end_of_recording(None);
+    assert_eq!(pipeline.status(at(0)).bytes_skipped, 796);
 }
