@@ -272,11 +272,20 @@ impl Score {
 
     /// Whether this one is surely likelier than `other`. However much a press is in favour, it is one.
     pub(crate) fn is_surely_less(&self, other: &Self) -> bool {
+        other.once - self.once + self.lead_of_presses(other) >= SURE_BITS
+    }
+
+    /// Whether this one is surely likelier than `other`, whose cells are the same but for a few at the ends.
+    /// Then presses say less.
+    pub(crate) fn is_surely_before(&self, other: &Self) -> bool {
+        other.once - self.once + self.lead_of_presses(other) / 2.0 >= SURE_BITS
+    }
+
+    fn lead_of_presses(&self, other: &Self) -> f64 {
         let presses = other.presses.iter().zip(&self.presses);
-        let lead: f64 = presses
+        presses
             .map(|(other, own)| (other - own).clamp(-AGAINST_BITS, PRESS_BITS))
-            .sum();
-        other.once - self.once + lead >= SURE_BITS
+            .sum()
     }
 }
 

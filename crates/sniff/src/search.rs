@@ -395,7 +395,7 @@ fn other_cells<'a>(
     let is_other = |other: &&Candidate| {
         other.format == best.format
             && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
-            && !best.score.is_surely_less(&other.score)
+            && !best.score.is_surely_before(&other.score)
     };
     let around = |place: &Place| {
         let mark = place.mark()?;
