@@ -89,7 +89,7 @@ impl Source {
     /// Fails if no daemon answers.
     pub(super) fn connect(&self) -> Result<Connection, Failure> {
         match self.given() {
-            Some(address) => Connection::open(address),
+            Some(address) => Connection::open(&address),
             None => find("events.sock"),
         }
     }
@@ -109,7 +109,7 @@ impl Source {
 /// Fails if no daemon answers.
 pub(super) fn control(path: Option<PathBuf>) -> Result<Connection, Failure> {
     match path {
-        Some(path) => Connection::open(Address::Unix(path)),
+        Some(path) => Connection::open(&Address::Unix(path)),
         None => find("control.sock"),
     }
 }
@@ -143,9 +143,8 @@ fn find(name: &str) -> Result<Connection, Failure> {
 }
 
 impl Connection {
-    pub(super) fn open(address: Address) -> Result<Self, Failure> {
-        let opened = Self::try_open(&address);
-        opened.map_err(|error| refusal(&address, error))
+    pub(super) fn open(address: &Address) -> Result<Self, Failure> {
+        Self::try_open(address).map_err(|error| refusal(address, error))
     }
 
     fn try_open(address: &Address) -> io::Result<Self> {

@@ -138,7 +138,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     }
     let listen = "`hardnessd watch` and `hardnessd tail` find it";
     stderr_line!("socket: {} ({listen})", socket.display());
-    let subscriber = Connection::open(Address::Unix(socket))?;
+    let subscriber = Connection::open(&Address::Unix(socket))?;
     let print = move || print_events(subscriber, args.presses, account);
     let mut printed = spawn_thread("events", print)?;
     let start = Instant::now();

@@ -39,7 +39,7 @@ enum Source<'a> {
     Recording(Reader<File<'a>>),
     Raw {
         file: File<'a>,
-        sensor: Sensor,
+        sensor: Box<Sensor>,
         /// The positions of the arm that are not played yet.
         motion: VecDeque<Point>,
     },
@@ -80,7 +80,7 @@ impl<'a> Played<'a> {
                 let motion = motion.map(motion::load).transpose()?;
                 let source = Source::Raw {
                     file,
-                    sensor: sensor.clone(),
+                    sensor: Box::new(sensor.clone()),
                     motion: motion.unwrap_or_default().into(),
                 };
                 (source, Playback::of_bytes(sensor.clone(), hrn.clone()))
@@ -103,7 +103,7 @@ impl<'a> Played<'a> {
             match &self.source {
                 Source::Recording(_) => self.playback.identify(name, hrn.clone()),
                 Source::Raw { sensor, .. } if sensor.name() == name => {
-                    self.playback = Playback::of_bytes(sensor.clone(), hrn.clone());
+                    self.playback = Playback::of_bytes((**sensor).clone(), hrn.clone());
                 }
                 Source::Raw { .. } => {}
             }

@@ -5,7 +5,7 @@
 //! sensor.
 
 use std::convert::Infallible;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
@@ -50,8 +50,8 @@ pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread>
 }
 
 /// Sends positions to one daemon until the daemon ends or refuses them.
-fn send(socket: &PathBuf, position: &Position) -> Result<Infallible, Failure> {
-    let mut daemon = connect::control(Some(socket.clone()))?;
+fn send(socket: &Path, position: &Position) -> Result<Infallible, Failure> {
+    let mut daemon = connect::control(Some(socket.to_owned()))?;
     let hello = daemon.meet()?;
     // The arm has the daemon's first sensor. It needs no events.
     let sensor = &hello["sensors"][0]["name"];

@@ -141,7 +141,7 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
                     Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
                     Some(Order::Context(context)) => {
                         let (daemon_at, told) = (daemon_at.clone(), sender.clone());
-                        start("command", move || tell(daemon_at, context, &told))?;
+                        start("command", move || tell(daemon_at, &context, &told))?;
                     }
                     None => {}
                 },
@@ -208,7 +208,7 @@ fn read(mut daemon: Connection, news: &SyncSender<Input>) -> Result<Infallible, 
 }
 
 /// Sets a context at the control socket beside the daemon's other one, and sends the outcome in words.
-fn tell(daemon_at: Option<Address>, context: Value, told: &SyncSender<Input>) {
+fn tell(daemon_at: Option<Address>, context: &Value, told: &SyncSender<Input>) {
     let outcome = match daemon_at {
         Some(Address::Unix(path)) => {
             let daemon = connect::control(Some(path.with_file_name("control.sock")));

@@ -37,8 +37,8 @@ impl Fit {
             whole.len(),
             presses.len()
         );
-        let logs = medians(whole.iter());
-        let halves = [0, 1].map(|first| medians(whole.iter().skip(first).step_by(2)));
+        let logs = medians(&whole.iter());
+        let halves = [0, 1].map(|first| medians(&whole.iter().skip(first).step_by(2)));
         let apart = halves[0].iter().zip(&halves[1]);
         let apart = apart.filter_map(|(one, other)| Some((*one)? - (*other)?));
         Ok(Self {
@@ -72,11 +72,11 @@ fn compare(frames: &[Vec<f32>], is_dead: &[bool]) -> Option<Vec<Option<f64>>> {
         )
     });
     let logs: Vec<Vec<Option<f64>>> = logs.collect();
-    (!logs.is_empty()).then(|| medians(logs.iter()))
+    (!logs.is_empty()).then(|| medians(&logs.iter()))
 }
 
 /// The median of each taxel over those that know it.
-fn medians<'a>(all: impl Iterator<Item = &'a Vec<Option<f64>>> + Clone) -> Vec<Option<f64>> {
+fn medians<'a>(all: &(impl Iterator<Item = &'a Vec<Option<f64>>> + Clone)) -> Vec<Option<f64>> {
     let taxels = all.clone().map(Vec::len).max().unwrap_or(0);
     let median = |place: usize| median(all.clone().filter_map(|one| one[place]).collect());
     (0..taxels).map(median).collect()

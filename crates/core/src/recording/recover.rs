@@ -101,6 +101,9 @@ pub fn recover<R: Read + Seek, W: Write>(
     Ok(copy.finish()?)
 }
 
+/// The opcode, the bytes and the end of a record.
+type FoundRecord = (u8, Option<Vec<u8>>, u64);
+
 /// The damaged file.
 struct Broken<R> {
     file: R,
@@ -133,7 +136,7 @@ impl<R: Read + Seek> Broken<R> {
     /// The opcode, the bytes and the end of the record at `place`. `None` if there is none: a chunk begins
     /// with the bytes that every chunk has, and another record is followed by a record or by the end of
     /// the file. The bytes of an attachment, and of a record longer than any that is read, are `None`.
-    fn record(&mut self, place: u64) -> io::Result<Option<(u8, Option<Vec<u8>>, u64)>> {
+    fn record(&mut self, place: u64) -> io::Result<Option<FoundRecord>> {
         let Some(end) = self.end_of(place)? else {
             return Ok(None);
         };
