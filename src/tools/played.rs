@@ -36,7 +36,7 @@ pub(super) struct Played<'a> {
 type File<'a> = BufReader<Box<dyn Read + 'a>>;
 
 enum Source<'a> {
-    Recording(Reader<File<'a>>),
+    Recording(Box<Reader<File<'a>>>),
     Raw {
         file: File<'a>,
         sensor: Box<Sensor>,
@@ -73,7 +73,7 @@ impl<'a> Played<'a> {
                 return Err(Failure::new(USAGE, problem));
             }
             FileKind::Recording => (
-                Source::Recording(Reader::new(file)),
+                Source::Recording(Box::new(Reader::new(file))),
                 Playback::new(hrn.clone()),
             ),
             FileKind::Raw => {
