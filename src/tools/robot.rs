@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::time::Instant;
 
+use super::connect;
 use super::exit::Failure;
-use super::{connect, control};
 use crate::daemon::now;
 use crate::thread::NoThread;
+use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
 
 /// The time between two positions.
@@ -58,7 +59,15 @@ fn send(socket: &Path, position: &Position) -> Result<Infallible, Failure> {
     daemon.send("{\"subscribe\":[]}")?;
     let mut points: Vec<(u64, f64)> = Vec::with_capacity(POINTS);
     loop {
-        thread::sleep(STEP);
+        // Meanwhile answers come. A position is due whether or not the last ones were taken.
+        let due = Instant::now() + STEP;
+        while let Some(line) = daemon.next_within(due.saturating_duration_since(Instant::now()))? {
+            let answer: Value = serde_json::from_str(&line).unwrap_or_default();
+            if answer["type"] == "error" {
+                let refusal = answer["message"].as_str().unwrap_or_default();
+                return Err(Failure::new(FAILED, refusal.to_owned()));
+            }
+        }
         // The position may have to wait for the simulation, and is that of this moment.
         let (at, mono) = (Instant::now(), now().mono);
         let Some(mm) = position(at) else {
@@ -68,7 +77,7 @@ fn send(socket: &Path, position: &Position) -> Result<Infallible, Failure> {
         points.push((mono_ns, mm));
         if points.len() == POINTS {
             let motion = json!({"motion": {"sensor": sensor, "at": points}});
-            control::ask(&mut daemon, motion)?;
+            daemon.send(&motion.to_string())?;
             points.clear();
         }
     }

@@ -201,7 +201,7 @@ def an_arm(binary):
         reached = arm_reached_the_press(bench, daemon, Arm(bench.path("arm.sock"), tell), read_ros2_messages)
         with open(bench.path("log")) as log:
             said = log.read()
-        assert said.count("no number or no time") == 2 and "found a moment" in said, said
+        assert said.count("positions refused") == 3 and "found a moment" in said and said.count("expected at most") == 2, said
         return reached
 
 
