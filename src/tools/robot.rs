@@ -40,12 +40,13 @@ pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread>
         let mut complained = false;
         loop {
             let Err(failure) = send(&socket, &position);
+            // A demo that ends has closed its daemon, and needs no words about that.
+            thread::sleep(RETRY);
             if !complained {
                 let why = failure.line();
                 stderr_line!("warning: {why} (positions are sent as soon as a daemon takes them)");
                 complained = true;
             }
-            thread::sleep(RETRY);
         }
     })
 }
