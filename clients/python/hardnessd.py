@@ -963,13 +963,17 @@ def _verdict(event: Hardness, hello: Optional[Message]) -> str:
 
 
 def _with_shore(event: Hardness, hello: Optional[Message]) -> str:
-    """The answer with the Shore hardness first. The interval of 90 % lies within its limits."""
+    """The answer with the Shore hardness first, and the limits or the bounds of its interval of 90 %."""
     # An older daemon sends no Shore hardness.
     shore = event.get("shore")
     if shore is None:
         return answer(event, hello)
-    wide = max(shore["value"] - shore["low"], shore["high"] - shore["value"])
-    return f"{shore['value']:.0f} +- {wide:.0f} OO, {answer(event, hello)}"
+    value, low, high = shore["value"], shore["low"], shore["high"]
+    below, above = value - low, high - value
+    # Outside the middle half of the interval, one number for both sides would hide that one side is short.
+    if min(below, above) >= (high - low) / 4:
+        return f"{value:.0f} +- {max(below, above):.0f} OO, {answer(event, hello)}"
+    return f"{value:.0f} OO ({low:.0f} to {high:.0f}), {answer(event, hello)}"
 
 
 def _reason(text: Optional[str]) -> str:
@@ -1065,7 +1069,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             count += event["type"] in args.types
             if count == args.count:
                 return 0
-        said = f"timed out after {args.timeout:g} s ({count} events)"
+        wanted = f" of {args.count}" if args.count else ""
+        said = f"timed out after {args.timeout:g} s ({count}{wanted} events)"
         if client.hello is None and client.connection and reason is None:
             said = f"{_shown(client._found)}: {_silence(client._found, args.timeout)}\n{said}"
         print(said, file=sys.stderr)

@@ -40,6 +40,7 @@ use super::client::set_context;
 use super::hub::{Hub, Snapshot};
 use super::sensor::Sensors;
 use hardnessd_core::event::{self, Event, LinkState, Reply, Status};
+use hardnessd_core::wording::cut_found;
 
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
@@ -154,7 +155,7 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
         let why = "Content-Type: expected application/json";
         return refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, why);
     }
-    let read = serde_json::from_slice(&body).map_err(|error| error.to_string());
+    let read = serde_json::from_slice(&body).map_err(|error| cut_found(&error.to_string()));
     let set = async { set_context(sensors, read?).await }.await;
     match set {
         Ok(()) => text("application/json", "{}".to_owned()),

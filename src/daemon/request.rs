@@ -155,7 +155,10 @@ fn request(mut fields: Map<String, Value>) -> Result<Request, String> {
         fields = Map::from_iter([(key.clone(), Value::Object(fields))]);
     }
     let request = serde_json::from_value(Value::Object(fields));
-    request.map_err(|error| format!("{key}: {error}"))
+    request.map_err(|error| {
+        let error = wording::cut_found(&error.to_string());
+        format!("{}: {error}", wording::cut(&key))
+    })
 }
 
 /// The message of a value that cannot be used.

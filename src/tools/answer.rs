@@ -26,16 +26,17 @@ pub(super) fn answer(verdict: &Value, labels: &[String]) -> (String, bool) {
     (text, true)
 }
 
-/// What a verdict says, with its Shore hardness first, such as `63 +- 6 OO, firm`. The interval of 90 % lies
-/// within these limits.
+/// What a verdict says, with its Shore hardness first: `63 +- 6 OO, firm`, where the interval of 90 % lies within
+/// these limits, or `92 OO (24 to 99), firm`, where the estimate is outside the middle half of its interval.
 pub(super) fn with_shore(answer: &str, verdict: &Value) -> String {
     let shore = |key| verdict["shore"][key].as_f64();
-    match (shore("value"), shore("low"), shore("high")) {
-        (Some(value), Some(low), Some(high)) => {
-            let wide = (value - low).max(high - value);
-            format!("{value:.0} +- {wide:.0} OO, {answer}")
-        }
-        _ => answer.to_owned(),
+    let (Some(value), Some(low), Some(high)) = (shore("value"), shore("low"), shore("high")) else {
+        return answer.to_owned();
+    };
+    let (below, above) = (value - low, high - value);
+    match below.min(above) >= (high - low) / 4.0 {
+        true => format!("{value:.0} +- {:.0} OO, {answer}", below.max(above)),
+        false => format!("{value:.0} OO ({low:.0} to {high:.0}), {answer}"),
     }
 }
 
@@ -96,14 +97,17 @@ mod tests {
         let cases: Value =
             serde_json::from_str(include_str!("../../fixtures/answers.json")).unwrap();
         let labels = labels(&cases["hello"]);
-        let cases = cases["cases"].as_array().unwrap();
-        assert!(!cases.is_empty());
-        for case in cases {
+        let cases_of = |key: &str| cases[key].as_array().unwrap().clone();
+        for case in cases_of("cases") {
             let (text, is_weak) = answer(&case["verdict"], &labels);
             assert_eq!(
                 (json!(text), json!(is_weak)),
                 (case["text"].clone(), case["is_weak"].clone())
             );
+        }
+        for case in cases_of("shores") {
+            let shown = format!("{}, firm", case["text"].as_str().unwrap());
+            assert_eq!(with_shore("firm", &case), shown);
         }
     }
 }

@@ -65,7 +65,7 @@ fn kind(name: &str) -> Result<Kind, &'static str> {
 ///
 /// Returns a [`Failure`] if no daemon answers, the daemon ends, or the time limit has passed.
 pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), Failure> {
-    let timeout = args.timeout;
+    let (timeout, count) = (args.timeout, args.count);
     let counted = Arc::new(AtomicU64::new(0));
     let found = counted.clone();
     let printed = spawn_thread("tail", move || print(&args, &counted))?;
@@ -76,7 +76,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     }
     let seconds = timeout.unwrap_or_default();
     let found = found.load(Ordering::Relaxed);
-    let problem = format!("timed out after {seconds} s ({found} events)");
+    let wanted = count.map_or(String::new(), |count| format!(" of {count}"));
+    let problem = format!("timed out after {seconds} s ({found}{wanted} events)");
     Err(Failure::new(FAILED, problem))
 }
 

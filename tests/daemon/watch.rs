@@ -65,7 +65,7 @@ impl Watch {
 
 /// Whether a line is that of the final verdict of a press. It ends with the force, an early one with `early`.
 fn is_final(line: &str, press: u32) -> bool {
-    line.contains(&format!(" {press} ")) && line.contains(" OO, ") && !line.contains("early")
+    line.contains(&format!(" {press} ")) && line.contains(" OO") && !line.contains("early")
 }
 
 #[test]

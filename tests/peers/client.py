@@ -190,6 +190,9 @@ def a_verdict_in_words():
         said = hardnessd.answer(case["verdict"], table["hello"])
         assert said == case["text"], (said, case)
     assert hardnessd.answer(table["cases"][2]["verdict"]) == "level 3 or level 4"
+    for case in table["shores"]:
+        said = hardnessd._with_shore({**table["cases"][0]["verdict"], "shore": case["shore"]}, table["hello"])
+        assert said == f"{case['text']}, firm", said
 
 
 def program(bench):

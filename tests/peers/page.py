@@ -160,6 +160,8 @@ def a_verdict_in_words(page):
         finally { hello = before; }"""
     said = page.driver.execute_script(script, table)
     assert said == [[case["text"], case["is_weak"]] for case in table["cases"]], said
+    said = page.driver.execute_script("return arguments[0].map((c) => shoreOf(c.shore))", table["shores"])
+    assert said == [case["text"].replace("+-", "±") for case in table["shores"]], said
 
 
 def what_is_pressed_is_counted(page, bench):

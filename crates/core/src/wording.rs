@@ -96,7 +96,7 @@ pub fn of_usage(rendered: &str) -> String {
 /// The error of a TOML text on one line: its place, the text's line there, and the parser's message.
 pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
     let message = error.message().trim().replace('\n', ", ");
-    let message = cut(&in_words(&message));
+    let message = cut_found(&in_words(&message));
     let Some(span) = error.span() else {
         return message;
     };
@@ -159,7 +159,9 @@ const SIMILAR: f64 = 0.75;
 const AS_SIMILAR: f64 = 0.04;
 
 /// The most characters of its input that an error repeats, at its beginning and at its end.
-const LONGEST_END: usize = 500;
+const LONGEST_END: usize = 100;
+/// The most bytes of what a parser expected.
+const LONGEST_EXPECTED: usize = 1000;
 
 /// A text without its middle, if it is longer than an error repeats.
 pub fn cut(text: &str) -> String {
@@ -170,6 +172,16 @@ pub fn cut(text: &str) -> String {
             format!("{}...{}", &text[..begin], &text[end..])
         }
         _ => text.to_owned(),
+    }
+}
+
+/// A parser's message with what it found cut, and what it expected whole, because that is a list of ours.
+pub fn cut_found(message: &str) -> String {
+    match message.rsplit_once(", expected ") {
+        Some((found, expected)) if expected.len() <= LONGEST_EXPECTED => {
+            format!("{}, expected {expected}", cut(found))
+        }
+        _ => cut(message),
     }
 }
 
@@ -310,7 +322,10 @@ mod tests {
         assert!(!of("é = 1\na b\n").contains('\n'));
         for text in [format!("a = [{}", "1, ".repeat(5000)), "b ".repeat(5000)] {
             let long = of(&text);
-            assert!(long.chars().count() < 2100, "{long}");
+            assert!(long.chars().count() < 500, "{long}");
         }
+        let names = "`name`, ".repeat(60);
+        let found = cut_found(&format!("unknown field `{}`, expected {names}", "x".repeat(999)));
+        assert!(found.ends_with(&names) && found.len() < names.len() + 250, "{found}");
     }
 }

@@ -20,7 +20,7 @@ use super::refusal;
 use crate::daemon::hub::{Hub, Line};
 use crate::daemon::request::{Policy, Since, Subscription, unusable};
 use hardnessd_core::event::Kind;
-use hardnessd_core::wording::named;
+use hardnessd_core::wording::{cut, named};
 
 const LAST_EVENT_ID: &str = "Last-Event-ID";
 
@@ -80,7 +80,10 @@ fn wanted<B>(request: &Request<B>) -> Result<Subscription, String> {
             "types" => wanted.kinds = kinds(&value)?,
             "since" => wanted.since = Some(since("since", &value)?),
             _ => {
-                return Err(format!("found {key:?}, expected \"types\" or \"since\""));
+                return Err(format!(
+                    "found {:?}, expected \"types\" or \"since\"",
+                    cut(&key)
+                ));
             }
         }
     }
