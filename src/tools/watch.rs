@@ -27,7 +27,7 @@ use ratatui_crossterm::crossterm::terminal;
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
-use self::draw::{Look, draw};
+use self::draw::draw;
 use self::screen::Screen;
 use self::view::{Order, View};
 use super::connect::{self, Address, Connection, Source};
@@ -46,7 +46,7 @@ use hardnessd_core::wording::escaped;
                         again; p asks what you press (`firm`, `2`, `cup` or `cup firm`), tells it to the daemon as \
                         the context `object` and `level`, and counts right and wrong verdicts. DAEMON SILENT: no answer for 3 s. NO DAEMON: nobody answers, or the \
                         protocol is another one; `watch` connects again. A map that is not live is \
-                        grey. Without colours where NO_COLOR is set or TERM has none."
+                        grey. Needs a terminal with 256 colours."
 )]
 pub struct Args {
     #[command(flatten)]
@@ -113,8 +113,6 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
         let address = connection.address().to_string();
         stderr_line!("hardnessd: watching {}", escaped(&address));
     }
-    let variable = |name| std::env::var(name).unwrap_or_default();
-    let look = Look::new(&variable("TERM"), &variable("NO_COLOR"));
     let mut view = View::new();
     let mut screen = Screen::open().of("terminal", IO)?;
     let (sender, inputs) = sync_channel(16);
@@ -125,7 +123,7 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
     // The address of the last daemon.
     let mut daemon_at = None;
     while !is_over.load(Ordering::Relaxed) {
-        let drawn = screen.draw(|frame| draw(frame, &view, now().mono, look));
+        let drawn = screen.draw(|frame| draw(frame, &view, now().mono));
         if drawn.is_err() {
             // The terminal has gone.
             break;

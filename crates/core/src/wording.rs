@@ -325,7 +325,13 @@ mod tests {
             assert!(long.chars().count() < 500, "{long}");
         }
         let names = "`name`, ".repeat(60);
-        let found = cut_found(&format!("unknown field `{}`, expected {names}", "x".repeat(999)));
-        assert!(found.ends_with(&names) && found.len() < names.len() + 250, "{found}");
+        let found = cut_found(&format!(
+            "unknown field `{}`, expected {names}",
+            "x".repeat(999)
+        ));
+        assert!(
+            found.ends_with(&names) && found.len() < names.len() + 250,
+            "{found}"
+        );
     }
 }

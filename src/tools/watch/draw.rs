@@ -43,9 +43,6 @@ const GREY: [u8; 13] = [
     234, 235, 236, 238, 240, 241, 243, 244, 246, 247, 249, 251, 253,
 ];
 
-/// Characters from no pressure to the greatest, for a terminal without colours.
-const CHARACTERS: &[u8; 10] = b" .:-=+*#%@";
-
 /// The symbols of a cell that is filled by 0 to 8 eighths.
 const BLOCKS: [char; 9] = [
     ' ', '\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}',
@@ -62,78 +59,40 @@ pub(super) const UNPLUGGED: [&str; 4] = [
 ];
 pub(super) const UNPLUGGED_WORDS: &str = "unplugged: plug it in again";
 
-/// The abilities of the terminal, and the styles that follow from them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Look {
-    /// Whether the terminal has 256 colours.
-    pub(super) colours: bool,
+const HEADING: Style = Style::new().fg(Color::Indexed(75));
+const ASIDE: Style = Style::new().fg(Color::Indexed(245));
+const STRONG: Style = Style::new().add_modifier(Modifier::BOLD);
+/// A count of damage stands out if it is not 0.
+const DAMAGE: Style = Style::new().fg(Color::Indexed(214));
+
+/// A heading, and a text beside it.
+fn headed(heading: &str, text: &str, style: Style) -> Line<'static> {
+    Line::from_iter([span(&format!("{heading} "), HEADING), span(text, style)])
 }
 
-impl Look {
-    /// Derives the abilities from the values of `TERM` and `NO_COLOR` (<https://no-color.org>).
-    pub(super) fn new(term: &str, no_color: &str) -> Self {
-        let is_plain = ["", "dumb", "unknown"].contains(&term);
-        let is_old = term.starts_with("vt") || term.ends_with("-m") || term.ends_with("-mono");
-        Self {
-            colours: !is_plain && !is_old && no_color.is_empty(),
-        }
-    }
-
-    fn colour(self, colour: u8, without: Modifier) -> Style {
-        match self.colours {
-            true => Style::new().fg(Color::Indexed(colour)),
-            false => Style::new().add_modifier(without),
-        }
-    }
-
-    fn heading(self) -> Style {
-        self.colour(75, Modifier::BOLD)
-    }
-
-    fn aside(self) -> Style {
-        self.colour(245, Modifier::empty())
-    }
-
-    fn strong(self) -> Style {
-        Style::new().add_modifier(Modifier::BOLD)
-    }
-
-    /// A heading, and a text beside it.
-    fn line(self, heading: &str, text: &str, style: Style) -> Line<'static> {
-        Line::from_iter([
-            span(&format!("{heading} "), self.heading()),
-            span(text, style),
-        ])
-    }
-
-    /// The style of the word for a link. Other states must not look like live.
-    fn link(self, link: Link) -> Style {
-        let (fg, bg) = match link {
-            Link::Live => (16, 40),
-            Link::Connecting => (16, 75),
-            Link::NoZero | Link::Stale | Link::Silent => (16, 214),
-            Link::Lost | Link::NoDaemon => (231, 160),
-        };
-        match (self.colours, link) {
-            (true, _) => self.strong().fg(Color::Indexed(fg)).bg(Color::Indexed(bg)),
-            (false, Link::Live) => self.strong(),
-            (false, _) => self.strong().add_modifier(Modifier::REVERSED),
-        }
-    }
+/// The style of the word for a link. Other states must not look like live.
+fn style_of(link: Link) -> Style {
+    let (fg, bg) = match link {
+        Link::Live => (16, 40),
+        Link::Connecting => (16, 75),
+        Link::NoZero | Link::Stale | Link::Silent => (16, 214),
+        Link::Lost | Link::NoDaemon => (231, 160),
+    };
+    STRONG.fg(Color::Indexed(fg)).bg(Color::Indexed(bg))
 }
 
 /// Draws as much as there is room for.
-pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
+pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration) {
     let area = frame.area();
     let width = usize::from(area.width);
     let sensor = view.sensor();
     let (link, reason) = view.link(sensor, now);
-    let mut head = vec![title(view, look)];
+    let mut head = vec![title(view)];
     if view.sensors.len() > 1 {
-        head.push(tabs(view, now, width, look));
+        head.push(tabs(view, now, width));
     }
     let line = link_line(sensor, link, reason.as_deref(), now);
-    head.extend(wrapped(&line, width, look.link(link)));
+    head.extend(wrapped(&line, width, style_of(link)));
     // The keys have the last row.
     head.truncate(usize::from(area.height).saturating_sub(1).max(1));
     let [top, body, foot] = Layout::vertical([
@@ -143,7 +102,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
     ])
     .areas(area);
     frame.render_widget(Text::from(head), top);
-    frame.render_widget(keys(view, look), foot);
+    frame.render_widget(keys(view), foot);
     let Some(sensor) = sensor else { return };
     let mut right = body;
     if body.width > NARROW && body.height > 10 {
@@ -160,7 +119,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
         let newtons = sensor.newtons();
         let top_n = newtons.iter().copied().fold(LEAST_SCALE_N, f32::max);
         let range = format!("0 to {top_n:.2} N a taxel");
-        frame.render_widget(look.line("pressure", &range, look.aside()), scale);
+        frame.render_widget(headed("pressure", &range, ASIDE), scale);
         let map = Rect { width: cols, ..map };
         if !newtons.is_empty() {
             let share = |n: f32| (n / top_n).min(1.0);
@@ -171,24 +130,23 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration, look: Look) {
                 (sensor.rows, sensor.cols),
                 &shares,
                 link,
-                look,
             );
         }
         if link != Link::Live {
-            let word = span(&format!(" {} ", link.name()), look.link(link));
+            let word = span(&format!(" {} ", link.name()), style_of(link));
             frame.render_widget(Line::from(word).centered(), map);
         }
-        frame.render_widget(counters(sensor, look), counts);
+        frame.render_widget(counters(sensor), counts);
     }
     let width = usize::from(right.width);
-    let mut lines = vec![press_line(sensor, link, now, look)];
+    let mut lines = vec![press_line(sensor, link, now)];
     if let Some(line) = sensor.count.line(&view.labels) {
         lines.extend(wrapped(&format!("pressing {line}"), width, Style::new()));
     }
-    lines.push(force_line(sensor, link, look));
+    lines.push(force_line(sensor, link));
     let height = (right.height / 4).clamp(1, 10);
-    lines.extend(curve(sensor, now, width, usize::from(height), look));
-    lines.extend(verdicts(view, sensor, link, now, width, look));
+    lines.extend(curve(sensor, now, width, usize::from(height)));
+    lines.extend(verdicts(view, sensor, link, now, width));
     frame.render_widget(Text::from(lines), right);
 }
 
@@ -215,10 +173,10 @@ fn wrapped(text: &str, width: usize, style: Style) -> Vec<Line<'static>> {
     lines.into_iter().map(line).collect()
 }
 
-fn title(view: &View, look: Look) -> Line<'static> {
+fn title(view: &View) -> Line<'static> {
     let (hello, model) = (&view.hello, &view.hello["model"]);
     if hello.is_null() {
-        return span("hardnessd", look.strong()).into();
+        return span("hardnessd", STRONG).into();
     }
     let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
     // Several sensors have tabs.
@@ -233,18 +191,18 @@ fn title(view: &View, look: Look) -> Line<'static> {
         text(model, "validation"),
         text(model, "needs")
     );
-    let robot = span(&text(hello, "robot"), look.strong());
-    Line::from_iter([robot, span(&line, look.aside())])
+    let robot = span(&text(hello, "robot"), STRONG);
+    Line::from_iter([robot, span(&line, ASIDE)])
 }
 
 /// All sensors with their links. The chosen one is visible.
-fn tabs(view: &View, now: Duration, width: usize, look: Look) -> Line<'static> {
+fn tabs(view: &View, now: Duration, width: usize) -> Line<'static> {
     let tab = |(index, sensor): (usize, &Sensor)| {
         let (link, _) = view.link(Some(sensor), now);
         let (mark, style) = match (index == view.chosen, link) {
-            (true, _) => ('>', look.strong()),
-            (false, Link::Live) => (' ', look.aside()),
-            (false, _) => (' ', look.link(link)),
+            (true, _) => ('>', STRONG),
+            (false, Link::Live) => (' ', ASIDE),
+            (false, _) => (' ', style_of(link)),
         };
         let text = format!("{mark}{} {} {}  ", index + 1, sensor.name, link.name());
         span(&text, style)
@@ -301,7 +259,7 @@ fn map_size(sensor: &Sensor, width: u16, height: u16) -> (u16, u16) {
     (places(sensor.cols) as u16, halves.div_ceil(2) as u16)
 }
 
-/// The pressure map: in colours, in greys if it is no longer current, or in characters. `shares` of the full scale are
+/// The pressure map: in colours, or in greys if it is no longer current. `shares` of the full scale are
 /// those of the taxels.
 fn draw_map(
     buffer: &mut Buffer,
@@ -309,7 +267,6 @@ fn draw_map(
     (rows, cols): (usize, usize),
     shares: &[f32],
     link: Link,
-    look: Look,
 ) {
     let (wide, high) = (usize::from(area.width), 2 * usize::from(area.height));
     // The taxels of a place: a part of one, or several.
@@ -323,22 +280,17 @@ fn draw_map(
         let shared = taxels(y, high, rows).flat_map(of_row);
         shared.copied().fold(0.0, f32::max).sqrt()
     };
-    let step = |share: f32, steps: usize| ((share * steps as f32) as usize).min(steps - 1);
+    let grey = |share: f32| ((share * GREY.len() as f32) as usize).min(GREY.len() - 1);
     let colour = |share: f32| match link {
         Link::Live => indexed(viridis(share)),
-        _ => Color::Indexed(GREY[step(share, GREY.len())]),
+        _ => Color::Indexed(GREY[grey(share)]),
     };
     for (x, y) in (0..area.height).flat_map(|y| (0..area.width).map(move |x| (x, y))) {
         let half = |half: usize| shade(usize::from(x), 2 * usize::from(y) + half);
         let (upper, lower) = (half(0), half(1));
         let cell = &mut buffer[(area.x + x, area.y + y)];
-        if look.colours {
-            cell.set_char('\u{2580}').set_fg(colour(upper));
-            cell.set_bg(colour(lower));
-        } else {
-            let step = step(upper.max(lower), CHARACTERS.len());
-            cell.set_char(char::from(CHARACTERS[step]));
-        }
+        cell.set_char('\u{2580}').set_fg(colour(upper));
+        cell.set_bg(colour(lower));
     }
 }
 
@@ -354,13 +306,12 @@ fn indexed(colour: [u8; 3]) -> Color {
     Color::Indexed(16 + 36 * red + 6 * green + blue)
 }
 
-fn counters(sensor: &Sensor, look: Look) -> Text<'static> {
+fn counters(sensor: &Sensor) -> Text<'static> {
     let line = |key: &str| {
         let count = number(&sensor.status, key);
-        // A count of damage stands out if it is not 0.
         let style = match key == "frames" || count == 0 {
-            true => look.aside(),
-            false => look.colour(214, Modifier::BOLD),
+            true => ASIDE,
+            false => DAMAGE,
         };
         let name = key.replace('_', " ");
         Line::from(span(&format!("{name:<14} {count:>14}"), style))
@@ -370,13 +321,13 @@ fn counters(sensor: &Sensor, look: Look) -> Text<'static> {
     counts.map(line).collect()
 }
 
-fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'static> {
+fn press_line(sensor: &Sensor, link: Link, now: Duration) -> Line<'static> {
     let Some((at, press)) = &sensor.press else {
-        return look.line("press", "none yet", look.aside());
+        return headed("press", "none yet", ASIDE);
     };
     let (old, number) = (age(now.saturating_sub(*at)), number(press, "press"));
     let (mut line, style) = match (press["state"].as_str().unwrap_or_default(), link) {
-        ("begin", Link::Live) => (format!("{number} in contact for {old}"), look.strong()),
+        ("begin", Link::Live) => (format!("{number} in contact for {old}"), STRONG),
         ("begin", _) => {
             let unknown = format!("{number} began {old} ago, its end is not known");
             (unknown, Style::new())
@@ -386,29 +337,23 @@ fn press_line(sensor: &Sensor, link: Link, now: Duration, look: Look) -> Line<'s
     if let Some(reason) = press["reason"].as_str() {
         line += &format!(" ({reason})");
     }
-    look.line("press", &line, style)
+    headed("press", &line, style)
 }
 
 /// The present force and contact area.
-fn force_line(sensor: &Sensor, link: Link, look: Look) -> Line<'static> {
+fn force_line(sensor: &Sensor, link: Link) -> Line<'static> {
     let Some((_, frame)) = sensor.frame.as_ref().filter(|_| link == Link::Live) else {
-        return look.line("force", "not known", look.aside());
+        return headed("force", "not known", ASIDE);
     };
     // A small negative sum is noise.
     let force_n = frame["force_n"].as_f64().unwrap_or(0.0).max(0.0);
     let taxels = number(frame, "contact_area_taxels");
     let present = format!("{force_n:.2} N on {taxels} taxels");
-    look.line("force", &present, look.strong())
+    headed("force", &present, STRONG)
 }
 
 /// The force of the last 30 s, as bars, and its scale.
-fn curve(
-    sensor: &Sensor,
-    now: Duration,
-    width: usize,
-    height: usize,
-    look: Look,
-) -> Vec<Line<'static>> {
+fn curve(sensor: &Sensor, now: Duration, width: usize, height: usize) -> Vec<Line<'static>> {
     let curve = sensor.curve(now, width);
     let most = curve.iter().flatten().copied().fold(0.0, f32::max);
     let symbol = |force_n: &Option<f32>, below: usize| match force_n {
@@ -421,9 +366,9 @@ fn curve(
     };
     let row = |below: usize| -> String { curve.iter().map(|one| symbol(one, below)).collect() };
     let rows = (0..height).rev().map(row);
-    let mut lines: Vec<Line> = rows.map(|row| span(&row, look.heading()).into()).collect();
+    let mut lines: Vec<Line> = rows.map(|row| span(&row, HEADING).into()).collect();
     let scale = format!("{} s, to {most:.0} N", WINDOW.as_secs());
-    lines.push(span(&scale, look.aside()).into());
+    lines.push(span(&scale, ASIDE).into());
     lines
 }
 
@@ -433,18 +378,17 @@ fn verdicts(
     link: Link,
     now: Duration,
     width: usize,
-    look: Look,
 ) -> Vec<Line<'static>> {
     let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
-    let mut lines = vec![look.line("verdicts", &of, look.aside())];
+    let mut lines = vec![headed("verdicts", &of, ASIDE)];
     if sensor.verdicts.is_empty() {
-        lines.push(span("none yet", look.aside()).into());
+        lines.push(span("none yet", ASIDE).into());
     }
     for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
         let (answer, is_weak) = answer(verdict, &view.labels);
         let style = match is_weak {
-            true => look.aside(),
-            false if index == 0 && link == Link::Live => look.strong(),
+            true => ASIDE,
+            false if index == 0 && link == Link::Live => STRONG,
             false => Style::new(),
         };
         let old = age(now.saturating_sub(*at));
@@ -479,18 +423,18 @@ fn verdict_line(verdict: &Value, answer: &str, old: &str, width: usize) -> Strin
 }
 
 /// The keys, what a person types, or the outcome of the last command.
-fn keys(view: &View, look: Look) -> Line<'static> {
+fn keys(view: &View) -> Line<'static> {
     if let Some(text) = &view.entry {
         let ask = "pressing (a level, a name, or both; Enter):";
-        return look.line(ask, &format!("{text}_"), look.strong());
+        return headed(ask, &format!("{text}_"), STRONG);
     }
     if let Some(said) = &view.said {
-        return span(said, look.strong()).into();
+        return span(said, STRONG).into();
     }
     let more = match view.sensors.len() {
         0 | 1 => "",
         _ => "Tab or 1-9 another sensor   ",
     };
     let line = format!("q quit   p what you press   {more}Ctrl-L draw again");
-    span(&line, look.aside()).into()
+    span(&line, ASIDE).into()
 }

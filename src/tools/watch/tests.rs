@@ -11,14 +11,11 @@ use ratatui_crossterm::crossterm::event::KeyCode;
 use rustix::termios::LocalModes;
 use serde_json::{Value, json};
 
-use super::draw::{Look, UNPLUGGED, UNPLUGGED_WORDS, draw};
+use super::draw::{UNPLUGGED, UNPLUGGED_WORDS, draw};
 use super::screen::Screen;
 use super::view::{Link, Order, View};
 use crate::tools::pty::pair::Pair;
 use hardnessd_core::frame::Stamp;
-
-const COLOURS: Look = Look { colours: true };
-const PLAIN: Look = Look { colours: false };
 
 /// The stamp `ms` milliseconds after a moment at which the machine had been up for an hour.
 fn at(ms: u64) -> Stamp {
@@ -102,10 +99,10 @@ fn pressed_sensor() -> View {
     ])
 }
 
-fn picture(view: &View, ms: u64, (width, height): (u16, u16), look: Look) -> Buffer {
+fn picture(view: &View, ms: u64, (width, height): (u16, u16)) -> Buffer {
     let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
     terminal
-        .draw(|frame| draw(frame, view, at(ms).mono, look))
+        .draw(|frame| draw(frame, view, at(ms).mono))
         .unwrap();
     terminal.backend().buffer().clone()
 }
@@ -118,13 +115,13 @@ fn rows(buffer: &Buffer) -> Vec<String> {
         .collect()
 }
 
-fn shown(view: &View, ms: u64, size: (u16, u16), look: Look) -> String {
-    rows(&picture(view, ms, size, look)).join("\n")
+fn shown(view: &View, ms: u64, size: (u16, u16)) -> String {
+    rows(&picture(view, ms, size)).join("\n")
 }
 
-/// Asserts that all `parts` are shown without colours on 24 rows.
+/// Asserts that all `parts` are shown on 24 rows.
 fn assert_shown(view: &View, ms: u64, width: u16, parts: &[&str]) {
-    let text = shown(view, ms, (width, 24), PLAIN);
+    let text = shown(view, ms, (width, 24));
     for part in parts {
         assert!(text.contains(part), "{part:?} not in\n{text}");
     }
@@ -168,7 +165,7 @@ fn what_is_not_live_is_not_shown_as_present() {
     ];
     for (view, word) in cases {
         for size in [(80, 24), (120, 50)] {
-            let buffer = picture(&view, 4_100, size, COLOURS);
+            let buffer = picture(&view, 4_100, size);
             let text = rows(&buffer).join("\n");
             // The word comes at the top and on the map.
             assert!(
@@ -202,7 +199,7 @@ fn a_sensor_without_a_zero_shows_no_force_and_says_why() {
     let view = view_of(&[(0, hello("a", &["forearm"])), (0, status), (100, raw)]);
     let said = "(tare: contact: 512 taxels varied by 0.07 N or more)";
     assert_shown(&view, 200, 140, &[" NO ZERO YET ", said, "force not known"]);
-    let text = shown(&view, 200, (140, 24), PLAIN);
+    let text = shown(&view, 200, (140, 24));
     assert!(!text.contains("LIVE") && !text.contains("600"), "{text}");
 }
 
@@ -211,7 +208,7 @@ fn verdicts_stand_with_their_probabilities_newest_first() {
     let mut view = pressed_sensor();
     take_event(&mut view, 9_000, verdict(4, None, Some("low_force")));
     take_event(&mut view, 9_100, status("forearm", "live"));
-    let text = shown(&view, 10_200, (80, 24), PLAIN);
+    let text = shown(&view, 10_200, (80, 24));
     let lines = text
         .lines()
         .map(|line| line.get(32..).unwrap_or("").trim_end());
@@ -267,17 +264,11 @@ fn each_connection_begins_anew_and_shows_the_chosen_sensor() {
 }
 
 #[test]
-fn without_colours_pressure_is_told_by_characters_and_no_name_turns_the_line() {
-    let mut view = pressed_sensor();
-    assert_shown(&view, 300, 80, &["@@@@@@@@"]);
-    take_event(&mut view, 200, frame("forearm", 4.6, 3));
-    // A soft touch is seen after a hard one. The force is little more than the usual contact threshold.
-    take_event(&mut view, 300, frame("forearm", 0.08, 12));
-    assert_shown(&view, 400, 80, &["::::::::::::"]);
+fn no_name_turns_the_line() {
     let mut turned = hello("a", &["forearm"]);
     turned["robot"] = json!("b\u{202e}\u{e4}r-7");
     let turned = view_of(&[(0, turned)]);
-    assert!(shown(&turned, 0, (80, 24), COLOURS).starts_with("b\u{e4}r-7 "));
+    assert!(shown(&turned, 0, (80, 24)).starts_with("b\u{e4}r-7 "));
 }
 
 #[test]
@@ -286,14 +277,12 @@ fn every_size_is_drawn_and_says_what_holds() {
     take_event(&mut view, 2_000, status("forearm", "stale"));
     for width in 1..=130 {
         for height in 1..=50 {
-            for look in [COLOURS, PLAIN] {
-                let text = shown(&view, 2_100, (width, height), look);
-                let is_readable = width >= 8 && height >= 3;
-                assert!(
-                    !is_readable || text.contains("STALE"),
-                    "{width}x{height}\n{text}"
-                );
-            }
+            let text = shown(&view, 2_100, (width, height));
+            let is_readable = width >= 8 && height >= 3;
+            assert!(
+                !is_readable || text.contains("STALE"),
+                "{width}x{height}\n{text}"
+            );
         }
     }
 }
@@ -335,7 +324,7 @@ fn a_long_reason_is_wrapped_and_not_cut() {
                  then start the daemon";
     status["reason"] = json!(words);
     let view = view_of(&[(0, hello("a", &["forearm"])), (0, status)]);
-    let text = shown(&view, 200, (80, 24), PLAIN);
+    let text = shown(&view, 200, (80, 24));
     let joined = text.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(joined.contains(words), "{text}");
 }
@@ -387,7 +376,7 @@ fn lost_says_unplugged_where_it_is() {
         let mut status = status("forearm", "lost");
         status["reason"] = json!(reason);
         take_event(&mut view, 1_000, status);
-        shown(&view, 1_100, (120, 24), PLAIN)
+        shown(&view, 1_100, (120, 24))
     };
     let text = lost("Input/output error (os error 5)");
     let words = " LOST  unplugged: plug it in again; last frame";
