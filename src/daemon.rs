@@ -7,7 +7,6 @@
 //! daemon starts without its sensors and waits for them.
 
 pub(crate) mod accept;
-pub(crate) mod baud;
 mod client;
 mod clients;
 pub mod config;
@@ -30,7 +29,6 @@ mod relay;
 mod request;
 #[cfg(feature = "ros2")]
 pub mod ros2;
-mod running;
 mod sensor;
 pub(crate) mod serial;
 pub mod socket;
@@ -39,27 +37,32 @@ pub mod tcp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::pin::pin;
 use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use tokio::signal::unix::Signal;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
-use tracing::{debug, info, warn};
+use tokio::time::MissedTickBehavior;
+use tracing::{debug, error, info, warn};
 
 use self::clients::Clients;
 use self::config::{Publish, Setup};
 use self::hub::Hub;
+use self::log::Log;
 use self::own::Store;
 use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target};
-pub use self::running::Reload;
-use self::sensor::{SensorCore, SensorHandle, Sensors};
-use crate::thread::NoThread;
+use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
+use crate::maybe;
+use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
 use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
@@ -67,6 +70,9 @@ use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
 use hardnessd_core::sensor::{Sensor, Settings};
 
+/// How long subscribers may take to fetch their last lines. This is short, because the daemon must
+/// end within 1 s.
+const FAREWELL: Duration = Duration::from_millis(300);
 /// The most commands that wait for a sensor.
 const QUESTIONS: usize = 64;
 
@@ -285,12 +291,167 @@ impl Daemon {
     pub async fn run(
         mut self,
         shutdown: impl Future<Output = ()>,
-        reload: Option<Reload>,
+        mut reload: Option<Reload>,
     ) -> Result<(), Error> {
-        // The log lasts until the end.
-        let (mut setups, log) = reload.map(Reload::start).unzip();
-        self.serve(shutdown, &mut setups, log.as_ref()).await;
+        self.serve(shutdown, reload.as_mut()).await;
         self.finish().await
+    }
+
+    /// Serves until `shutdown` is ready, or there is no more to record.
+    async fn serve(&mut self, shutdown: impl Future<Output = ()>, mut reload: Option<&mut Reload>) {
+        let mut heartbeat = tokio::time::interval(systemd::heartbeat());
+        heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut shutdown = pin!(shutdown);
+        loop {
+            tokio::select! {
+                () = &mut shutdown => return,
+                () = maybe::wait(self.recorder.as_mut().map(Recorder::stopped)) => return,
+                _ = heartbeat.tick() => {
+                    // This is the sensors' thread, so it works.
+                    systemd::alive(self.hub.log().live());
+                }
+                Some((read, log)) = maybe::wait(reload.as_deref_mut().map(Reload::next)) => {
+                    match read.and_then(|changed| self.may_adopt(changed)) {
+                        Ok(changed) => {
+                            log.change(changed.config.log);
+                            self.adopt(changed).await;
+                        }
+                        Err(reason) => error!(%reason, "reload refused, all stays as it was"),
+                    }
+                    systemd::ready();
+                }
+            }
+        }
+    }
+
+    /// Returns `changed` if all of it can change while the daemon runs.
+    fn may_adopt(&self, changed: Setup) -> Result<Setup, Refusal> {
+        match self.setup.config.fixed_difference(&changed.config) {
+            Some(key) => Err(format!(
+                "{key} has changed, which a running daemon cannot take over: restart it"
+            )),
+            None => Ok(changed),
+        }
+    }
+
+    /// Uses `changed` from now on: sensors whose tables differ start anew, the others get the model.
+    /// Nothing here can fail.
+    async fn adopt(&mut self, changed: Setup) {
+        let former = std::mem::replace(&mut self.setup, changed);
+        // All end first, because a sensor that starts may have the port of another one.
+        let stopped = (0..former.sensors.len()).filter(|&at| !self.setup.is_same(&former, at));
+        let mut stopped = self.stop(stopped.collect()).await;
+        self.hub.log().describe(hello(&self.setup, String::new()));
+        let mut anew = Vec::new();
+        for (index, sensor) in self.setup.sensors.iter().enumerate() {
+            let hrn = self.setup.hrn_of(sensor.name()).clone();
+            let Some(mut core) = stopped.remove(sensor.name()) else {
+                let model = Command::Model(Box::new(sensor.clone()), hrn);
+                let _ = self.sensors[index].commands.send(model).await;
+                continue;
+            };
+            info!(sensor = sensor.name(), "stopped");
+            announce_sensor(&self.setup, &self.setup.config.sensors[index]);
+            core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
+            core.recorder.begin_anew(&core.pipeline, now());
+            anew.push(core);
+        }
+        self.start_sensors(anew);
+        info!(model = short(&self.setup), "reloaded");
+    }
+
+    /// Ends the tasks of these sensors. Returns what is left of them, by name.
+    async fn stop(&mut self, stopped: Vec<usize>) -> BTreeMap<String, SensorCore> {
+        let mut ended = BTreeMap::new();
+        for &index in &stopped {
+            let _ = self.sensors[index].commands.send(Command::Finish).await;
+        }
+        for _ in stopped {
+            let core = self.tasks.join_next().await;
+            let core = core
+                .expect("a task for each")
+                .expect("a panic ends the process");
+            ended.insert(core.name().to_owned(), core);
+        }
+        ended
+    }
+
+    /// Ends the daemon. Presses are aborted, and subscribers and the recording get their last
+    /// lines.
+    async fn finish(mut self) -> Result<(), Error> {
+        systemd::stopping();
+        info!("stopping");
+        drop(self.stop((0..self.sensors.len()).collect()).await);
+        self.hub.log().close();
+        drop(self.listening);
+        let farewell = async { while self.publishers.tasks.join_next().await.is_some() {} };
+        if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
+            warn!("a subscriber did not fetch its last lines");
+        }
+        drop(self.clients);
+        match self.recorder {
+            // Wait as long as necessary for a recording into one file, because a user asked for it.
+            Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,
+            Some(recorder) => tokio::time::timeout(FAREWELL, recorder.finish())
+                .await
+                .unwrap_or_else(|_| {
+                    warn!("the disk did not take the end of the recording");
+                    Ok(())
+                }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// How long reading the files of a configuration may take. The built-in model takes well under a
+/// second.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// The reason a reload was refused, in words: nobody tells reasons apart.
+type Refusal = String;
+
+/// The configurations that a running daemon is to use next.
+pub struct Reload {
+    setups: mpsc::Receiver<Result<Setup, Refusal>>,
+    /// Its format may change. It lasts until the end.
+    log: Log,
+}
+
+impl Reload {
+    /// Reads the configuration at `path` after each SIGHUP, in a task of its own. `model` replaces the configuration's
+    /// own. A request while another one waits is the same one: what is read then has all changes.
+    pub fn start(mut requests: Signal, path: PathBuf, model: Option<PathBuf>, log: Log) -> Self {
+        let (sender, setups) = mpsc::channel(1);
+        tokio::spawn(async move {
+            while requests.recv().await.is_some() {
+                systemd::reloading();
+                // The daemon may have ended.
+                let _ = sender.send(read(path.clone(), model.clone()).await).await;
+            }
+        });
+        Self { setups, log }
+    }
+
+    async fn next(&mut self) -> Option<(Result<Setup, Refusal>, &Log)> {
+        Some((self.setups.recv().await?, &self.log))
+    }
+}
+
+/// Reads the configuration at `path` and its model, or `model` in its place. A thread of its own reads, and is abandoned
+/// after [`PATIENCE`]: a pipe may have no writer and a file system may hang, and a thread that reads from them cannot be
+/// ended.
+async fn read(path: PathBuf, model: Option<PathBuf>) -> Result<Setup, Refusal> {
+    let shown = path.display().to_string();
+    let reading = spawn_thread("reload", move || Setup::load(&path, model.as_deref()));
+    let reading = reading.map_err(|error| format!("{shown}: {error}"))?;
+    match tokio::time::timeout(PATIENCE, reading).await {
+        Ok(loaded) => loaded
+            .expect("a configuration is read without a panic")
+            .map_err(|error| error.to_string()),
+        Err(_) => Err(format!(
+            "{shown}: reading it and its files did not end within {} s",
+            PATIENCE.as_secs()
+        )),
     }
 }
 

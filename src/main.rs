@@ -198,12 +198,7 @@ async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<
     };
     let log = Log::start(setup.config.log, "info")?;
     let daemon = Daemon::start(setup)?;
-    let reload = Reload {
-        requests: hangup,
-        path,
-        model,
-        log,
-    };
+    let reload = Reload::start(hangup, path, model, log);
     Ok(daemon.run(shutdown, Some(reload)).await?)
 }
 

@@ -7,30 +7,31 @@
 //! change something, the reader runs on the clients' thread, where requests without end delay no
 //! sensor. While the daemon carries out a command, events are still sent and the next request waits.
 
-mod requests;
-
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream as StdStream;
 use std::sync::Arc;
 
 use futures_util::StreamExt as _;
+use serde_json::Value;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::net::unix::pipe::Receiver;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::task::coop::consume_budget;
 use tracing::debug;
 
-pub(super) use self::requests::set_context;
-#[cfg(feature = "ros2")]
-pub(super) use self::requests::try_move_arm;
 use super::accept::Serve;
 use super::hub::{Hub, Line, Subscriber};
 use super::lines::{LineError, Lines, lines};
-use super::realtime;
-use super::request::{self, Request, Subscription};
-use super::sensor::Sensors;
+#[cfg(feature = "ros2")]
+use super::request::motion::ReportedPoint;
+use super::request::motion::{self, Positions};
+use super::request::{self, Context, Query, Request, Subscription};
+use super::sensor::{Answer, Command, Done, SensorHandle, Sensors};
+use super::{now, realtime};
+use hardnessd_core::event::Reply;
+use hardnessd_core::pipeline::Input;
 
 /// The longest line that a subscriber may send (`docs/protocol.md`).
 const LONGEST_LINE_BYTES: usize = 64 * 1024;
@@ -65,7 +66,7 @@ impl<S: AsFd + Send + 'static> Serve<S> for Service {
         let message = format!(
             "too many subscribers ({found}): try later, or raise max_clients in the configuration"
         );
-        let line = requests::end(Err(message), None);
+        let line = end(Err(message), None);
         // If the line cannot be sent, the client still sees the connection end.
         let _ = socket_of(stream).and_then(|mut socket| socket.write_all(line.json().as_bytes()));
     }
@@ -75,7 +76,7 @@ impl<S: AsFd + Send + 'static> Serve<S> for Service {
 enum Asked {
     /// A subscription, and the `id` of its request. The writer makes it, because its answer comes
     /// between the lines of the old and of the new one.
-    Subscribe(Subscription, Option<serde_json::Value>),
+    Subscribe(Subscription, Option<Value>),
     /// The lines of an answer.
     Answer(Vec<Arc<Line>>),
 }
@@ -123,7 +124,7 @@ async fn read(
             Some(Err(LineError::MaxChunkLengthExceeded)) => {
                 let message =
                     format!("found a line over {LONGEST_LINE_BYTES} bytes, expected a shorter one");
-                let answer = requests::answer(service, Err(message), None).await;
+                let answer = answer(service, Err(message), None).await;
                 place.send(Asked::Answer(answer));
                 return Ok(());
             }
@@ -134,7 +135,7 @@ async fn read(
         place.send(match request {
             Ok(Request::Subscribe(subscription)) => Asked::Subscribe(subscription, id),
             // A command may take long, because it may wait for frames or for a file to be written.
-            request => Asked::Answer(requests::answer(service, request, id).await),
+            request => Asked::Answer(answer(service, request, id).await),
         });
     }
 }
@@ -188,8 +189,8 @@ impl Writer {
             Asked::Answer(lines) => self.write(&lines).await,
             Asked::Subscribe(subscription, id) => {
                 let subscribed = self.subscriber.subscribe(&subscription);
-                let done = subscribed.map(|()| requests::Done::default());
-                self.write(&[requests::end(done, id)]).await
+                let done = subscribed.map(|()| Done::default());
+                self.write(&[end(done, id)]).await
             }
         }
     }
@@ -215,6 +216,117 @@ impl Writer {
         consume_budget().await;
         Ok(())
     }
+}
+
+/// The key of a sensor's name in a request with positions.
+const MOTION_KEY: &str = "motion.sensor";
+
+/// The answer to a query or a command.
+async fn answer(
+    service: &Service,
+    request: Result<Request, String>,
+    id: Option<Value>,
+) -> Vec<Arc<Line>> {
+    let mut lines = Vec::new();
+    let done = match request {
+        Ok(Request::Get(query)) => {
+            let now = service.hub.snapshot().await;
+            match query {
+                Query::Status => lines.extend(now.statuses()),
+                Query::Last => lines.extend(now.sensors.into_iter().filter_map(|one| one.last)),
+            }
+            Ok(Done::default())
+        }
+        Ok(request) => change(service.control.as_ref(), request).await,
+        Err(unusable) => Err(unusable),
+    };
+    lines.push(end(done, id));
+    lines
+}
+
+/// The last line of an answer.
+fn end(done: Result<Done, String>, id: Option<Value>) -> Arc<Line> {
+    Line::reply(&match done {
+        Ok((tare, blackbox)) => Reply::Ok {
+            id,
+            tare,
+            blackbox: blackbox.map(|path| path.display().to_string()),
+        },
+        Err(message) => Reply::Error { message, id },
+    })
+}
+
+/// Carries out a request that changes something. Of all sockets, only the control socket may.
+async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, String> {
+    let Some(sensors) = sensors else {
+        return Err("this socket changes nothing: send it to the control socket".to_owned());
+    };
+    match request {
+        Request::Tare(sensor) => ask(sensors, "tare", &sensor, Command::Tare).await,
+        Request::Context(context) => set_context(sensors, context).await,
+        Request::Motion(Positions { sensor, points }) => {
+            // Read the clocks now, because the sensor's task may have other work to do first.
+            let input = Input::Motion(motion::placed(&points, now())?);
+            let command = |reply| Command::Take(input, reply);
+            ask(sensors, MOTION_KEY, &sensor, command).await
+        }
+        Request::Blackbox(sensor) => ask(sensors, "blackbox", &sensor, Command::Blackbox).await,
+        // They change nothing.
+        Request::Subscribe(_) | Request::Get(_) => Ok(Done::default()),
+    }
+}
+
+/// Sets the context of a sensor.
+pub(super) async fn set_context(
+    sensors: &Sensors,
+    Context { sensor, context }: Context,
+) -> Result<Done, String> {
+    let command = |reply| Command::Take(Input::Context(context), reply);
+    ask(sensors, "context.sensor", &sensor, command).await
+}
+
+/// Passes positions of the arm on to the task of their sensor, without waiting. If the task refuses them, it
+/// logs that.
+#[cfg(feature = "ros2")]
+pub(super) fn try_move_arm(
+    sensors: &Sensors,
+    sensor: &str,
+    points: &[ReportedPoint],
+) -> Result<(), String> {
+    let found = find(sensors, MOTION_KEY, sensor)?;
+    let (reply, _) = oneshot::channel();
+    let command = Command::Take(Input::Motion(motion::placed(points, now())?), reply);
+    let sent = found.commands.try_send(command);
+    sent.map_err(|_| "they come too fast".to_owned())
+}
+
+/// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's
+/// key for that name.
+async fn ask(
+    sensors: &Sensors,
+    key: &str,
+    name: &str,
+    command: impl FnOnce(Answer) -> Command,
+) -> Result<Done, String> {
+    let sensor = find(sensors, key, name)?;
+    let (reply, answer) = oneshot::channel();
+    // An answer that does not come is dropped by a sensor's task that ends, or by a recorder whose
+    // queue is full.
+    let _ = sensor.commands.send(command(reply)).await;
+    let none = |_| {
+        Err(format!(
+            "{key}: the daemon is stopping, or has no time for it"
+        ))
+    };
+    answer.await.unwrap_or_else(none)
+}
+
+fn find<'a>(sensors: &'a Sensors, key: &str, name: &str) -> Result<&'a SensorHandle, String> {
+    let found = sensors.iter().find(|sensor| sensor.name == name);
+    found.ok_or_else(|| {
+        let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+        request::unusable(key, name, &format!("one of {}", names.join(", ")))
+    })
 }
 
 #[cfg(test)]

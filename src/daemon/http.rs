@@ -158,7 +158,7 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
     let read = serde_json::from_slice(&body).map_err(|error| cut_found(&error.to_string()));
     let set = async { set_context(sensors, read?).await }.await;
     match set {
-        Ok(()) => text("application/json", "{}".to_owned()),
+        Ok(_) => text("application/json", "{}".to_owned()),
         Err(why) => refusal(StatusCode::BAD_REQUEST, why),
     }
 }

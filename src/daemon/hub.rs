@@ -10,7 +10,6 @@
 
 mod cursor;
 mod log;
-mod tally;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 #[cfg(feature = "zenoh")]
@@ -20,8 +19,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 
 use self::log::Log;
-pub(crate) use self::log::{Line, SensorSnapshot, Snapshot};
-pub(crate) use self::tally::Series;
+pub(crate) use self::log::{Line, SensorSnapshot, Series, Snapshot};
 use super::now;
 use super::request::Subscription;
 use hardnessd_core::event::{Event, Hello};

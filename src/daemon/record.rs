@@ -17,6 +17,7 @@ use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 
 use self::worker::Worker;
+use super::sensor::Answer;
 use super::{Error, config};
 use crate::thread::spawn_thread;
 use hardnessd_core::event::Event;
@@ -77,7 +78,7 @@ enum Job {
     /// A client requests the last minute of a sensor as a file.
     Blackbox {
         sensor: usize,
-        reply: oneshot::Sender<Result<PathBuf, String>>,
+        reply: Answer,
     },
 }
 
@@ -237,7 +238,7 @@ impl SensorRecorder {
     }
 
     /// Requests the last minute as a file. The answer comes when the file is written.
-    pub(crate) fn blackbox(&self, reply: oneshot::Sender<Result<PathBuf, String>>) {
+    pub(crate) fn blackbox(&self, reply: Answer) {
         // If there is no room for the job, `reply` is dropped with the job, which the caller sees.
         match &self.0 {
             Some(active) => {
@@ -245,7 +246,7 @@ impl SensorRecorder {
                 active.jobs.send(Job::Blackbox { sensor, reply });
             }
             None => {
-                let none = "nothing is kept: the configuration has no [record]";
+                let none = "blackbox: nothing is kept: the configuration has no [record]";
                 let _ = reply.send(Err(none.to_owned()));
             }
         }

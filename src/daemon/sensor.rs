@@ -26,16 +26,23 @@ use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Hrn;
 use hardnessd_core::wording;
 
+/// The content of an `ok`: the tare that was taken, or the file that was written.
+pub(crate) type Done = (Option<Tared>, Option<PathBuf>);
+
+/// Where the answer to a command goes: what was done, or why it is refused, in words, because nobody tells reasons
+/// apart.
+pub(crate) type Answer = oneshot::Sender<Result<Done, String>>;
+
 /// A command to a sensor's task.
 #[derive(Debug)]
 pub(crate) enum Command {
     /// Take another tare. The answer comes when the tare is taken, refused or abandoned.
-    Tare(oneshot::Sender<Result<Tared, RetareError>>),
+    Tare(Answer),
     /// Take a context of the controller, or positions of the arm. The answer comes when the pipeline has it, or
     /// says why it is refused.
-    Take(Input, oneshot::Sender<Result<(), String>>),
-    /// Write the last minute to a file. The answer is the path of the file.
-    Blackbox(oneshot::Sender<Result<PathBuf, String>>),
+    Take(Input, Answer),
+    /// Write the last minute to a file. The answer comes when it is written.
+    Blackbox(Answer),
     /// Judge with another model from the next rest on. Of the sensor's tables, only `[model]` may differ.
     Model(Box<Sensor>, Arc<Hrn>),
     /// End the task. A press under way is aborted, and no further event follows.
@@ -84,7 +91,7 @@ pub(crate) async fn serve(
     store: Store,
 ) -> SensorCore {
     // The client that waits for the outcome of a tare.
-    let mut taring: Option<oneshot::Sender<_>> = None;
+    let mut taring: Option<Answer> = None;
     let mut frames = core.pipeline.frame_counts().0;
     // The model that judges from the next rest on.
     let mut next_model = None;
@@ -107,8 +114,7 @@ pub(crate) async fn serve(
                 Some(Command::Tare(reply)) => {
                     match core.take(Input::Tare) {
                         Err(Refused::Tare(refusal)) => {
-                            log::tare(core.name(), &Err(refusal));
-                            let _ = reply.send(Err(refusal));
+                            let _ = reply.send(tared(core.name(), Err(refusal)));
                         }
                         _ => taring = Some(reply),
                     }
@@ -144,9 +150,9 @@ pub(crate) async fn serve(
             source.proven();
         }
         if let Some(outcome) = core.pipeline.retared() {
-            log::tare(core.name(), &outcome);
+            let done = tared(core.name(), outcome);
             // The client may have gone.
-            let _ = taring.take().map(|reply| reply.send(outcome));
+            let _ = taring.take().map(|reply| reply.send(done));
         }
         for failed in core.pipeline.unjudged() {
             log::limited(core.name(), || {
@@ -189,7 +195,7 @@ impl SensorCore {
     }
 
     /// The same for an input that a client sent.
-    fn take_asked(&mut self, input: Input) -> Result<(), String> {
+    fn take_asked(&mut self, input: Input) -> Result<Done, String> {
         if let Input::Context(context) = &input {
             let levels = self.pipeline.hrn().card().levels.len();
             check_truth(context.as_ref(), levels)?;
@@ -201,7 +207,7 @@ impl SensorCore {
         }
         match self.take(input) {
             Err(Refused::Motion(back)) => Err(format!("motion.at[{}]: {back}", back.index)),
-            _ => Ok(()),
+            _ => Ok(Done::default()),
         }
     }
 
@@ -216,6 +222,13 @@ impl SensorCore {
             motion: pipeline.motion_counts(),
         }
     }
+}
+
+/// Logs the outcome of a tare that a client requested, and returns the answer.
+fn tared(sensor: &str, outcome: Result<Tared, RetareError>) -> Result<Done, String> {
+    log::tare(sensor, &outcome);
+    let answer = outcome.map(|tared| (Some(tared), None));
+    answer.map_err(|refusal| format!("tare: {refusal}"))
 }
 
 /// Checks the keys of a context that say what is pressed, for a model with so many levels.

@@ -25,7 +25,7 @@ use tracing::warn;
 use self::network::{Received, Udp};
 use self::tty::LineSettings;
 use self::turns::Turns;
-use super::baud::BITS_A_BYTE;
+use super::port::BITS_A_BYTE;
 use super::{log, realtime};
 use crate::maybe;
 use crate::thread::{NoThread, spawn_thread};

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 
 use super::faults::{Faults, Line};
 use super::pty::Pty;
-use crate::daemon::baud::BITS_A_BYTE;
+use crate::daemon::port::BITS_A_BYTE;
 use crate::thread::{NoThread, start};
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::wire::Layout;

@@ -2,7 +2,7 @@
 
 use super::error::Problem;
 use super::{Config, Publish, Ros2, Unix, Zenoh};
-use crate::daemon::baud;
+use crate::daemon::port;
 use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::{range, verdict, wording};
 
@@ -82,7 +82,7 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
         let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
         let sensor = sensor.and_then(|sensor| {
             check_beside(given, &config.sensors[..index])?;
-            let carried = baud::check(given, sensor.layout());
+            let carried = port::check_baud(given, sensor.layout());
             carried.map_err(|problem| Problem::because("sensor.frame_rate_hz", problem))?;
             Ok(sensor)
         });

@@ -7,12 +7,11 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use super::cursor::{Cursor, Place, QUEUE};
-use super::tally::Counts;
 use crate::daemon::record::Jobs;
 use crate::daemon::request::{Since, Subscription};
 use crate::daemon::sensor::SensorState;
 use crate::daemon::{log, now};
-use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply, Status};
+use hardnessd_core::event::{Event, Hello, Kind, LinkState, Phase, Reply, Status, name};
 
 /// The number of numbered events that are held for `since` (`docs/controller.md`).
 pub(super) const HELD: usize = 4096;
@@ -80,6 +79,34 @@ pub(super) struct Entry {
     /// The number of earlier events of this sensor: of its frames, or of its numbered events.
     nth: u64,
     pub(super) line: Arc<Line>,
+}
+
+/// The name of a metric, and the labels of one of its series.
+pub(crate) type Series = (&'static str, Vec<(&'static str, String)>);
+
+/// Counts of one sensor.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Counts(pub(crate) BTreeMap<Series, u64>);
+
+impl Counts {
+    /// Counts an event of this sensor.
+    fn count(&mut self, event: &Event) {
+        let series = match event {
+            Event::Status(_) | Event::Frame(_) => return,
+            Event::Press(press) => ("presses", vec![("state", name(&press.state))]),
+            Event::Hardness(verdict) => {
+                let phase = ("phase", name(&verdict.phase));
+                match (&verdict.rejected, verdict.level) {
+                    (Some(reason), _) => {
+                        ("verdicts_rejected", vec![phase, ("reason", name(reason))])
+                    }
+                    (None, Some(level)) => ("verdicts", vec![phase, ("level", level.to_string())]),
+                    (None, None) => return,
+                }
+            }
+        };
+        *self.0.entry(series).or_default() += 1;
+    }
 }
 
 /// What the log keeps of a sensor.

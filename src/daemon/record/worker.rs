@@ -176,8 +176,9 @@ impl Worker {
             Job::Entry { sensor, at, entry } => self.entry(sensor, at, entry),
             Job::Event(event) => self.event(&event),
             Job::Blackbox { sensor, reply } => {
+                let written = self.blackbox(sensor).map(|path| (None, Some(path)));
                 // The client may have gone.
-                let _ = reply.send(self.blackbox(sensor));
+                let _ = reply.send(written.map_err(|error| format!("blackbox: {error}")));
                 Ok(())
             }
         }

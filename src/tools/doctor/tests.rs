@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
-use super::checks::{Access, examine, ports};
+use super::{Access, examine, ports};
 
 const PORT: &str = "/dev/serial/by-id/usb-film-if00";
 
