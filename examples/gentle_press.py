@@ -2,13 +2,11 @@
 """Presses an object no harder than its level needs: the arm withdraws when the level is known, or at a force. It
 presses harder, or again, where the verdict's `advice` asks for it.
 
-ARM is the socket of `hardnessd simulate --arm`; docs/motion.md shows how to start it. For a robot of yours, replace
-the class `Arm`. `hardnessd.py` must be beside this file or installed.
+Replace the class `Arm` by your robot's. docs/motion.md shows how to try it beside a simulated sensor. `hardnessd.py`
+must be beside this file or installed.
 """
 
 import argparse
-import json
-import socket
 import time
 
 import hardnessd
@@ -18,19 +16,10 @@ MOST_PRESSES, MOST_N = 4, 30.0
 
 
 class Arm:
-    """The simulated arm. It stops when this program ends."""
+    """The arm of a robot. This one only says where it would go."""
 
-    def __init__(self, path):
-        self.socket = socket.socket(socket.AF_UNIX)
-        self.socket.connect(path)
-        self.lines = self.socket.makefile("rw")
-
-    def order(self, **order):
-        print(json.dumps(order), file=self.lines, flush=True)
-        answer = json.loads(self.lines.readline())
-        if "error" in answer:
-            raise ValueError(answer["error"])
-        return answer
+    def move(self, to_mm, speed_mm_s):
+        print(f"arm: to {to_mm:.0f} mm at {speed_mm_s:.0f} mm/s")
 
 
 def press(arm, events, sensor, limit_n=15.0, sure=0.0):
@@ -57,31 +46,28 @@ def press(arm, events, sensor, limit_n=15.0, sure=0.0):
         wanted_mm = FAR_MM if loading and live else 0.0
         if wanted_mm != goal_mm:
             goal_mm = wanted_mm
-            arm.order(to_mm=goal_mm, speed_mm_s=SPEED_MM_S)
+            arm.move(goal_mm, SPEED_MM_S)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("arm")
     parser.add_argument("sensor", nargs="?", default="forearm")
     parser.add_argument("--limit", type=float, default=15.0, help="greatest force in newtons [default: 15]")
     args = parser.parse_args()
     events = hardnessd.Client(types=["frame", "hardness", "press", "status"])
     try:
-        arm = Arm(args.arm)
+        arm = Arm()
         limit_n = args.limit
         for _ in range(MOST_PRESSES):
             early, final, greatest_n = press(arm, events, args.sensor, limit_n)
             why = f"an early verdict ({early['confidence']:.0%})" if early else "no early verdict"
             print(f"{final}\n{why}, greatest force {greatest_n:.1f} N, advice: {final['advice']}")
-            while arm.order(to_mm=0.0)["at_mm"] > 0:
-                time.sleep(0.05)
             if final["advice"] is None:
                 break
             if final["advice"] == "press_harder":
                 limit_n = min(2 * limit_n, MOST_N)
     except (OSError, RuntimeError) as error:
-        raise SystemExit(f"{args.arm}: {error}")
+        raise SystemExit(error)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 
 mod answer;
 pub mod args;
-mod arm;
 pub mod calibrate;
 pub mod check;
 pub mod configuration;

@@ -146,7 +146,7 @@ fn failed(key: &str, path: &Path, what: &str, error: &io::Error) -> Error {
 }
 
 /// Listens at a new socket of this mode and group. Its calls do not block.
-pub(crate) fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<StdListener> {
+fn listen(path: &Path, mode: u32, group: Option<Gid>) -> io::Result<StdListener> {
     let socket = socket()?;
     rustix::net::bind(&socket, &SocketAddrUnix::new(path)?)?;
     // Until the socket listens, connections are refused. So nobody comes in before the file has its

@@ -142,7 +142,7 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let print = move || print_events(subscriber, args.presses, account);
     let mut printed = spawn_thread("events", print)?;
     let start = Instant::now();
-    robot::start(control, Box::new(player.position(start)))?;
+    robot::start(control, player.position(start))?;
     let frames = player::sequence(sequence)?;
     // When it is dropped, the daemon stops.
     let (stop, stopped) = oneshot::channel::<()>();

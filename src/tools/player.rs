@@ -102,7 +102,7 @@ impl Player {
             let since = self.period * frame.number;
             let due = start + since;
             tokio::time::sleep_until(due).await;
-            self.approach.send_replace(frame.approach);
+            self.approach.send_replace(Some(frame.approach));
             let time_s = since.as_secs_f64() * self.speed;
             let layout = &self.layout;
             let line = self.faults.encode(time_s, &frame.raw, layout, &mut bytes);
@@ -148,8 +148,8 @@ pub(crate) struct Played {
     /// Its number: frame n is taken n periods after the first one.
     pub(crate) number: u32,
     pub(crate) raw: RawFrame,
-    /// The motion of the arm until the next frame, if it is known in advance.
-    pub(crate) approach: Option<Approach>,
+    /// The motion of the arm until the next frame.
+    pub(crate) approach: Approach,
 }
 
 /// The frames of a sequence.
@@ -167,7 +167,7 @@ pub(crate) fn sequence(settings: SequenceSettings) -> Result<mpsc::Receiver<Play
             let frame = Played {
                 number,
                 raw: frame.raw,
-                approach: Some(approach),
+                approach,
             };
             if frames.blocking_send(frame).is_err() {
                 return;

@@ -26,16 +26,17 @@ const POINTS: usize = 2;
 /// How long the robot waits before it looks for the daemon again.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// Where the arm is at a moment, in mm. `None` while it does not move yet.
-pub(crate) type Position = Box<dyn Fn(Instant) -> Option<f64> + Send>;
-
-/// Sends positions to the daemon at a control socket, for ever, on a thread of its own. Prints the first reason on
+/// Sends positions to the daemon at a control socket, for ever, on a thread of its own. `position` is where the arm is at
+/// a moment, in mm, and `None` while it does not move yet. Prints the first reason on
 /// stderr why a daemon does not take them.
 ///
 /// # Errors
 ///
 /// Fails if the system has no thread to spare.
-pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread> {
+pub(crate) fn start(
+    socket: PathBuf,
+    position: impl Fn(Instant) -> Option<f64> + Send + 'static,
+) -> Result<(), NoThread> {
     crate::thread::start("robot", move || {
         let mut complained = false;
         loop {
@@ -52,7 +53,7 @@ pub(crate) fn start(socket: PathBuf, position: Position) -> Result<(), NoThread>
 }
 
 /// Sends positions to one daemon until the daemon ends or refuses them.
-fn send(socket: &Path, position: &Position) -> Result<Infallible, Failure> {
+fn send(socket: &Path, position: &impl Fn(Instant) -> Option<f64>) -> Result<Infallible, Failure> {
     let mut daemon = connect::control(Some(socket.to_owned()))?;
     let hello = daemon.meet()?;
     // The arm has the daemon's first sensor. It needs no events.

@@ -8,11 +8,10 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
 
-use super::arm::{self, Arm};
 use super::exit::{Fail, Failure};
 use super::faults::{self, Faults, Line};
 use super::player::{self, Player};
-use super::robot::{self, Position};
+use super::robot;
 use crate::daemon::config::Unix;
 use crate::daemon::port::BITS_A_BYTE;
 use crate::thread::spawn_thread;
@@ -48,7 +47,7 @@ pub struct Args {
     materials: Vec<Material>,
     /// Rigid piece to press in place of the materials, for `identify`: flat:MM (its width) or ball:MM (its radius),
     /// 1 to 100 mm
-    #[arg(long, value_name = "PIECE", conflicts_with_all = ["materials", "arm"], value_parser = piece)]
+    #[arg(long, value_name = "PIECE", conflicts_with = "materials", value_parser = piece)]
     piece: Option<Piece>,
     /// Peak force of a press in newtons, 0.01 to 200; repeat the option for several in turn [default:
     /// random, 5 to 25]
@@ -72,9 +71,6 @@ pub struct Args {
     /// second. Without SOCKET, the one that a daemon started here has by default
     #[arg(long, value_name = "SOCKET", conflicts_with = "to")]
     motion: Option<Option<PathBuf>>,
-    /// Play no presses: move the arm as a controller says on this new Unix socket
-    #[arg(long, value_name = "SOCKET", conflicts_with_all = ["to", "speed", "presses", "forces"])]
-    arm: Option<PathBuf>,
     /// Script of faults; `--help` shows its format
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
@@ -118,24 +114,10 @@ async fn play(args: Args) -> Result<(), Failure> {
     let player = Player::new(link, layout, faults, args.fps, baud, args.speed);
     let player = player.of(&what, IO)?;
     let line = format!("{}\n", player.path().display());
-    let (settings, start) = (sequence(&args), Instant::now());
-    let arm = args.arm.as_deref();
-    let arm = arm.map(|path| Arm::start(path, settings.clone(), start));
-    let (position, frames, start, _socket): (Position, _, _, _) = match arm.transpose()? {
-        Some(arm) => (
-            arm.position,
-            arm.frames,
-            start + arm::SCAN,
-            Some(arm.socket),
-        ),
-        None => {
-            let frames = player::sequence(settings)?;
-            (Box::new(player.position(start)), frames, start, None)
-        }
-    };
+    let (frames, start) = (player::sequence(sequence(&args))?, Instant::now());
     if let Some(socket) = args.motion {
         let socket = socket.unwrap_or_else(|| Unix::default().control_path());
-        robot::start(socket, position)?;
+        robot::start(socket, player.position(start))?;
     }
     // It is no error if nobody reads the path, because the link shows it too.
     let printed = super::print_apart(line);

@@ -1,6 +1,5 @@
 //! The real binary on a real pty: the daemon, its outputs and its tools.
 
-mod arm;
 mod calibrate;
 mod commands;
 mod demo;

@@ -2,8 +2,7 @@
 //!
 //! In: settings and a seed. Out: [`dataset`], the labelled samples of the paper's Table 1 (force
 //! prescribed), `courses`, whole presses with the arm's motion, on one kind of sensor or on many,
-//! [`Sequence`], raw frames as a sensor would send them (motion prescribed), and [`Rig`], the same
-//! while somebody else moves the arm. Everything follows from the seed. Nothing here reads a clock,
+//! and [`Sequence`], raw frames as a sensor would send them (motion prescribed). Everything follows from the seed. Nothing here reads a clock,
 //! does I/O or keeps global state. The modules are in reading order: each uses only the modules above
 //! it. The head of each says what it models and what it does not.
 //!
@@ -34,7 +33,6 @@ mod solved;
 mod dataset;
 mod courses;
 mod sequence;
-mod rig;
 
 pub use courses::{LabelledCourse, Sample, courses};
 pub use dataset::{LabelledSample, dataset};
@@ -42,7 +40,6 @@ pub use level::{LEVELS, LevelRange, level_of};
 pub use material::{Material, Split};
 pub use motion::{ARM_N_PER_MM, Approach, Motion};
 pub use object::Shapes;
-pub use rig::{Rig, Touched};
 pub use sensor::SensorProfile;
 pub use sequence::{Pressed, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns};

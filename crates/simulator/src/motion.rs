@@ -46,12 +46,6 @@ impl Motion {
         let withdrawing = self.top_mm - self.speed_mm_s * (time_s - self.load_s - self.hold_s);
         loading.min(self.top_mm).min(withdrawing).max(-CLEARANCE_MM)
     }
-
-    /// The time after the touch at which a loading arm is this far beyond it, at most that at which it
-    /// stops.
-    pub(super) fn loading_s(&self, approach_mm: f64) -> f64 {
-        self.load_s + ((approach_mm - self.top_mm) / self.speed_mm_s).min(0.0)
-    }
 }
 
 /// The arm's motion in a sequence of presses, around the last press and the next.

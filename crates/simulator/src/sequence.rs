@@ -257,7 +257,7 @@ impl Sequence {
 }
 
 /// Draws an object of the material, or of a random one, and one of its faces in a pose.
-pub(super) fn presented(material: Option<Material>, draws: &mut Stream) -> (Body, Specimen) {
+fn presented(material: Option<Material>, draws: &mut Stream) -> (Body, Specimen) {
     let body = broad::body_of(material, &mut draws.child(3));
     let object = object::draw(Shapes::Matched, body.level, &mut draws.child(0));
     let face = object[draws.below(POSTURES)];
