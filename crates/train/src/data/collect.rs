@@ -236,6 +236,9 @@ impl Collection {
         let mut presses = std::mem::take(&mut recording.presses);
         let labelled = recording.label_presses(&mut presses, settings, new);
         labelled.with_context(|| shown.to_string())?;
+        for source in &mut presses.sources {
+            source.levels = Some(settings.levels.clone());
+        }
         let labels = &recording.labels;
         let material = labels.get("material").map_or(NO_MATERIAL, String::as_str);
         // The names of a recording that is refused after all do not stay.

@@ -293,6 +293,19 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
 }
 
 #[test]
+fn the_levels_of_a_configuration_are_those_of_the_labels_and_of_the_data_set() {
+    let desk = Desk::new();
+    let sensor = "[[sensor]]\nname = \"a\"\nport = \"b\"\n";
+    let level = |label, shore| format!("[[level]]\nlabel = \"{label}\"\nshore = {shore}\n");
+    let levels = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 50.0]");
+    desk.write("own.toml", &format!("{sensor}{levels}"));
+    desk.recording("a.mcap", "level=limp");
+    let all = desk.collected("own.npz", "--config own.toml a.mcap");
+    assert!(all.iter().all(|press| press.level == 2), "{all:?}");
+    assert_eq!(desk.meta("own.npz")["levels"][1]["label"], "limp");
+}
+
+#[test]
 fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
     let desk = Desk::new();
     desk.collected("own.npz", "--object 1 --level 1 foam.bin");

@@ -9,13 +9,13 @@ use hrn_train::data::source::papers_levels;
 use hrn_train::run::disk::lock;
 
 use super::arguments::Collect;
-use super::configuration::first_sensor;
+use super::configuration::{first_sensor, levels};
 use super::files::check_new;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
-    let sensor = match &arguments.config {
-        Some(config) => first_sensor(config)?,
-        None => Sensor::new(Description::default())?,
+    let (sensor, levels) = match &arguments.config {
+        Some(config) => (first_sensor(config)?, levels(config)?),
+        None => (Sensor::new(Description::default())?, None),
     };
     let captures = collect::captures(&arguments.captures)?;
     let out = &arguments.out;
@@ -26,7 +26,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     // No other call adds to the data set meanwhile, because the later one would undo the earlier one.
     let _locked = earlier.map(lock).transpose()?;
     let settings = Settings {
-        levels: papers_levels(),
+        levels: levels.unwrap_or_else(papers_levels),
         level: arguments.level,
         object: arguments.object,
         is_one_object: true,
