@@ -62,7 +62,7 @@ use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target};
 use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
 use crate::maybe;
-use crate::thread::{NoThread, spawn_thread};
+use crate::thread::{self, NoThread};
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
 use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
@@ -442,12 +442,10 @@ impl Reload {
 /// ended.
 async fn read(path: PathBuf, model: Option<PathBuf>) -> Result<Setup, Refusal> {
     let shown = path.display().to_string();
-    let reading = spawn_thread("reload", move || Setup::load(&path, model.as_deref()));
-    let reading = reading.map_err(|error| format!("{shown}: {error}"))?;
+    let reading = thread::run("reload", move || Setup::load(&path, model.as_deref()));
     match tokio::time::timeout(PATIENCE, reading).await {
-        Ok(loaded) => loaded
-            .expect("a configuration is read without a panic")
-            .map_err(|error| error.to_string()),
+        Ok(Ok(loaded)) => loaded.map_err(|error| error.to_string()),
+        Ok(Err(error)) => Err(format!("{shown}: {error}")),
         Err(_) => Err(format!(
             "{shown}: reading it and its files did not end within {} s",
             PATIENCE.as_secs()

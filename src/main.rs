@@ -12,7 +12,7 @@ use clap::Parser;
 use hardnessd::daemon::config::{self, Setup};
 use hardnessd::daemon::log::{Log, Settings as LogSettings};
 use hardnessd::daemon::{Daemon, Reload};
-use hardnessd::thread::{self, spawn_thread};
+use hardnessd::thread;
 use hardnessd::tools::args::{Args, Command};
 use hardnessd::tools::exit::{self, Failure};
 #[cfg(feature = "watch")]
@@ -160,11 +160,7 @@ async fn finish_blocking(
     signals: Signals,
     work: impl FnOnce() -> Result<(), Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let done = spawn_thread("work", work)?;
-    finish(signals, async {
-        done.await.expect("the work does not panic")
-    })
-    .await
+    finish(signals, async { thread::run("work", work).await? }).await
 }
 
 /// Loads a configuration and its model on a thread of its own, because a file may be a pipe that sends
@@ -172,10 +168,7 @@ async fn finish_blocking(
 async fn load(
     read: impl FnOnce() -> Result<Setup, config::Error> + Send + 'static,
 ) -> Result<Setup, Failure> {
-    let loaded = spawn_thread("load", read)?;
-    Ok(loaded
-        .await
-        .expect("a configuration is read without a panic")?)
+    Ok(thread::run("load", read).await??)
 }
 
 async fn run(path: PathBuf, model: Option<PathBuf>, signals: Signals) -> Result<(), Failure> {

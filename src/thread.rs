@@ -52,6 +52,24 @@ pub fn spawn_thread<T: Send + 'static>(
     Ok(result)
 }
 
+/// The result of `work`, which runs on a thread of its own. Dropping the future does not end the work.
+///
+/// # Errors
+///
+/// Fails if the system has no thread to spare.
+///
+/// # Panics
+///
+/// Panics if the work does.
+pub async fn run<T: Send + 'static>(
+    name: &str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, NoThread> {
+    Ok(spawn_thread(name, work)?
+        .await
+        .expect("the work has not panicked"))
+}
+
 /// Waits until a write to stdout that is under way has ended, but no longer than `patience`. Nothing is written
 /// after it.
 pub fn finish(patience: Duration) {

@@ -37,7 +37,7 @@ use std::process::ExitCode;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 use self::exit::{Fail, Failure};
-use crate::thread::spawn_thread;
+use crate::thread;
 use hardnessd_core::exit::{FAILED, IO, NO_INPUT};
 use hardnessd_core::recording;
 use hardnessd_core::wording;
@@ -146,8 +146,7 @@ pub fn print(lines: &[u8]) -> Result<bool, Failure> {
 
 /// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
 async fn print_apart(text: String) -> Result<bool, Failure> {
-    let printed = spawn_thread("stdout", move || print(text.as_bytes()))?;
-    printed.await.expect("a text is printed without a panic")
+    thread::run("stdout", move || print(text.as_bytes())).await?
 }
 
 /// An absolute path, or the path as it is if the system does not know the current directory.

@@ -224,8 +224,13 @@ struct Active {
 impl SensorRecorder {
     /// Records `input`, which `pipeline` is about to take.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input, at: Stamp) {
-        if let Some(active) = &mut self.0 {
-            active.follow(pipeline, at, Entry::Input(input.clone()));
+        let Some(active) = &mut self.0 else { return };
+        active.begin(pipeline, at);
+        // Before the first state, entries are left out: a replay could not use them.
+        if active.noted.is_some() {
+            let entry = Entry::Input(input.clone());
+            active.bytes += entry.weight();
+            active.queue(at, entry);
         }
     }
 
@@ -254,16 +259,7 @@ impl SensorRecorder {
 }
 
 impl Active {
-    /// Sends `entry`, after a state if one is due. Before the first state, entries are left out: a
-    /// replay could not use them.
-    fn follow(&mut self, pipeline: &Pipeline, at: Stamp, entry: Entry) {
-        self.begin(pipeline, at);
-        if self.noted.is_some() {
-            self.bytes += entry.weight();
-            self.queue(at, entry);
-        }
-    }
-
+    /// Sends a state if one is due.
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
         self.was_busy |= !pipeline.is_at_rest();
         let due = |noted| {

@@ -17,7 +17,7 @@ use super::record;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::Progress;
-use crate::thread::spawn_thread;
+use crate::thread;
 use hardnessd_core::exit::IO;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::stderr_line;
@@ -56,9 +56,8 @@ pub(super) async fn gather<T: Send + 'static>(
         Ok(all)
     };
     // A file may be a pipe that sends nothing.
-    let done = spawn_thread("presses", work)?;
     tokio::select! {
-        done = done => done.expect("presses are read without a panic"),
+        done = thread::run("presses", work) => done?,
         signal = end => Err(Failure::interrupted(signal)),
     }
 }

@@ -14,7 +14,7 @@ use super::player::{self, Player};
 use super::robot;
 use crate::daemon::config::Unix;
 use crate::daemon::port::BITS_A_BYTE;
-use crate::thread::spawn_thread;
+use crate::thread;
 use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
@@ -96,17 +96,15 @@ async fn play(args: Args) -> Result<(), Failure> {
     .of("--preset", USAGE)?;
     let (script, seed) = (args.faults.clone(), args.seed);
     // The script may be a pipe without a writer.
-    let faults = spawn_thread("faults", move || {
+    let faults = thread::run("faults", move || {
         let faults = script.map(|path| Faults::load(&path, seed));
         faults.unwrap_or_else(|| Ok(Faults::none()))
-    })?;
-    let faults = faults.await.expect("a script is read without a panic")?;
+    });
+    let faults = faults.await??;
     if let Some(path) = args.to.clone() {
         let (settings, shown) = (sequence(&args), path.clone());
         let work = move || record(&path, &layout, settings, faults);
-        let written = spawn_thread("record", work)?.await;
-        let written = written.expect("bytes are written without a panic");
-        return written.of(shown.display(), IO);
+        return thread::run("record", work).await?.of(shown.display(), IO);
     }
     let baud = baud(&args, &layout)?;
     let link = args.link.as_deref();
