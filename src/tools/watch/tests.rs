@@ -209,10 +209,9 @@ fn verdicts_stand_with_their_probabilities_newest_first() {
     take_event(&mut view, 9_000, verdict(4, None, Some("low_force")));
     take_event(&mut view, 9_100, status("forearm", "live"));
     let text = shown(&view, 10_200, (80, 24));
-    let lines = text
-        .lines()
-        .map(|line| line.get(32..).unwrap_or("").trim_end());
-    let lines: Vec<&str> = lines
+    let right = |line: &str| line.chars().skip(32).collect::<String>();
+    let lines = text.lines().map(|line| right(line).trim_end().to_owned());
+    let lines: Vec<String> = lines
         .skip_while(|line| !line.starts_with("verdicts"))
         .collect();
     let expected = [

@@ -298,7 +298,7 @@ fn the_levels_of_a_configuration_are_those_of_the_labels_and_of_the_data_set() {
     let sensor = "[[sensor]]\nname = \"a\"\nport = \"b\"\n";
     let level = |label, shore| format!("[[level]]\nlabel = \"{label}\"\nshore = {shore}\n");
     let levels = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 50.0]");
-    desk.write("own.toml", &format!("{sensor}{levels}"));
+    desk.write("own.toml", format!("{sensor}{levels}"));
     desk.recording("a.mcap", "level=limp");
     let all = desk.collected("own.npz", "--config own.toml a.mcap");
     assert!(all.iter().all(|press| press.level == 2), "{all:?}");
