@@ -259,7 +259,7 @@ fn of_taxels(
     let plain = presses.iter().map(gather::Press::without_gains);
     let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead).exit(FAILED)?;
     let gains: Vec<f32> = fit.gains.iter().map(|gain| gain.unwrap_or(1.0)).collect();
-    let bytes = npy::to_bytes(&gains, array.rows, array.cols);
+    let bytes = npy::to_bytes(&[array.rows, array.cols], &gains);
     part.write(&bytes).of(path.display(), IO)?;
 
     let mut text = String::from("gains, in percent; . where no press tells of it:\n");

@@ -6,6 +6,7 @@
 
 use std::io::{self, ErrorKind, Read};
 
+use half::f16;
 use serde::Deserialize;
 
 /// The longest header that is read, in bytes. Numpy writes about a hundred bytes and reads ten
@@ -13,6 +14,44 @@ use serde::Deserialize;
 const LONGEST_HEADER: usize = 10_000;
 /// The number of bytes that are unpacked at once.
 const BLOCK_BYTES: usize = 1 << 16;
+
+/// An element type that our files may hold.
+pub trait Element: Copy {
+    /// The type's name in errors.
+    const NAME: &'static str;
+    /// The type's name in numpy's headers.
+    const DESCR: &'static str;
+    /// A number of any type as this one. `None` if it does not fit.
+    fn of(number: f64) -> Option<Self>;
+    /// Adds the element's bytes.
+    fn push(self, bytes: &mut Vec<u8>);
+}
+
+macro_rules! element {
+    ($type:ident, $descr:literal, $of:expr) => {
+        impl Element for $type {
+            const NAME: &'static str = stringify!($type);
+            const DESCR: &'static str = $descr;
+            fn of(number: f64) -> Option<Self> {
+                $of(number as $type, number)
+            }
+            fn push(self, bytes: &mut Vec<u8>) {
+                bytes.extend(self.to_le_bytes());
+            }
+        }
+    };
+}
+element!(f32, "<f4", |rounded, _| Some(rounded));
+element!(u32, "<u4", exactly);
+element!(i32, "<i4", exactly);
+element!(u16, "<u2", exactly);
+element!(i16, "<i2", exactly);
+element!(u8, "|u1", exactly);
+
+/// A whole number, if it equals `number`.
+fn exactly<T: Copy + Into<f64>>(whole: T, number: f64) -> Option<T> {
+    (whole.into() == number).then_some(whole)
+}
 
 /// The header of an array.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -101,17 +140,13 @@ impl Header {
     }
 
     /// Reads the elements that follow the header, and no more bytes, and returns them row by row. It allocates
-    /// memory only for elements that are there. `convert` gives the number as the needed type, if it fits.
+    /// memory only for elements that are there.
     ///
     /// # Errors
     ///
     /// Returns an error if the elements are no numbers or one does not fit, if there are fewer or more
     /// elements, or they cannot be unpacked.
-    pub fn elements<T: Copy>(
-        &self,
-        reader: &mut impl Read,
-        convert: impl Fn(f64) -> Option<T>,
-    ) -> io::Result<Vec<T>> {
+    pub fn elements<T: Element>(&self, reader: &mut impl Read) -> io::Result<Vec<T>> {
         let count = self.count();
         let count = count.ok_or_else(|| self.unexpected_shape())?;
         let size = size(&self.descr);
@@ -128,8 +163,8 @@ impl Header {
             for bytes in block.chunks_exact(size) {
                 let value = number(&self.descr, bytes);
                 let place = values.len();
-                let converted = convert(value);
-                values.push(converted.ok_or_else(|| unusable(format!("{value:?} at {place}")))?);
+                let element = T::of(value);
+                values.push(element.ok_or_else(|| unusable(format!("{value:?} at {place}")))?);
             }
             if block.len() < wanted {
                 let found = values.len();
@@ -214,24 +249,12 @@ fn number(descr: &str, bytes: &[u8]) -> f64 {
     }
     let bits = u64::from_le_bytes(low_first);
     match (&descr[1..2], bytes.len()) {
-        ("f", 2) => half(bits as u16),
+        ("f", 2) => f16::from_bits(bits as u16).to_f64(),
         ("f", 4) => f32::from_bits(bits as u32).into(),
         ("f", _) => f64::from_bits(bits),
         ("i", _) => ((bits << unused).cast_signed() >> unused) as f64,
         _ => bits as f64,
     }
-}
-
-/// The number that a float16 of IEEE 754 is.
-fn half(bits: u16) -> f64 {
-    let (exponent, fraction) = (bits >> 10 & 31, f64::from(bits & 0x3FF));
-    let size = match exponent {
-        0 => fraction * 2_f64.powi(-24),
-        31 if fraction == 0.0 => f64::INFINITY,
-        31 => f64::NAN,
-        _ => (1.0 + fraction / 1024.0) * 2_f64.powi(i32::from(exponent) - 15),
-    };
-    if bits & 0x8000 == 0 { size } else { -size }
 }
 
 /// Reads a table of numbers, row by row.
@@ -244,24 +267,25 @@ pub fn table(reader: &mut impl Read) -> io::Result<Vec<Vec<f32>>> {
     let (&[_, cols], Some(1..)) = (header.shape.as_slice(), header.count()) else {
         return Err(header.unexpected_shape());
     };
-    let values = header.elements(reader, |value| Some(value as f32))?;
+    let values: Vec<f32> = header.elements(reader)?;
     Ok(values.chunks_exact(cols).map(<[f32]>::to_vec).collect())
 }
 
-/// The bytes of an array of f32 with `rows` rows and `cols` columns, row by row, in numpy's format.
+/// The bytes of an array of this shape in numpy's format. The elements are row by row.
 ///
 /// # Panics
 ///
-/// Panics if there are not `rows * cols` values.
-pub fn to_bytes(values: &[f32], rows: usize, cols: usize) -> Vec<u8> {
-    assert_eq!(values.len(), rows * cols, "a value for each row and column");
+/// Panics if the shape has another number of elements.
+pub fn to_bytes<T: Element>(shape: &[usize], elements: &[T]) -> Vec<u8> {
     let header = Header {
-        descr: "<f4".to_owned(),
+        descr: T::DESCR.to_owned(),
         fortran_order: false,
-        shape: vec![rows, cols],
+        shape: shape.to_vec(),
     };
+    assert_eq!(header.count(), Some(elements.len()), "{shape:?}");
     let mut bytes = header.to_bytes();
-    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes.reserve_exact(size_of_val(elements));
+    elements.iter().for_each(|element| element.push(&mut bytes));
     bytes
 }
 
@@ -351,23 +375,22 @@ mod tests {
     #[test]
     fn no_more_is_unpacked_than_the_header_asks_for() {
         let mut endless = Endless(0);
-        let elements = of("<f4", false, &[10, 100]).elements(&mut endless, Some);
+        let elements = of("<f4", false, &[10, 100]).elements::<f32>(&mut endless);
         assert_eq!(elements.unwrap_err().to_string(), "more than 1000 elements");
         assert!(endless.0 <= 4_001, "{} bytes were unpacked", endless.0);
         let header = of("<f4", false, &[1 << 40, 1 << 40]);
-        let error = header.elements(&mut &[0; 7][..], Some).unwrap_err();
+        let error = header.elements::<f32>(&mut &[0; 7][..]).unwrap_err();
         let expected = "an array of shape [1099511627776, 1099511627776]";
         assert_eq!(error.to_string(), expected);
     }
 
     #[test]
     fn numbers_of_every_type_are_read_if_they_fit() {
-        let read = |descr: &str, bytes: &[u8]| {
+        fn read<T: Element>(descr: &str, bytes: &[u8]) -> Result<Vec<T>, String> {
             let header = of(descr, false, &[bytes.len() / size(descr).unwrap_or(1)]);
-            let fits = |value| (value < 300.0).then_some(value);
-            let read = header.elements(&mut &*bytes, fits);
+            let read = header.elements(&mut &*bytes);
             read.map_err(|error| error.to_string())
-        };
+        }
         let half = [0.5_f32.to_le_bytes(), (-2.0_f32).to_le_bytes()].concat();
         let double = [0.5_f64.to_le_bytes(), (-2.0_f64).to_le_bytes()].concat();
         let long = [7_i64.to_le_bytes(), (-7_i64).to_le_bytes()].concat();
@@ -381,8 +404,8 @@ mod tests {
             (">f4", &[0x3F, 0x80, 0, 0, 0xC0, 0, 0, 0], [1.0, -2.0]),
             ("<f8", &double, [0.5, -2.0]),
             // 1, and the least number.
-            ("<f2", &[0, 0x3C, 1, 0], [1.0, 2_f64.powi(-24)]),
-            (">f2", &[0xC0, 0, 0x35, 0x55], [-2.0, 0.333_251_953_125]),
+            ("<f2", &[0, 0x3C, 1, 0], [1.0, 2_f32.powi(-24)]),
+            (">f2", &[0xC0, 0, 0x35, 0x55], [-2.0, 0.333_251_95]),
         ] {
             assert_eq!(read(descr, bytes), Ok(expected.to_vec()), "{descr}");
         }
@@ -391,14 +414,14 @@ mod tests {
             ("<f2", &[0, 0x7C], "inf at 0"),
             ("|O", &[0; 4], "dtype '|O'"),
         ] {
-            assert_eq!(read(descr, bytes), Err(expected.to_owned()));
+            assert_eq!(read::<u8>(descr, bytes), Err(expected.to_owned()));
         }
     }
 
     #[test]
     fn a_table_is_read_in_both_orders_as_it_is_written() {
-        let values = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
-        let bytes = to_bytes(&values, 2, 3);
+        let values = [1.0_f32, 2.0, 3.0, 4.0, 5.0, 6.0];
+        let bytes = to_bytes(&[2, 3], &values);
         let rows = table(&mut bytes.as_slice()).unwrap();
         assert_eq!(rows, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
         let numbers = &bytes[bytes.len() - 24..];

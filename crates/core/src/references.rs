@@ -94,7 +94,7 @@ fn is_usable(press: &ReferencePress) -> bool {
 ///
 /// Returns the errors of packing.
 pub fn write(references: &[ReferencePress]) -> std::io::Result<Vec<u8>> {
-    let mut npz = Writer::compressed(Cursor::new(Vec::new()));
+    let mut npz = Writer::new(Cursor::new(Vec::new()));
     for (number, press) in references.iter().enumerate() {
         npz.add_list(&number.to_string(), &serde_json::to_vec(press)?)?;
     }
@@ -148,7 +148,7 @@ mod tests {
         let mut strong = press(4, flat(1.0));
         strong.course.moments[2].frame.newtons[7] = 2e6;
         let text = |bytes: &[u8]| {
-            let mut npz = Writer::compressed(Cursor::new(Vec::new()));
+            let mut npz = Writer::new(Cursor::new(Vec::new()));
             npz.add_list("0", bytes).unwrap();
             npz.finish().unwrap().into_inner()
         };

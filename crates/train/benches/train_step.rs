@@ -132,7 +132,7 @@ impl Inputs {
 
     fn write(&self, path: &Path) {
         let file = std::fs::File::create(path).expect("a file that can be written");
-        let mut npz = Writer::compressed(file);
+        let mut npz = Writer::new(file);
         let mut add = |name: &str, dims: &[usize], values: Vec<f32>| {
             npz.add(name, dims, &values).expect("room on the disk");
         };

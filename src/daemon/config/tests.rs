@@ -129,8 +129,8 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
     );
     std::fs::write(&path, &text).unwrap();
     let write = |bytes: &[u8]| std::fs::write(directory.path().join("gains.npy"), bytes).unwrap();
-    let gains = [1.0, 1.1, 0.9, 1.0, 0.5, 2.0];
-    write(&npy::to_bytes(&gains, 2, 3));
+    let gains = [1.0_f32, 1.1, 0.9, 1.0, 0.5, 2.0];
+    write(&npy::to_bytes(&[2, 3], &gains));
     let rows = vec![gains[..3].to_vec(), gains[3..].to_vec()];
     let read = checked(&path).unwrap();
     assert_eq!(
@@ -138,11 +138,11 @@ fn gains_are_read_from_a_file_beside_the_configuration() {
         Some(tare::Gains::Taxels(rows))
     );
     // The sensor begins anew with other gains.
-    write(&npy::to_bytes(&gains.map(|gain| 2.0 * gain), 2, 3));
+    write(&npy::to_bytes(&[2, 3], &gains.map(|gain| 2.0 * gain)));
     let changed = checked(&path).unwrap();
     assert_ne!(read, changed);
     assert_eq!(read.fixed_difference(&changed), None);
-    write(&npy::to_bytes(&gains, 3, 2));
+    write(&npy::to_bytes(&[3, 2], &gains));
     let error = checked(&path).unwrap_err();
     let expected = "sensor.calibration.gains of \"sensor\": found 3 rows of 2, expected 2 of 3";
     assert!(error.contains(expected) && !error.contains('\n'), "{error}");

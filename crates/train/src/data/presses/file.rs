@@ -13,7 +13,8 @@ use super::{MILLINEWTON, Press, Presses};
 use crate::data::source::{Kind, MOST_LEVELS, SIMULATOR, Source};
 use crate::exit::unreadable;
 use hardnessd_core::frame::Array;
-use hardnessd_core::npz::{ANY, Element, Reader, Unexpected, Writer, within};
+use hardnessd_core::npy::Element;
+use hardnessd_core::npz::{ANY, Reader, Unexpected, Writer, within};
 use hardnessd_core::verdict::{
     COLS, COURSE_FRAMES, Level, Piece, ROWS, TAXELS, are_levels, sha256_hex,
 };
@@ -305,7 +306,7 @@ pub fn write<W: Write + Seek>(
     layout: Layout,
     meta: &Value,
 ) -> io::Result<W> {
-    let mut npz = Writer::compressed(out);
+    let mut npz = Writer::new(out);
     let all = &presses.all;
     match layout {
         Layout::Frames => {

@@ -164,7 +164,7 @@ type Npz = Writer<Cursor<Vec<u8>>>;
 
 /// The bytes of a file with the arrays that `fill` adds.
 fn npz(fill: impl FnOnce(&mut Npz)) -> Vec<u8> {
-    let mut npz = Writer::compressed(Cursor::new(Vec::new()));
+    let mut npz = Writer::new(Cursor::new(Vec::new()));
     fill(&mut npz);
     npz.finish().unwrap().into_inner()
 }
