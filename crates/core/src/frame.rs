@@ -153,10 +153,10 @@ impl Default for Pitch {
 ///
 /// let array = Array { rows: 10, cols: 12 };
 /// let mut raw = RawFrame::zero(array);
-/// raw.counts[array.place(0, 0)] = 200.0;
-/// assert_eq!(format!("{raw:?}"), "RawFrame { array: 10x12, sum: 200.0, peak: 200.0 }");
+/// raw.counts[array.place(1, 0)] = 200.0;
+/// assert_eq!(raw.counts[12], 200.0);
 /// ```
-#[derive(Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RawFrame {
     /// The size of the array.
     pub array: Array,
@@ -182,28 +182,6 @@ impl Default for RawFrame {
     }
 }
 
-impl std::fmt::Debug for RawFrame {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        summary(f, "RawFrame", self.array, &self.counts)
-    }
-}
-
-/// Prints the sum and the peak, because hundreds of numbers are unreadable in a log or a failed
-/// assertion.
-pub(crate) fn summary(
-    f: &mut std::fmt::Formatter<'_>,
-    name: &str,
-    array: Array,
-    taxels: &[f32],
-) -> std::fmt::Result {
-    let peak = taxels.iter().copied().fold(f32::MIN, f32::max);
-    f.debug_struct(name)
-        .field("array", &format_args!("{array}"))
-        .field("sum", &force_n(taxels))
-        .field("peak", &peak)
-        .finish()
-}
-
 impl std::fmt::Display for Array {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}x{}", self.rows, self.cols)
@@ -222,7 +200,7 @@ impl std::fmt::Display for Array {
 /// assert_eq!(frame.contact_area_taxels(0.07), 4);
 /// assert_eq!(frame.force_n(), 2.0);
 /// ```
-#[derive(Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
     /// The size of the array.
     pub array: Array,
@@ -235,12 +213,6 @@ impl Default for Frame {
     /// A frame of zeros of the JX255N.
     fn default() -> Self {
         Self::zero(Array::JX255N)
-    }
-}
-
-impl std::fmt::Debug for Frame {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        summary(f, "Frame", self.array, &self.newtons)
     }
 }
 

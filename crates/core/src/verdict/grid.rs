@@ -27,7 +27,7 @@ const SAME_PITCH: f64 = 0.02;
 /// assert_eq!(frame.contact_area_taxels(0.07), 4);
 /// assert_eq!(frame.force_n(), 2.0);
 /// ```
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModelFrame {
     /// `[ROWS, COLS]` flattened, row-major, in newtons a taxel; finite. Noise around a contact makes
     /// some of them negative.
@@ -39,12 +39,6 @@ impl Default for ModelFrame {
         Self {
             newtons: [0.0; TAXELS],
         }
-    }
-}
-
-impl std::fmt::Debug for ModelFrame {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        frame::summary(f, "ModelFrame", Array::JX255N, &self.newtons)
     }
 }
 
@@ -103,11 +97,15 @@ impl Resampling {
     pub fn new(best: &Frame, pitch: Pitch, model_mm: f64) -> Self {
         let Array { rows, cols } = best.array;
         let (row, col) = best.centre();
-        let is_same = |mm: f64| (mm / model_mm - 1.0).abs() <= SAME_PITCH;
+        // Taxels of the same pitch move as they are.
+        let [height, width] = [pitch.rows_mm, pitch.cols_mm].map(|mm| match mm / model_mm {
+            length if (length - 1.0).abs() <= SAME_PITCH => 1.0,
+            length => length,
+        });
         Self {
-            rows: shares(rows, pitch.rows_mm / model_mm, ROWS, row),
-            cols: shares(cols, pitch.cols_mm / model_mm, COLS, col),
-            is_resampled: !(is_same(pitch.rows_mm) && is_same(pitch.cols_mm)),
+            rows: shares(rows, height, ROWS, row),
+            cols: shares(cols, width, COLS, col),
+            is_resampled: (height, width) != (1.0, 1.0),
         }
     }
 
@@ -139,12 +137,6 @@ impl Resampling {
 /// How a side of `count` taxels, each as long as `length` model taxels, lies on a side of `grid` model
 /// taxels. The contact's centre is at taxel `centre`.
 fn shares(count: usize, length: f64, grid: usize, centre: f64) -> Vec<Vec<(usize, f32)>> {
-    // Taxels of the same pitch move as they are.
-    let length = if (length - 1.0).abs() <= SAME_PITCH {
-        1.0
-    } else {
-        length
-    };
     let whole = count as f64 * length;
     // The place of the array's border on the grid, negative if the array begins before it. It
     // is a whole number, so that taxels half or a third as long share no border.
