@@ -219,7 +219,7 @@ impl SensorCore {
             last_frame: pipeline.last_frame().map(|frame| frame.mono),
             contact_threshold_n: pipeline.sensor().thresholds().contact_threshold_n,
             unjudged: self.unjudged,
-            motion: pipeline.motion_counts(),
+            motion: pipeline.track().counts(),
         }
     }
 }

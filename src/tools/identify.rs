@@ -199,9 +199,12 @@ fn of_file(
 ) -> Result<Vec<ReferencePress>, Failure> {
     let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
     played.playback.keep_courses();
+    let grid_mm = hrn.card().pitch_mm.into();
     let mut courses = Vec::new();
     played.play(|played, _, _| {
-        courses.extend(played.playback.courses(sensor.name()));
+        let ended = played.playback.ended().into_iter();
+        let ended = ended.filter(|press| press.sensor == sensor.name());
+        courses.extend(ended.map(|press| press.course(grid_mm)));
         Ok(true)
     })?;
     let labels = played.playback.labels();

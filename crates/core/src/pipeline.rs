@@ -27,7 +27,7 @@ use crate::motion::Track;
 use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{Aim, Contact, RetareError, Tare};
-use crate::verdict::{Hrn, TimeSeries};
+use crate::verdict::Hrn;
 use crate::wire::{Decoded, Decoder};
 
 /// The source of the frames' times.
@@ -134,12 +134,6 @@ impl Pipeline {
         Some(outcome.map(|[old, new]| Tared { sensor, old, new }))
     }
 
-    /// The number of positions since the start, and the number of them that came too late for their
-    /// verdict.
-    pub fn motion_counts(&self) -> (u64, u64) {
-        self.judge.track.counts()
-    }
-
     /// The positions of the arm.
     pub fn track(&self) -> &Track {
         &self.judge.track
@@ -150,7 +144,7 @@ impl Pipeline {
         std::mem::take(&mut self.judge.unjudged)
     }
 
-    /// Keeps each press that ends from now on, until [`Self::ended`] or [`Self::courses`] returns it.
+    /// Keeps each press that ends from now on, until [`Self::ended`] returns it.
     pub fn keep_courses(&mut self) {
         self.judge.ended.get_or_insert_default();
     }
@@ -159,13 +153,6 @@ impl Pipeline {
     pub fn ended(&mut self) -> Vec<EndedPress> {
         let kept = self.judge.ended.as_mut();
         kept.map(std::mem::take).unwrap_or_default()
-    }
-
-    /// The same as a model of courses takes them.
-    pub fn courses(&mut self) -> Vec<TimeSeries> {
-        let grid_mm = self.hrn().card().pitch_mm.into();
-        let ended = self.ended().into_iter();
-        ended.map(|press| press.course(grid_mm)).collect()
     }
 
     /// The own presses of the sensor.

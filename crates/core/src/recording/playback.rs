@@ -7,11 +7,10 @@ use super::{Entry, Found, Labels, RecordedSensor, State};
 use crate::event::Event;
 use crate::frame::Stamp;
 use crate::judge::{EndedPress, Unjudged};
-use crate::motion::Track;
 use crate::pipeline::{Clock, Pipeline};
 use crate::press::End;
 use crate::sensor::Sensor;
-use crate::verdict::{Hrn, ModelError, TimeSeries};
+use crate::verdict::{Hrn, ModelError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -100,7 +99,7 @@ impl Playback {
         playback
     }
 
-    /// Keeps each press that ends, until [`Self::ended`] or [`Self::courses`] returns it.
+    /// Keeps each press that ends, until [`Self::ended`] returns it.
     pub fn keep_courses(&mut self) {
         self.keeps_courses = true;
         for player in &mut self.players {
@@ -112,15 +111,6 @@ impl Playback {
     pub fn ended(&mut self) -> Vec<EndedPress> {
         let players = self.players.iter_mut();
         players.flat_map(|player| player.pipeline.ended()).collect()
-    }
-
-    /// The kept presses of a sensor as a model of courses takes them.
-    pub fn courses(&mut self, sensor: &str) -> Vec<TimeSeries> {
-        let mut players = self.players.iter_mut();
-        let player = players.find(|player| player.pipeline.sensor().name() == sensor);
-        player
-            .map(|player| player.pipeline.courses())
-            .unwrap_or_default()
     }
 
     /// Judges the presses of a sensor with `hrn`, which has references of that sensor.
@@ -233,11 +223,6 @@ impl Playback {
     pub fn pipeline(&self, sensor: &str) -> Option<&Pipeline> {
         let mut pipelines = self.players.iter().map(|player| &player.pipeline);
         pipelines.find(|pipeline| pipeline.sensor().name() == sensor)
-    }
-
-    /// The positions of a sensor's arm, as its pipeline knows them.
-    pub fn track(&self, sensor: &str) -> Option<&Track> {
-        self.pipeline(sensor).map(Pipeline::track)
     }
 
     /// What cannot be played, in words: a clip of a recording may begin inside a press. It is played

@@ -164,7 +164,7 @@ fn positions_after_the_final_verdict_are_counted() {
     judged(&mut pipeline, |_| Vec::new());
     pipeline.judge.track.push(&positions(2000, 4000)).unwrap();
     // The press's last frame in contact came at 3 s.
-    assert_eq!(pipeline.motion_counts(), (41, 21));
+    assert_eq!(pipeline.track().counts(), (41, 21));
 }
 
 #[test]
