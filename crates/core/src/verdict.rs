@@ -29,6 +29,7 @@ pub use self::card::{
 };
 pub use self::course::{COURSE_FRAMES, Moment, TimeSeries};
 pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
+use self::error::{JUDGING, RUNNING};
 use self::file::File;
 pub use self::file::{are_levels, check_line};
 pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
@@ -133,32 +134,32 @@ impl Hrn {
         // The file's types and shapes of values inside the graph are not needed, and are unchecked.
         let onnx = tract_onnx::onnx().with_ignore_value_info(true);
         let proto = onnx.proto_model_for_read(&mut &*bytes);
-        let mut proto = proto.map_err(|error| {
-            ModelError::new(format!("not an ONNX model: {}", error.root_cause()))
-        })?;
+        let mut proto = proto.map_err(ModelError::of("not an ONNX model"))?;
         let file = File::read(&proto)?;
         proto.graph.iter().try_for_each(guard::check_operators)?;
         // The inference library would keep a copy of the metadata.
         proto.metadata_props.clear();
         let inference = onnx.model_for_proto_model(&proto);
-        let mut inference = inference.map_err(ModelError::of_graph)?;
+        let mut inference = inference.map_err(ModelError::of(RUNNING))?;
         // The protobuf is as large as the weights. Only the plan is needed from here on.
         drop(proto);
         for (at, input) in file.inputs.iter().enumerate() {
             let shape = input.shape(file.lengths);
             let fixed = inference.with_input_fact(at, f32::fact(&shape).into());
-            inference = fixed.map_err(ModelError::of_graph)?;
+            inference = fixed.map_err(ModelError::of(RUNNING))?;
         }
         let typed = inference.into_typed();
         let typed = typed.and_then(TypedModel::into_decluttered);
-        let mut optimized = typed.map_err(ModelError::of_graph)?;
+        let mut optimized = typed.map_err(ModelError::of(RUNNING))?;
         guard::check_values(&optimized)?;
-        optimized.optimize().map_err(ModelError::of_graph)?;
+        optimized.optimize().map_err(ModelError::of(RUNNING))?;
         for (place, output) in file.outputs.iter().enumerate() {
             let Some(lengths) = file.lengths_of(output) else {
                 continue;
             };
-            let fact = optimized.output_fact(place).map_err(ModelError::of_graph)?;
+            let fact = optimized
+                .output_fact(place)
+                .map_err(ModelError::of(RUNNING))?;
             let is_float = fact.datum_type == f32::datum_type();
             let shape = fact.shape.as_concrete();
             if !(is_float && matches!(shape, Some([1, length]) if lengths.contains(length))) {
@@ -170,7 +171,7 @@ impl Hrn {
         }
         let plan = optimized.into_runnable();
         Ok(Self {
-            plan: plan.map_err(ModelError::of_graph)?,
+            plan: plan.map_err(ModelError::of(RUNNING))?,
             file,
             sha256: sha256_hex(bytes),
             references: References::NONE,
@@ -235,7 +236,7 @@ impl Hrn {
         let least = if input == Input::Frame { 0.0 } else { f32::MIN };
         let newtons: Vec<f32> = newtons.iter().map(|newtons| newtons.max(least)).collect();
         let tensor = Tensor::from_shape(&input.shape(self.file.lengths), &newtons);
-        let tensor = tensor.map_err(ModelError::of_judgement)?;
+        let tensor = tensor.map_err(ModelError::of(JUDGING))?;
         self.verdict(&self.run(tvec!(tensor.into()))?, Knowledge::None)
     }
 
@@ -383,13 +384,13 @@ impl Hrn {
         let mut inputs = TVec::new();
         for input in &self.file.inputs {
             let tensor = input.tensor(query, self.file.lengths);
-            inputs.push(tensor.map_err(ModelError::of_judgement)?.into());
+            inputs.push(tensor.map_err(ModelError::of(JUDGING))?.into());
         }
         self.run(inputs)
     }
 
     fn run(&self, inputs: TVec<TValue>) -> Result<TVec<TValue>, ModelError> {
-        self.plan.run(inputs).map_err(ModelError::of_judgement)
+        self.plan.run(inputs).map_err(ModelError::of(JUDGING))
     }
 
     /// The numbers of an output, if the model has it.
@@ -398,8 +399,8 @@ impl Hrn {
             return Ok(None);
         };
         let view = outputs[place].try_as_plain_ram();
-        let view = view.map_err(ModelError::of_judgement)?;
-        let values = view.as_slice::<f32>().map_err(ModelError::of_judgement)?;
+        let view = view.map_err(ModelError::of(JUDGING))?;
+        let values = view.as_slice::<f32>().map_err(ModelError::of(JUDGING))?;
         match values.iter().all(|value| value.is_finite()) {
             true => Ok(Some(values.to_vec())),
             false => Err(ModelError::new(format!(

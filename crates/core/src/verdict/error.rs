@@ -10,6 +10,9 @@ pub const MAX_FILE_BYTES: usize = 64_000_000;
 pub const MIN_OPSET: i64 = 17;
 /// The largest accepted difference from the check frames' probabilities.
 pub const CHECK_TOLERANCE: f32 = 1e-4;
+/// What failed inside the inference library.
+pub(super) const RUNNING: &str = "model graph cannot be run";
+pub(super) const JUDGING: &str = "model could not judge a frame";
 /// The largest accepted difference from the check presses' Shore hardness.
 pub const SHORE_TOLERANCE: f32 = 1e-2;
 
@@ -37,18 +40,9 @@ impl ModelError {
         ))
     }
 
-    /// The error of a graph that cannot be run. Of the library's messages, the outer ones name only its
-    /// own stages.
-    #[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
-    pub(super) fn of_graph(error: TractError) -> Self {
-        let cause = error.root_cause();
-        Self(format!("model graph cannot be run: {cause}"))
-    }
-
-    /// The error of a judgement that failed inside the inference library.
-    #[expect(clippy::needless_pass_by_value, reason = "for `map_err`")]
-    pub(super) fn of_judgement(error: TractError) -> Self {
-        let cause = error.root_cause();
-        Self(format!("model could not judge a frame: {cause}"))
+    /// The error of what failed inside the inference library. Of the library's messages, the outer ones
+    /// name only its own stages.
+    pub(super) fn of(what: &str) -> impl Fn(TractError) -> Self {
+        move |error| Self(format!("{what}: {}", error.root_cause()))
     }
 }

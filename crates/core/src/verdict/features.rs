@@ -67,17 +67,19 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
     let felt = felt.map(|(place, &newtons)| (place / COLS, place % COLS, newtons));
     let felt: Vec<(usize, usize, f32)> = felt.collect();
     let peak = felt.iter().map(|taxel| taxel.2).fold(0.0, f32::max);
-    let mut sums = Sums::default();
+    // The force over all taxels has its sign, so that noise cancels. The taxels in contact count alike.
+    let (mut of_force, mut of_contact) = (Moments::default(), Moments::default());
+    let mut squares = 0.0;
     let mut counts = [0.0_f32; 5];
     let mut shares = [0.0_f32; 3];
     let (mut roughness, mut border) = (0.0, 0.0);
     for &(row, col, newtons) in &felt {
-        sums.of_force.add(row, col, newtons);
+        of_force.add(row, col, newtons);
         if newtons < CONTACT_N {
             continue;
         }
-        sums.of_contact.add(row, col, 1.0);
-        sums.squares += newtons * newtons;
+        of_contact.add(row, col, 1.0);
+        squares += newtons * newtons;
         for (count, threshold_n) in counts.iter_mut().zip(COUNTED_N) {
             *count += f32::from(u8::from(newtons >= threshold_n));
         }
@@ -99,11 +101,11 @@ pub fn of_frame(frame: &ModelFrame) -> FrameFeatures {
             }
         }
     }
-    let (spread, elongation) = sums.of_force.moments();
-    let (width, oblong) = sums.of_contact.moments();
-    let (force, area) = (sums.of_force.total.max(0.0), sums.of_contact.total);
-    let fourth = sums.fourth(&felt);
-    let effective = force * force / (sums.squares + TINY);
+    let (spread, elongation) = of_force.moments();
+    let (width, oblong) = of_contact.moments();
+    let (force, area) = (of_force.total.max(0.0), of_contact.total);
+    let fourth = of_force.fourth(&felt);
+    let effective = force * force / (squares + TINY);
     let [c02, c05, c1, c2, c4] = counts.map(f32::ln_1p);
     let [half, quarter, most] = shares.map(|count| (count + 0.5).ln());
     [
@@ -144,29 +146,6 @@ pub fn force_n(frame: &FrameFeatures) -> f32 {
     (frame[FORCE].exp() - LITTLE_N).max(0.0)
 }
 
-/// Sums of the force over all taxels, with its sign, so that noise cancels; and over the taxels in
-/// contact, all alike.
-#[derive(Default)]
-struct Sums {
-    of_force: Moments,
-    of_contact: Moments,
-    squares: f32,
-}
-
-impl Sums {
-    /// The fourth moment of the force of these taxels about its centre.
-    fn fourth(&self, felt: &[(usize, usize, f32)]) -> f32 {
-        let [centre_row, centre_col] = self.of_force.centre();
-        let moment = |&(row, col, newtons): &(usize, usize, f32)| {
-            let (row, col) = centred(row, col);
-            let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
-            newtons * square * square
-        };
-        let sum: f32 = felt.iter().map(moment).sum();
-        (sum / self.of_force.weight()).clamp(0.0, MOST_MOMENT * MOST_MOMENT)
-    }
-}
-
 /// A taxel's place from the middle of the grid.
 fn centred(row: usize, col: usize) -> (f32, f32) {
     let middle = |length: usize| (length as f32 - 1.0) / 2.0;
@@ -199,6 +178,18 @@ impl Moments {
     /// The divisor of sums. It is positive, even where noise outweighs a light touch.
     fn weight(&self) -> f32 {
         self.total.max(0.0) + TINY
+    }
+
+    /// The fourth moment of these taxels' weight about its centre.
+    fn fourth(&self, taxels: &[(usize, usize, f32)]) -> f32 {
+        let [centre_row, centre_col] = self.centre();
+        let moment = |&(row, col, weight): &(usize, usize, f32)| {
+            let (row, col) = centred(row, col);
+            let square = (row - centre_row).powi(2) + (col - centre_col).powi(2);
+            weight * square * square
+        };
+        let sum: f32 = taxels.iter().map(moment).sum();
+        (sum / self.weight()).clamp(0.0, MOST_MOMENT * MOST_MOMENT)
     }
 
     /// The trace of the second central moments, and their anisotropy from 0 (round) to 1 (a line).

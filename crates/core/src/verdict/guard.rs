@@ -12,7 +12,7 @@ use tract_onnx::pb;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::ops::scan::Scan;
 
-use super::error::ModelError;
+use super::error::{ModelError, RUNNING};
 use super::file::shown;
 
 /// Operators whose input decides which graph runs, and how often.
@@ -126,7 +126,7 @@ pub(super) fn check_values(model: &TypedModel) -> Result<(), ModelError> {
         }
         if !TAKES_ANY_INTEGER.contains(&&*node.op.name()) {
             for &input in &node.inputs {
-                let fact = model.outlet_fact(input).map_err(ModelError::of_graph)?;
+                let fact = model.outlet_fact(input).map_err(ModelError::of(RUNNING))?;
                 let is_integer = fact.datum_type.is_integer() || fact.datum_type.is_tdim();
                 if is_integer && fact.konst.is_none() {
                     return refused("it takes integers that depend on an input of the model");
