@@ -12,7 +12,7 @@ use super::shore::{Level, Shore};
 use crate::frame::{Array, Pitch};
 
 /// The range of forces and areas in training. A verdict on a press outside it has the note
-/// `outside_training`. Other keys, which earlier trainers wrote, are passed over.
+/// `outside_training`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Range {
     /// The least and the greatest total force of a training frame, in newtons.

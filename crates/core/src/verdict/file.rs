@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, IgnoredAny};
 use tract_onnx::pb;
 use tract_onnx::pb::tensor_shape_proto::dimension::Value as Dimension;
 
@@ -34,6 +34,18 @@ const BINS: RangeInclusive<usize> = 10..=400;
 const NUMBERS: RangeInclusive<usize> = 1..=1024;
 /// The key of the checks.
 const CHECK: &str = "hrn.check";
+/// The keys of `hrn.range`. Earlier trainers also wrote the last five, into the built-in model too: they have
+/// no effect.
+const RANGES: [&str; 8] = [
+    "force_n",
+    "contact_area_taxels",
+    "pitch_mm",
+    "duration_s",
+    "frame_period_s",
+    "speed_mm_s",
+    "approach_mm",
+    "arm_n_per_mm",
+];
 
 /// What breaks the format, so that all of it is said at once.
 #[derive(Default)]
@@ -381,9 +393,7 @@ fn card(metadata: &Metadata<'_>, problems: &mut Problems) -> Option<Card> {
     let metrics = problems.keep(metadata.json("hrn.metrics", "JSON", |_| true));
     let format = format?;
     let is_of_frames = format == "1";
-    let range = "[least, greatest] of finite numbers for `force_n` and `contact_area_taxels`, and perhaps \
-                 `pitch_mm`";
-    let range = problems.keep(metadata.json("hrn.range", range, is_range));
+    let range = problems.keep(range(metadata));
     let grid = format!("[rows, columns], each 1 to {MOST_SIDE}, in a file of format 1");
     let grid = problems.keep(
         metadata.json_if_any("hrn.grid", &grid, |sides: &[usize; 2]| {
@@ -416,6 +426,17 @@ fn format(metadata: &Metadata<'_>) -> Result<String, ModelError> {
     match ["1", "3"].contains(&format) {
         true => Ok(format.to_owned()),
         false => Err(ModelError::of_key(key, shown(format), "\"1\" or \"3\"")),
+    }
+}
+
+fn range(metadata: &Metadata<'_>) -> Result<Range, ModelError> {
+    let key = "hrn.range";
+    let expected = "[least, greatest] of finite numbers for `force_n` and `contact_area_taxels`, and perhaps \
+                    `pitch_mm`";
+    let given: BTreeMap<String, IgnoredAny> = metadata.json(key, expected, |_| true)?;
+    match given.keys().find(|name| !RANGES.contains(&name.as_str())) {
+        Some(unknown) => Err(ModelError::of_key(key, shown(unknown), expected)),
+        None => metadata.json(key, expected, is_range),
     }
 }
 

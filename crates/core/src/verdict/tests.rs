@@ -146,6 +146,9 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
         ("expected [least, greatest]", |p| {
             edit(p, "hrn.range", |range| range["force_n"] = json!([2, 1]));
         }),
+        ("`hrn.range`: found \"pitch\", expected [least", |p| {
+            edit(p, "hrn.range", |range| range["pitch"] = json!([1.5, 5]));
+        }),
         ("`hrn.metrics`: found", |p| set(p, "hrn.metrics", "{")),
         (
             "found 7 of other lengths or number, expected 8, or two a level, each with 4",
@@ -291,6 +294,17 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
     for (expected, change) in changes {
         refused_by(&encoded(8, &[], change), expected);
     }
+    // A model that takes references gives its distribution, and not logits of levels.
+    let renamed = changed(BUILT_IN, |p| {
+        let graph = graph(p);
+        let nodes = graph.node.iter_mut().flat_map(|node| &mut node.output);
+        let outputs = graph.output.iter_mut().map(|output| &mut output.name);
+        let of_bins = nodes.chain(outputs).filter(|name| *name == "bins");
+        of_bins.for_each(|name| *name = "logits".to_owned());
+    });
+    let error = Hrn::load(&renamed).unwrap_err().to_string();
+    let expected = "model outputs: found \"logits, reference\", expected bins, reference";
+    assert_eq!(error, expected);
     type OfCheck = fn(&mut Value);
     let checks: &[(&str, OfCheck)] = &[
         (
