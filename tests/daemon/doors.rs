@@ -5,7 +5,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use hardnessd_core::test_support::of_a_press;
+use hardnessd_core::tests::support::of_a_press;
 use hardnessd_core::trial;
 use proptest::prelude::*;
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};

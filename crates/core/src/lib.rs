@@ -30,6 +30,4 @@ pub mod pipeline;
 pub mod recording;
 pub mod trial;
 #[cfg(any(test, feature = "test-support"))]
-pub mod test_support;
-#[cfg(test)]
-mod tests;
+pub mod tests;

@@ -1,4 +1,7 @@
-//! What the tests of several modules need.
+//! What the tests of several modules need, also those of the other crates.
 
+#[cfg(test)]
 pub(crate) mod course_model;
+#[cfg(test)]
 pub(crate) mod graph;
+pub mod support;

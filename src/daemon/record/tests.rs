@@ -3,11 +3,11 @@ use std::sync::mpsc::Receiver;
 use super::*;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
-use hardnessd_core::test_support;
+use hardnessd_core::tests::support;
 
 /// A recorder with room for so many bytes.
 fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) {
-    let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
+    let pipeline = Pipeline::new(support::sensor(), support::hrn(), Clock::Arrival);
     let active = Active {
         jobs: Jobs::new(sender, bytes),
         index: 0,
@@ -75,7 +75,7 @@ fn after_a_gap_comes_a_state() {
 fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
     let (sender, inbox) = channel();
     let (mut recorder, _) = recorder(sender, QUEUED_BYTES);
-    let pressed = test_support::of_a_press(|_| {}, None, false);
+    let pressed = support::of_a_press(|_| {}, None, false);
     let entries = hardnessd_core::recording::Reader::new(&pressed.0[..]);
     let inputs: Vec<_> = entries
         .map(Result::unwrap)
@@ -84,7 +84,7 @@ fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
             _ => None,
         })
         .collect();
-    let mut pipeline = Pipeline::new(pressed.1, test_support::hrn(), Clock::Arrival);
+    let mut pipeline = Pipeline::new(pressed.1, support::hrn(), Clock::Arrival);
     let mut note = |pipeline: &mut Pipeline, (input, at): &(Input, Stamp)| {
         recorder.note(pipeline, input, *at);
         pipeline.take(input.to_owned(), *at).unwrap();

@@ -246,8 +246,8 @@ mod tests {
     use hardnessd_core::frame::Array;
     use hardnessd_core::sensor::Description;
     use hardnessd_core::tare::Gains;
-    use hardnessd_core::test_support::hrn;
-    use hardnessd_core::test_support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
+    use hardnessd_core::tests::support::hrn;
+    use hardnessd_core::tests::support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
 
     fn sensor(calibration: tare::Settings) -> Sensor {
         let mut described = Description::default();

@@ -147,7 +147,7 @@ impl Gathered {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::test_support::{hrn, of_a_press};
+    use hardnessd_core::tests::support::{hrn, of_a_press};
 
     #[test]
     fn a_press_has_the_positions_from_before_its_recording() {

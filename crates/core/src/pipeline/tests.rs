@@ -12,7 +12,7 @@ use crate::event::{Hardness, LinkState, Note, Phase, Rejection, Status};
 use crate::frame::Array;
 use crate::motion::Point;
 use crate::sensor::Description;
-use crate::test_support;
+use crate::tests::support;
 use crate::verdict::BUILT_IN_HRN;
 use crate::wire::Preset;
 
@@ -27,7 +27,7 @@ fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
     let mut described = Description::default();
     described.sensor.name = "forearm".to_owned();
     change(&mut described);
-    let hrn = test_support::hrn();
+    let hrn = support::hrn();
     Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
 }
 
@@ -577,7 +577,7 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
     pipeline.judge.context = Some(serde_json::json!({"object": 7}));
     assert_eq!(judged(&mut pipeline, 13), Some(("7".to_owned(), 1)));
     let state = pipeline.at_rest().unwrap();
-    let mut next = Pipeline::resumed(pipeline.sensor().clone(), test_support::hrn(), state);
+    let mut next = Pipeline::resumed(pipeline.sensor().clone(), support::hrn(), state);
     next.judge.context = Some(serde_json::json!({"object": "cup"}));
     assert_eq!(judged(&mut next, 17), Some(("cup".to_owned(), 2)));
     // The same model goes on with its objects.

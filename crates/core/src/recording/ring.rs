@@ -107,7 +107,7 @@ mod tests {
     use super::*;
     use crate::pipeline::{Clock, Input, Pipeline};
     use crate::recording::{Labels, State};
-    use crate::test_support;
+    use crate::tests::support;
 
     fn at(seconds: u64) -> Stamp {
         Stamp {
@@ -117,7 +117,7 @@ mod tests {
     }
 
     fn state() -> Entry {
-        let pipeline = Pipeline::new(test_support::sensor(), test_support::hrn(), Clock::Arrival);
+        let pipeline = Pipeline::new(support::sensor(), support::hrn(), Clock::Arrival);
         Entry::State(Box::new(State::of(&pipeline, &Labels::new()).unwrap()))
     }
 

@@ -6,7 +6,7 @@ use super::*;
 use crate::event::{Event, Press, PressState};
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
-use crate::test_support::{at, hrn, labels, sensor};
+use crate::tests::support::{at, hrn, labels, sensor};
 use crate::wire;
 
 mod rewritten;

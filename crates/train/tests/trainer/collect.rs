@@ -7,7 +7,7 @@ use std::process::Output;
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Labels, MAGIC};
 use hardnessd_core::sensor::Description;
-use hardnessd_core::test_support::of_a_labelled_press;
+use hardnessd_core::tests::support::of_a_labelled_press;
 use hardnessd_core::verdict::{Card, Hrn, Piece};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Press, Presses, meta, read_one};

@@ -61,7 +61,7 @@ fn a_recording_that_begins_in_a_flood_goes_on_as_the_sensor_did() {
         first.push(&frame, at(ms));
     }
     let state = first.at_rest().unwrap();
-    let mut second = Pipeline::resumed(first.sensor().clone(), test_support::hrn(), state);
+    let mut second = Pipeline::resumed(first.sensor().clone(), support::hrn(), state);
     for ms in (10_000..20_000).step_by(10) {
         assert_eq!(second.push(&frame, at(ms)), first.push(&frame, at(ms)));
     }
@@ -168,7 +168,7 @@ fn the_bare_frames_of_a_file_follow_each_other_also_after_a_damaged_one() {
     described.sensor.frame.cols = Some(4);
     let sensor = Sensor::new(described).unwrap();
     let frames = |clock, cells: &[f32]| {
-        let mut pipeline = Pipeline::new(sensor.clone(), test_support::hrn(), clock);
+        let mut pipeline = Pipeline::new(sensor.clone(), support::hrn(), clock);
         let bytes: Vec<u8> = cells.iter().flat_map(|cell| cell.to_le_bytes()).collect();
         pipeline.push(&bytes, at(0));
         let status = pipeline.status(at(0));

@@ -264,7 +264,7 @@ fn a_long_press_is_thinned() {
 fn a_model_of_frames_has_no_course_but_the_slope_is_known() {
     let found = |reported: &[Point], arm_n_per_mm| {
         let mut pipeline = tared(&[], |d| d.sensor.arm.stiffness_n_per_mm = arm_n_per_mm);
-        judge_by(&mut pipeline, test_support::hrn());
+        judge_by(&mut pipeline, support::hrn());
         pipeline.judge.track.push(reported).unwrap();
         let held = [20, 40, 60, 80, 80, 80, 80, 0, 0].map(|counts| raw(9, counts));
         let found = verdicts(feed(&mut pipeline, 6, &held));

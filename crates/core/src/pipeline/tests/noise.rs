@@ -1,8 +1,8 @@
 //! Tests that noise is no force: an array of 16x32 taxels of 12 bits that rests anywhere.
 
 use super::*;
-use crate::test_support::hrn;
-use crate::test_support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
+use crate::tests::support::hrn;
+use crate::tests::support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
 
 /// The noise of the taxels, in counts.
 const NOISES: [f64; 5] = [0.0, 2.0, 4.0, 6.0, 8.0];

@@ -356,7 +356,7 @@ fn grid_mm(sensor: &Sensor) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::test_support::{hrn, of_a_press};
+    use hardnessd_core::tests::support::{hrn, of_a_press};
     use hardnessd_simulator::Split;
     use serde_json::json;
 

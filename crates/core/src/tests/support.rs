@@ -1,4 +1,4 @@
-//! A sensor, a model and a recorded press for tests, also for those of the other crates.
+//! A sensor, a model and a recorded press.
 #![allow(
     clippy::unwrap_used,
     clippy::missing_panics_doc,
