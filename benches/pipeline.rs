@@ -12,7 +12,7 @@ use hardnessd_core::event::{Event, Phase};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 use hardnessd_core::sensor::{Description, Sensor};
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 use hardnessd_core::wire::{self, Decoder, Layout};
 
 /// The approximate size of one read of a serial port at 115,200 baud.
@@ -31,11 +31,11 @@ fn layout() -> Layout {
     Layout::new(&wire::Settings::default()).expect("the default is a layout")
 }
 
-fn hrn() -> Arc<Hrn> {
-    Arc::new(Hrn::load(BUILT_IN_HRN).expect("the model in the binary is one"))
+fn hrn() -> Arc<Model> {
+    Arc::new(Model::load(BUILT_IN_HRN).expect("the model in the binary is one"))
 }
 
-fn pipeline(hrn: &Arc<Hrn>) -> Pipeline {
+fn pipeline(hrn: &Arc<Model>) -> Pipeline {
     let sensor = Sensor::new(Description::default()).expect("the default is a sensor");
     Pipeline::new(sensor, Arc::clone(hrn), Clock::FrameRate)
 }
@@ -103,6 +103,6 @@ fn judge(bencher: Bencher) {
 
 /// Measures loading a model file, including its check frames. Start and reload do this.
 #[divan::bench]
-fn load_model() -> Arc<Hrn> {
+fn load_model() -> Arc<Model> {
     hrn()
 }

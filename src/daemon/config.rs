@@ -28,7 +28,7 @@ use super::log;
 use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
-use hardnessd_core::verdict::{self, BuiltIn, Format, Hrn};
+use hardnessd_core::verdict::{self, BuiltIn, Format, Model};
 use hardnessd_core::{motion, press, trial};
 
 settings! {
@@ -192,11 +192,11 @@ pub struct Setup {
     /// The sensors of the configuration, in its order.
     pub sensors: Vec<Sensor>,
     /// The model that the configuration names.
-    pub hrn: Arc<Hrn>,
+    pub hrn: Arc<Model>,
     /// The text of the configuration.
     pub text: Text,
     /// The model with the references of the sensors that have some.
-    identified: BTreeMap<String, Arc<Hrn>>,
+    identified: BTreeMap<String, Arc<Model>>,
 }
 
 impl Setup {
@@ -333,7 +333,7 @@ impl Setup {
     }
 
     /// The sensors that have references, each with its model.
-    pub fn identified(&self) -> impl Iterator<Item = (&str, &Arc<Hrn>)> {
+    pub fn identified(&self) -> impl Iterator<Item = (&str, &Arc<Model>)> {
         self.identified
             .iter()
             .map(|(name, hrn)| (name.as_str(), hrn))
@@ -359,7 +359,7 @@ impl Setup {
     }
 
     /// The model for the presses of a sensor.
-    pub fn hrn_of(&self, sensor: &str) -> &Arc<Hrn> {
+    pub fn hrn_of(&self, sensor: &str) -> &Arc<Model> {
         self.identified.get(sensor).unwrap_or(&self.hrn)
     }
 }

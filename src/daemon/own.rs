@@ -156,13 +156,13 @@ mod tests {
     use hardnessd_core::frame::Stamp;
     use hardnessd_core::pipeline::{Clock, Input};
     use hardnessd_core::sensor::{Description, Sensor};
-    use hardnessd_core::verdict::{BUILT_IN, Hrn};
+    use hardnessd_core::verdict::{BUILT_IN, Model};
     use hardnessd_simulator::{Sequence, SequenceSettings};
 
     fn pipeline(change: impl FnOnce(&mut Description)) -> Pipeline {
         let mut described = Description::default();
         change(&mut described);
-        let hrn = Arc::new(Hrn::load(BUILT_IN).unwrap());
+        let hrn = Arc::new(Model::load(BUILT_IN).unwrap());
         Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::FrameRate)
     }
 

@@ -23,7 +23,7 @@ use hardnessd_core::event::{self, Event, Phase, Status, Tared};
 use hardnessd_core::pipeline::{Input, Pipeline, Refused};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::RetareError;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::Model;
 use hardnessd_core::wording;
 
 /// The content of an `ok`: the tare that was taken, or the file that was written.
@@ -44,7 +44,7 @@ pub(crate) enum Command {
     /// Write the last minute to a file. The answer comes when it is written.
     Blackbox(Answer),
     /// Judge with another model from the next rest on. Of the sensor's tables, only `[model]` may differ.
-    Model(Box<Sensor>, Arc<Hrn>),
+    Model(Box<Sensor>, Arc<Model>),
     /// End the task. A press under way is aborted, and no further event follows.
     Finish,
 }

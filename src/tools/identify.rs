@@ -26,7 +26,7 @@ use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
 use hardnessd_core::verdict::{
-    Borders, Hrn, Level, MOST_REFERENCES, Piece, ReferencePress, TimeSeries, Tried,
+    Borders, Level, MOST_REFERENCES, Model, Piece, ReferencePress, TimeSeries, Tried,
 };
 
 /// Arguments of `identify`.
@@ -195,7 +195,7 @@ fn of_file(
     file: File,
     path: &Path,
     sensor: &Sensor,
-    hrn: &Arc<Hrn>,
+    hrn: &Arc<Model>,
 ) -> Result<Vec<ReferencePress>, Failure> {
     let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
     played.playback.keep_courses();

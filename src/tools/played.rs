@@ -24,7 +24,7 @@ use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, FileKind, Found, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::Model;
 
 /// A file that is being played.
 pub(super) struct Played<'a> {
@@ -61,7 +61,7 @@ impl<'a> Played<'a> {
         path: &Path,
         file: impl Read + 'a,
         sensor: &Sensor,
-        hrn: &Arc<Hrn>,
+        hrn: &Arc<Model>,
         motion: Option<&Path>,
     ) -> Result<Self, Failure> {
         let (kind, file) = FileKind::read(file).map_err(unplayable(path))?;

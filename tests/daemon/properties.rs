@@ -21,7 +21,7 @@ use hardnessd_core::motion::{Point, Track};
 use hardnessd_core::recording::{Playback, Reader, recover};
 use hardnessd_core::references as known;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, Framing, HexBytes, Layout, LengthField, Packets, Preset,
     Settings,
@@ -294,9 +294,9 @@ pub fn configuration(bytes: &[u8]) {
     }
 }
 
-fn hrn() -> Arc<Hrn> {
-    static HRN: OnceLock<Arc<Hrn>> = OnceLock::new();
-    let load = || Arc::new(Hrn::load(BUILT_IN_HRN).expect("the model in the binary is one"));
+fn hrn() -> Arc<Model> {
+    static HRN: OnceLock<Arc<Model>> = OnceLock::new();
+    let load = || Arc::new(Model::load(BUILT_IN_HRN).expect("the model in the binary is one"));
     Arc::clone(HRN.get_or_init(load))
 }
 

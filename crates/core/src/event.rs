@@ -350,9 +350,9 @@ pub enum Note {
 /// use hardnessd_core::frame::Stamp;
 /// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 /// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 ///
-/// let hrn = Arc::new(Hrn::load(BUILT_IN_HRN)?);
+/// let hrn = Arc::new(Model::load(BUILT_IN_HRN)?);
 /// let mut pipeline = Pipeline::new(Sensor::new(Description::default())?, hrn, Clock::FrameRate);
 /// let at = Stamp {
 ///     mono: Duration::ZERO,

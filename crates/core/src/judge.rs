@@ -23,7 +23,7 @@ use crate::motion::Track;
 use crate::press::{ContactFrame, FrameAt, SoFar};
 use crate::sensor::Sensor;
 use crate::verdict::{
-    COURSE_FRAMES, Format, Hrn, Knowledge, ModelError, References, Resampling, Verdict,
+    COURSE_FRAMES, Format, Knowledge, Model, ModelError, References, Resampling, Verdict,
 };
 
 /// The number of frames in contact that an early verdict on the course needs.
@@ -57,7 +57,7 @@ pub struct Unjudged {
 pub struct Judge {
     sensor: Arc<Sensor>,
     /// The model.
-    pub(crate) hrn: Arc<Hrn>,
+    pub(crate) hrn: Arc<Model>,
     /// The positions of the arm.
     pub(crate) track: Track,
     /// The controller's context.
@@ -102,7 +102,7 @@ pub(crate) struct Moment {
 
 impl Judge {
     /// A judge that has seen no press.
-    pub(crate) fn new(sensor: Arc<Sensor>, hrn: Arc<Hrn>) -> Self {
+    pub(crate) fn new(sensor: Arc<Sensor>, hrn: Arc<Model>) -> Self {
         Self {
             sensor,
             hrn,
@@ -135,7 +135,7 @@ impl Judge {
     }
 
     /// What a judge with `hrn` can take over from this one.
-    pub(crate) fn kept_for(&self, hrn: &Hrn) -> Kept {
+    pub(crate) fn kept_for(&self, hrn: &Model) -> Kept {
         let is_same = hrn.sha256() == self.hrn.sha256()
             && hrn.known_references() == self.hrn.known_references();
         // Another model errs in other ways, and so does one that knows the sensor better.

@@ -27,7 +27,7 @@ use crate::motion::Track;
 use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
 use crate::tare::{Aim, Contact, RetareError, Tare};
-use crate::verdict::Hrn;
+use crate::verdict::Model;
 use crate::wire::{Decoded, Decoder};
 
 /// The source of the frames' times.
@@ -75,13 +75,13 @@ impl Pipeline {
     /// use hardnessd_core::frame::{RawFrame, Stamp};
     /// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
     /// use hardnessd_core::sensor::{Description, Sensor};
-    /// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+    /// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
     ///
     /// let sensor = Sensor::new(Description::default())?;
     /// let mut bytes = Vec::new();
     /// sensor.layout().encode(&RawFrame::default(), &mut bytes);
     ///
-    /// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN_HRN)?), Clock::Arrival);
+    /// let mut pipeline = Pipeline::new(sensor, Arc::new(Model::load(BUILT_IN_HRN)?), Clock::Arrival);
     /// let at = Stamp {
     ///     mono: Duration::from_secs(1),
     ///     wall: jiff::Timestamp::UNIX_EPOCH,
@@ -92,7 +92,7 @@ impl Pipeline {
     /// assert_eq!(kinds, [Kind::Status, Kind::Frame]);
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
-    pub fn new(sensor: Sensor, hrn: Arc<Hrn>, clock: Clock) -> Self {
+    pub fn new(sensor: Sensor, hrn: Arc<Model>, clock: Clock) -> Self {
         let sensor = Arc::new(sensor);
         let layout = sensor.layout();
         let mut decoder = Decoder::new(layout.clone());
@@ -171,7 +171,7 @@ impl Pipeline {
     }
 
     /// The current model.
-    pub fn hrn(&self) -> &Arc<Hrn> {
+    pub fn hrn(&self) -> &Arc<Model> {
         &self.judge.hrn
     }
 

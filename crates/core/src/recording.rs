@@ -30,7 +30,7 @@ use crate::motion::Point;
 use crate::pipeline::{AtRest, Input, Pipeline};
 use crate::range::OutOfRange;
 use crate::sensor::{Description, Sensor};
-use crate::verdict::{Hrn, References};
+use crate::verdict::{Model, References};
 
 /// An entry of a recording for one sensor. Entries are in order of time.
 ///
@@ -105,7 +105,7 @@ pub struct RecordedSensor {
 
 impl RecordedSensor {
     /// The recorded description of `sensor` with the model `hrn`.
-    pub fn new(sensor: &Sensor, hrn: &Hrn) -> Self {
+    pub fn new(sensor: &Sensor, hrn: &Model) -> Self {
         Self {
             description: sensor.for_recording(),
             model_sha256: hrn.sha256().to_owned(),

@@ -1,6 +1,6 @@
 //! The trial of a model file in a child process, before this process loads the file.
 //!
-//! In: the bytes of a model file, and how long a verdict may take. Out: the [`Hrn`], or the reason
+//! In: the bytes of a model file, and how long a verdict may take. Out: the [`Model`], or the reason
 //! why the file is refused. With some files the inference library panics, fills the memory or never
 //! ends. That happens to the child. This process then reports it in one line and continues. The
 //! child is the same program, which calls [`entry`] first. If nobody has called [`entry`], as in a
@@ -16,7 +16,7 @@ use std::time::Duration;
 use rustix::process::{Resource, Rlimit, Signal};
 use rustix::time::ClockId;
 
-use crate::verdict::{self, Hrn, ModelError};
+use crate::verdict::{self, Model, ModelError};
 
 /// The name (argv 0) by which a process of the program knows that it is a trial.
 const NAME: &str = "hardnessd-trial";
@@ -68,9 +68,9 @@ pub fn set_program(program: PathBuf) {
 ///
 /// # Errors
 ///
-/// Returns the errors of [`Hrn::load`], and an error if the trial does not complete or a verdict takes too
+/// Returns the errors of [`Model::load`], and an error if the trial does not complete or a verdict takes too
 /// long.
-pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
+pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Model, ModelError> {
     if bytes.len() > verdict::MAX_FILE_BYTES {
         return Err(ModelError::too_large(bytes.len()));
     }
@@ -86,7 +86,7 @@ pub fn load(bytes: &[u8], most: Option<Duration>) -> Result<Hrn, ModelError> {
             )));
         }
     }
-    Hrn::load(bytes)
+    Model::load(bytes)
 }
 
 /// Runs a trial of the file in a child. Returns how long a verdict takes.
@@ -142,7 +142,7 @@ fn trial() -> ExitCode {
         .read_to_end(&mut bytes);
     let judged: Answer = match read {
         Err(error) => Err(error.to_string()),
-        Ok(_) => Hrn::load(&bytes)
+        Ok(_) => Model::load(&bytes)
             .and_then(|hrn| median_us(&hrn))
             .map_err(|error| error.to_string()),
     };
@@ -174,7 +174,7 @@ fn limit() {
 }
 
 /// The median of the processor time of verdicts. Processor time excludes that of other processes.
-fn median_us(hrn: &Hrn) -> Result<f64, ModelError> {
+fn median_us(hrn: &Model) -> Result<f64, ModelError> {
     let now = || {
         let time = rustix::time::clock_gettime(ClockId::ThreadCPUTime);
         Duration::try_from(time).unwrap_or_default()
@@ -244,7 +244,7 @@ mod tests {
 
     #[test]
     fn a_file_within_its_limits_is_timed() {
-        let hrn = Hrn::load(verdict::BUILT_IN_HRN).unwrap();
+        let hrn = Model::load(verdict::BUILT_IN_HRN).unwrap();
         let us = median_us(&hrn).unwrap();
         assert!(us > 0.0 && us < 1e6, "{us}");
     }

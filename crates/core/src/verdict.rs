@@ -1,9 +1,9 @@
-//! A press becomes a verdict: loads an HRN from ONNX bytes and judges presses with it.
+//! A press becomes a verdict: loads a model from ONNX bytes and judges presses with it.
 //!
 //! In: the bytes of a model file as `hrn-train export` writes them, then frames in newtons
 //! (format 1) or the course of a press (format 3). Out: [`Verdict`]s. This module refuses a file
 //! unless all of it follows the format and it reproduces the probabilities that its trainer wrote
-//! into it. So a loaded [`Hrn`] computes what was evaluated. This module never reads a file itself,
+//! into it. So a loaded [`Model`] computes what was evaluated. This module never reads a file itself,
 //! never prints and never trains.
 
 mod card;
@@ -49,16 +49,16 @@ pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
 /// The model of single frames, also built into the binary; `models/README.md` is its card.
 pub const BUILT_IN_HRN: &[u8] = include_bytes!("../../../models/hrn.onnx");
 
-/// The verdict of an HRN on a press.
+/// The verdict of a model on a press.
 ///
 /// # Example
 ///
 /// The card of a model has the labels of its levels.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn, TAXELS};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model, TAXELS};
 ///
-/// let hrn = Hrn::load(BUILT_IN_HRN)?;
+/// let hrn = Model::load(BUILT_IN_HRN)?;
 /// let mut newtons = [0.0; TAXELS];
 /// newtons[400..404].fill(2.0);
 /// let verdict = hrn.judge_taxels(&newtons)?;
@@ -84,23 +84,23 @@ pub struct Verdict {
     pub levels: Option<Vec<u8>>,
 }
 
-/// A hardness recognition network, ready to judge.
+/// A model, ready to judge.
 ///
 /// # Example
 ///
 /// The built-in model judges one of the frames that it carries as a check.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN, Model};
 ///
-/// let hrn = Hrn::load(BUILT_IN)?;
+/// let hrn = Model::load(BUILT_IN)?;
 /// let verdict = hrn.judge_check(0)?;
 /// assert_eq!(verdict.probabilities.len(), hrn.card().levels.len());
 /// assert_eq!(verdict.confidence, verdict.probabilities[usize::from(verdict.level) - 1]);
 /// # Ok::<(), hardnessd_core::verdict::ModelError>(())
 /// ```
 #[derive(Debug, Clone)]
-pub struct Hrn {
+pub struct Model {
     plan: Arc<TypedRunnableModel>,
     file: File,
     sha256: String,
@@ -108,13 +108,13 @@ pub struct Hrn {
     references: References,
 }
 
-impl Hrn {
+impl Model {
     /// Loads a model file and reproduces its check frames.
     ///
     /// # Errors
     ///
     /// Returns a [`ModelError`] with all that breaks the format, or an
-    /// error as [`Hrn::judge_taxels`] if a check frame cannot be judged.
+    /// error as [`Model::judge_taxels`] if a check frame cannot be judged.
     pub fn load(bytes: &[u8]) -> Result<Self, ModelError> {
         let hrn = Self::read(bytes)?;
         hrn.reproduce_check()?;
@@ -126,7 +126,7 @@ impl Hrn {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Hrn::load`], except those of the check frames.
+    /// Returns the errors of [`Model::load`], except those of the check frames.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
         if bytes.len() > MAX_FILE_BYTES {
             return Err(ModelError::too_large(bytes.len()));

@@ -10,7 +10,7 @@ use super::error::{Error, MAX_BYTES, Problem, Text};
 use super::{Config, LevelTable};
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{self, Hrn, Level};
+use hardnessd_core::verdict::{self, Level, Model};
 use hardnessd_core::{npy, range, references, sensor, trial, wording};
 
 /// The configuration at `path` with its paths resolved and its gains read, and its text.
@@ -137,12 +137,12 @@ fn syntax(text: &str, error: &toml::de::Error) -> Problem {
 
 /// Loads the model. If it is a file, another process tries it first. `most` is the longest time
 /// that a verdict may take.
-pub(super) fn model(config: &Config, most: Duration) -> Result<Hrn, Problem> {
+pub(super) fn model(config: &Config, most: Duration) -> Result<Model, Problem> {
     let (key, model) = ("model.path", &config.model);
     let (file, hrn) = match &model.path {
         None => (
             Path::new("the model built in"),
-            Hrn::load(model.built_in.bytes()),
+            Model::load(model.built_in.bytes()),
         ),
         Some(file) => {
             let bytes = read_named(key, file, verdict::MAX_FILE_BYTES)?;
@@ -171,10 +171,10 @@ pub(super) fn model(config: &Config, most: Duration) -> Result<Hrn, Problem> {
 
 /// The model with the references in `file`, which are those of `sensor`.
 pub(super) fn identified(
-    hrn: &Hrn,
+    hrn: &Model,
     file: &Path,
     sensor: (usize, &sensor::Settings),
-) -> Result<Hrn, Problem> {
+) -> Result<Model, Problem> {
     let key = "sensor.references";
     let own = || {
         let bytes = read_named(key, file, references::MAX_FILE_BYTES)?;

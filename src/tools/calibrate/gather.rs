@@ -15,7 +15,7 @@ use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::Pipeline;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::{self, Gains};
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::Model;
 
 /// One press.
 #[derive(Debug, Default)]
@@ -60,7 +60,7 @@ pub(super) fn presses(
     file: impl Read,
     path: &Path,
     sensor: &Sensor,
-    hrn: &Arc<Hrn>,
+    hrn: &Arc<Model>,
 ) -> Result<Vec<Press>, Failure> {
     let mut gathered = Gathered::default();
     Played::open(path, file, sensor, hrn, None)?.play(|played, mut events, at| {

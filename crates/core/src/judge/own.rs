@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use super::approach::PressWithApproach;
 use crate::press::ContactFrame;
 use crate::sensor::Sensor;
-use crate::verdict::{Hrn, ModelError, Piece, Reference, References, TimeSeries};
+use crate::verdict::{Model, ModelError, Piece, Reference, References, TimeSeries};
 
 /// The fewest presses that are used.
 const LEAST: usize = 6;
@@ -94,9 +94,9 @@ impl OwnPresses {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Hrn::judge_taxels`].
+    /// Returns the errors of [`Model::judge_taxels`].
     pub fn references_of(
-        hrn: &Hrn,
+        hrn: &Model,
         courses: &[TimeSeries],
         most: usize,
     ) -> Result<References, ModelError> {
@@ -111,7 +111,7 @@ impl OwnPresses {
     pub(super) fn add(
         &mut self,
         press: PressedAt,
-        hrn: &Hrn,
+        hrn: &Model,
         course: &TimeSeries,
         most: usize,
     ) -> Result<(), ModelError> {
@@ -123,7 +123,7 @@ impl OwnPresses {
         }
     }
 
-    fn keep(&mut self, hrn: &Hrn, course: &TimeSeries, most: usize) -> Result<(), ModelError> {
+    fn keep(&mut self, hrn: &Model, course: &TimeSeries, most: usize) -> Result<(), ModelError> {
         let most = most.min(hrn.most_references());
         if most == 0 {
             return Ok(());
@@ -169,7 +169,7 @@ impl OwnPresses {
     }
 
     /// The presses, if this model computed them. A recording or a file may hold anything.
-    pub(super) fn of_model(self, hrn: &Hrn) -> Self {
+    pub(super) fn of_model(self, hrn: &Model) -> Self {
         let mut presses = self.presses.iter();
         let is_usable = self.model == hrn.sha256()
             && presses.len() <= hrn.most_references()
@@ -186,7 +186,7 @@ impl OwnPresses {
 }
 
 /// What own presses belong to: the model that computed them, and the array, its calibration and its arm.
-pub fn owner(sensor: &Sensor, hrn: &Hrn) -> String {
+pub fn owner(sensor: &Sensor, hrn: &Model) -> String {
     let described = sensor.description();
     let of = (
         hrn.sha256(),

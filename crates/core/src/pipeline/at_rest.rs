@@ -12,7 +12,7 @@ use crate::judge::{self, OwnPresses};
 use crate::motion::{Point, Track};
 use crate::sensor::Sensor;
 use crate::tare;
-use crate::verdict::Hrn;
+use crate::verdict::Model;
 use crate::wire::{Decoder, HexBytes, Place};
 
 /// The state of a pipeline while no press is under way. A pipeline of the same sensor that continues
@@ -99,7 +99,7 @@ impl Pipeline {
     /// The pipeline that judges with `hrn` from now on, as `sensor` says. `None` unless at rest: a press
     /// under way is judged by the model that it began with. Of the tables of `sensor`, only `[model]`
     /// may differ.
-    pub fn with_model(&self, sensor: Sensor, hrn: Arc<Hrn>) -> Option<Self> {
+    pub fn with_model(&self, sensor: Sensor, hrn: Arc<Model>) -> Option<Self> {
         let state = AtRest {
             judge: self.judge.kept_for(&hrn),
             ..self.at_rest()?
@@ -111,7 +111,7 @@ impl Pipeline {
     /// The pipeline of a sensor that begins anew with other tables. Its counters, its context and the
     /// positions of the arm go on.
     #[must_use]
-    pub fn restarted(mut self, sensor: Sensor, hrn: Arc<Hrn>) -> Self {
+    pub fn restarted(mut self, sensor: Sensor, hrn: Arc<Model>) -> Self {
         self.decoder.restart();
         self.chunks.clear();
         let mut kept = self.judge.kept_for(&hrn);
@@ -134,7 +134,7 @@ impl Pipeline {
     }
 
     /// A pipeline of `sensor` that continues from a usable state.
-    pub(crate) fn resumed(sensor: Sensor, hrn: Arc<Hrn>, state: AtRest) -> Self {
+    pub(crate) fn resumed(sensor: Sensor, hrn: Arc<Model>, state: AtRest) -> Self {
         let mut track = Track::default();
         // Of points that step back, the earlier ones are forgotten.
         let _ = track.push(&state.motion);

@@ -23,10 +23,10 @@ use crate::tare::RetareError;
 /// use hardnessd_core::frame::Stamp;
 /// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 /// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 ///
 /// let sensor = Sensor::new(Description::default())?;
-/// let mut pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN_HRN)?), Clock::Arrival);
+/// let mut pipeline = Pipeline::new(sensor, Arc::new(Model::load(BUILT_IN_HRN)?), Clock::Arrival);
 /// let at = Stamp {
 ///     mono: Duration::from_secs(1),
 ///     wall: jiff::Timestamp::UNIX_EPOCH,

@@ -38,7 +38,7 @@ fn ready(change: impl FnOnce(&mut Description)) -> Pipeline {
     pipeline
 }
 
-fn judge_by(pipeline: &mut Pipeline, hrn: Arc<Hrn>) {
+fn judge_by(pipeline: &mut Pipeline, hrn: Arc<Model>) {
     pipeline.judge = Judge::new(Arc::clone(&pipeline.sensor), hrn);
 }
 
@@ -469,7 +469,7 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
         let entry = entries.find(|entry| entry.key == "hrn.range").unwrap();
         let range = serde_json::json!({"force_n": range, "contact_area_taxels": [9, 10]});
         entry.value = range.to_string();
-        let hrn = Hrn::load(&file.encode_to_vec()).unwrap();
+        let hrn = Model::load(&file.encode_to_vec()).unwrap();
         judge_by(&mut pipeline, Arc::new(hrn));
         let mut held = RawFrame::default();
         // Three by three taxels in the middle.
@@ -526,7 +526,7 @@ fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
     let mut weights = file.graph.as_mut().unwrap().initializer.iter_mut();
     let bias = weights.find(|tensor| tensor.name == "head.bias").unwrap();
     bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    let failing = Hrn::read(&file.encode_to_vec()).unwrap();
+    let failing = Model::read(&file.encode_to_vec()).unwrap();
     judge_by(&mut pipeline, Arc::new(failing));
     let events = play(&mut pipeline, 5, &short_press());
     assert_eq!(events, ["Begin 1", "End 1"]);

@@ -10,7 +10,7 @@ use crate::judge::{EndedPress, Unjudged};
 use crate::pipeline::{Clock, Pipeline};
 use crate::press::End;
 use crate::sensor::Sensor;
-use crate::verdict::{Hrn, ModelError};
+use crate::verdict::{Model, ModelError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -20,9 +20,9 @@ use crate::verdict::{Hrn, ModelError};
 /// use std::sync::Arc;
 ///
 /// use hardnessd_core::recording::{Playback, Reader};
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 ///
-/// let mut playback = Playback::new(Arc::new(Hrn::load(BUILT_IN_HRN)?));
+/// let mut playback = Playback::new(Arc::new(Model::load(BUILT_IN_HRN)?));
 /// let mut events = Vec::new();
 /// for found in Reader::new(std::fs::File::open("press.mcap")?) {
 ///     events.extend(playback.feed(found?)?);
@@ -33,9 +33,9 @@ use crate::verdict::{Hrn, ModelError};
 /// ```
 #[derive(Debug)]
 pub struct Playback {
-    hrn: Arc<Hrn>,
+    hrn: Arc<Model>,
     /// The models of sensors whose references are not those of the recording.
-    identified: BTreeMap<String, Arc<Hrn>>,
+    identified: BTreeMap<String, Arc<Model>>,
     players: Vec<Player>,
     /// The first moment of each sensor whose first entry is no state, and the moment of its first
     /// state, if there is one.
@@ -76,7 +76,7 @@ type Problem = Box<dyn std::error::Error + Send + Sync>;
 impl Playback {
     /// A playback without any sensor yet. The model is `hrn`. A sensor keeps the references of the
     /// recording if the recording is of this model.
-    pub fn new(hrn: Arc<Hrn>) -> Self {
+    pub fn new(hrn: Arc<Model>) -> Self {
         Self {
             hrn,
             identified: BTreeMap::new(),
@@ -88,7 +88,7 @@ impl Playback {
 
     /// A playback of the raw bytes of a sensor. The moments of entries do not count: the frames get theirs from
     /// the frame rate.
-    pub fn of_bytes(sensor: Sensor, hrn: Arc<Hrn>) -> Self {
+    pub fn of_bytes(sensor: Sensor, hrn: Arc<Model>) -> Self {
         let mut playback = Self::new(hrn.clone());
         playback.players.push(Player {
             model: hrn.sha256().to_owned(),
@@ -114,12 +114,12 @@ impl Playback {
     }
 
     /// Judges the presses of a sensor with `hrn`, which has references of that sensor.
-    pub fn identify(&mut self, sensor: &str, hrn: Arc<Hrn>) {
+    pub fn identify(&mut self, sensor: &str, hrn: Arc<Model>) {
         self.identified.insert(sensor.to_owned(), hrn);
     }
 
     /// The model with the references of a recorded sensor.
-    fn hrn_of(&self, recorded: &RecordedSensor) -> Result<Arc<Hrn>, ModelError> {
+    fn hrn_of(&self, recorded: &RecordedSensor) -> Result<Arc<Model>, ModelError> {
         if let Some(hrn) = self.identified.get(recorded.name()) {
             return Ok(hrn.clone());
         }

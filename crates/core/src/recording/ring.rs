@@ -27,10 +27,10 @@ const KEPT_BYTES: usize = 32 << 20;
 /// use hardnessd_core::pipeline::{Clock, Input, Pipeline};
 /// use hardnessd_core::recording::{Entry, Labels, Ring, State};
 /// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 ///
 /// let sensor = Sensor::new(Description::default())?;
-/// let pipeline = Pipeline::new(sensor, Arc::new(Hrn::load(BUILT_IN_HRN)?), Clock::Arrival);
+/// let pipeline = Pipeline::new(sensor, Arc::new(Model::load(BUILT_IN_HRN)?), Clock::Arrival);
 /// let at = Stamp {
 ///     mono: Duration::from_secs(1),
 ///     wall: jiff::Timestamp::UNIX_EPOCH,

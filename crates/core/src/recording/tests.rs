@@ -66,7 +66,7 @@ fn story() -> Vec<(Stamp, Input)> {
 }
 
 /// What begins a recording of the sensor.
-fn about(hrn: &Hrn) -> About {
+fn about(hrn: &Model) -> About {
     About {
         robot: "arm-7".to_owned(),
         run: "r".to_owned(),

@@ -41,7 +41,7 @@ pub struct About {
 /// use hardnessd_core::pipeline::Input;
 /// use hardnessd_core::recording::{About, Entry, Labels, Reader, RecordedSensor, Writer};
 /// use hardnessd_core::sensor::{Description, Sensor};
-/// use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+/// use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 ///
 /// let sensor = Sensor::new(Description::default())?;
 /// let about = About {
@@ -50,7 +50,7 @@ pub struct About {
 ///     boot_id: String::new(),
 ///     reason: None,
 ///     labels: Labels::new(),
-///     sensors: vec![RecordedSensor::new(&sensor, &Hrn::load(BUILT_IN_HRN)?)],
+///     sensors: vec![RecordedSensor::new(&sensor, &Model::load(BUILT_IN_HRN)?)],
 /// };
 /// let at = Stamp {
 ///     mono: Duration::from_secs(1),

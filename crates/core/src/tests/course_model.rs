@@ -13,7 +13,7 @@ use super::graph::{indices, int, ints, node, number, value};
 /// How far the last three logits are below the others.
 const NEVER: f32 = 50.0;
 
-/// The file for presses of `most` frames, for `Hrn::read`. `more` adds or replaces metadata.
+/// The file for presses of `most` frames, for `Model::read`. `more` adds or replaces metadata.
 pub(crate) fn course_model(most: usize, more: &[(&str, Value)]) -> Vec<u8> {
     encoded(most, more, |_| {})
 }

@@ -18,11 +18,12 @@ use crate::pipeline::{Clock, Input, Pipeline};
 use crate::recording::{About, Entry, Labels, RecordedSensor, State, Writer};
 use crate::sensor::{Description, Sensor};
 use crate::tare::Gains;
-use crate::verdict::{BUILT_IN_HRN, Hrn};
+use crate::verdict::{BUILT_IN_HRN, Model};
 
 /// The built-in model.
-pub fn hrn() -> Arc<Hrn> {
-    static HRN: LazyLock<Arc<Hrn>> = LazyLock::new(|| Arc::new(Hrn::load(BUILT_IN_HRN).unwrap()));
+pub fn hrn() -> Arc<Model> {
+    static HRN: LazyLock<Arc<Model>> =
+        LazyLock::new(|| Arc::new(Model::load(BUILT_IN_HRN).unwrap()));
     Arc::clone(&HRN)
 }
 

@@ -38,7 +38,7 @@ impl<F> Moment<F> {
 /// The built-in model judges a whole press, here one of two frames.
 ///
 /// ```
-/// use hardnessd_core::verdict::{BUILT_IN, Hrn, ModelFrame, Moment, TimeSeries};
+/// use hardnessd_core::verdict::{BUILT_IN, Model, ModelFrame, Moment, TimeSeries};
 ///
 /// let moment = |time_s, approach_mm, newtons| {
 ///     let mut frame = ModelFrame::default();
@@ -49,7 +49,7 @@ impl<F> Moment<F> {
 ///     moments: vec![moment(0.0, 0.0, 0.2), moment(0.1, 0.5, 2.0)],
 ///     arm_n_per_mm: 10.0,
 /// };
-/// let verdict = Hrn::load(BUILT_IN)?.judge_course(&course)?;
+/// let verdict = Model::load(BUILT_IN)?.judge_course(&course)?;
 /// let shore = verdict.shore.unwrap();
 /// assert!(shore.low <= shore.value && shore.value <= shore.high);
 /// # Ok::<(), hardnessd_core::verdict::ModelError>(())

@@ -149,7 +149,7 @@ impl Reference {
     }
 }
 
-/// A sensor's references as one model takes them. [`super::Hrn::references`] computes them.
+/// A sensor's references as one model takes them. [`super::Model::references`] computes them.
 /// Recordings hold them, so that a replay needs no other file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

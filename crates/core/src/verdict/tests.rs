@@ -42,7 +42,7 @@ fn tensor_type(proto: &mut pb::ModelProto) -> &mut pb::type_proto::Tensor {
 type Change = fn(&mut pb::ModelProto);
 
 fn refused_by(bytes: &[u8], expected: &str) {
-    let error = Hrn::load(bytes).unwrap_err().to_string();
+    let error = Model::load(bytes).unwrap_err().to_string();
     assert!(
         error.contains(expected),
         "{error}\nshould contain\n{expected}"
@@ -76,7 +76,7 @@ fn course(length: usize, approach: bool) -> TimeSeries {
 #[test]
 fn the_built_in_models_load_and_judge() {
     for bytes in [BUILT_IN, BUILT_IN_HRN] {
-        let hrn = Hrn::load(bytes).unwrap();
+        let hrn = Model::load(bytes).unwrap();
         let labels: Vec<&str> = hrn.card().levels.iter().map(|l| l.label.as_str()).collect();
         assert_eq!(labels, ["hard", "firm", "soft", "very-soft"]);
         assert_eq!(hrn.sha256().len(), 64);
@@ -203,7 +203,7 @@ fn of_grid(grid: &str) -> Vec<u8> {
 
 #[test]
 fn a_model_of_frames_as_they_are_has_one_array() {
-    let card = Hrn::load(&of_grid("[28, 28]")).unwrap().card().clone();
+    let card = Model::load(&of_grid("[28, 28]")).unwrap().card().clone();
     assert!(card.check_array(Array::JX255N).is_ok());
     let refused = card.check_array(Array { rows: 2, cols: 3 }).unwrap_err();
     let expected = "the model takes frames of 28x28 taxels as they are, and the sensor has 2x3: use the model of \
@@ -257,7 +257,7 @@ fn parts_keep_the_sign_and_a_frame_is_of_0_or_more() {
         ("frame", 1, Format::Frame, [0.5, 0.0]),
         ("parts", 8, Format::Parts, [0.5, -2.0]),
     ] {
-        let hrn = Hrn::load(&of_first_taxels(input, frames)).unwrap();
+        let hrn = Model::load(&of_first_taxels(input, frames)).unwrap();
         assert_eq!(hrn.format(), format);
         let mut taxels = vec![0.0; 6 * frames];
         taxels[..2].copy_from_slice(&[0.5, -2.0]);
@@ -302,7 +302,7 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
         let of_bins = nodes.chain(outputs).filter(|name| *name == "bins");
         of_bins.for_each(|name| *name = "logits".to_owned());
     });
-    let error = Hrn::load(&renamed).unwrap_err().to_string();
+    let error = Model::load(&renamed).unwrap_err().to_string();
     let expected = "model outputs: found \"logits, reference\", expected bins, reference";
     assert_eq!(error, expected);
     type OfCheck = fn(&mut Value);
@@ -350,10 +350,10 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
 #[test]
 fn a_model_takes_courses_or_frames() {
     for most in [3, 48] {
-        let hrn = Hrn::read(&course_model(most, &[])).unwrap();
+        let hrn = Model::read(&course_model(most, &[])).unwrap();
         assert_eq!(hrn.format(), Format::Course { most_frames: most });
     }
-    let hrn = Hrn::load(BUILT_IN_HRN).unwrap();
+    let hrn = Model::load(BUILT_IN_HRN).unwrap();
     let error = hrn.judge_course(&course(4, true)).unwrap_err().to_string();
     assert!(error.contains("the model takes no courses"), "{error}");
     let verdict = hrn.judge_check(0).unwrap();
@@ -368,7 +368,7 @@ fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
     assert_eq!(set(0.9, &[0.3, 0.4, 0.3]), [2]);
     assert_eq!(set(0.0, &[1.0, 0.0]), [1, 2]);
     let more = [("hrn.conformal", json!({"alpha": 0.1, "threshold": 0.25}))];
-    let hrn = Hrn::read(&course_model(8, &more)).unwrap();
+    let hrn = Model::read(&course_model(8, &more)).unwrap();
     let verdict = hrn.judge_course(&course(8, true)).unwrap();
     assert_eq!(verdict.levels, Some(vec![2, 3]));
 }

@@ -5,7 +5,7 @@
 //! too.
 
 use super::references::{Piece, ReferencePress, References};
-use super::{Borders, Format, Hrn, ModelError, argmax};
+use super::{Borders, Format, Model, ModelError, argmax};
 
 /// A probability below it counts as this.
 const LEAST_PROBABILITY: f32 = 0.01;
@@ -31,17 +31,17 @@ impl Tried {
     }
 }
 
-impl Hrn {
+impl Model {
     /// The same model, which knows a sensor by these references, unless they make verdicts on themselves
     /// worse.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Hrn::judge_taxels`].
+    /// Returns the errors of [`Model::judge_taxels`].
     ///
     /// # Panics
     ///
-    /// Panics as [`Hrn::references`] does.
+    /// Panics as [`Model::references`] does.
     pub fn identified_by(&self, presses: &[ReferencePress]) -> Result<(Self, Tried), ModelError> {
         let references = self.references(presses)?;
         let tried = self.tried(presses, &references)?;

@@ -23,7 +23,7 @@ use crate::data::source::{COLLECTOR, MOST_LEVELS};
 use crate::exit::unreadable;
 use hardnessd_core::recording::MAGIC;
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn, Level, sha256_hex};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Level, Model, sha256_hex};
 use hardnessd_core::wording;
 use hardnessd_simulator::Split;
 
@@ -116,7 +116,7 @@ pub fn recordings(
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
     let bar = ProgressBar::new(paths.len() as u64);
     let bar = bar.with_style(style.expect("the template is right"));
-    let hrn = Arc::new(Hrn::load(BUILT_IN_HRN)?);
+    let hrn = Arc::new(Model::load(BUILT_IN_HRN)?);
     let (mut recordings, mut left_out) = (Vec::new(), Vec::new());
     for path in paths {
         let played = file::whole(path).and_then(|bytes| {

@@ -16,7 +16,7 @@ use crate::recipe;
 use crate::run::{Description, Run};
 use crate::settings::Profile;
 use hardnessd_core::frame::{Array, Frame};
-use hardnessd_core::verdict::{BUILT_IN, Borders, Hrn, Level, Piece, ReferencePress};
+use hardnessd_core::verdict::{BUILT_IN, Borders, Level, Model, Piece, ReferencePress};
 
 /// The paper's network needs this many presses.
 pub const LEAST_FOR_HRN: usize = 1_500;
@@ -31,7 +31,7 @@ const HRN: &str = "hrn";
 #[derive(Debug)]
 pub enum Candidate {
     /// The built-in model, with the presses as references.
-    BuiltIn(Box<Hrn>),
+    BuiltIn(Box<Model>),
     /// A regression.
     Regression(Seen),
     /// The paper's network.
@@ -61,7 +61,7 @@ pub fn all(presses: &Presses, places: &[usize]) -> anyhow::Result<Vec<Entry>> {
 
 /// The built-in model, if it can say these levels.
 fn built_in(levels: &[Level]) -> anyhow::Result<Result<Candidate, String>> {
-    let hrn = Hrn::load(BUILT_IN)?;
+    let hrn = Model::load(BUILT_IN)?;
     if hrn.card().levels == levels {
         return Ok(Ok(Candidate::BuiltIn(Box::new(hrn))));
     }
@@ -204,7 +204,7 @@ fn with_hrn<T>(
 ///
 /// Fails if the levels have no ranges of Shore hardness.
 pub fn references(
-    hrn: &Hrn,
+    hrn: &Model,
     presses: &Presses,
     places: &[usize],
 ) -> anyhow::Result<Vec<ReferencePress>> {

@@ -21,7 +21,7 @@ use crate::net::network::Weights;
 use crate::run::{Description, Run};
 use hardnessd_core::press;
 use hardnessd_core::verdict::{
-    Card, Check, CheckedCourse, Checks, CourseCheck, Hrn, Knowledge, ModelFrame, Piece, Range,
+    Card, Check, CheckedCourse, Checks, CourseCheck, Knowledge, Model, ModelFrame, Piece, Range,
     TAIL, check_line,
 };
 use hardnessd_simulator::Split;
@@ -55,7 +55,7 @@ pub fn finish(
     description: &Description,
 ) -> anyhow::Result<Option<Evaluated>> {
     let mut card = learnt.card(&description.method, &description.data)?;
-    let hrn = Hrn::load(&learnt.bytes(&card)?)?;
+    let hrn = Model::load(&learnt.bytes(&card)?)?;
     let test: Vec<usize> = learnt.presses.labelled(Split::Test).collect();
     let cases = verdicts::of(&hrn, learnt.presses, &test, Given::USUAL)?;
     let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &card.levels));

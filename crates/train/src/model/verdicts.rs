@@ -8,7 +8,7 @@ use crate::data::presses::Presses;
 use crate::judge::evaluated::{Case, cases};
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
-use hardnessd_core::verdict::{Format, Hrn, Piece, ReferencePress, References, TimeSeries};
+use hardnessd_core::verdict::{Format, Model, Piece, ReferencePress, References, TimeSeries};
 use hardnessd_simulator::random::Stream;
 
 /// The references of its sensor that a model is given beside a press.
@@ -60,11 +60,11 @@ pub fn reference(presses: &Presses, (place, piece): (usize, Piece)) -> Reference
 }
 
 /// The model with the references of each sensor, and the objects that serve as such.
-type Identified = (BTreeMap<u32, Hrn>, BTreeSet<Option<u32>>);
+type Identified = (BTreeMap<u32, Model>, BTreeSet<Option<u32>>);
 
 /// The model with the references of each sensor that has some of these presses.
 fn identified(
-    hrn: &Hrn,
+    hrn: &Model,
     presses: &Presses,
     places: &[usize],
     given: Given,
@@ -104,7 +104,7 @@ fn by_sensor(presses: &Presses, places: &[usize]) -> BTreeMap<u32, Vec<usize>> {
 
 /// Own presses of a sensor, for each half of its objects from the other half: at most two of an object.
 fn own_presses(
-    hrn: &Hrn,
+    hrn: &Model,
     presses: &Presses,
     of_sensor: &[usize],
     count: usize,
@@ -138,7 +138,7 @@ fn half_of(object: Option<u32>) -> usize {
 ///
 /// Fails if the model has fewer levels than the data, or fails to judge a press.
 pub fn of(
-    hrn: &Hrn,
+    hrn: &Model,
     presses: &Presses,
     places: &[usize],
     given: Given,

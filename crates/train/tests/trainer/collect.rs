@@ -8,7 +8,7 @@ use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Labels, MAGIC};
 use hardnessd_core::sensor::Description;
 use hardnessd_core::tests::support::of_a_labelled_press;
-use hardnessd_core::verdict::{Card, Hrn, Piece};
+use hardnessd_core::verdict::{Card, Model, Piece};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Press, Presses, meta, read_one};
 use hrn_train::data::source::Kind;
@@ -95,7 +95,7 @@ impl Desk {
         let train = format!("train --method features --out run --data {data}");
         succeed_in(self.0.path(), &train);
         let model = fs::read(self.path("run/hrn.onnx")).unwrap();
-        Hrn::load(&model).unwrap().card().clone()
+        Model::load(&model).unwrap().card().clone()
     }
 }
 

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use hardnessd_core::verdict::{Checks, Format, Hrn, References};
+use hardnessd_core::verdict::{Checks, Format, Model, References};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Presses, read_one};
 use prost::Message as _;
@@ -49,7 +49,7 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     let whole = std::fs::read(at.join("whole/hrn.onnx")).unwrap();
 
     // The daemon's own code loads the file, and the approach changes its verdicts.
-    let hrn = Hrn::load(&whole).unwrap();
+    let hrn = Model::load(&whole).unwrap();
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     assert_eq!(hrn.card().metrics["not_promised"], Value::Null);
     let presses = read_one(&at.join("d.npz")).unwrap();
@@ -102,7 +102,7 @@ fn a_course_model_says_nothing_of_what_it_never_knew() {
     let expected = "held-out objects: found 2, expected at least 9: there are no sets";
     assert!(errors.contains(expected), "{errors}");
     let bytes = std::fs::read(at.join("one/hrn.onnx")).unwrap();
-    let hrn = Hrn::load(&bytes).unwrap();
+    let hrn = Model::load(&bytes).unwrap();
     assert_eq!(hrn.card().conformal, None);
     let not_promised = &hrn.card().metrics["not_promised"];
     assert!(not_promised.as_str().unwrap().starts_with(expected));
@@ -132,7 +132,7 @@ fn a_course_model_takes_the_references_of_each_sensor() {
         "train --method course --data d.npz --config settings.toml --out run",
     );
     let bytes = std::fs::read(at.join("run/hrn.onnx")).unwrap();
-    let hrn = Hrn::load(&bytes).unwrap();
+    let hrn = Model::load(&bytes).unwrap();
     assert_eq!(
         (hrn.card().format.as_str(), hrn.most_references()),
         ("3", 32)
@@ -172,7 +172,7 @@ fn the_committed_model_is_the_one_of_its_card() {
     let models = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../..")
         .join("models");
-    let hrn = Hrn::load(&std::fs::read(models.join("course.onnx")).unwrap()).unwrap();
+    let hrn = Model::load(&std::fs::read(models.join("course.onnx")).unwrap()).unwrap();
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     let card = std::fs::read_to_string(models.join("course.md")).unwrap();
     assert!(card.contains(hrn.sha256()), "{}", hrn.sha256());

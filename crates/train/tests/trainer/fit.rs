@@ -6,7 +6,7 @@ use std::path::Path;
 
 use hardnessd_core::frame::Array;
 use hardnessd_core::references;
-use hardnessd_core::verdict::{Format, Hrn, ModelFrame};
+use hardnessd_core::verdict::{Format, Model, ModelFrame};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{self, Layout, Press, Presses};
 use serde_json::{Value, json};
@@ -85,7 +85,7 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     );
     assert_eq!(report["wrong"], json!([]));
 
-    let hrn = Hrn::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
+    let hrn = Model::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
     assert_eq!(hrn.format(), Format::Parts);
     assert_eq!(hrn.card().grid, Some(Array { rows: 4, cols: 4 }));
     let evaluation = "evaluate --json --split train --model m.onnx --data d.npz";
@@ -95,7 +95,7 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     write(&path("e.npz"), &[(1, 0), (1, 1), (2, 2), (2, 3)], &PAPERS);
     let train = "train --method taxels --profile smoke --data e.npz --out run";
     succeed_in(directory.path(), train);
-    let again = Hrn::load(&fs::read(path("run/hrn.onnx")).unwrap()).unwrap();
+    let again = Model::load(&fs::read(path("run/hrn.onnx")).unwrap()).unwrap();
     assert_eq!(again.card().grid, hrn.card().grid);
 }
 

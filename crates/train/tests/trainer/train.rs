@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
 
-use hardnessd_core::verdict::{BUILT_IN_HRN, Hrn};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Presses, meta, read_one};
 use rustix::process::{Pid, Signal};
@@ -98,7 +98,7 @@ fn a_run_learns_and_leaves_what_it_promises() {
         .map(|row| row.split(',').nth(3).unwrap());
     let losses: Vec<f64> = losses.map(|loss| loss.parse().unwrap()).collect();
     assert!(losses.len() == 6 && losses[5] < 0.8 * losses[0], "{rows}");
-    let hrn = Hrn::load(&trial.read("hrn.onnx")).unwrap();
+    let hrn = Model::load(&trial.read("hrn.onnx")).unwrap();
     assert_eq!(hrn.card().method, "hrn100");
     assert_eq!(hrn.card().validation, "simulated data only");
     assert!(hrn.card().data.contains("\"seed\":5"));
@@ -229,7 +229,7 @@ fn methods_with_parts_of_their_own_make_models_that_the_loader_reproduces() {
             GAN_SETTINGS,
         );
         trial.train("");
-        let hrn = Hrn::load(&trial.read("hrn.onnx")).unwrap();
+        let hrn = Model::load(&trial.read("hrn.onnx")).unwrap();
         assert_eq!(hrn.card().method, method);
     }
 }

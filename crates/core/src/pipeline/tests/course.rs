@@ -16,7 +16,7 @@ fn tared(more: &[(&str, Value)], change: impl FnOnce(&mut Description)) -> Pipel
         described.model.early_confidence = 0.8;
         change(described);
     });
-    let hrn = Hrn::read(&course_model(8, more)).unwrap();
+    let hrn = Model::read(&course_model(8, more)).unwrap();
     judge_by(&mut pipeline, Arc::new(hrn));
     play(&mut pipeline, 1, &vec![raw(0, 0); 5]);
     pipeline
@@ -308,7 +308,7 @@ fn a_press_that_cannot_be_kept_has_its_verdict() {
     let mut proto = pb::ModelProto::decode(BUILT_IN).unwrap();
     spoil(&mut proto, "reference", 1.0, "span");
     let mut pipeline = tared(&[], |_| {});
-    let hrn = Hrn::load(&proto.encode_to_vec()).unwrap();
+    let hrn = Model::load(&proto.encode_to_vec()).unwrap();
     judge_by(&mut pipeline, Arc::new(hrn));
     let found = judged(&mut pipeline, |_| Vec::new());
     assert_eq!(found.last().unwrap().phase, Phase::Final);
@@ -325,7 +325,7 @@ fn a_press_without_a_verdict_is_remembered() {
     // The model fails on an arm of 10 N/mm. That of its checks is at most 6 N/mm.
     let bytes = encoded(8, &[], |proto| spoil(proto, "second", 7.0, "arm_n_per_mm"));
     let mut pipeline = tared(&[], |described| described.sensor.arm.speed_mm_s = Some(5.0));
-    judge_by(&mut pipeline, Arc::new(Hrn::read(&bytes).unwrap()));
+    judge_by(&mut pipeline, Arc::new(Model::read(&bytes).unwrap()));
     assert_eq!(judged(&mut pipeline, |_| Vec::new()), []);
     assert!(!pipeline.unjudged().is_empty());
     assert_ne!(pipeline.judge.kept.own, OwnPresses::default());

@@ -45,7 +45,7 @@ fn graph(nodes: &[NodeProto]) -> GraphProto {
     }
 }
 
-/// Checks a graph as [`super::super::Hrn::read`] does.
+/// Checks a graph as [`super::super::Model::read`] does.
 fn check(graph: GraphProto) -> Result<(), ModelError> {
     check_operators(&graph)?;
     let proto = pb::ModelProto {

@@ -3,12 +3,12 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::Model;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated, NEAR_BORDER};
 use serde_json::json;
 
 /// The card of the model read from `path`.
-pub(super) fn of_model(path: &Path, hrn: &Hrn) -> String {
+pub(super) fn of_model(path: &Path, hrn: &Model) -> String {
     let card = hrn.card();
     let mut text = format!("{}\n", path.display());
     let mut row = |name: &str, value: String| {

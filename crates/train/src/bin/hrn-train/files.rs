@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use hardnessd_core::part::Part;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{Hrn, MAX_FILE_BYTES};
+use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
 
 use hrn_train::exit::unreadable;
 
@@ -33,7 +33,7 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 /// A model and the bytes of its file, read once: the file may be a pipe.
-pub(super) fn load(path: &Path) -> anyhow::Result<(Hrn, Vec<u8>)> {
+pub(super) fn load(path: &Path) -> anyhow::Result<(Model, Vec<u8>)> {
     let bytes = read(path)?;
     let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
     Ok((model, bytes))

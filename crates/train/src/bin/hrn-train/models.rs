@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use hardnessd_core::trial;
-use hardnessd_core::verdict::Hrn;
+use hardnessd_core::verdict::Model;
 use hardnessd_core::{exit, wording};
 use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
@@ -16,7 +16,7 @@ use super::files::{check_new, load, read, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let models = arguments.model.iter().map(|path| Ok(load(path)?.0));
-    let models: Vec<Hrn> = models.collect::<anyhow::Result<_>>()?;
+    let models: Vec<Model> = models.collect::<anyhow::Result<_>>()?;
     anyhow::ensure!(
         models.len() <= 2 && (models.len() == 1 || arguments.verdicts.is_none()),
         "--model: found {}, expected one, or two without --verdicts",
@@ -59,7 +59,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
 }
 
 /// A model's verdicts on the presses that the arguments choose.
-fn judge(arguments: &Evaluate, presses: &Presses, hrn: &Hrn) -> anyhow::Result<Vec<Case>> {
+fn judge(arguments: &Evaluate, presses: &Presses, hrn: &Model) -> anyhow::Result<Vec<Case>> {
     warn_of_pitch(&arguments.data, presses, hrn);
     anyhow::ensure!(
         hrn.card().method != "course" || presses.are_over_time(),
@@ -79,7 +79,7 @@ fn judge(arguments: &Evaluate, presses: &Presses, hrn: &Hrn) -> anyhow::Result<V
 }
 
 /// Prints a warning if most presses have forces that the model was not trained with.
-fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Hrn) {
+fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Model) {
     let [least_n, most_n] = hrn.card().range.force_n;
     let is_outside = |&&place: &&usize| {
         let newtons: f32 = presses.frame(place).newtons.iter().sum();
@@ -97,7 +97,7 @@ fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Hrn) {
 }
 
 /// Prints a warning if the data are of a sensor with another pitch than the model's.
-fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Hrn) {
+fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Model) {
     let (of_model, of_data) = (hrn.card().pitch_mm, presses.pitch_mm() as f32);
     if of_model != of_data {
         hardnessd_core::stderr_line!(

@@ -18,7 +18,7 @@ use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{Borders, COLS, Hrn, Piece, ROWS, sha256_hex};
+use hardnessd_core::verdict::{Borders, COLS, Model, Piece, ROWS, sha256_hex};
 
 /// The moment of raw bytes, whose times come from the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {
@@ -60,7 +60,7 @@ impl Recording {
         bytes: &[u8],
         sensor: &Sensor,
         layout: Layout,
-        hrn: &Arc<Hrn>,
+        hrn: &Arc<Model>,
     ) -> anyhow::Result<Self> {
         ensure!(
             !bytes.starts_with(ARCHIVE),
@@ -151,7 +151,7 @@ impl Recording {
     }
 
     /// Plays a recording of hardnessd, or raw bytes of this sensor.
-    fn play(&mut self, bytes: &[u8], sensor: &Sensor, hrn: &Arc<Hrn>) -> anyhow::Result<()> {
+    fn play(&mut self, bytes: &[u8], sensor: &Sensor, hrn: &Arc<Model>) -> anyhow::Result<()> {
         let (mut playback, entries): (_, Box<dyn Iterator<Item = Result<Found, _>>>) =
             match FileKind::of(bytes) {
                 FileKind::Recording => (Playback::new(hrn.clone()), Box::new(Reader::new(bytes))),
