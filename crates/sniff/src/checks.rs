@@ -3,6 +3,7 @@
 //! In: frames with the bytes beside the cells, before them and after them. Out: a checksum that holds in
 //! nearly all of them. Each kind is tried at each place: a wrong one never holds.
 
+use std::collections::HashMap;
 use std::ops::Range;
 
 use hardnessd_core::wire::Checksum;
@@ -45,11 +46,20 @@ const CHECKSUMS: [Checksum; 14] = [
     Checksum::Crc8,
 ];
 
+/// Whether a checksum holds, by its index, its place, and where the bytes that it covers begin and end. Many places of
+/// the cells ask for the same.
+pub(crate) type Tried = HashMap<(usize, [usize; 3]), bool>;
+
 /// The checksum that holds for `spans`: the cells of some frames, with the bytes beside them on both sides.
-/// The kinds are those of the bytes on one side.
-pub(crate) fn find(spans: &[&[u8]], beside: &[Kind]) -> Option<Check> {
+/// The kinds are those of the bytes on one side. The spans begin at `first` of a frame of `period` bytes.
+pub(crate) fn find(
+    spans: &[&[u8]],
+    beside: &[Kind],
+    (first, period): (usize, usize),
+    tried: &mut Tried,
+) -> Option<Check> {
     let length = beside.len();
-    for checksum in CHECKSUMS {
+    for (index, checksum) in CHECKSUMS.into_iter().enumerate() {
         for at in (0..(length + 1).saturating_sub(checksum.bytes())).rev() {
             let check = |begin| Check {
                 checksum,
@@ -61,12 +71,16 @@ pub(crate) fn find(spans: &[&[u8]], beside: &[Kind]) -> Option<Check> {
             if kinds.all(|kind| kind.constant().is_some()) {
                 continue;
             }
-            let holds = |from: usize, end: usize| {
-                holds(spans, |span| {
-                    let cells_end = span.len() - length;
-                    let sent = checksum.sent(&span[from..cells_end + end]);
-                    let is_right = span[cells_end..][places.clone()] == sent[..checksum.bytes()];
-                    (sent, is_right)
+            let mut holds = |from: usize, end: usize| {
+                let asked = [at, from, end].map(|place| (first + place) % period);
+                *tried.entry((index, asked)).or_insert_with(|| {
+                    holds(spans, |span| {
+                        let cells_end = span.len() - length;
+                        let sent = checksum.sent(&span[from..cells_end + end]);
+                        let is_right =
+                            span[cells_end..][places.clone()] == sent[..checksum.bytes()];
+                        (sent, is_right)
+                    })
                 })
             };
             // One of two bytes or more holds by chance nowhere. Others begin with the mark, or the cells.

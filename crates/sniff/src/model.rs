@@ -11,7 +11,7 @@
 //! | | numbers that grow, and checksums | none |
 //! | | other bytes | as cells on their own |
 //! | rest | a cell that never changes | by the cells near it: their values at rest, and whether they are as still |
-//! | presses | the change of each cell | by its neighbours in the array ([`Rows`]) |
+//! | presses | the change of each cell | by its neighbours in the array ([`rows`]) |
 //! | | of cells on their own | by what they do in other presses ([`alone`]) |
 //!
 //! Changes are whole numbers of steps. They are coded as what is left of a prediction, by a geometric
@@ -32,8 +32,6 @@ pub(crate) const CONSTANT_BITS: f64 = 8.0;
 pub(crate) const ZERO_BITS: f64 = 6.0;
 /// What is known beforehand, but for whether it is there.
 pub(crate) const EXPECTED_BITS: f64 = 1.0;
-/// That bytes between the mark and the cells look like cells at rest, on each side.
-pub(crate) const SKIPPED_BITS: f64 = 8.0;
 /// That a board sends a byte of which nothing is known: one like a checksum, and one like a taxel.
 pub(crate) const UNKNOWN_BITS: f64 = 4.0;
 pub(crate) const UNKNOWN_TAXEL_BITS: f64 = 12.0;
@@ -61,64 +59,57 @@ fn bits(left: f32, width: f32) -> f32 {
     (PI * (width + left * left / width)).log2()
 }
 
-/// Predictions of a cell: like the one before it, like the one above it, like both, like both and on a slope
-/// with those above it, and on a plane.
-const PREDICTIONS: usize = 5;
-
 /// The bits of each press in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
-/// each. Where little goes on around, a cell is predicted to be at rest.
+/// each. A cell is predicted to be like those before it and above it, and to be at rest where little goes on
+/// around. All moments of a press count as one.
 pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64> {
     let width = cols * channels;
     let noise = pictures.noise;
-    let of_picture = |Picture { change, .. }: &Picture| {
-        let mut sums = [0.0_f64; PREDICTIONS];
-        for at in pictures.changing() {
-            let place = at % width;
-            let back = |by: usize| change[at - by];
-            let (has_west, has_north) = (place >= channels, at >= width);
-            let west = if has_west { back(channels) } else { 0.0 };
-            let north = if has_north { back(width) } else { 0.0 };
-            let east = if has_north && place + channels < width {
-                back(width - channels)
-            } else {
-                north
-            };
-            let (predicted, around) = match (has_west, has_north) {
-                (true, true) => {
-                    let corner = back(width + channels);
-                    let around =
-                        (west - corner).abs() + (north - corner).abs() + (north - east).abs();
-                    let both = (west + north) / 2.0;
-                    let slope = (both + (east - corner) / 4.0).round();
-                    (
-                        [west, north, both.round(), slope, west + north - corner],
-                        around,
-                    )
-                }
-                (true, false) => {
-                    let before = if place >= 2 * channels {
-                        back(2 * channels)
-                    } else {
-                        0.0
-                    };
-                    ([west; PREDICTIONS], 2.0 * (west - before).abs())
-                }
-                _ => ([north; PREDICTIONS], 2.0 * (north - east).abs()),
-            };
-            if around + west.abs() + north.abs() <= NOISE * noise {
-                let bits = f64::from(bits(change[at], noise));
-                sums.iter_mut().for_each(|sum| *sum += bits);
-                continue;
+    let of_cell = |change: &[f32], at: usize| {
+        let place = at % width;
+        let back = |by: usize| change[at - by];
+        let (has_west, has_north) = (place >= channels, at >= width);
+        let west = if has_west { back(channels) } else { 0.0 };
+        let north = if has_north { back(width) } else { 0.0 };
+        let east = if has_north && place + channels < width {
+            back(width - channels)
+        } else {
+            north
+        };
+        let (predicted, around) = match (has_west, has_north) {
+            (true, true) => {
+                let corner = back(width + channels);
+                let around = (west - corner).abs() + (north - corner).abs() + (north - east).abs();
+                // Between the two, on the slope of the row above.
+                let between = (west + north) / 2.0 + (east - corner) / 4.0;
+                (between.round(), around)
             }
-            let width =
-                LEFT_OF_AROUND * around + LEFT_OF_OWN * (west.abs() + north.abs()) / 2.0 + noise;
-            for (sum, predicted) in sums.iter_mut().zip(predicted) {
-                *sum += f64::from(bits(change[at] - predicted, width));
+            (true, false) => {
+                let before = if place >= 2 * channels {
+                    back(2 * channels)
+                } else {
+                    0.0
+                };
+                (west, 2.0 * (west - before).abs())
             }
+            _ => (north, 2.0 * (north - east).abs()),
+        };
+        let own = west.abs() + north.abs();
+        if around + own <= NOISE * noise {
+            return bits(change[at], noise);
         }
-        sums
+        let width = LEFT_OF_AROUND * around + LEFT_OF_OWN * own / 2.0 + noise;
+        bits(change[at] - predicted, width)
     };
-    best_prediction(pictures, true, of_picture)
+    let of_picture = |picture: &Picture| -> f64 {
+        let cells = pictures.changing();
+        cells
+            .map(|at| f64::from(of_cell(&picture.change, at)))
+            .sum()
+    };
+    let of_press =
+        |press: &Vec<Picture>| press.iter().map(of_picture).sum::<f64>() / press.len() as f64;
+    pictures.presses.iter().map(of_press).collect()
 }
 
 /// How much cells differ on average from those `by` places before them in the same row.
@@ -133,75 +124,22 @@ pub(crate) fn difference(pictures: &Pictures, cols: usize, by: usize) -> f64 {
     sum / count.max(1) as f64
 }
 
-/// The bits of each press under the prediction that is best for all of them. All moments of a press count as
-/// one if it `is_once`.
-fn best_prediction<const N: usize>(
-    pictures: &Pictures,
-    is_once: bool,
-    of_picture: impl Fn(&Picture) -> [f64; N],
-) -> Vec<f64> {
-    let of_press = |press: &Vec<Picture>| {
-        let mut sums = [0.0; N];
-        for picture in press {
-            sums.iter_mut()
-                .zip(of_picture(picture))
-                .for_each(|(sum, bits)| *sum += bits);
-        }
-        sums.map(|sum| {
-            if is_once {
-                sum / press.len() as f64
-            } else {
-                sum
-            }
-        })
-    };
-    let presses: Vec<[f64; N]> = pictures.presses.iter().map(of_press).collect();
-    let total = |prediction: usize| presses.iter().map(|press| press[prediction]).sum::<f64>();
-    let best = (0..N)
-        .min_by(|&a, &b| total(a).total_cmp(&total(b)))
-        .unwrap_or(0);
-    presses.iter().map(|press| press[best]).collect()
-}
-
 /// The bits of each press in its later frames, whatever the shape of the array and how many numbers a taxel
-/// has: by the number that is before each.
+/// has.
 pub(crate) fn later(pictures: &Pictures) -> Vec<f64> {
-    best_prediction(pictures, false, |picture| {
-        let mut sums = [0.0_f64; LATER];
-        for at in pictures.changing() {
-            let bits = later_bits(pictures, picture, at);
-            sums.iter_mut()
-                .zip(bits)
-                .for_each(|(sum, bits)| *sum += f64::from(bits));
-        }
-        sums
-    })
+    let of_picture = |picture: &Picture| -> f64 {
+        let cells = pictures.changing();
+        cells.map(|at| later_bits(pictures, picture, at)).sum()
+    };
+    let of_press = |press: &Vec<Picture>| press.iter().map(of_picture).sum();
+    pictures.presses.iter().map(of_press).collect()
 }
 
-/// Predictions of a cell in a later frame: it stays, or it grows by as much, or by the same factor, as those
-/// before it.
-const LATER: usize = 3;
-
-fn later_bits(
-    pictures: &Pictures,
-    Picture { change, before }: &Picture,
-    at: usize,
-) -> [f32; LATER] {
-    let near = |of: &[f32]| {
-        let back = |by: usize| at.checked_sub(by).map_or(0.0, |at| of[at]);
-        (back(1), back(1) + back(2))
-    };
-    let ((west, wide), (west_before, wide_before)) = (near(change), near(before));
-    let factor = if wide_before == 0.0 {
-        1.0
-    } else {
-        (wide / wide_before).clamp(0.0, 4.0)
-    };
-    let (now, then) = (change[at], before[at]);
-    let width =
-        LEFT_OF_AROUND * (west - west_before).abs() + LEFT_OF_OWN * then.abs() + pictures.noise;
-    [then, then + west - west_before, (then * factor).round()]
-        .map(|predicted| bits(now - predicted, width))
+/// The bits of a cell in a later frame. It is predicted to stay, as nearly as the one before it did.
+fn later_bits(pictures: &Pictures, Picture { change, before }: &Picture, at: usize) -> f64 {
+    let west = at.checked_sub(1).map_or(0.0, |at| change[at] - before[at]);
+    let width = LEFT_OF_AROUND * west.abs() + LEFT_OF_OWN * before[at].abs() + pictures.noise;
+    bits(change[at] - before[at], width).into()
 }
 
 /// The bits of each press and cell in its first frame, if cells have nothing to do with those around them. A
@@ -249,7 +187,7 @@ pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
     let mut bits = alone(pictures);
     for (bits, press) in bits.iter_mut().zip(&pictures.presses) {
         for at in pictures.changing() {
-            let later = |picture| f64::from(later_bits(pictures, picture, at)[0]);
+            let later = |picture| later_bits(pictures, picture, at);
             bits[at] += press.iter().map(later).sum::<f64>();
         }
     }

@@ -9,9 +9,7 @@ use hardnessd_core::wire::Checksum;
 
 use crate::checks::Check;
 use crate::columns::{Columns, Kind};
-use crate::model::{
-    CONSTANT_BITS, EXPECTED_BITS, SKIPPED_BITS, UNKNOWN_BITS, UNKNOWN_TAXEL_BITS, ZERO_BITS,
-};
+use crate::model::{CONSTANT_BITS, EXPECTED_BITS, UNKNOWN_BITS, UNKNOWN_TAXEL_BITS, ZERO_BITS};
 
 /// A stretch of each frame that may be the cells.
 #[derive(Debug, Clone, PartialEq)]
@@ -128,15 +126,6 @@ impl Place {
             let of_mark: f64 = self.beside[end - 2..end].iter().map(Beside::bits).sum();
             of_mark - EXPECTED_BITS
         });
-        let is_padding = |beside: &&Beside| beside.is_resting() && !beside.is_high;
-        let (after, before) = self.skipped();
-        let mut sides = [
-            self.beside[..after].iter().rfind(is_padding),
-            self.beside[self.beside.len() - before..]
-                .iter()
-                .find(is_padding),
-        ];
-        let skipped = SKIPPED_BITS * sides.iter_mut().flatten().count() as f64;
         let beside = self
             .beside
             .iter()
@@ -147,7 +136,7 @@ impl Place {
             _ => UNKNOWN_BITS,
         };
         let unknown: f64 = self.unknown().map(of).sum();
-        constants - field + in_cells + skipped + unknown
+        constants - field + in_cells + unknown
     }
 
     /// The place with this checksum. A sum of two bytes may be the low half of one of four: zeros that are next

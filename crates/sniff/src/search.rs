@@ -8,7 +8,7 @@ use hardnessd_core::wire::Cell;
 
 use crate::Capture;
 use crate::cells::Cells;
-use crate::checks;
+use crate::checks::{self, Tried};
 use crate::columns::{Columns, Kind};
 use crate::found::{
     Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, is_too_large, name_bits,
@@ -19,7 +19,7 @@ use crate::model::{
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
-use crate::pictures::{Pictures, Presses, energy, middle, some};
+use crate::pictures::{Pictures, Presses, activity, energy, some};
 use crate::places::{Place, places};
 
 /// The longest side that is tried, so that an array that is too large is found.
@@ -29,8 +29,6 @@ const LONGEST_SIDE: usize = 128;
 const MOST_PLACES: usize = 60;
 const FEWEST_PLACES: usize = 24;
 const PLACE_BYTES: usize = 60_000;
-/// What is left out at the ends of the cells to tell formats.
-const MARGIN: usize = 16;
 /// The most bytes of a mark that look like cells at rest.
 const MOST_RESTING: usize = 4;
 /// At most so many of the likeliest candidates are decoded. Noise has thousands that all fail.
@@ -150,12 +148,17 @@ pub(crate) fn in_frames(
         presses,
         alone,
     };
+    let mut tried = Tried::new();
     let mut places: Vec<Place> = places
         .into_iter()
-        .map(|place| search.checked(place))
+        .map(|place| search.checked(place, &mut tried))
         .collect();
     places.sort_by(|a, b| a.bits(columns).total_cmp(&b.bits(columns)));
     places.truncate(most);
+    // A checksum holds in all frames by no chance.
+    if places.iter().any(|place| place.check.is_some()) {
+        places.retain(|place| place.check.is_some());
+    }
     let candidates = search.candidates(places, known);
     search.rank(&candidates, begin, &capture.bytes, known)
 }
@@ -200,13 +203,6 @@ impl Search<'_> {
 
     /// The formats that may be at a place, the likeliest first, by the order of the wire alone.
     fn formats(&self, place: &Place, known: Known) -> Vec<Format> {
-        // What is at the ends may be no cells.
-        let ends = if place.bytes > 4 * MARGIN { MARGIN } else { 0 };
-        let place = &Place {
-            start: place.start + ends,
-            bytes: place.bytes - 2 * ends,
-            ..place.clone()
-        };
         let mut found = Vec::new();
         let is_allowed = |cell: &Cell| known.cell.is_none_or(|known| known == *cell);
         let most = if known.cell.is_none() {
@@ -295,7 +291,7 @@ impl Search<'_> {
     }
 
     /// Finds the checksum among the bytes beside the cells.
-    fn checked(&self, place: Place) -> Place {
+    fn checked(&self, place: Place, tried: &mut Tried) -> Place {
         if place.unknown().next().is_none() {
             return place;
         }
@@ -305,7 +301,7 @@ impl Search<'_> {
         let span = |&index: &usize| self.frames.from(index, first, period + length);
         let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
         let kinds: Vec<Kind> = place.beside.iter().map(|beside| beside.kind).collect();
-        place.with(checks::find(&spans, &kinds))
+        place.with(checks::find(&spans, &kinds, (first, period), tried))
     }
 
     /// Decodes the likeliest candidates.
@@ -318,15 +314,7 @@ impl Search<'_> {
     ) -> Result<Found, Failure> {
         let mut ranked: Vec<Ranked> = Vec::new();
         let mut tried: Vec<(Array, Format)> = Vec::new();
-        // A checksum holds in all frames by no chance.
-        let is_checked = |candidate: &&Candidate| candidate.place.check.is_some();
-        let is_one_checked = candidates.iter().any(|candidate| is_checked(&candidate));
-        let candidates = || {
-            candidates
-                .iter()
-                .filter(|one| !is_one_checked || is_checked(one))
-        };
-        for candidate in candidates() {
+        for candidate in candidates {
             let Candidate { array, format, .. } = *candidate;
             if ranked.len() == RANKED || tried.contains(&(array, format)) {
                 continue;
@@ -370,7 +358,7 @@ impl Search<'_> {
             if !proposal.is_board && !known.is_complete() {
                 own_doubt = own_doubt
                     .or_else(|| several_numbers(&pictures, array, format))
-                    .or_else(|| other_cells(candidate, candidates()));
+                    .or_else(|| other_cells(candidate, candidates));
             }
             tried.push((array, format));
             ranked.push(Ranked {
@@ -388,10 +376,7 @@ impl Search<'_> {
 
 /// Says where else the cells may begin and end, if that is as likely, or what beside them looks like
 /// cells.
-fn other_cells<'a>(
-    best: &Candidate,
-    mut candidates: impl Iterator<Item = &'a Candidate>,
-) -> Option<String> {
+fn other_cells(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
     let is_other = |other: &&Candidate| {
         other.format == best.format
             && (other.place.start, other.place.bytes) != (best.place.start, best.place.bytes)
@@ -401,7 +386,7 @@ fn other_cells<'a>(
         let mark = place.mark()?;
         Some((place.beside.len() - mark.end, mark.start))
     };
-    if let Some(other) = candidates.find(is_other)
+    if let Some(other) = candidates.iter().find(is_other)
         && let Some(((before, after), (other_before, other_after))) =
             around(&best.place).zip(around(&other.place))
     {
@@ -438,33 +423,6 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
 
 /// A press stands out by so many times as much as frames at rest differ.
 const CONTRAST: f64 = 4.0;
-
-/// How far the numbers of each frame are from rest, by what they change from frame to frame.
-fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
-    let rest = middle(frames);
-    let mut activity = vec![0.0; frames.len()];
-    for cell in 0..rest.len() {
-        let of = |frame: &Vec<f32>| frame[cell];
-        if !frames.iter().map(of).all(f32::is_finite) {
-            continue;
-        }
-        let mut steps: Vec<f32> = frames
-            .windows(2)
-            .map(|pair| (of(&pair[1]) - of(&pair[0])).abs())
-            .collect();
-        steps.sort_by(f32::total_cmp);
-        let usual = steps.get(steps.len() / 2)?.max(f32::MIN_POSITIVE);
-        for (sum, frame) in activity.iter_mut().zip(frames) {
-            *sum += f64::from(((of(frame) - rest[cell]).abs() / usual).min(64.0));
-        }
-    }
-    Some(
-        activity
-            .into_iter()
-            .map(|sum| (sum * 16.0) as u32)
-            .collect(),
-    )
-}
 
 /// The bits of each press that no shape changes.
 fn later(pictures: &Pictures) -> Vec<f64> {
