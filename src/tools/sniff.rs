@@ -5,8 +5,12 @@
 //! sure, it shows the likeliest arrays as pictures on stderr, and the user chooses. The crate
 //! `hardnessd-sniff` finds the layouts.
 
+mod framing;
+
 use std::fmt::Write;
+use std::fs;
 use std::io::{BufReader, Read};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -246,6 +250,7 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Capture, Failure
         bytes_at_once: usize::MAX,
         bytes_per_s: f64::INFINITY,
     };
+    let errors_before = framing_errors(port);
     let mut source = serial::open(port, baud, &[settings]).remove(0);
     let mut captured = Capture::default();
     let mut lost = None;
@@ -270,6 +275,12 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Capture, Failure
         }
     })
     .await;
+    let errors = framing_errors(port).zip(errors_before);
+    let errors = errors.map_or(0, |(after, before)| after.saturating_sub(before));
+    if errors > captured.bytes.len() as u64 / FRAMED_BYTES {
+        let port = escaped(&port.to_string());
+        stderr_line!("{port}: {errors} framing errors: try another --baud");
+    }
     match lost {
         Some(reason) if captured.bytes.is_empty() => {
             let reason = doctor::obstacle(port).unwrap_or(reason);
@@ -277,6 +288,15 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Capture, Failure
         }
         _ => Ok(captured),
     }
+}
+
+/// A line has fewer framing errors than one in so many bytes, also if the port was opened within a byte.
+const FRAMED_BYTES: u64 = 100;
+
+/// The framing errors of `port` since the system started, if they are shown.
+fn framing_errors(port: &Port) -> Option<u64> {
+    let device = fs::metadata(port.device()?).ok()?;
+    framing::errors(Path::new("/"), device.rdev())
 }
 
 /// Shows the strongest press as an array would have it.
