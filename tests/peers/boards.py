@@ -9,6 +9,7 @@ areas of a hand are all read at one port.
 
 import contextlib
 import os
+import pty
 import re
 import socket
 import struct
@@ -17,6 +18,7 @@ import sys
 import threading
 import time
 import tomllib
+import tty
 
 from bench import Bench, free_port, wait_for
 
@@ -155,6 +157,41 @@ def hand(connection):
         connection.sendall(head + struct.pack(">H", 0x8000 | first % 97) * cells)
 
 
+def robotiq():
+    """A TSF-85 at a pty, whose path this returns. Not every packet has the static tactile field, and lengths vary."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    port = os.ttyname(theirs)
+
+    def send():
+        assert os.read(ours, 5) == bytes.fromhex("9A00580114")
+        for packet in range(1 << 30):
+            fields = b"".join(bytes([0x20 | finger << 2]) + struct.pack(">h", packet % 50) for finger in (0, 1))
+            if packet % 3 == 0:
+                fields += b"".join(
+                    bytes([0x10 | finger << 2]) + struct.pack(">28H", *[count + finger for count in counts(28)])
+                    for finger in (0, 1)
+                )
+            if packet % 5 == 0:
+                fields += b"\x70" + struct.pack(">Q", packet)
+            os.write(ours, bytes([0x9A, 0, 0x58, len(fields)]) + fields)
+            time.sleep(0.01)
+
+    threading.Thread(target=send, daemon=True).start()
+    return port
+
+
+def bridged(binary, program, config, expected):
+    """The daemon reads what this bridge sends."""
+    port = str(free_port())
+    process = subprocess.Popen([sys.executable, "-c", program, port])
+    try:
+        check(binary, config.replace("8300", port), {"bridge": expected})
+    finally:
+        process.kill()
+        process.wait()
+
+
 def presets():
     """The boards that have a preset."""
     for name, preset, rate in [("flexitac", "flexitac", 50), ("m1616", "m1616", 20), ("jq_glove", "jq-glove", 50)]:
@@ -192,6 +229,7 @@ def main(binary):
         page = page.read()
     blocks = re.findall(r"(?ms)^```toml\n(.*?)^```", page)
     programs = dict(re.findall(r"(?ms)^```python\n# (\S+)\n(.*?)^```", page))
+    programs["robotiq"] = re.search(r"(?ms)^```python\n(from pyrobotiqtactile.*?)^```", page)[1]
     boards = {tomllib.loads(block)["sensor"][0]["name"]: block for block in [*blocks, *presets()]}
     bridge = boards.pop("bridge")
     assert boards.keys() == BOARDS.keys(), boards.keys() ^ BOARDS.keys()
@@ -215,14 +253,13 @@ def main(binary):
     check(binary, config, wanted)
     print(f"inspire: {len(areas)} areas at one port")
 
-    port = str(free_port())
-    process = subprocess.Popen([sys.executable, "-c", programs["bridge.py"], port])
-    try:
-        check(binary, bridge.replace("8300", port), {"bridge": [row + col / 10 for row in range(4) for col in range(4)]})
-    finally:
-        process.kill()
-        process.wait()
+    bridged(binary, programs["bridge.py"], bridge, [row + col / 10 for row in range(4) for col in range(4)])
     print("bridge: UDP")
+
+    begin, end = programs["bridge.py"].split("def read_taxels")
+    program = begin + programs["robotiq"].replace("/dev/ttyACM0", robotiq()) + end[end.index("\n\n\ndaemon") :]
+    bridged(binary, program, bridge.replace("rows = 4", "rows = 7"), counts(28))
+    print("robotiq: by its package and the bridge")
 
 
 if __name__ == "__main__":
