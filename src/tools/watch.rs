@@ -46,7 +46,7 @@ use hardnessd_core::wording::escaped;
                         again; p asks what you press (`firm`, `2`, `cup` or `cup firm`), tells it to the daemon as \
                         the context `object` and `level`, and counts right and wrong verdicts. DAEMON SILENT: no answer for 3 s. NO DAEMON: nobody answers, or the \
                         protocol is another one; `watch` connects again. A map that is not live is \
-                        grey. Needs a terminal with 256 colours."
+                        grey. Needs 256 colours, also where NO_COLOR is set."
 )]
 pub struct Args {
     #[command(flatten)]

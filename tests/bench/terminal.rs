@@ -39,8 +39,8 @@ pub fn on_terminal(line: &str, device: &OwnedFd) -> Process {
     command.arg(BINARY).args(line.split_whitespace());
     command
         .env("TERM", "xterm-256color")
-        .env("LC_ALL", "C.UTF-8");
-    command.env_remove("NO_COLOR");
+        .env("LC_ALL", "C.UTF-8")
+        .env("NO_COLOR", "1");
     Process::start(command.stdin(end()).stdout(end()).stderr(end()))
 }
 

@@ -43,6 +43,29 @@ impl Watch {
         }
     }
 
+    /// Waits until the screen has at least so many colours.
+    fn colours(&mut self, most: usize) {
+        let start = Instant::now();
+        loop {
+            let screen = self.screen.screen();
+            let cells = (0..24).flat_map(|row| (0..80).map(move |col| (row, col)));
+            let cells = cells.filter_map(|(row, col)| screen.cell(row, col));
+            let mut found: Vec<String> = cells
+                .flat_map(|cell| [cell.fgcolor(), cell.bgcolor()])
+                .map(|colour| format!("{colour:?}"))
+                .collect();
+            found.sort_unstable();
+            found.dedup();
+            if found.len() >= most {
+                return;
+            }
+            assert!(start.elapsed() < PATIENCE, "{found:?}");
+            if let Some(bytes) = self.terminal.read(Duration::from_millis(50)) {
+                self.screen.process(&bytes);
+            }
+        }
+    }
+
     fn shows(&mut self, part: &str) -> String {
         self.until(part, |text| text.contains(part))
     }
@@ -78,6 +101,8 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     let mut sensor = bench.sensor("");
     watch.shows("LIVE");
     watch.shows("in contact for");
+    // The map is nothing but colours. The terminal's user has NO_COLOR.
+    watch.colours(10);
     watch.until("a final verdict", |text| {
         text.lines().any(|line| is_final(line, 1))
     });

@@ -11,7 +11,7 @@ use ratatui_core::terminal::{Frame, Terminal, TerminalOptions, Viewport};
 use ratatui_crossterm::CrosstermBackend;
 use ratatui_crossterm::crossterm::cursor::{Hide, MoveTo, Show};
 use ratatui_crossterm::crossterm::execute;
-use ratatui_crossterm::crossterm::style::{Attribute, SetAttribute};
+use ratatui_crossterm::crossterm::style::{Attribute, SetAttribute, force_color_output};
 use ratatui_crossterm::crossterm::terminal::{
     self, Clear, ClearType, EnterAlternateScreen, LeaveAlternateScreen,
 };
@@ -38,6 +38,8 @@ impl Screen {
             let _ = terminal::disable_raw_mode();
             before(panic);
         }));
+        // The map is its colours, so they are drawn where NO_COLOR is set, too.
+        force_color_output(true);
         terminal::enable_raw_mode()?;
         let mut out = BufWriter::new(stdout);
         execute!(out, EnterAlternateScreen, Hide, Clear(ClearType::All))?;
