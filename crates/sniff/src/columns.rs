@@ -40,6 +40,8 @@ pub(crate) struct Columns {
     /// The most frequent value of each byte.
     pub(crate) rest: Vec<u8>,
     pub(crate) numbers: Vec<Number>,
+    /// Whether the bytes look like numbers of 64 bits.
+    pub(crate) are_of_64_bits: bool,
     /// The bits of each byte as a cell, of those that hardly look like one, and of all of them.
     pub(crate) cell_bits: Vec<f64>,
     pub(crate) all_cell_bits: f64,
@@ -111,6 +113,7 @@ impl Columns {
             kinds: kinds.collect(),
             rest,
             numbers: Vec::new(),
+            are_of_64_bits: false,
             cell_bits: Vec::new(),
             all_cell_bits: 0.0,
         };
@@ -226,6 +229,7 @@ impl Columns {
             differences.sum::<f64>() / little.len() as f64 > RESTLESS_DIFFERENCE
         };
         let restless: Vec<usize> = active.iter().copied().filter(is_restless).collect();
+        self.are_of_64_bits = are_of_64_bits(&restless, self.kinds.len());
         if restless.len() <= MOST_RESTLESS.min(active.len() / 2) {
             for at in restless {
                 self.kinds[at] = Kind::Restless;
@@ -347,6 +351,13 @@ impl Number {
         let at = self.at.min(self.higher());
         Self::steady(at, self.bytes + 1, self.is_big_endian, pairs)
     }
+}
+
+/// Whether of each eight bytes of a frame one is nearly always restless, and the fourth after it hardly ever:
+/// the first are digits of a long number below the noise. Numbers of four bytes and fewer recur after four.
+fn are_of_64_bits(restless: &[usize], period: usize) -> bool {
+    let of_eight = |phase: usize| restless.iter().filter(|&&at| at % 8 == phase).count() * 8;
+    (0..8).any(|phase| 5 * of_eight(phase) > 4 * period && 5 * of_eight((phase + 4) % 8) < period)
 }
 
 /// The number in these bytes.

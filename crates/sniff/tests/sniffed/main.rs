@@ -208,6 +208,24 @@ fn what_the_user_knows_decides() {
 }
 
 #[test]
+fn numbers_of_64_bits_are_taken_for_no_shorter_ones() {
+    for seed in 0..4 {
+        let mut stream = Stream::new(seed, "long");
+        let array = Array { rows: 5, cols: 12 };
+        let (pressed, _) = frames(array, 250, &mut stream);
+        let bytes = pressed.iter().flat_map(|frame| {
+            let cells = frame.counts.iter().flat_map(|&count| {
+                let newtons = f64::from(count) / 12.5 + 0.02 * stream.normal();
+                newtons.to_be_bytes()
+            });
+            [&[0xE9, 0xD9, 0x45][..], &cells.collect::<Vec<u8>>()].concat()
+        });
+        let found = of(&bytes.collect::<Vec<u8>>(), Known::default());
+        assert!(found.is_err() || found.is_ok_and(|found| found.doubt.is_some()));
+    }
+}
+
+#[test]
 fn each_failure_has_its_own_message() {
     let check = |bytes: &[u8], part: &str| {
         let message = match of(bytes, Known::default()) {
