@@ -1,12 +1,14 @@
 //! The eight materials of the paper's Table 1: stiffness, laws, creep, texture.
 //!
 //! Young's modulus E of levels 2 to 4 follows from the Shore OO hardness by simulating the
-//! durometer with the same laws ([`super::durometer`]). This file holds the resulting moduli, and a
+//! durometer with the same laws ([`super::durometer`]). `materials.toml` holds the resulting moduli, and a
 //! test repeats the simulation.
+
+use std::sync::LazyLock;
 
 use serde::Deserialize;
 
-use super::substance::{Creep, Law, Substance, Texture};
+use super::substance::Substance;
 use crate::random::Stream;
 
 /// A reference material (paper, Table 1).
@@ -82,7 +84,7 @@ impl Material {
 
     /// The name used in commands and files.
     pub fn name(self) -> &'static str {
-        self.properties().name
+        &self.properties().name
     }
 
     /// Index in [`Material::ALL`].
@@ -95,14 +97,15 @@ impl Material {
     }
 }
 
-/// The properties of a material: a row of the table.
-#[derive(Debug)]
+/// The properties of a material: a row of `materials.toml`.
+#[derive(Debug, Deserialize)]
 pub(super) struct Properties {
-    name: &'static str,
+    name: String,
     pub(super) shore: Shore,
     /// Young's modulus in MPa, from the durometer, at the lowest, the mean and the highest hardness.
     /// Wood and hard plastic are too hard for the Shore OO scale to tell them apart.
     young_mpa: [f64; 3],
+    #[serde(flatten)]
     pub(super) substance: Substance,
 }
 
@@ -135,7 +138,7 @@ impl Body {
 }
 
 /// Distribution of the Shore OO hardness over a material's objects.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Deserialize)]
 pub(super) struct Shore {
     pub(super) mean: f64,
     pub(super) sd: f64,
@@ -171,129 +174,17 @@ impl Properties {
     }
 }
 
-const fn shore(mean: f64, sd: f64, low: f64, high: f64) -> Shore {
-    Shore {
-        mean,
-        sd,
-        low,
-        high,
+/// The table of the materials, in the order of [`Material::ALL`].
+static PROPERTIES: LazyLock<[Properties; 8]> = LazyLock::new(|| {
+    #[derive(Deserialize)]
+    struct Table {
+        material: [Properties; 8],
     }
-}
-
-const fn creep(j: f64, tau_s: f64) -> Creep {
-    Creep { j, tau_s }
-}
-
-const fn foam(exponent: f64, plateau: f64, strain: f64) -> Law {
-    Law::Foam {
-        exponent,
-        plateau,
-        strain,
-    }
-}
-
-/// A texture of these numbers: rms in um, shortest and longest wavelength in mm, Hurst exponent, anisotropy.
-const fn texture(numbers: [f64; 5]) -> Texture {
-    let [rms_um, shortest_mm, longest_mm, hurst, anisotropy] = numbers;
-    Texture {
-        rms_um,
-        shortest_mm,
-        longest_mm,
-        hurst,
-        anisotropy,
-    }
-}
-
-/// A row of the table: the name, the hardness with the moduli that belong to it, and the substance.
-const fn row(
-    name: &'static str,
-    (shore, young_mpa): (Shore, [f64; 3]),
-    nu: f64,
-    law: Law,
-    creep: [Creep; 2],
-    texture: Texture,
-) -> Properties {
-    Properties {
-        name,
-        shore,
-        young_mpa,
-        substance: Substance {
-            nu,
-            law,
-            creep,
-            texture,
-        },
-    }
-}
-
-const PROPERTIES: [Properties; 8] = [
-    row(
-        "wood",
-        (shore(87.0, 1.5, 82.0, 95.0), [600.0; 3]),
-        0.35,
-        Law::Solid,
-        [creep(0.03, 1.0), Creep::NONE],
-        texture([55.0, 2.5, 18.0, 0.4, 2.0]),
-    ),
-    row(
-        "rubber",
-        (shore(66.0, 1.2, 61.5, 69.5), [0.4673, 0.5870, 0.7126]),
-        0.49,
-        Law::Solid,
-        [creep(0.10, 0.3), creep(0.06, 3.0)],
-        texture([35.0, 3.0, 40.0, 0.9, 1.0]),
-    ),
-    row(
-        "plasticine",
-        (shore(52.0, 1.0, 51.0, 56.0), [1.1336, 1.1638, 1.3005]),
-        0.45,
-        Law::Plastic {
-            hardness: 1.0 / 12.0,
-        },
-        [creep(0.10, 0.5), Creep::NONE],
-        texture([90.0, 4.0, 30.0, 0.9, 1.0]),
-    ),
-    row(
-        "sponge",
-        (shore(32.0, 2.0, 25.0, 40.0), [0.2041, 0.2784, 0.3985]),
-        0.10,
-        foam(2.5, 0.12, 0.50),
-        [creep(0.12, 0.3), creep(0.08, 3.0)],
-        texture([160.0, 2.0, 10.0, 0.5, 1.0]),
-    ),
-    row(
-        "hard-plastic",
-        (shore(88.0, 1.5, 82.0, 95.0), [2200.0; 3]),
-        0.38,
-        Law::Solid,
-        [creep(0.03, 1.0), Creep::NONE],
-        texture([55.0, 4.0, 22.0, 0.6, 1.0]),
-    ),
-    row(
-        "foam",
-        (shore(63.0, 1.2, 61.2, 67.0), [0.6990, 0.7628, 0.9340]),
-        0.25,
-        foam(2.5, 0.35, 0.35),
-        [creep(0.12, 0.3), creep(0.06, 3.0)],
-        texture([50.0, 3.0, 30.0, 0.7, 1.0]),
-    ),
-    row(
-        "soft-candy",
-        (shore(55.0, 1.2, 51.5, 59.0), [0.3417, 0.3971, 0.4757]),
-        0.48,
-        Law::Solid,
-        [creep(0.30, 0.2), creep(0.30, 2.0)],
-        texture([80.0, 5.0, 30.0, 0.9, 1.0]),
-    ),
-    row(
-        "yoga-mat",
-        (shore(38.0, 2.0, 32.0, 44.0), [0.2464, 0.3179, 0.4121]),
-        0.15,
-        foam(2.0, 0.15, 0.42),
-        [creep(0.12, 0.3), creep(0.06, 3.0)],
-        texture([110.0, 3.0, 8.0, 0.5, 1.0]),
-    ),
-];
+    let table = include_str!("../materials.toml");
+    toml::from_str::<Table>(table)
+        .expect("the table is right")
+        .material
+});
 
 #[cfg(test)]
 mod tests {

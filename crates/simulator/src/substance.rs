@@ -1,9 +1,12 @@
 //! An object's substance, apart from its hardness: law, creep and texture.
 
+use serde::Deserialize;
+
 use super::kernel::Base;
 
 /// The law of the bulk. Stresses and moduli are relative to Young's modulus E.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub(super) enum Law {
     /// Elastic half-space.
     Solid,
@@ -25,7 +28,7 @@ pub(super) enum Law {
 const CORE_NU: f64 = 0.3;
 
 /// One term of the creep compliance, `j (1 - exp(-t / tau))`.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub(super) struct Creep {
     pub(super) j: f64,
     pub(super) tau_s: f64,
@@ -37,7 +40,7 @@ impl Creep {
 }
 
 /// Roughness of a face.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub(super) struct Texture {
     pub(super) rms_um: f64,
     pub(super) shortest_mm: f64,
@@ -47,7 +50,7 @@ pub(super) struct Texture {
 }
 
 /// The properties of a material except its modulus.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 pub(super) struct Substance {
     /// Poisson's ratio.
     pub(super) nu: f64,

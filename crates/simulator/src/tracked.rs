@@ -10,12 +10,8 @@ use hardnessd_core::press::{Change, ContactFrame, End, FrameAt, PressTracker, Th
 
 /// Whether a press tracker of a JX255N begins a press with this frame.
 pub(super) fn begins_press(frame: &Frame) -> bool {
-    let Thresholds {
-        contact_threshold_n,
-        begin_area_taxels,
-        ..
-    } = Thresholds::default();
-    frame.contact_area_taxels(contact_threshold_n) >= begin_area_taxels
+    let usual = Thresholds::default();
+    frame.contact_area_taxels(usual.contact_threshold_n) >= usual.begin_area_taxels
 }
 
 /// The single press among some frames, by the frames' indices.

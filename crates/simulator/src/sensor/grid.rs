@@ -101,17 +101,12 @@ impl Grid {
 /// transform is `(1 + q z) exp(-q z)`. A taxel integrates its active square and is calibrated
 /// under uniform pressure, so that over a taxel's places the shares add up to 1 on average.
 fn spreading(design: &Design, steps: usize, reach: usize) -> Vec<f32> {
-    let Design {
-        pitch_mm,
-        active_mm,
-        depth_mm,
-        ..
-    } = *design;
+    let (pitch_mm, depth_mm) = (design.pitch_mm, design.depth_mm);
     let span = 2 * reach + 1;
     let points = |(most, in_depth): (usize, f64), width_mm: f64| {
         most.min((in_depth * width_mm / depth_mm).ceil() as usize)
     };
-    let (fine, parts) = (points(FINE, active_mm), points(PARTS, CELL_MM));
+    let (fine, parts) = (points(FINE, design.active_mm), points(PARTS, CELL_MM));
     let mut shares = vec![0.0_f32; steps * steps * span * span];
     let mut sum = 0.0;
     let step_mm = pitch_mm / steps as f64;
@@ -121,7 +116,7 @@ fn spreading(design: &Design, steps: usize, reach: usize) -> Vec<f32> {
     };
     let active = |taxel: usize, point: usize| {
         (taxel as f64 - reach as f64) * pitch_mm
-            + ((point as f64 + 0.5) / fine as f64 - 0.5) * active_mm
+            + ((point as f64 + 0.5) / fine as f64 - 0.5) * design.active_mm
     };
     for (k, share) in shares.iter_mut().enumerate() {
         let (cell, n) = (k / (span * span), k % (span * span));
