@@ -3,11 +3,17 @@
 use std::path::Path;
 
 use prost::Message as _;
+use tract_onnx::pb;
 
 use crate::hrn_train_in;
 
 fn check(path: &Path) -> (Option<i32>, String) {
-    let output = hrn_train_in(Path::new("."), &format!("check-model {}", path.display()));
+    check_at(path, "")
+}
+
+fn check_at(path: &Path, more: &str) -> (Option<i32>, String) {
+    let command = format!("check-model {} {more}", path.display());
+    let output = hrn_train_in(Path::new("."), &command);
     let lines = [output.stdout, output.stderr].concat();
     (output.status.code(), String::from_utf8(lines).unwrap())
 }
@@ -22,6 +28,65 @@ fn the_built_in_models_pass() {
             "{lines}"
         );
     }
+}
+
+/// The built-in model of one frame with two convolutions of 128 channels beside it, whose result is nothing.
+fn slow() -> Vec<u8> {
+    const CHANNELS: usize = 128;
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
+    let bytes = std::fs::read(models.join("hrn.onnx")).unwrap();
+    let mut model = pb::ModelProto::decode(&*bytes).unwrap();
+    let graph = model.graph.as_mut().unwrap();
+    for (name, dims, value) in [
+        ("first", &[CHANNELS, 1, 5, 5][..], 0.01_f32),
+        ("second", &[CHANNELS, CHANNELS, 5, 5], 0.0),
+        ("nothing", &[CHANNELS, 4], 0.0),
+    ] {
+        graph.initializer.push(pb::TensorProto {
+            name: name.to_owned(),
+            dims: dims.iter().map(|&length| length as i64).collect(),
+            data_type: pb::tensor_proto::DataType::Float as i32,
+            raw_data: value.to_le_bytes().repeat(dims.iter().product()),
+            ..Default::default()
+        });
+    }
+    let logits = graph.node.iter_mut();
+    for node in logits.filter(|node| node.output[0] == "logits") {
+        node.output[0] = "fast".to_owned();
+    }
+    let node = |op: &str, inputs: &[&str], output: &str| pb::NodeProto {
+        name: format!("slow {output}"),
+        op_type: op.to_owned(),
+        input: inputs.iter().map(|&input| input.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        ..Default::default()
+    };
+    let beside = [
+        node("Conv", &["frame", "first"], "wide"),
+        node("Conv", &["wide", "second"], "deep"),
+        node("GlobalAveragePool", &["deep"], "mean"),
+        node("Flatten", &["mean"], "flat"),
+        node("MatMul", &["flat", "nothing"], "zero"),
+    ];
+    graph.node.splice(0..0, beside);
+    let place = graph.node.iter().position(|node| node.output[0] == "fast");
+    let sum = node("Add", &["fast", "zero"], "logits");
+    graph.node.insert(place.unwrap() + 1, sum);
+    model.encode_to_vec()
+}
+
+#[test]
+fn a_slow_model_passes_for_a_slow_sensor_alone() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("slow.onnx");
+    std::fs::write(&path, slow()).unwrap();
+    let (code, lines) = check_at(&path, "--fps 5");
+    let expected = "a model that hardnessd loads, for sensors of up to 5 frames/s";
+    assert!(code == Some(0) && lines.contains(expected), "{lines}");
+    let (code, lines) = check_at(&path, "--fps 1000");
+    let expected =
+        "ms for a verdict: expected at most 1.0 ms, a tenth of the fastest sensor's frame period";
+    assert!(code == Some(78) && lines.contains(expected), "{lines}");
 }
 
 #[test]
