@@ -220,6 +220,21 @@ fn right(presses: &Presses, judged: &Judged) -> Vec<(usize, f64)> {
     right.collect()
 }
 
+/// Which candidates were judged on some of the presses only.
+fn partly_judged(candidates: &[Row]) -> Option<String> {
+    let judged = |row: &Row| row.judged(Division::NewObjects).map_or(0, Vec::len);
+    let most = candidates.iter().map(judged).max()?;
+    let row = candidates
+        .iter()
+        .find(|row| (1..most).contains(&judged(row)))?;
+    Some(format!(
+        "{} is judged on {} of the {most} presses of new objects, because it takes minutes to learn from the others: compare \
+         its figures by their intervals",
+        row.name,
+        judged(row)
+    ))
+}
+
 /// The calibration of a model that was judged so.
 pub(super) fn calibration(
     judged: &Judged,
@@ -259,6 +274,7 @@ impl Comparison<'_> {
     /// candidate is chosen by new objects, or where nothing there is better than guessing, by later presses.
     pub(super) fn report(self) -> (Report, Option<usize>) {
         let mut remarks = self.remarks_on_objects();
+        remarks.extend(partly_judged(&self.candidates));
         if !self.has_references && self.candidates[0].left_out.is_none() {
             remarks.push(
                 "as references of the built-in model these presses make verdicts on each other worse, so the daemon would \
@@ -437,5 +453,27 @@ impl Comparison<'_> {
             }
         }
         (confusion, wrong)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_candidate_that_is_judged_on_some_presses_is_named() {
+        let row = |name: &str, presses: usize| Row {
+            name: name.to_owned(),
+            judged: [Some(vec![(0, Vec::new()); presses]), None],
+            ..Row::default()
+        };
+        let all = [row("built-in", 5), row("taxels", 0), row("features", 5)];
+        assert_eq!(partly_judged(&all), None);
+        let [first, _, last] = all;
+        let found = partly_judged(&[first, last, row("hrn", 1)]).unwrap();
+        assert!(
+            found.starts_with("hrn is judged on 1 of the 5 presses"),
+            "{found}"
+        );
     }
 }
