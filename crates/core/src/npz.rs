@@ -16,11 +16,14 @@ use crate::npy::{self, Element, Header};
 /// An array above this size gets 64-bit lengths in the archive. Packed bytes may be slightly more
 /// than unpacked ones, so it is less than 4 GiB.
 const LARGE_BYTES: usize = 0xF000_0000;
+/// Bytes of an array that are packed at once, where not all are.
+const CHUNK_BYTES: usize = 1 << 16;
 
 /// An `.npz` file being written. Its arrays are compressed. It holds no date, so the same arrays give the
 /// same bytes.
 pub struct Writer<W: Write + Seek> {
     zip: ZipWriter<W>,
+    chunk_bytes: usize,
 }
 
 impl<W: Write + Seek> Writer<W> {
@@ -28,6 +31,16 @@ impl<W: Write + Seek> Writer<W> {
     pub fn new(out: W) -> Self {
         Self {
             zip: ZipWriter::new(out),
+            chunk_bytes: usize::MAX,
+        }
+    }
+
+    /// The same for arrays that are too large for memory. The packed bytes of a large array then differ from those of
+    /// [`Self::new`], because the packer looks ahead as far as it is given bytes.
+    pub fn in_chunks(out: W) -> Self {
+        Self {
+            chunk_bytes: CHUNK_BYTES,
+            ..Self::new(out)
         }
     }
 
@@ -45,20 +58,59 @@ impl<W: Write + Seek> Writer<W> {
         self.add_npy(name, &npy::to_bytes(shape, elements))
     }
 
+    /// The same of elements that are made one by one. There must be as many as the shape says.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of writing.
+    pub fn add_each<T: Element>(
+        &mut self,
+        name: &str,
+        shape: &[usize],
+        elements: impl Iterator<Item = T>,
+    ) -> io::Result<()> {
+        let header = Header {
+            descr: T::DESCR.to_owned(),
+            fortran_order: false,
+            shape: shape.to_vec(),
+        };
+        let mut bytes = header.to_bytes();
+        let expected = header.count().unwrap_or(usize::MAX);
+        let all_bytes = expected.saturating_mul(size_of::<T>());
+        self.begin(name, all_bytes.saturating_add(bytes.len()))?;
+        let mut found = 0;
+        for element in elements {
+            element.push(&mut bytes);
+            found += 1;
+            if bytes.len() >= self.chunk_bytes {
+                self.zip.write_all(&bytes)?;
+                bytes.clear();
+            }
+        }
+        assert_eq!(found, expected, "{name}: {shape:?}");
+        self.zip.write_all(&bytes)?;
+        self.zip.flush()
+    }
+
     /// Adds the bytes of an `.npy` file.
     ///
     /// # Errors
     ///
     /// Returns the errors of writing.
     pub fn add_npy(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
-        let options = SimpleFileOptions::default()
-            .compression_method(CompressionMethod::Deflated)
-            .large_file(bytes.len() > LARGE_BYTES);
-        self.zip.start_file(format!("{name}.npy"), options)?;
+        self.begin(name, bytes.len())?;
         self.zip.write_all(bytes)?;
         // Without this the file would be a few bytes shorter, and not the same as that of which a
         // model's card gives the SHA-256.
         self.zip.flush()
+    }
+
+    /// Begins an array of so many bytes.
+    fn begin(&mut self, name: &str, bytes: usize) -> io::Result<()> {
+        let options = SimpleFileOptions::default()
+            .compression_method(CompressionMethod::Deflated)
+            .large_file(bytes > LARGE_BYTES);
+        Ok(self.zip.start_file(format!("{name}.npy"), options)?)
     }
 
     /// Adds an array with one axis.

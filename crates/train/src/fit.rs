@@ -166,15 +166,19 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
         .into_iter()
         .partition(|path| collect::is_data_set(path));
     let mut sets = Presses::read(&sets)?;
-    let layout = match sets.all.is_empty() || sets.are_over_time() {
+    let layout = match sets.all.is_empty() {
         true => Layout::OverTime,
-        false => Layout::Frames,
+        false => sets.layout(),
     };
-    let recordings = collect::recordings(&recordings, sensor, layout, false)?;
+    let mut played = Vec::new();
+    collect::recordings(&recordings, sensor, layout, false, |recording| {
+        played.push(recording);
+        Ok(())
+    })?;
     let stated = sets.sources.iter().find_map(|source| source.levels.clone());
     let levels = match levels.or(stated) {
         Some(levels) => levels,
-        None => levels::of_labels(recordings.iter().map(|recording| &recording.labels))?,
+        None => levels::of_labels(played.iter().map(|recording| &recording.labels))?,
     };
     for source in &mut sets.sources {
         source.levels = Some(levels.clone());
@@ -187,7 +191,7 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
         split: Split::Train,
     };
     let mut collection = Collection::default();
-    for recording in recordings {
+    for recording in played {
         collection.add(recording, &settings)?;
     }
     let mut all = collection.into_presses(&settings.levels);

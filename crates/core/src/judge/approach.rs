@@ -52,7 +52,7 @@ impl EndedPress {
     }
 
     /// The press on the array's own grid, for a model of parts.
-    pub(super) fn parts(&self) -> Vec<f32> {
+    pub fn parts(&self) -> Vec<f32> {
         let moments = self.moments.iter();
         let moments = moments.map(|moment| (moment.time_s, &moment.frame.newtons[..]));
         parts(&moments.collect::<Vec<_>>())

@@ -49,10 +49,7 @@ pub(super) fn all(
             presses.shown_paths()
         );
     }
-    let layout = match presses.are_over_time() {
-        true => Layout::OverTime,
-        false => Layout::Frames,
-    };
+    let layout = presses.layout();
     let mut sets = vec![(PAPER_SPLIT, presses)];
     sets.retain(|(_, own)| own.labelled(Split::Test).next().is_some());
     for (name, seed, shapes) in FRESH {

@@ -4,7 +4,7 @@
 //! the arm's approach. The daemon's own pipeline decodes, tares and selects, so a model learns from the same
 //! frames that it will judge.
 //!
-//! All presses of a call are in memory.
+//! One recording is in memory at a time, and of each press what the data set gets of it.
 
 mod recording;
 
@@ -19,8 +19,9 @@ use serde_json::{Map, Value, json};
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::{COLLECTOR, MOST_LEVELS};
+use crate::data::source::{COLLECTOR, Grid, MOST_LEVELS};
 use crate::exit::unreadable;
+use hardnessd_core::npz::Writer;
 use hardnessd_core::recording::MAGIC;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{BUILT_IN_HRN, Level, Model, sha256_hex};
@@ -101,23 +102,26 @@ fn begins(path: &Path, with: &[u8]) -> bool {
     }
 }
 
-/// Plays recordings, in the order of the paths. `sensor` is that of recordings that do not describe their own. A
-/// recording without a press is left out, with a word.
+/// Plays recordings, in the order of the paths, and gives each to `take` before the next one is read. Returns how
+/// many were used. `sensor` is that of recordings that do not describe their own. A recording without a press is
+/// left out, with a word.
 ///
 /// # Errors
 ///
-/// Returns the error of the first file that cannot be used, unless `skips_unusable`: then such a file is left out too.
+/// Returns the error of the first file that cannot be used, or that `take` refuses, unless `skips_unusable`: then such
+/// a file is left out too.
 pub fn recordings(
     paths: &[PathBuf],
     sensor: &Sensor,
     layout: Layout,
     skips_unusable: bool,
-) -> anyhow::Result<Vec<Recording>> {
+    mut take: impl FnMut(Recording) -> anyhow::Result<()>,
+) -> anyhow::Result<usize> {
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
     let bar = ProgressBar::new(paths.len() as u64);
     let bar = bar.with_style(style.expect("the template is right"));
     let hrn = Arc::new(Model::load(BUILT_IN_HRN)?);
-    let (mut recordings, mut left_out) = (Vec::new(), Vec::new());
+    let mut left_out = Vec::new();
     for path in paths {
         let played = file::whole(path).and_then(|bytes| {
             let played = Recording::played(path, &bytes, sensor, layout, &hrn);
@@ -129,20 +133,18 @@ pub fn recordings(
                  in a recording",
                 path.display()
             )),
-            Ok(recording) => recordings.push(recording),
-            Err(error) if skips_unusable => left_out.push(error),
-            Err(error) => return Err(error),
+            played => match played.and_then(&mut take) {
+                Err(error) if skips_unusable => left_out.push(error),
+                taken => taken?,
+            },
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    left_out.iter().for_each(say_left_out);
-    Ok(recordings)
-}
-
-/// Says that a recording is left out, and why.
-pub fn say_left_out(error: &anyhow::Error) {
-    hardnessd_core::stderr_line!("left out: {}", wording::line(error.as_ref()));
+    for error in &left_out {
+        hardnessd_core::stderr_line!("left out: {}", wording::line(error.as_ref()));
+    }
+    Ok(paths.len() - left_out.len())
 }
 
 /// A data set under construction.
@@ -169,14 +171,14 @@ impl Collection {
     pub fn of(path: &Path, layout: Layout) -> anyhow::Result<Self> {
         let shown = path.display();
         let mut presses = read_one(path)?;
-        match (presses.are_over_time(), layout) {
-            (true, Layout::Frames) => {
+        match presses.layout() {
+            own if own == layout => {}
+            Layout::OverTime => {
                 bail!("{shown}: has whole presses, not single frames: collect with --sequences")
             }
-            (false, Layout::OverTime) => {
+            Layout::Frames => {
                 bail!("{shown}: has single frames, not whole presses: collect without --sequences")
             }
-            _ => {}
         }
         ensure!(
             presses.all.iter().all(|press| press.object.is_some()),
@@ -286,22 +288,28 @@ impl Collection {
     /// Returns the errors of writing to `out`.
     pub fn write<W: Write + Seek>(&self, out: W, layout: Layout) -> anyhow::Result<W> {
         let mut meta = self.meta.clone();
-        let grid = self.presses.grid();
+        // A single frame has no parts.
+        let is_held = |grid: &Grid| grid.is_kept() || layout == Layout::OverTime;
+        let grid = self.presses.grid().filter(is_held);
         for (key, value) in [
             ("captures", json!(self.captures)),
             ("levels", json!(self.levels())),
             ("materials", json!(self.materials)),
             ("pitch_mm", json!(self.presses.pitch_mm())),
-            ("grid", json!(grid.map(|array| [array.rows, array.cols]))),
+            ("grid", json!(grid.map(|of| [of.array.rows, of.array.cols]))),
         ] {
             meta.insert(key.to_owned(), value);
+        }
+        if let Some(grid) = grid.filter(|grid| !grid.is_kept()) {
+            meta.insert("grid_pitch_mm".to_owned(), json!(grid.pitch_mm));
         }
         meta.entry("generator").or_insert(json!(collector()));
         meta.entry("seed").or_insert(Value::Null);
         if layout == Layout::OverTime {
             meta.insert("sensors".to_owned(), json!(self.sensors));
         }
-        Ok(presses::write(out, &self.presses, layout, &meta.into())?)
+        let npz = Writer::in_chunks(out);
+        Ok(presses::write(npz, &self.presses, layout, &meta.into())?)
     }
 
     /// The levels of an earlier data set or the paper's, or as many as the presses have, with their numbers for

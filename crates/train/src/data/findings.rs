@@ -11,7 +11,7 @@ use anyhow::ensure;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 
-use super::presses::{Press, Presses};
+use super::presses::Presses;
 
 /// Presses with fewer taxels that are not 0, over all frames, may be alike by chance.
 const LEAST_TAXELS: usize = 32;
@@ -152,17 +152,15 @@ fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
 
 /// The press as its reader would find it.
 fn named(presses: &Presses, place: usize) -> String {
-    let Press {
-        source,
-        object,
-        name,
-        ..
-    } = &presses.all[place];
-    let object = object.map(|object| format!(" of object {object}"));
-    let name = name.as_ref().map(|name| format!(" ({name})"));
+    let press = &presses.all[place];
+    let object = press.object.map(|object| format!(" of object {object}"));
+    let name = press.name.as_ref().map(|name| format!(" ({name})"));
     format!(
         "press {place} of {}{}{}",
-        presses.sources.get(*source).map_or("", |one| &one.name),
+        presses
+            .sources
+            .get(press.source)
+            .map_or("", |one| &one.name),
         object.unwrap_or_default(),
         name.unwrap_or_default()
     )
@@ -193,6 +191,7 @@ mod tests {
     use hardnessd_core::verdict::ModelFrame;
 
     use super::*;
+    use crate::data::presses::Press;
     use crate::data::source::Source;
 
     /// Presses of `frames` frames each, on object, level and split, with a content of its own for each number.

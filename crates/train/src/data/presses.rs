@@ -20,7 +20,7 @@ use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Split};
 
 pub use self::file::{Layout, meta, write};
 use self::frames::Frames;
-use super::source::{Kind, Object, PITCH_MM, Source, papers_levels};
+use super::source::{Grid, Kind, Object, PITCH_MM, Source, papers_levels};
 
 /// Newtons per unit of a file's `frames_mn`, and of the simulator's presses.
 const MILLINEWTON: f32 = 1e-3;
@@ -52,6 +52,9 @@ pub struct Press {
     /// The newtons of the array before the touch, without a zero taken: the sensor's own unloaded state. Only
     /// recordings have it.
     pub unloaded: Option<Vec<f32>>,
+    /// The input `parts` of a model on the array's own grid, where the array is larger than the frames here. Only
+    /// recordings have it.
+    pub parts: Option<Vec<f32>>,
     /// What felt the press.
     pub kind: Kind,
     /// Index of the press's file in [`Presses::sources`].
@@ -264,6 +267,14 @@ impl Presses {
         used.into_iter().map(of).reduce(both)
     }
 
+    /// How a file keeps them.
+    pub fn layout(&self) -> Layout {
+        match self.are_over_time() {
+            true => Layout::OverTime,
+            false => Layout::Frames,
+        }
+    }
+
     /// Whether a press has more than one moment.
     pub fn are_over_time(&self) -> bool {
         self.frames.len() > self.all.len()
@@ -322,14 +333,17 @@ impl Presses {
         })
     }
 
-    /// The array whose frames all presses have as they are.
-    pub fn grid(&self) -> Option<Array> {
+    /// The array that all presses are of, if it is one with square taxels.
+    pub fn grid(&self) -> Option<Grid> {
         let first = self.sources.first()?.grid;
         first.filter(|_| self.sources.iter().all(|source| source.grid == first))
     }
 
     /// The input `parts` of a model on the grid of the presses' own array.
     pub fn parts(&self, press: usize, Array { rows, cols }: Array) -> Vec<f32> {
+        if let Some(parts) = &self.all[press].parts {
+            return parts.clone();
+        }
         let (top, left) = ((ROWS - rows) / 2, (COLS - cols) / 2);
         let own = |row: usize| -> (f32, Vec<f32>) {
             let frame = self.frames.frame(row).newtons;

@@ -7,6 +7,7 @@ use std::io::Cursor;
 
 use anyhow::Context as _;
 use hardnessd_core::exit::CONFIG;
+use hardnessd_core::npz::Writer;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
 use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Materials};
@@ -91,6 +92,7 @@ pub fn to_bytes(
             meta["settings"] = json!(settings);
         }
     }
-    let written = presses::write(Cursor::new(Vec::new()), presses, layout, &meta);
+    let npz = Writer::new(Cursor::new(Vec::new()));
+    let written = presses::write(npz, presses, layout, &meta);
     Ok(written.context("the archive")?.into_inner())
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use hardnessd_core::frame::{Array, Pitch};
-use hardnessd_core::verdict::Level;
+use hardnessd_core::verdict::{COLS, Level, ROWS};
 use hardnessd_simulator::{LEVELS, LevelRange};
 
 /// The distance between taxels, unless a file names another one.
@@ -44,6 +44,23 @@ pub enum Kind {
     Recorded = 2,
 }
 
+/// An array of square taxels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    /// Its rows and columns.
+    pub array: Array,
+    /// The distance between its taxels.
+    pub pitch_mm: f64,
+}
+
+impl Grid {
+    /// Whether a data set has the frames as they are, in the middle of its own. A press on a larger array has its
+    /// parts beside the frames.
+    pub fn is_kept(&self) -> bool {
+        self.array.rows <= ROWS && self.array.cols <= COLS
+    }
+}
+
 /// A file that presses came from.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Source {
@@ -63,9 +80,9 @@ pub struct Source {
     /// The least and the greatest distance between the taxels of the file's sensors, if they differ.
     #[serde(skip)]
     pub pitches_mm: Option<[f64; 2]>,
-    /// The array whose frames the file has as they are, in the middle of its own.
+    /// The array of all presses, if they are of one with square taxels.
     #[serde(skip)]
-    pub grid: Option<Array>,
+    pub grid: Option<Grid>,
     /// The levels that the file states.
     #[serde(skip)]
     pub levels: Option<Vec<Level>>,

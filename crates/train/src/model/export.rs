@@ -101,10 +101,14 @@ impl Learnt<'_> {
             }
         };
         let pitches = self.presses.pitches_mm(self.train);
+        let grid = match graph.inputs {
+            Inputs::Parts(_) => self.presses.grid(),
+            _ => None,
+        };
         Ok(Card {
             format: format.to_owned(),
             levels: self.presses.levels(),
-            pitch_mm: self.presses.pitch_mm() as f32,
+            pitch_mm: grid.map_or(self.presses.pitch_mm(), |grid| grid.pitch_mm) as f32,
             method: method.to_owned(),
             data: data(sources)?,
             metrics,
@@ -113,10 +117,7 @@ impl Learnt<'_> {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
                 ..range(best)
             },
-            grid: match graph.inputs {
-                Inputs::Parts(array) => Some(array),
-                _ => None,
-            },
+            grid: grid.map(|grid| grid.array),
             conformal,
         })
     }

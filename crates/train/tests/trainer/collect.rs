@@ -393,10 +393,10 @@ fn what_cannot_be_used_is_left_out_with_its_reason() {
     let lines: Vec<&str> = errors.lines().collect();
     assert_eq!(lines.len(), 4, "{errors}");
     for (line, (path, reason)) in lines.into_iter().zip([
+        ("foam.bin", "the recording has no label `level`"),
         ("zeros.bin", "no press found"),
         ("fleet/a/damaged.mcap", "damaged"),
         ("none.mcap", "No such file"),
-        ("foam.bin", "the recording has no label `level`"),
     ]) {
         assert!(line.starts_with(&format!("left out: {path}: ")), "{line}");
         assert!(line.contains(reason), "{line}");

@@ -4,8 +4,15 @@ use std::fs;
 use std::fs::File;
 use std::path::Path;
 
-use hardnessd_core::frame::Array;
+use std::sync::Arc;
+
+use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::frame::{Array, Stamp};
+use hardnessd_core::npz::Writer;
+use hardnessd_core::pipeline::Input;
+use hardnessd_core::recording::{Entry, Found, Playback};
 use hardnessd_core::references;
+use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::verdict::{Format, Model, ModelFrame};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{self, Layout, Press, Presses};
@@ -48,7 +55,7 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
     let levels: Vec<Value> = levels.iter().enumerate().map(level).collect();
     let meta = json!({"grid": [4, 4], "pitch_mm": 3.5, "levels": levels});
     presses::write(
-        File::create(path).unwrap(),
+        Writer::new(File::create(path).unwrap()),
         &presses,
         Layout::OverTime,
         &meta,
@@ -99,6 +106,96 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     assert_eq!(again.card().grid, hrn.card().grid);
 }
 
+/// The table of a sensor with so many taxels a side.
+fn table(side: usize) -> String {
+    format!(
+        "name = \"wide\"\nport = \"/dev/null\"\nframe_rate_hz = 20\n[FRAME]\nsync = \"AA 55 C3 3C\"\nlength = \"none\"\n\
+         checksum = \"none\"\ncell = \"u8\"\nrows = {side}\ncols = {side}\n[CALIBRATION]\nnewtons_per_count = 0.05\n\
+         pitch_mm = 2.0\n"
+    )
+}
+
+/// A press of a bar of so many rows and columns on the middle of that sensor, as raw bytes.
+fn pressed(side: usize, [rows, cols]: [usize; 2], hardest: u8) -> Vec<u8> {
+    let ramp = (1..=10).map(|step| hardest / 10 * step);
+    let frame = |counts: u8| {
+        let mut cells = vec![0; side * side];
+        for row in (side - rows) / 2..(side + rows) / 2 {
+            cells[row * side + (side - cols) / 2..][..cols].fill(counts);
+        }
+        [&[0xAA, 0x55, 0xC3, 0x3C][..], &cells].concat()
+    };
+    let counts = [0; 6].into_iter().chain(ramp).chain([0; 4]);
+    counts.flat_map(frame).collect()
+}
+
+#[test]
+fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
+    for side in [32, 64] {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        let table = table(side);
+        let config = table.replace("[FRAME]", "[sensor.frame]");
+        let config = config.replace("[CALIBRATION]", "[sensor.calibration]");
+        fs::write(path("wide.toml"), format!("[[sensor]]\n{config}")).unwrap();
+        // Features do not tell a bar along the rows from one along the columns.
+        let bars = [[2, 8], [8, 2]];
+        for (object, bar) in [bars[0], bars[0], bars[1], bars[1]].into_iter().enumerate() {
+            for number in 0..3 {
+                let bytes = pressed(side, bar, 100 + 10 * object as u8 + 30 * number);
+                fs::write(path(&format!("{object}{number}.bin")), bytes).unwrap();
+            }
+            let level = object / 2 + 1;
+            let collect = format!(
+                "collect --sequences --config wide.toml --level {level} --object {object} --out {object}.npz \
+                 {object}0.bin {object}1.bin {object}2.bin"
+            );
+            succeed_in(directory.path(), &collect);
+        }
+        let fit = "fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx --json";
+        let report = parsed(&succeed_in(directory.path(), fit));
+        assert_eq!(
+            (&report["best"], &report["writes"]),
+            (&json!("taxels"), &json!("model"))
+        );
+
+        let hrn = Model::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
+        let array = Array {
+            rows: side,
+            cols: side,
+        };
+        assert_eq!((hrn.card().grid, hrn.card().pitch_mm), (Some(array), 2.0));
+        let table = table
+            .replace("[FRAME]", "[frame]")
+            .replace("[CALIBRATION]", "[calibration]");
+        let sensor: sensor::Settings = toml::from_str(&table).unwrap();
+        let sensor = Sensor::new(Description {
+            sensor,
+            ..Description::default()
+        })
+        .unwrap();
+        let hrn = Arc::new(hrn);
+        for (bar, level) in bars.into_iter().zip(1..) {
+            let mut playback = Playback::of_bytes(sensor.clone(), hrn.clone());
+            let found = Found {
+                sensor: "wide".to_owned(),
+                at: Stamp {
+                    mono: std::time::Duration::ZERO,
+                    wall: jiff::Timestamp::UNIX_EPOCH,
+                },
+                entry: Entry::Input(Input::Bytes(pressed(side, bar, 145))),
+            };
+            let mut events = playback.feed(found).unwrap();
+            events.extend(playback.end());
+            let verdicts = events.into_iter().filter_map(|event| match event {
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.level,
+                _ => None,
+            });
+            assert_eq!(verdicts.collect::<Vec<u8>>(), [level], "{side}");
+        }
+    }
+}
+
 #[test]
 fn presses_that_tell_nothing_become_references() {
     let directory = tempfile::tempdir().unwrap();
@@ -134,7 +231,7 @@ fn references_that_the_daemon_would_not_use_are_not_written() {
         let level = (u32::from(number) * 7 / 3 % 4) as u8 + 1;
         (press.level, press.shore, press.split) = (level, None, Split::Train);
     }
-    let file = File::create(path("d.npz")).unwrap();
+    let file = Writer::new(File::create(path("d.npz")).unwrap());
     let meta = presses::meta(&path("s.npz")).unwrap();
     presses::write(file, &presses, Layout::OverTime, &meta).unwrap();
     let output = hrn_train_in(directory.path(), "fit d.npz --out m.onnx");

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+use hardnessd_core::npz::Writer;
 use hrn_train::data::presses::{self, Layout, Presses};
 use serde_json::Value;
 
@@ -52,7 +53,7 @@ fn errors(output: &Output) -> String {
 
 fn write_data(path: &Path, presses: &Presses, meta: &Value) {
     let file = File::create(path).unwrap();
-    presses::write(file, presses, Layout::Frames, meta).unwrap();
+    presses::write(Writer::new(file), presses, Layout::Frames, meta).unwrap();
 }
 
 /// A directory with a data set of few presses, `d.npz`.

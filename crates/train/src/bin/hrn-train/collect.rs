@@ -42,16 +42,8 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     };
     let before = collection.presses().all.len();
     let skips = arguments.skip_unusable;
-    let mut used = 0;
-    for recording in collect::recordings(&captures, &sensor, layout, skips)? {
-        match collection.add(recording, &settings) {
-            Err(error) if skips => collect::say_left_out(&error),
-            added => {
-                added?;
-                used += 1;
-            }
-        }
-    }
+    let add = |recording| collection.add(recording, &settings);
+    let used = collect::recordings(&captures, &sensor, layout, skips, add)?;
     ensure!(used > 0, "no recording can be used");
     let written = || -> anyhow::Result<()> {
         let part = match earlier {

@@ -9,16 +9,16 @@ use serde_json::Value;
 use super::{ARCHIVE, Settings};
 use crate::data::presses::file::SHORE;
 use crate::data::presses::{Layout, Press, Presses};
-use crate::data::source::{Kind, MOST_LEVELS, PITCH_MM, Source};
+use crate::data::source::{Grid, Kind, MOST_LEVELS, PITCH_MM, Source};
 use crate::exit::coded;
 use hardnessd_core::event::{self, Event, PressState};
 use hardnessd_core::exit::USAGE;
-use hardnessd_core::frame::{Array, Stamp};
+use hardnessd_core::frame::Stamp;
 use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{Borders, COLS, Model, Piece, ROWS, sha256_hex};
+use hardnessd_core::verdict::{Borders, Model, Piece, sha256_hex};
 
 /// The moment of raw bytes, whose times come from the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {
@@ -258,7 +258,6 @@ impl Recording {
             arm_n_per_mm: ended.arm_n_per_mm,
             sensor: place as u32,
             name: Some(format!("{name} press {}", press.press)),
-            unloaded: Some(watched.unloaded()),
             kind: self.kind,
             ..Press::default()
         };
@@ -271,8 +270,15 @@ impl Recording {
                     before_s = moment.time_s.max(before_s.next_up());
                     (before_s, moment.approach_mm, moment.frame.newtons)
                 });
-                let best = ended.best;
-                self.presses.push(Press { best, ..press }, moments);
+                let press = Press {
+                    best: ended.best,
+                    unloaded: Some(watched.unloaded()),
+                    parts: grid(&watched.sensor)
+                        .filter(|grid| !grid.is_kept())
+                        .map(|_| ended.parts()),
+                    ..press
+                };
+                self.presses.push(press, moments);
             }
             Layout::Frames => {
                 let best = moments.swap_remove(ended.best);
@@ -336,21 +342,20 @@ impl Watched {
     }
 }
 
-/// The array of a sensor whose frames a data set has as they are.
-fn grid(sensor: &Sensor) -> Option<Array> {
-    let array = sensor.layout().array();
+/// The array of a sensor with square taxels.
+fn grid(sensor: &Sensor) -> Option<Grid> {
     let pitch = sensor.calibration().pitch_mm;
-    let is_kept = array.rows <= ROWS && array.cols <= COLS && pitch.rows_mm == pitch.cols_mm;
-    is_kept.then_some(array)
+    (pitch.rows_mm == pitch.cols_mm).then(|| Grid {
+        array: sensor.layout().array(),
+        pitch_mm: pitch.rows_mm,
+    })
 }
 
 /// The distance between the taxels of the grid on which a data set holds the frames of `sensor`. An
 /// array that fits into a data set is kept as it is.
 fn grid_mm(sensor: &Sensor) -> f64 {
-    match grid(sensor) {
-        Some(_) => sensor.calibration().pitch_mm.rows_mm,
-        None => PITCH_MM,
-    }
+    let kept = grid(sensor).filter(Grid::is_kept);
+    kept.map_or(PITCH_MM, |grid| grid.pitch_mm)
 }
 
 #[cfg(test)]

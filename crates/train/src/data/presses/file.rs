@@ -10,11 +10,12 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::{MILLINEWTON, Press, Presses};
-use crate::data::source::{Kind, MOST_LEVELS, SIMULATOR, Source};
+use crate::data::source::{Grid, Kind, MOST_LEVELS, PITCH_MM, SIMULATOR, Source};
 use crate::exit::unreadable;
-use hardnessd_core::frame::Array;
+use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::npy::Element;
 use hardnessd_core::npz::{ANY, Reader, Unexpected, Writer, within};
+use hardnessd_core::verdict::parts::PARTS;
 use hardnessd_core::verdict::{
     COLS, COURSE_FRAMES, Level, Piece, ROWS, TAXELS, are_levels, sha256_hex,
 };
@@ -141,12 +142,18 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
     let reference = column(file, "reference", count, &(0..=2_u8))?;
     let reference_mm = column(file, "reference_mm", count, &(0.0..=1e6_f32))?;
     let kind = column(file, "kind", count, &(0..=2_u8))?;
-    let unloaded = match presses.grid() {
-        Some(Array { rows, cols }) => file.find("unloaded", &[rows, cols], count..=count)?,
-        None => None,
-    };
-    let unloaded: Vec<f32> = unloaded.unwrap_or_default();
+    let (mut unloaded, mut parts) = (Vec::<f32>::new(), Vec::<f32>::new());
+    if let Some(grid) = presses.grid() {
+        let Array { rows, cols } = grid.array;
+        let of_each = file.find("unloaded", &[rows, cols], count..=count)?;
+        unloaded = of_each.unwrap_or_default();
+        if !grid.is_kept() {
+            parts = file.read("parts", &[PARTS, rows, cols], count..=count)?;
+            within("parts", &parts, &FORCES)?;
+        }
+    }
     let mut unloaded = unloaded.chunks((unloaded.len() / count).max(1));
+    let mut parts = parts.chunks((parts.len() / count).max(1));
     let generator = presses.sources[0].generator.as_deref().unwrap_or_default();
     let of_file = match generator.starts_with(SIMULATOR) {
         true => Kind::Simulated,
@@ -206,6 +213,7 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
             sensor: sensor[number].unwrap_or(0),
             reference: piece,
             unloaded: unloaded.next().map(<[f32]>::to_vec),
+            parts: parts.next().map(<[f32]>::to_vec),
             kind: match kind[number] {
                 Some(0) => Kind::Unknown,
                 Some(1) => Kind::Simulated,
@@ -243,6 +251,7 @@ struct Meta {
     levels: Option<Vec<Level>>,
     pitch_mm: Option<f64>,
     grid: Option<[usize; 2]>,
+    grid_pitch_mm: Option<f64>,
     settings: Value,
 }
 
@@ -251,7 +260,8 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
     let meta: Option<Meta> = serde_json::from_value(described(file)?)
         .map_err(|error| Unexpected::new("meta", error, "the keys of docs/formats.md"))?;
     let meta = meta.unwrap_or_default();
-    if let Some(mm) = meta.pitch_mm.filter(|mm| !PITCHES_MM.contains(mm)) {
+    let mut pitches = [meta.pitch_mm, meta.grid_pitch_mm].into_iter().flatten();
+    if let Some(mm) = pitches.find(|mm| !PITCHES_MM.contains(mm)) {
         let found = format!("pitch_mm {mm}");
         return Err(Unexpected::new(
             "meta",
@@ -273,13 +283,19 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
     let sensors: Option<BroadSensors> = serde_json::from_value(sensors).ok();
     let pitches_mm = sensors.map(|sensors| sensors.designs.pitches_mm());
     let generator = meta.generator.as_deref().unwrap_or_default();
-    let grid = match meta.grid {
+    let array = match meta.grid {
         Some([rows, cols]) => Some(Array { rows, cols }),
         // Simulated frames are those of a whole array.
         None if generator.starts_with(SIMULATOR) && pitches_mm.is_none() => Some(Array::JX255N),
         None => None,
     };
-    let fits = |array: &Array| (1..=ROWS).contains(&array.rows) && (1..=COLS).contains(&array.cols);
+    let pitch_mm = meta.grid_pitch_mm.or(meta.pitch_mm).unwrap_or(PITCH_MM);
+    let grid = array.map(|array| Grid { array, pitch_mm });
+    let is_side = |side: usize| (1..=MOST_SIDE).contains(&side);
+    let fits = |of: &Grid| {
+        let is_array = is_side(of.array.rows) && is_side(of.array.cols);
+        is_array && (of.is_kept() || meta.grid_pitch_mm.is_some())
+    };
     let name = path.file_name().unwrap_or_default();
     Ok(Source {
         name: name.to_string_lossy().into_owned(),
@@ -299,20 +315,18 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
 ///
 /// # Errors
 ///
-/// Returns the errors of writing to `out`.
+/// Returns the errors of writing.
 pub fn write<W: Write + Seek>(
-    out: W,
+    mut npz: Writer<W>,
     presses: &Presses,
     layout: Layout,
     meta: &Value,
 ) -> io::Result<W> {
-    let mut npz = Writer::new(out);
     let all = &presses.all;
     match layout {
         Layout::Frames => {
             let frames = (0..all.len()).flat_map(|press| presses.frame(press).newtons);
-            let frames: Vec<f32> = frames.collect();
-            npz.add("frames", &[all.len(), ROWS, COLS], &frames)?;
+            npz.add_each("frames", &[all.len(), ROWS, COLS], frames)?;
         }
         Layout::OverTime => write_moments(&mut npz, presses)?,
     }
@@ -329,12 +343,20 @@ pub fn write<W: Write + Seek>(
     // The whole array of each press, where all have the same one.
     let unloaded = all.iter().map(|press| press.unloaded.as_ref());
     let unloaded: Option<Vec<&Vec<f32>>> = unloaded.collect();
-    if let (Some(array), Some(unloaded)) = (presses.grid(), unloaded)
+    let array = presses.grid().map(|grid| grid.array);
+    if let (Some(array), Some(unloaded)) = (array, unloaded)
         && layout == Layout::OverTime
         && unloaded.iter().all(|own| own.len() == array.taxels())
     {
-        let unloaded: Vec<f32> = unloaded.into_iter().flatten().copied().collect();
-        npz.add("unloaded", &[all.len(), array.rows, array.cols], &unloaded)?;
+        let unloaded = unloaded.into_iter().flatten().copied();
+        npz.add_each("unloaded", &[all.len(), array.rows, array.cols], unloaded)?;
+    }
+    let parts = all.iter().map(|press| press.parts.as_ref());
+    if let (Some(Array { rows, cols }), Some(parts)) = (array, parts.collect::<Option<Vec<_>>>())
+        && layout == Layout::OverTime
+    {
+        let parts = parts.into_iter().flatten().copied();
+        npz.add_each("parts", &[all.len(), PARTS, rows, cols], parts)?;
     }
     let is_known = |press: &Press| press.sensor > 0 || press.reference.is_some();
     if all.iter().any(is_known) {
@@ -376,10 +398,8 @@ fn write_moments<W: Write + Seek>(npz: &mut Writer<W>, presses: &Presses) -> io:
     let rows = presses.frames.len();
     // An i16 holds up to 32 N on a taxel, which is beyond the range of most films.
     let millinewtons = |newtons: f32| (newtons / MILLINEWTON).round() as i16;
-    let frames: Vec<i16> = (0..rows)
-        .flat_map(|row| presses.frames.frame(row).newtons.map(millinewtons))
-        .collect();
-    npz.add("frames_mn", &[rows, ROWS, COLS], &frames)?;
+    let frames = (0..rows).flat_map(|row| presses.frames.frame(row).newtons.map(millinewtons));
+    npz.add_each("frames_mn", &[rows, ROWS, COLS], frames)?;
     let press = all.iter().zip(0..);
     let press = press.flat_map(|(press, number)| press.moments.clone().map(move |_| number));
     npz.add_list("press", &press.collect::<Vec<u32>>())?;

@@ -64,7 +64,8 @@ fn courses() -> Presses {
 }
 
 fn bytes_of(presses: &Presses, layout: Layout, meta: &Value) -> Vec<u8> {
-    let out = write(Cursor::new(Vec::new()), presses, layout, meta);
+    let npz = Writer::new(Cursor::new(Vec::new()));
+    let out = write(npz, presses, layout, meta);
     out.unwrap().into_inner()
 }
 
@@ -96,14 +97,61 @@ fn a_file_gives_back_what_was_written() {
         let read = parse(&bytes).unwrap();
         assert_eq!(read.sources[0].seed, Some(7));
         assert!(without_files(read) == presses, "{layout:?}");
+        // Packed piece by piece, the arrays are the same.
+        let npz = Writer::in_chunks(Cursor::new(Vec::new()));
+        let packed = write(npz, &presses, layout, &json!({})).unwrap();
+        let read = parse(&packed.into_inner()).unwrap();
+        assert!(without_files(read) == presses, "{layout:?}");
         // The file holds no date: the same presses give the same bytes.
         assert_eq!(bytes, bytes_of(&presses, layout, &json!({"seed": 7})));
     }
 }
 
 #[test]
+fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
+    let array = Array { rows: 64, cols: 32 };
+    let mut presses = Presses::default();
+    let parts: Vec<f32> = (0..8 * array.taxels()).map(|n| n as f32 / 7.0).collect();
+    let press = Press {
+        parts: Some(parts.clone()),
+        ..Press::default()
+    };
+    presses.push(
+        press,
+        [(0.0, None, [0.5; TAXELS]), (0.1, None, [0.5; TAXELS])],
+    );
+    let grid = Grid {
+        array,
+        pitch_mm: 1.5,
+    };
+    presses.sources.push(Source {
+        grid: Some(grid),
+        ..Source::default()
+    });
+    let meta = json!({"grid": [64, 32], "grid_pitch_mm": 1.5});
+    let read = parse(&bytes_of(&presses, Layout::OverTime, &meta)).unwrap();
+    assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 3.5));
+    assert_eq!(read.parts(0, array), parts);
+    // Without the distance the array says nothing.
+    let read = parse(&bytes_of(
+        &presses,
+        Layout::OverTime,
+        &json!({"grid": [64, 32]}),
+    ))
+    .unwrap();
+    assert_eq!(read.grid(), None);
+    presses.all[0].parts = None;
+    let expected = "array `parts`: found none, expected f32 [1,8,64,32]";
+    assert_refused(&bytes_of(&presses, Layout::OverTime, &meta), expected);
+}
+
+#[test]
 fn the_array_and_what_it_reads_unloaded_come_back() {
     let array = Array { rows: 3, cols: 2 };
+    let grid = Grid {
+        array,
+        pitch_mm: 5.0,
+    };
     let mut presses = Presses::default();
     let moments = [0.0, 1.0].map(|time_s| {
         let mut frame = ModelFrame::default();
@@ -118,12 +166,12 @@ fn the_array_and_what_it_reads_unloaded_come_back() {
     };
     presses.push(press, moments);
     presses.sources.push(Source {
-        grid: Some(array),
+        grid: Some(grid),
         ..Source::default()
     });
     let meta = json!({"grid": [3, 2], "pitch_mm": 5.0});
     let read = parse(&bytes_of(&presses, Layout::OverTime, &meta)).unwrap();
-    assert_eq!((read.grid(), read.pitch_mm()), (Some(array), 5.0));
+    assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 5.0));
     assert_eq!(read.all[0].unloaded, presses.all[0].unloaded);
     let parts = read.parts(0, array);
     assert_eq!(parts[..6], [1.0, 0.0, 0.0, 0.0, 0.0, -0.5]);
