@@ -22,11 +22,12 @@ use crate::net::network::Weights;
 use crate::recipe::{Kind, Recipe};
 use crate::run::Run;
 use crate::settings::{Settings, Training};
+use hardnessd_core::npz::Writer;
 use hardnessd_simulator::random::Stream;
 
 /// Why there is no model of the taxels.
-const NO_GRID: &str = "the data have no whole presses on the grid of one array of at most 28x28 square taxels: make \
-                       them with `collect --sequences`";
+const NO_GRID: &str = "the data have no whole presses on one array of square taxels: make them with `collect \
+                       --sequences`";
 /// Generated samples of each level that a run keeps to look at.
 const KEPT: usize = 24;
 
@@ -57,46 +58,35 @@ pub fn last_stage<'a>(
     recipe: &Recipe,
     stages: &Stages<'a>,
 ) -> anyhow::Result<Box<dyn Learning + 'a>> {
-    let &Stages {
-        presses,
-        parts,
-        settings,
-        seed,
-        device,
-        ..
-    } = stages;
+    let (presses, parts, device) = (stages.presses, stages.parts, stages.device);
     Ok(match recipe.learning {
         Kind::Sgan => Box::new(stages.semi_supervised("sgan", Game::FakeLevel)),
         Kind::Igan => Box::new(stages.semi_supervised("igan", Game::FeatureMatching)),
         Kind::Features | Kind::Taxels => {
-            let Parts {
-                train, held_out, ..
-            } = parts;
             let seen = match recipe.learning {
                 Kind::Taxels => Seen::parts(presses).context(NO_GRID)?,
                 _ => Seen::Features,
             };
-            Box::new(Regression::new(presses, seen, [train, held_out], device))
+            Box::new(Regression::new(presses, seen, parts, device))
         }
         Kind::Course => {
-            let of_parts = (parts.train.as_slice(), parts.held_out.as_slice());
-            let course = Course::new(presses, of_parts, settings, seed, device);
+            let course = Course::new(presses, parts, stages.settings, stages.seed, device);
             Box::new(course.context("levels of the data")?)
         }
         Kind::Hrn => {
             let needs_gan = recipe.from_ustgan || recipe.pretrained;
             let ustgan = needs_gan.then(|| stages.ustgan()).transpose()?;
-            let (levels, means) = (stages.levels(), settings.mean_pooling);
+            let (levels, means) = (stages.levels(), stages.settings.mean_pooling);
             let start = ustgan.as_ref().filter(|_| recipe.from_ustgan);
             let start = start.map(|[_, discriminator]| discriminator);
-            let mut weights = hrn::initial(start, levels, means, seed, device);
+            let mut weights = hrn::initial(start, levels, means, stages.seed, device);
             if let Some(ustgan) = ustgan.as_ref().filter(|_| recipe.pretrained) {
                 weights = stages.pretrained(ustgan, weights)?;
             }
             let stage = if needs_gan { "fine-tuning" } else { "hrn" };
             Box::new(Hrn {
-                on: stages.on(stage, settings.training),
-                augmentation: settings.augmentation,
+                on: stages.on(stage, stages.settings.training),
+                augmentation: stages.settings.augmentation,
                 train: parts.train.clone(),
                 held_out: &parts.held_out,
                 initial: weights,
@@ -131,16 +121,14 @@ impl<'a> Stages<'a> {
 
     /// A GAN whose discriminator also learns the levels and becomes the recogniser.
     fn semi_supervised(&self, stage: &'static str, game: Game) -> Gan<'a> {
-        let Parts {
-            train, unlabelled, ..
-        } = self.parts;
+        let real = &self.parts.unlabelled;
         Gan {
             on: self.on(stage, self.settings.ustgan),
             game,
-            real: unlabelled,
-            labelled: train,
+            real,
+            labelled: &self.parts.train,
             initial: gan::initial(game, self.levels(), self.seed, self.device),
-            sensor: gan::sensor(self.presses, unlabelled),
+            sensor: gan::sensor(self.presses, real),
         }
     }
 
@@ -210,7 +198,8 @@ impl<'a> Stages<'a> {
             }
         }
         let meta = json!({ "generator": "STGANs of hrn-train", "levels": self.presses.levels() });
-        let file = presses::write(Cursor::new(Vec::new()), &kept, Layout::Frames, &meta)?;
+        let npz = Writer::new(Cursor::new(Vec::new()));
+        let file = presses::write(npz, &kept, Layout::Frames, &meta)?;
         self.run
             .write("samples/generated.npz", &file.into_inner())?;
         Ok(all)

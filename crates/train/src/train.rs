@@ -95,12 +95,7 @@ impl DeviceName {
 /// Fails if the data do not have what the method needs, the directory has another run or cannot be written,
 /// or the training diverges.
 pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
-    let &Train {
-        method: recipe,
-        profile,
-        seed,
-        ..
-    } = asked;
+    let (recipe, profile, seed) = (asked.method, asked.profile, asked.seed);
     let given = match &asked.config {
         Some(path) => {
             let text = fs::read_to_string(path).map_err(|error| unreadable(path, &error))?;

@@ -73,7 +73,7 @@ fn built_in(levels: &[Level]) -> anyhow::Result<Result<Candidate, String>> {
 /// The taxels, if the array is small or presses fall on the same place.
 fn taxels(presses: &Presses, places: &[usize]) -> Result<Seen, String> {
     let seen = Seen::parts(presses);
-    let seen = seen.ok_or("needs whole presses on one array of at most 28x28 square taxels")?;
+    let seen = seen.ok_or("needs whole presses on one array of square taxels")?;
     let is_small = matches!(seen, Seen::Parts(array, _) if array.taxels() <= MOST_TAXELS);
     match is_small || spread_taxels(presses, places) < SAME_PLACE_TAXELS {
         true => Ok(seen),
@@ -152,11 +152,20 @@ impl Candidate {
             Self::BuiltIn(_) => anyhow::bail!("the built-in model learns nothing"),
             Self::Regression(seen) => {
                 let device = Device::flex();
-                let regression = Regression::new(presses, *seen, [train, &[]], &device);
+                let parts = parts(train);
+                let regression = Regression::new(presses, *seen, &parts, &device);
                 take(&regression, &[regression.fitted()])
             }
             Self::Hrn => with_hrn(presses, train, seed, take),
         }
+    }
+}
+
+/// Labelled presses to learn from, and no others.
+fn parts(train: &[usize]) -> Parts {
+    Parts {
+        train: train.to_vec(),
+        ..Parts::default()
     }
 }
 
@@ -185,10 +194,7 @@ fn with_hrn<T>(
     )?;
     let stages = Stages {
         presses,
-        parts: &Parts {
-            train: train.to_vec(),
-            ..Parts::default()
-        },
+        parts: &parts(train),
         settings: &settings,
         seed,
         run: &run,

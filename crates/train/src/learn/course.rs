@@ -9,6 +9,7 @@ use self::lots::Lots;
 use super::learner::Learner;
 use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
 use crate::data::presses::Presses;
+use crate::data::split::Parts;
 use crate::net::bins::{self, BINS};
 use crate::net::course;
 use crate::net::graph::Graph;
@@ -87,7 +88,9 @@ impl<'a> Course<'a> {
     /// Fails if the levels are no parts of the scale of Shore hardness.
     pub fn new(
         presses: &'a Presses,
-        (train, held_out): (&'a [usize], &'a [usize]),
+        Parts {
+            train, held_out, ..
+        }: &'a Parts,
         settings: &Settings,
         seed: u64,
         device: &'a Device,

@@ -70,12 +70,7 @@ impl Learner {
     /// weight without a gradient does not change.
     pub fn step(&mut self, tracked: &Weights, gradients: &mut Gradients, rate: f64) {
         self.steps += 1;
-        let Training {
-            beta1,
-            weight_decay,
-            averaging,
-            ..
-        } = self.training;
+        let training = self.training;
         let correction = |beta: f64| 1.0 - beta.powf(self.steps as f64);
         for (index, weight) in self.weights.entries.iter_mut().enumerate() {
             let Some(gradient) = tracked.entries[index].values.grad_remove(gradients) else {
@@ -86,19 +81,19 @@ impl Learner {
                 Some(moments) => {
                     let [mean, square] =
                         moments.each_mut().map(|all| &mut all.entries[index].values);
-                    *mean = (mean.clone().mul_scalar(beta1))
-                        .add(gradient.clone().mul_scalar(1.0 - beta1));
+                    *mean = (mean.clone().mul_scalar(training.beta1))
+                        .add(gradient.clone().mul_scalar(1.0 - training.beta1));
                     *square = (square.clone().mul_scalar(BETA2))
                         .add(gradient.clone().mul(gradient).mul_scalar(1.0 - BETA2));
                     let deviation = square.clone().div_scalar(correction(BETA2)).sqrt();
-                    (mean.clone().div_scalar(correction(beta1)))
+                    (mean.clone().div_scalar(correction(training.beta1)))
                         .div(deviation.add_scalar(ADAM_EPSILON))
                 }
             };
             let mut values = weight.values.clone();
             let is_kernel = weight.dims.len() > 1 && !weight.name.starts_with("mixture.");
-            if weight_decay > 0.0 && is_kernel {
-                values = values.mul_scalar(1.0 - rate * weight_decay);
+            if training.weight_decay > 0.0 && is_kernel {
+                values = values.mul_scalar(1.0 - rate * training.weight_decay);
             }
             weight.values = values.sub(step.mul_scalar(rate));
         }
@@ -106,8 +101,8 @@ impl Learner {
             return;
         };
         for (sum, weight) in average.entries.iter_mut().zip(&self.weights.entries) {
-            let new = weight.values.clone().mul_scalar(1.0 - averaging);
-            sum.values = sum.values.clone().mul_scalar(averaging).add(new);
+            let new = weight.values.clone().mul_scalar(1.0 - training.averaging);
+            sum.values = sum.values.clone().mul_scalar(training.averaging).add(new);
         }
     }
 

@@ -12,6 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::learner::Learner;
 use super::{Inputs, Learning, Plan, Question, Taken, share_right};
 use crate::data::presses::Presses;
+use crate::data::split::Parts;
 use crate::net::graph::{Graph, RAW};
 use crate::net::network::{Weights, dense, numbers};
 use crate::net::standard::Standard;
@@ -43,9 +44,9 @@ pub enum Seen {
 impl Seen {
     /// The taxels of the presses' own array. `None` if the presses are not on one, or are single frames.
     pub fn parts(presses: &Presses) -> Option<Self> {
-        let array = presses.grid().filter(|_| presses.are_over_time())?;
-        let threshold_n = Pitch::square(presses.pitch_mm()).contact_threshold_n();
-        Some(Self::Parts(array, BEND_THRESHOLDS * threshold_n))
+        let grid = presses.grid().filter(|_| presses.are_over_time())?;
+        let threshold_n = Pitch::square(grid.pitch_mm).contact_threshold_n();
+        Some(Self::Parts(grid.array, BEND_THRESHOLDS * threshold_n))
     }
 
     fn columns(self) -> usize {
@@ -91,7 +92,9 @@ impl<'a> Regression<'a> {
     pub fn new(
         presses: &'a Presses,
         seen: Seen,
-        [train, held_out]: [&'a [usize]; 2],
+        Parts {
+            train, held_out, ..
+        }: &'a Parts,
         device: &'a Device,
     ) -> Self {
         let rows = train.iter().map(|&press| seen.of(presses, press));

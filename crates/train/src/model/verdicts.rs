@@ -59,61 +59,58 @@ pub fn reference(presses: &Presses, (place, piece): (usize, Piece)) -> Reference
     }
 }
 
-/// The model with the references of each sensor, and the objects that serve as such.
-type Identified = (BTreeMap<u32, Model>, BTreeSet<Option<u32>>);
+/// The references beside the presses of each half of a sensor's objects, by sensor, and the objects that serve as
+/// references with their hardness.
+type Beside = (BTreeMap<u32, [References; 2]>, BTreeSet<Option<u32>>);
 
-/// The model with the references of each sensor that has some of these presses.
-fn identified(
+/// The references of each sensor that has some of these presses.
+fn beside(
     hrn: &Model,
     presses: &Presses,
     places: &[usize],
     given: Given,
-) -> anyhow::Result<Identified> {
-    let (mut models, mut objects) = (BTreeMap::new(), BTreeSet::new());
+) -> anyhow::Result<Beside> {
+    let (mut beside, mut objects) = (BTreeMap::new(), BTreeSet::new());
     if hrn.most_references() == 0 || given == Given::default() {
-        return Ok((models, objects));
+        return Ok((beside, objects));
     }
-    for (sensor, places) in by_sensor(presses, places) {
-        let mut own = rigid(presses, sensor, given);
-        let mut of_level = BTreeMap::<u8, BTreeSet<Option<u32>>>::new();
-        for place in places {
-            let press = &presses.all[place];
-            let of_level = of_level.entry(press.level).or_default();
-            if of_level.len() < given.labelled && of_level.insert(press.object) {
-                objects.insert(press.object);
-                let range = |shore| Piece::Shore { range: [shore; 2] };
-                own.extend(press.shore.map(|shore| (place, range(shore))));
-            }
-        }
-        let own = own.into_iter().take(hrn.most_references());
-        let own: Vec<ReferencePress> = own.map(|own| reference(presses, own)).collect();
-        models.insert(sensor, hrn.identified(hrn.references(&own)?)?);
-    }
-    Ok((models, objects))
-}
-
-/// The presses of each sensor.
-fn by_sensor(presses: &Presses, places: &[usize]) -> BTreeMap<u32, Vec<usize>> {
     let mut by_sensor = BTreeMap::<u32, Vec<usize>>::new();
     for &place in places {
         let sensor = presses.all[place].sensor;
         by_sensor.entry(sensor).or_default().push(place);
     }
-    by_sensor
+    for (sensor, places) in by_sensor {
+        let mut known = rigid(presses, sensor, given);
+        let mut of_level = BTreeMap::<u8, BTreeSet<Option<u32>>>::new();
+        for &place in &places {
+            let press = &presses.all[place];
+            let of_level = of_level.entry(press.level).or_default();
+            if of_level.len() < given.labelled && of_level.insert(press.object) {
+                objects.insert(press.object);
+                let range = |shore| Piece::Shore { range: [shore; 2] };
+                known.extend(press.shore.map(|shore| (place, range(shore))));
+            }
+        }
+        let known = known.into_iter().take(hrn.most_references());
+        let known: Vec<ReferencePress> = known.map(|own| reference(presses, own)).collect();
+        let identified = hrn.identified(hrn.references(&known)?)?;
+        let own = own_presses(hrn, presses, places, given.own)?;
+        beside.insert(sensor, own.map(|own| identified.references_with(&own)));
+    }
+    Ok((beside, objects))
 }
 
 /// Own presses of a sensor, for each half of its objects from the other half: at most two of an object.
 fn own_presses(
     hrn: &Model,
     presses: &Presses,
-    of_sensor: &[usize],
+    mut of_sensor: Vec<usize>,
     count: usize,
 ) -> anyhow::Result<[References; 2]> {
     let mut of_half: [Vec<TimeSeries>; 2] = Default::default();
-    let mut order = of_sensor.to_vec();
-    Stream::new(0, "own presses").shuffle(&mut order);
+    Stream::new(0, "own presses").shuffle(&mut of_sensor);
     let mut of_object = BTreeMap::<Option<u32>, u32>::new();
-    for place in order {
+    for place in of_sensor {
         let object = presses.all[place].object;
         let half = &mut of_half[1 - half_of(object)];
         let of_object = of_object.entry(object).or_default();
@@ -144,13 +141,7 @@ pub fn of(
     given: Given,
 ) -> anyhow::Result<Vec<Case>> {
     let levels = hrn.card().levels.len();
-    let (identified, objects) = identified(hrn, presses, places, given)?;
-    let mut own = BTreeMap::<u32, [References; 2]>::new();
-    if given.own > 0 {
-        for (sensor, of_sensor) in by_sensor(presses, places) {
-            own.insert(sensor, own_presses(hrn, presses, &of_sensor, given.own)?);
-        }
-    }
+    let (beside, objects) = beside(hrn, presses, places, given)?;
     let mut verdicts = Vec::new();
     for &place in places {
         let press = &presses.all[place];
@@ -168,17 +159,15 @@ pub fn of(
                 hrn.judge_taxels(&presses.frame(place).newtons)?
             }
             Format::Parts => {
-                let grid = presses.grid().unwrap_or(Array::JX255N);
-                hrn.card().check_array(grid)?;
-                hrn.judge_taxels(&presses.parts(place, grid))?
+                let array = presses.grid().map_or(Array::JX255N, |grid| grid.array);
+                hrn.card().check_array(array)?;
+                hrn.judge_taxels(&presses.parts(place, array))?
             }
             Format::Course { .. } => {
-                let of_sensor = identified.get(&press.sensor).unwrap_or(hrn);
-                let own = own.get(&press.sensor);
+                let beside = beside.get(&press.sensor);
                 let none = References::NONE;
-                let own = own.map_or(&none, |own| &own[half_of(press.object)]);
-                let references = of_sensor.references_with(own);
-                of_sensor.judge_beside(&presses.course(place), &references)?
+                let references = beside.map_or(&none, |of| &of[half_of(press.object)]);
+                hrn.judge_beside(&presses.course(place), references)?
             }
         };
         verdicts.push((place, verdict));

@@ -19,27 +19,19 @@ pub struct PixelScale {
 impl PixelScale {
     /// The image's value for a taxel of `newtons`.
     pub fn pixel(self, newtons: f32) -> f32 {
-        let Self {
-            full_scale_n,
-            log_above_n,
-        } = self;
-        if log_above_n == 0.0 {
-            return newtons * (2.0 / full_scale_n) as f32 - 1.0;
+        if self.log_above_n == 0.0 {
+            return newtons * (2.0 / self.full_scale_n) as f32 - 1.0;
         }
-        let part = (newtons * (1.0 / log_above_n) as f32).ln_1p();
+        let part = (newtons * (1.0 / self.log_above_n) as f32).ln_1p();
         part * self.log_factor() - 1.0
     }
 
     /// The force on a taxel for a value of the image: the inverse of [`PixelScale::pixel`].
     pub fn newtons(self, pixel: f32) -> f32 {
-        let Self {
-            full_scale_n,
-            log_above_n,
-        } = self;
-        if log_above_n == 0.0 {
-            return (pixel + 1.0) * (full_scale_n / 2.0) as f32;
+        if self.log_above_n == 0.0 {
+            return (pixel + 1.0) * (self.full_scale_n / 2.0) as f32;
         }
-        ((pixel + 1.0) / self.log_factor()).exp_m1() * log_above_n as f32
+        ((pixel + 1.0) / self.log_factor()).exp_m1() * self.log_above_n as f32
     }
 
     /// The factor that makes log(1 + full scale / `log_above_n`) equal to 2.

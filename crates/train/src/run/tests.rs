@@ -30,22 +30,6 @@ fn a_run_goes_on_with_its_data_under_another_name_and_with_no_other() {
 }
 
 #[test]
-fn checkpoints_without_settings_are_somebody_elses() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path();
-    let open = |resume| Run::open(path, &description("a.npz", "12"), resume);
-    drop(open(false).unwrap());
-    fs::remove_file(path.join("settings.toml")).unwrap();
-    for resume in [false, true] {
-        let error = open(resume).unwrap_err().to_string();
-        assert!(
-            error.contains("has checkpoints but no settings.toml"),
-            "{error}"
-        );
-    }
-}
-
-#[test]
 fn every_program_that_had_a_part_in_a_run_is_named_once() {
     let directory = tempfile::tempdir().unwrap();
     let open =

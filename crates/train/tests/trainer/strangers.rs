@@ -68,6 +68,8 @@ fn a_directory_of_something_else_stays_as_it_is() {
     for (name, arguments) in [
         ("hrn.onnx", features),
         ("metrics.csv", features),
+        // Also a run that lost its settings.
+        ("checkpoints", features),
         (
             "tables.md",
             "compare --methods features --profile smoke --data d.npz --out",

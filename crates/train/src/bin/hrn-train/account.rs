@@ -124,23 +124,17 @@ pub(super) fn csv(cases: &[Case]) -> String {
     let probabilities: String = probabilities.collect();
     let mut text =
         format!("object,level,judged,{probabilities}shore,shore_low,shore_high,true_shore\n");
-    for Case {
-        object,
-        level,
-        shore,
-        verdict,
-        ..
-    } in cases
-    {
-        let object = object.map_or_else(String::new, |object| object.to_string());
-        let mut cells = vec![object, level.to_string(), verdict.level.to_string()];
+    for case in cases {
+        let verdict = &case.verdict;
+        let object = case.object.map_or_else(String::new, |of| of.to_string());
+        let mut cells = vec![object, case.level.to_string(), verdict.level.to_string()];
         cells.extend(verdict.probabilities.iter().map(|of| format!("{of:.6}")));
         let [value, low, high] = match verdict.shore {
             Some(of) => [of.value, of.low, of.high].map(Some),
             None => [None; 3],
         };
         let known = |shore: Option<f32>| shore.map_or_else(String::new, |of| format!("{of:.3}"));
-        cells.extend([value, low, high, *shore].map(known));
+        cells.extend([value, low, high, case.shore].map(known));
         text += &(cells.join(",") + "\n");
     }
     text
