@@ -21,32 +21,40 @@ class Arm:
     def move(self, to_mm, speed_mm_s):
         print(f"arm: to {to_mm:.0f} mm at {speed_mm_s:.0f} mm/s")
 
+    def wait(self):
+        """Returns when the arm is where it was sent. This one is there at once."""
+
 
 def press(arm, events, sensor, limit_n=15.0, sure=0.0):
     """Presses once. Returns the early verdict that ended the loading, or None; the final verdict; and the greatest
     force that the sensor read, in N. Early verdicts of a confidence below `sure` do not count."""
     early, greatest_n, loading, goal_mm = None, 0.0, True, 0.0
     start, live = time.monotonic(), False
-    for event in events:
-        seconds, ours = time.monotonic() - start, event.get("sensor", sensor) == sensor
-        if seconds > 2 * LONGEST_S or ours and event["type"] == "press" and event["state"] == "aborted":
-            raise RuntimeError(f"no verdict: {sensor} is no sensor, was lost, or the arm touched nothing or too lightly")
-        if not ours:
-            continue
-        if event["type"] in ("status", "disconnected"):
-            live = event.get("state") == "live"
-        elif event["type"] == "frame":
-            live, greatest_n = True, max(greatest_n, event["force_n"] or 0.0)
-        elif event["type"] == "hardness" and event["phase"] == "final":
-            return early, event, greatest_n
-        elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
-            early = event
-        loading = loading and not early and greatest_n < limit_n and seconds < LONGEST_S
-        # While nothing is known of the sensor, the arm goes back.
-        wanted_mm = FAR_MM if loading and live else 0.0
-        if wanted_mm != goal_mm:
-            goal_mm = wanted_mm
-            arm.move(goal_mm, SPEED_MM_S)
+    try:
+        for event in events:
+            seconds, ours = time.monotonic() - start, event.get("sensor", sensor) == sensor
+            if seconds > 2 * LONGEST_S or ours and event["type"] == "press" and event["state"] == "aborted":
+                raise RuntimeError(f"no verdict: {sensor} is no sensor, was lost, or the arm touched nothing or too lightly")
+            if not ours:
+                continue
+            if event["type"] in ("status", "disconnected"):
+                live = event.get("state") == "live"
+            elif event["type"] == "frame":
+                live, greatest_n = True, max(greatest_n, event["force_n"] or 0.0)
+            elif event["type"] == "hardness" and event["phase"] == "final":
+                return early, event, greatest_n
+            elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
+                early = event
+            loading = loading and not early and greatest_n < limit_n and seconds < LONGEST_S
+            # While nothing is known of the sensor, the arm goes back.
+            wanted_mm = FAR_MM if loading and live else 0.0
+            if wanted_mm != goal_mm:
+                goal_mm = wanted_mm
+                arm.move(goal_mm, SPEED_MM_S)
+    finally:
+        # Whatever ended the press, the arm goes back first.
+        arm.move(0.0, SPEED_MM_S)
+        arm.wait()
 
 
 def main():

@@ -70,7 +70,7 @@ pub fn usage(error: &clap::Error) -> ExitCode {
         // A configuration is never named without its option.
         let is_configuration = given.ends_with(".toml") && !given.starts_with('-');
         let tip = match is_configuration {
-            true => format!("; tip: --config {}", wording::cut(&wording::escaped(given))),
+            true => format!("; tip: --config {}", wording::escaped(given)),
             false => String::new(),
         };
         hardnessd_core::stderr_line!("hardnessd: {line}{tip}");

@@ -116,7 +116,7 @@ fn hardness(event: &Value, labels: &[String]) -> String {
     let percent = |value: &Value| format!("{:.0}", 100.0 * value.as_f64().unwrap_or_default());
     let probabilities: Vec<String> = items(event, "probabilities").map(percent).collect();
     let mut line = format!(
-        "#{press:<4} {:<8}  {answer:<32} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
+        "#{press:<4} {:<8}  {answer:<37} {:>3} % [{}]  {:>3} taxels  {:>6.2} N",
         phase.unwrap_or_default(),
         percent(&event["confidence"]),
         probabilities.join(" "),
@@ -207,7 +207,7 @@ mod tests {
                    "notes": ["at_edge"], "probabilities": [0.01, 0.93, 0.05, 0.01],
                    "confidence": 0.93, "contact_area_taxels": 52, "force_n": 12.345,
                    "frame": 41, "age_at_publish_ms": 1400.5, "context": {"tag": "pick-17"}}),
-            "10:00:01.523  wrist         hardness  #3    final     firm                              \
+            "10:00:01.523  wrist         hardness  #3    final     firm                                   \
              93 % [1 93 5 1]   52 taxels   12.35 N  frame 41 at 10:00:00.123  (at_edge)  \
              {\"tag\":\"pick-17\"}",
         );
@@ -218,7 +218,7 @@ mod tests {
                    "contact_area_taxels": 52, "force_n": 12.345, "context": null,
                    "advice": "press_again",
                    "shore": {"value": 63.6, "low": 58.2, "high": 70.0}}),
-            "10:00:00.123  wrist         hardness  #3    final     64 +- 6 OO, firm                  \
+            "10:00:00.123  wrist         hardness  #3    final     64 +- 6 OO, firm                       \
              90 % [10 90]   52 taxels   12.35 N  press again",
         );
         check(

@@ -70,7 +70,7 @@ impl Account {
         let columns = |label: &String| label.chars().count();
         let pairs = self.labels.windows(2);
         let pairs = pairs.map(|pair| columns(&pair[0]) + " or ".len() + columns(&pair[1]));
-        "84 OO (72 to 90), ".len() + pairs.max().unwrap_or_default()
+        "100 OO (72 to 100), ".len() + pairs.max().unwrap_or_default()
     }
 
     /// What the press of an event pressed.
@@ -118,15 +118,21 @@ mod tests {
         for (event, expected) in [
             (
                 verdict(1, Some(1), "hard", 1.0),
-                format!("press 1  {first}84 +- 12 OO, hard                 ok     7.4 N  at edge"),
+                format!(
+                    "press 1  {first}84 +- 12 OO, hard                   ok     7.4 N  at edge"
+                ),
             ),
             (
                 verdict(2, Some(1), "hard", 0.61),
-                format!("press 2  {second}84 +- 12 OO, hard?                wrong  7.4 N  at edge"),
+                format!(
+                    "press 2  {second}84 +- 12 OO, hard?                  wrong  7.4 N  at edge"
+                ),
             ),
             (
                 verdict(3, None, "", 0.3),
-                format!("press 3  {third}84 +- 12 OO, hard or medium       -      7.4 N  at edge"),
+                format!(
+                    "press 3  {third}84 +- 12 OO, hard or medium         -      7.4 N  at edge"
+                ),
             ),
             (
                 json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"}),

@@ -139,6 +139,27 @@ fn a_value_is_as_old_as_its_event_however_late_it_is_read() {
 }
 
 #[test]
+fn a_soft_touch_is_seen_after_a_hard_one() {
+    let mut view = live_sensor();
+    take_event(&mut view, 100, frame("forearm", 4.6, 12));
+    let mut colours = [0.0, 0.08].map(|newtons| {
+        take_event(&mut view, 200, frame("forearm", newtons, 12));
+        let cells = picture(&view, 300, (80, 24)).content;
+        let mut colours: Vec<String> = cells
+            .iter()
+            .map(|cell| format!("{:?}", [cell.fg, cell.bg]))
+            .collect();
+        colours.sort_unstable();
+        colours.dedup();
+        colours
+    });
+    // Little more than the usual contact threshold.
+    let [free, touched] = &mut colours;
+    touched.retain(|colour| !free.contains(colour));
+    assert!(!touched.is_empty(), "{free:?}");
+}
+
+#[test]
 fn what_is_not_live_is_not_shown_as_present() {
     let live = [
         "LIVE",
