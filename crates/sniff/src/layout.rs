@@ -84,6 +84,12 @@ impl Proposal {
         })
     }
 
+    /// Whether it is that of a known board, or has a checksum.
+    pub(crate) fn is_checked(&self) -> bool {
+        let checksum = self.settings.checksum.unwrap_or(Checksum::None);
+        self.is_board || checksum != Checksum::None
+    }
+
     /// The proposal for an array in frames.
     pub(crate) fn of(parts: &Parts, bytes: &[u8]) -> Option<Self> {
         let tried = [parts.check(), None]

@@ -100,17 +100,33 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
     if text::is_text(bytes) {
         return text::find(bytes, known);
     }
-    // Packets of two lengths, and a checksum behind a length that only one array has: these need no picture.
-    let boards = [
-        (Preset::JqGlove, Cell::U8),
-        (Preset::Jx255n, Cell::U8),
-        (Preset::Jx255nU16, Cell::U16le),
-    ];
-    let mut boards = boards
-        .into_iter()
-        .filter_map(|(preset, cell)| board(bytes, preset, cell))
-        .filter(|found| found.best.is_as(known));
-    boards.next().map_or_else(|| in_periods(capture, known), Ok)
+    let of_board = |preset, cell| {
+        let found = board(bytes, preset, cell);
+        found.filter(|found| found.best.is_as(known))
+    };
+    // Its packets have two lengths.
+    if let Some(found) = of_board(Preset::JqGlove, Cell::U8) {
+        return Ok(found);
+    }
+    let found = in_periods(capture, known);
+    let board = of_board(Preset::Jx255n, Cell::U8)
+        .or_else(|| of_board(Preset::Jx255nU16, Cell::U16le))
+        .filter(|board| board.best.proposal.explains_nearly_all());
+    let Some(board) = board else {
+        return found;
+    };
+    // Its checksum holds. A picture can only show that the array has another shape or other cells: the length
+    // is also that of 16x49, say, or of another order of bytes.
+    let is_right = |found: &Found| {
+        let has_shape = found.best.array == board.best.array && found.best.cell == board.best.cell;
+        let is_board = found.best.proposal.is_board;
+        let is_sure = found.doubt.is_none() && is_board;
+        found.best.proposal.is_checked() && (is_sure || !has_shape)
+    };
+    if found.as_ref().is_ok_and(is_right) {
+        return found;
+    }
+    Ok(board)
 }
 
 /// The layouts of frames of one length.
@@ -131,7 +147,7 @@ fn in_periods(capture: &Capture, known: Known) -> Result<Found, Failure> {
     open.ok_or(failure)
 }
 
-/// A known board, if its layout explains the bytes.
+/// A known board, if its layout explains the bytes. It needs no picture.
 fn board(bytes: &[u8], preset: Preset, cell: Cell) -> Option<Found> {
     let settings = Settings {
         preset: Some(preset),

@@ -358,7 +358,10 @@ impl Search<'_> {
             if !proposal.is_board && !known.is_complete() {
                 let long = "they look like numbers of 64 bits, which the daemon does not read";
                 own_doubt = own_doubt
-                    .or_else(|| self.columns.are_of_64_bits.then(|| long.to_owned()))
+                    .or_else(|| {
+                        (format.channels == 1 && self.columns.are_of_64_bits)
+                            .then(|| long.to_owned())
+                    })
                     .or_else(|| several_numbers(&pictures, array, format))
                     .or_else(|| other_cells(candidate, candidates));
             }

@@ -12,7 +12,7 @@ use crate::found::{
 };
 use crate::layout::Proposal;
 use crate::model::{self, Score};
-use crate::pictures::{Pictures, Presses, activity};
+use crate::pictures::{Pictures, Presses, middle};
 
 /// The share of the lines that must have the same number of cells.
 const SAME_SHARE: f64 = 0.6;
@@ -184,8 +184,19 @@ fn in_order(
     bytes: &[u8],
     known: Known,
 ) -> Result<Found, Failure> {
-    let presses = activity(frames).and_then(|activity| Presses::of(&activity));
-    let presses = presses.ok_or(Failure::NoPress(bytes.len() / frames.len()))?;
+    let rest = middle(frames);
+    let change = |frame: &Vec<f32>| -> f64 {
+        let cells = frame.iter().zip(&rest);
+        cells
+            .map(|(value, rest)| f64::from((value - rest).abs()))
+            .sum()
+    };
+    let changes: Vec<f64> = frames.iter().map(change).collect();
+    // In whole steps, also of volts. Most cells of a quiet board seldom change, so their usual step says nothing.
+    let most = changes.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    let activity = changes.iter().map(|change| (change / most * 1e6) as u32);
+    let activity: Vec<u32> = activity.collect();
+    let presses = Presses::of(&activity).ok_or(Failure::NoPress(bytes.len() / frames.len()))?;
     let pictures =
         Pictures::of(&presses, |index| frames[index].clone()).expect("words were numbers");
     let score = |array: Array, presses| Score {

@@ -33,7 +33,10 @@ fn line_of(driver: &str, device: u64) -> Option<(&str, u32)> {
     };
     let (first, last) = minors.split_once('-').unwrap_or((minors, minors));
     let (first, last): (u32, u32) = (first.parse().ok()?, last.parse().ok()?);
-    let is_its = of.parse() == Ok(major(device)) && (first..=last).contains(&minor(device));
+    // The kernel's own drivers, such as `/dev/tty`, have a path as their name, and no counts.
+    let is_its = !name.contains('/')
+        && of.parse() == Ok(major(device))
+        && (first..=last).contains(&minor(device));
     is_its.then(|| (name, minor(device) - first))
 }
 
@@ -72,6 +75,7 @@ mod tests {
             [at(4, 64), at(4, 65), at(4, 66)],
             [Some(2), Some(50), Some(0)]
         );
-        assert_eq!([at(4, 67), at(4, 63), at(188, 0)], [None; 3]);
+        write("/dev/tty".trim_start_matches('/'), "0: uart:");
+        assert_eq!([at(4, 67), at(4, 63), at(188, 0), at(5, 0)], [None; 4]);
     }
 }

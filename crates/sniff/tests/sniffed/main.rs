@@ -155,6 +155,50 @@ fn a_board_of_its_own_gets_keys_and_no_preset() {
 }
 
 #[test]
+fn the_frame_of_a_board_may_hold_another_array() {
+    // The mark, the length and the checksum of a JX255N say nothing of rows and cells.
+    let other = |cell, rows, cols| {
+        let settings = Settings {
+            cell: Some(cell),
+            rows: Some(rows),
+            cols: Some(cols),
+            ..preset(Preset::Jx255nU16)
+        };
+        let layout = Layout::new(&settings).unwrap();
+        let most = if cell == Cell::U8 { 1.0 } else { 12.0 };
+        let mut bytes = Vec::new();
+        for mut frame in played(&settings).0 {
+            frame.counts.iter_mut().for_each(|count| *count *= most);
+            layout.encode(&frame, &mut bytes);
+        }
+        let found = of(&bytes, Known::default()).unwrap();
+        (found.doubt, found.best.array, found.best.cell)
+    };
+    for (cell, rows, cols) in [(Cell::U16be, 28, 28), (Cell::U8, 49, 32)] {
+        let array = Array { rows, cols };
+        assert_eq!(other(cell, rows, cols), (None, array, Some(cell)));
+    }
+}
+
+#[test]
+fn a_quiet_board_of_text_has_its_presses() {
+    for flicker in [0.02, 0.2, 0.5] {
+        let mut stream = Stream::new(7, "quiet");
+        let array = Array { rows: 10, cols: 10 };
+        let (pressed, _) = frames(array, 250, &mut stream);
+        let lines = pressed.iter().map(|frame| {
+            let cells = frame.counts.iter().map(|&count| {
+                let one = u32::from(stream.uniform() < flicker);
+                (count as u32 + one).to_string()
+            });
+            cells.collect::<Vec<String>>().join(",") + "\r\n"
+        });
+        let found = of(lines.collect::<String>().as_bytes(), Known::default()).unwrap();
+        assert_eq!((found.doubt, found.best.array), (None, array), "{flicker}");
+    }
+}
+
+#[test]
 fn pauses_tell_a_header_from_a_tail() {
     let (frames, bytes) = played(&preset(Preset::JqTail));
     let bytes = &bytes[300..];
