@@ -215,6 +215,12 @@ impl Collection {
         &self.presses
     }
 
+    /// The levels that an earlier data set names.
+    pub fn stated_levels(&self) -> Option<Vec<Level>> {
+        let mut sources = self.presses.sources.iter();
+        sources.find_map(|source| source.levels.clone())
+    }
+
     /// Adds the presses of a recording, or nothing.
     ///
     /// # Errors
@@ -312,7 +318,7 @@ impl Collection {
         Ok(presses::write(npz, &self.presses, layout, &meta.into())?)
     }
 
-    /// The levels of an earlier data set or the paper's, or as many as the presses have, with their numbers for
+    /// The levels of an earlier data set, of the configuration or the paper's, or as many as the presses have, with their numbers for
     /// names.
     fn levels(&self) -> Vec<Level> {
         let stated = self.presses.levels();

@@ -303,6 +303,38 @@ fn the_levels_of_a_configuration_are_those_of_the_labels_and_of_the_data_set() {
     let all = desk.collected("own.npz", "--config own.toml a.mcap");
     assert!(all.iter().all(|press| press.level == 2), "{all:?}");
     assert_eq!(desk.meta("own.npz")["levels"][1]["label"], "limp");
+    // What is added has the same levels, also without the configuration: the softest is the second.
+    desk.recording("b.mcap", "shore=45");
+    let all = desk.collected("own.npz", "--append b.mcap");
+    assert!(all.iter().all(|press| press.level == 2), "{all:?}");
+    assert_eq!(desk.meta("own.npz")["levels"][1]["label"], "limp");
+    // Others are refused, and tables that no data set can have.
+    let other = level("stiff", "[70.0, 100.0]") + &level("limp", "[0.0, 70.0]");
+    let overlap = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 60.0]");
+    for (levels, append, code, part) in [
+        (
+            other,
+            "--append ",
+            1,
+            "its levels are not those of --config",
+        ),
+        (
+            level("stiff", "[0.0, 100.0]"),
+            "",
+            78,
+            "level: found 1 tables",
+        ),
+        (overlap, "", 78, "level: found"),
+    ] {
+        desk.write("other.toml", format!("{sensor}{levels}"));
+        let out = if append.is_empty() {
+            "new.npz"
+        } else {
+            "own.npz"
+        };
+        let collect = format!("{append}--config other.toml b.mcap");
+        desk.assert_refused(out, &collect, code, part);
+    }
 }
 
 #[test]

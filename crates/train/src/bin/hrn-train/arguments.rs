@@ -166,7 +166,8 @@ pub(super) struct Collect {
     /// Add to the data set, if it is there
     #[arg(long)]
     pub(super) append: bool,
-    /// Configuration whose first sensor describes raw bytes [default: a JX255N with default settings]
+    /// Configuration whose `[[level]]` tables name the levels, and whose first sensor describes raw bytes
+    /// [default: a JX255N with default settings]
     #[arg(long, value_name = "F")]
     pub(super) config: Option<PathBuf>,
     /// Leave out recordings that cannot be used, and say why of each

@@ -3,6 +3,7 @@
 use anyhow::{Context as _, ensure};
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::{Description, Sensor};
+use hardnessd_core::verdict::Borders;
 use hrn_train::data::collect::{self, Collection, Settings};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::source::papers_levels;
@@ -25,13 +26,6 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     }
     // No other call adds to the data set meanwhile, because the later one would undo the earlier one.
     let _locked = earlier.map(lock).transpose()?;
-    let settings = Settings {
-        levels: levels.unwrap_or_else(papers_levels),
-        level: arguments.level,
-        object: arguments.object,
-        is_one_object: true,
-        split: arguments.split,
-    };
     let layout = match arguments.sequences {
         true => Layout::OverTime,
         false => Layout::Frames,
@@ -39,6 +33,23 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let mut collection = match earlier {
         Some(earlier) => Collection::of(earlier, layout)?,
         None => Collection::default(),
+    };
+    let stated = collection.stated_levels();
+    if let (Some(stated), Some(levels)) = (&stated, &levels) {
+        ensure!(
+            stated == levels,
+            "{}: its levels are not those of --config, so its presses would get other names: collect a new data set",
+            out.display()
+        );
+    }
+    let settings = Settings {
+        levels: levels
+            .or(stated.filter(|stated| Borders::of(stated).is_ok()))
+            .unwrap_or_else(papers_levels),
+        level: arguments.level,
+        object: arguments.object,
+        is_one_object: true,
+        split: arguments.split,
     };
     let before = collection.presses().all.len();
     let skips = arguments.skip_unusable;

@@ -8,8 +8,9 @@ use hardnessd_core::npy;
 use hardnessd_core::press;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::Level;
+use hardnessd_core::verdict::{Borders, Level, are_levels};
 use hardnessd_core::wording;
+use hrn_train::data::source::MOST_LEVELS;
 use hrn_train::exit::{coded, unreadable};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -56,7 +57,7 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
     Sensor::new(description).map_err(|error| refused(path, error))
 }
 
-/// The levels of the `[[level]]` tables. `None` without such tables.
+/// The levels of the `[[level]]` tables, which a data set can have. `None` without such tables.
 pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
     #[derive(Deserialize)]
     struct Named {
@@ -75,5 +76,14 @@ pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
         shore: format!("{}-{}", of.shore[0], of.shore[1]),
     });
     let levels: Vec<Level> = levels.collect();
-    Ok((!levels.is_empty()).then_some(levels))
+    if levels.is_empty() {
+        return Ok(None);
+    }
+    if levels.len() > MOST_LEVELS || !are_levels(&levels) {
+        let expected = format!("2 to {MOST_LEVELS} with a label of plain text each");
+        let problem = format!("level: found {} tables, expected {expected}", levels.len());
+        return Err(refused(path, problem));
+    }
+    Borders::of(&levels).map_err(|error| refused(path, format_args!("level: {error}")))?;
+    Ok(Some(levels))
 }
