@@ -139,8 +139,8 @@ fn levels_of_ones_own_replace_those_of_the_model() {
 #[test]
 fn a_recording_keeps_the_references_that_presses_of_now_gave() {
     let bench = bench();
-    // It ends after the second press, and so does the recording.
-    let _sensor = bench.sensor("--seed 5 --presses 2 --speed 0.5");
+    // It ends after the third press, and so does the recording. A busy machine may miss the second one.
+    let _sensor = bench.sensor("--seed 5 --presses 3 --speed 0.5");
     let (code, text, message) = bench.run(&format!("{IDENTIFY} --as flat:20 --presses 1"));
     assert_eq!(code, 0, "{message}");
     assert!(text.contains("rigid flat piece 1"), "{text}");
