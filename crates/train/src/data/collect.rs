@@ -19,7 +19,7 @@ use serde_json::{Map, Value, json};
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::{COLLECTOR, Grid, MOST_LEVELS};
+use crate::data::source::{COLLECTOR, MOST_LEVELS};
 use crate::exit::unreadable;
 use hardnessd_core::npz::Writer;
 use hardnessd_core::recording::MAGIC;
@@ -294,9 +294,15 @@ impl Collection {
     /// Returns the errors of writing to `out`.
     pub fn write<W: Write + Seek>(&self, out: W, layout: Layout) -> anyhow::Result<W> {
         let mut meta = self.meta.clone();
-        // A single frame has no parts.
-        let is_held = |grid: &Grid| grid.is_kept() || layout == Layout::OverTime;
-        let grid = self.presses.grid().filter(is_held);
+        let grid = self.presses.grid();
+        if grid.is_none() && self.presses.all.iter().any(|press| press.parts.is_some()) {
+            hardnessd_core::stderr_line!(
+                "warning: not all presses have parts of one array: the data set has none, so no model of taxels is \
+                 learnt from it"
+            );
+        }
+        // That of an earlier data set.
+        meta.remove("grid_pitch_mm");
         for (key, value) in [
             ("captures", json!(self.captures)),
             ("levels", json!(self.levels())),

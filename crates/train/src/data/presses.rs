@@ -55,6 +55,8 @@ pub struct Press {
     /// The input `parts` of a model on the array's own grid, where the array is larger than the frames here. Only
     /// recordings have it.
     pub parts: Option<Vec<f32>>,
+    /// The contact area of the best frame in the array's own taxels. A press with parts has it.
+    pub contact_area_taxels: Option<u32>,
     /// What felt the press.
     pub kind: Kind,
     /// Index of the press's file in [`Presses::sources`].
@@ -333,10 +335,14 @@ impl Presses {
         })
     }
 
-    /// The array that all presses are of, if it is one with square taxels.
+    /// The array that all presses are of, if it is one with square taxels, and each press has the parts that such an
+    /// array needs.
     pub fn grid(&self) -> Option<Grid> {
-        let first = self.sources.first()?.grid;
-        first.filter(|_| self.sources.iter().all(|source| source.grid == first))
+        let grid = self.sources.first()?.grid?;
+        let length = (!grid.is_kept()).then(|| parts::PARTS * grid.array.taxels());
+        let fits = |press: &Press| press.parts.as_ref().map(Vec::len) == length;
+        let is_one = self.sources.iter().all(|source| source.grid == Some(grid));
+        (is_one && self.all.iter().all(fits)).then_some(grid)
     }
 
     /// The input `parts` of a model on the grid of the presses' own array.

@@ -74,19 +74,26 @@ fn built_in(levels: &[Level]) -> anyhow::Result<Result<Candidate, String>> {
 fn taxels(presses: &Presses, places: &[usize]) -> Result<Seen, String> {
     let seen = Seen::parts(presses);
     let seen = seen.ok_or("needs whole presses on one array of square taxels")?;
-    let is_small = matches!(seen, Seen::Parts(array, _) if array.taxels() <= MOST_TAXELS);
-    match is_small || spread_taxels(presses, places) < SAME_PLACE_TAXELS {
-        true => Ok(seen),
-        false => Err("presses fall on different places of a large array".to_owned()),
+    match seen {
+        Seen::Parts(array, _)
+            if array.taxels() > MOST_TAXELS
+                && spread_taxels(presses, places, array) >= SAME_PLACE_TAXELS =>
+        {
+            Err("presses fall on different places of a large array".to_owned())
+        }
+        _ => Ok(seen),
     }
 }
 
-/// How far the centres of presses are from their mean, in taxels.
-fn spread_taxels(presses: &Presses, places: &[usize]) -> f64 {
+/// How far the centres of presses on this array are from their mean, in taxels.
+fn spread_taxels(presses: &Presses, places: &[usize], array: Array) -> f64 {
     let centre = |&place: &usize| {
+        // Frames on the models' grid may have the contact in their middle.
+        let parts = presses.parts(place, array);
+        let of_all = |taxel| parts.iter().skip(taxel).step_by(array.taxels()).sum();
         let frame = Frame {
-            array: Array::JX255N,
-            newtons: presses.frame(place).newtons.into(),
+            array,
+            newtons: (0..array.taxels()).map(of_all).collect(),
         };
         let (row, col) = frame.centre();
         [row, col]

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::file;
 use super::verdicts::{self, Given, reference, rigid};
-use crate::data::presses::Presses;
+use crate::data::presses::{Press, Presses};
 use crate::data::source::{Kind, Source};
 use crate::judge::evaluated::Evaluated;
 use crate::learn::calibration::Calibration;
@@ -19,10 +19,10 @@ use crate::learn::{Inputs, Learning, Outputs, Question};
 use crate::net::graph::Graph;
 use crate::net::network::Weights;
 use crate::run::{Description, Run};
-use hardnessd_core::press;
+use hardnessd_core::frame::Pitch;
 use hardnessd_core::verdict::{
-    Card, Check, CheckedCourse, Checks, CourseCheck, Knowledge, Model, ModelFrame, Piece, Range,
-    TAIL, check_line,
+    Card, Check, CheckedCourse, Checks, CourseCheck, Knowledge, Model, Piece, Range, TAIL,
+    check_line,
 };
 use hardnessd_simulator::Split;
 
@@ -90,7 +90,6 @@ impl Learnt<'_> {
     pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
         let graph = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
-        let best = self.train.iter().map(|&press| self.presses.frame(press));
         let (format, conformal) = match graph.inputs {
             Inputs::Frame | Inputs::Parts(_) => ("1", None),
             Inputs::Features | Inputs::References => {
@@ -105,6 +104,18 @@ impl Learnt<'_> {
             Inputs::Parts(_) => self.presses.grid(),
             _ => None,
         };
+        let range = match grid.filter(|grid| !grid.is_kept()) {
+            Some(_) => range(self.presses.of(self.train).filter_map(felt)),
+            None => {
+                let pitch = Pitch::square(self.presses.pitch_mm());
+                let threshold_n = pitch.contact_threshold_n();
+                range(self.train.iter().map(|&press| {
+                    let best = self.presses.frame(press);
+                    let force_n = best.force_n() as f32;
+                    ([force_n; 2], best.contact_area_taxels(threshold_n))
+                }))
+            }
+        };
         Ok(Card {
             format: format.to_owned(),
             levels: self.presses.levels(),
@@ -115,7 +126,7 @@ impl Learnt<'_> {
             validation: validation(&self.presses.validated()).to_owned(),
             range: Range {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
-                ..range(best)
+                ..range
             },
             grid: grid.map(|grid| grid.array),
             conformal,
@@ -238,20 +249,24 @@ pub(crate) fn validation(kinds: &BTreeSet<Kind>) -> &'static str {
     }
 }
 
-/// The range of total force and contact area of the training frames.
-fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
-    let threshold_n = press::Thresholds::default().contact_threshold_n;
+/// Force and contact area of a press on an array that is larger than the frames here, as the daemon counts them. Its
+/// force was rounded.
+fn felt(press: &Press) -> Option<([f32; 2], u32)> {
+    let force_n = press.force_n?;
+    let force_n = [force_n.next_down(), force_n.next_up()];
+    Some((force_n, press.contact_area_taxels?))
+}
+
+/// The range of total force and contact area of the training presses. Each has the least and the greatest force that
+/// it may have had, and its area.
+fn range(presses: impl Iterator<Item = ([f32; 2], u32)>) -> Range {
     let mut range = Range {
         force_n: [f32::INFINITY, 0.0],
         contact_area_taxels: [u32::MAX, 0],
         pitch_mm: None,
     };
-    for frame in frames {
-        let (force_n, area) = (
-            frame.force_n() as f32,
-            frame.contact_area_taxels(threshold_n),
-        );
-        range.force_n = [range.force_n[0].min(force_n), range.force_n[1].max(force_n)];
+    for ([low_n, high_n], area) in presses {
+        range.force_n = [range.force_n[0].min(low_n), range.force_n[1].max(high_n)];
         let [least, most] = range.contact_area_taxels;
         range.contact_area_taxels = [least.min(area), most.max(area)];
     }
@@ -261,7 +276,6 @@ fn range(frames: impl Iterator<Item = ModelFrame>) -> Range {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::presses::Press;
 
     #[test]
     fn a_model_is_validated_by_what_judged_it_and_it_did_not_learn() {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use std::sync::Arc;
 
-use hardnessd_core::event::{Event, Phase};
+use hardnessd_core::event::{Event, Note, Phase};
 use hardnessd_core::frame::{Array, Stamp};
 use hardnessd_core::npz::Writer;
 use hardnessd_core::pipeline::Input;
@@ -115,18 +115,29 @@ fn table(side: usize) -> String {
     )
 }
 
-/// A press of a bar of so many rows and columns on the middle of that sensor, as raw bytes.
-fn pressed(side: usize, [rows, cols]: [usize; 2], hardest: u8) -> Vec<u8> {
+/// A configuration with it.
+fn config_of(side: usize) -> String {
+    let config = table(side).replace("[FRAME]", "[sensor.frame]");
+    let config = config.replace("[CALIBRATION]", "[sensor.calibration]");
+    format!("[[sensor]]\n{config}")
+}
+
+/// A press of a bar of so many rows and columns on that sensor, so far to the right of its middle, as raw bytes.
+fn pressed_at(side: usize, [rows, cols]: [usize; 2], hardest: u8, right: usize) -> Vec<u8> {
     let ramp = (1..=10).map(|step| hardest / 10 * step);
     let frame = |counts: u8| {
         let mut cells = vec![0; side * side];
         for row in (side - rows) / 2..(side + rows) / 2 {
-            cells[row * side + (side - cols) / 2..][..cols].fill(counts);
+            cells[row * side + (side - cols) / 2 + right..][..cols].fill(counts);
         }
         [&[0xAA, 0x55, 0xC3, 0x3C][..], &cells].concat()
     };
     let counts = [0; 6].into_iter().chain(ramp).chain([0; 4]);
     counts.flat_map(frame).collect()
+}
+
+fn pressed(side: usize, bar: [usize; 2], hardest: u8) -> Vec<u8> {
+    pressed_at(side, bar, hardest, 0)
 }
 
 #[test]
@@ -135,9 +146,7 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
         let table = table(side);
-        let config = table.replace("[FRAME]", "[sensor.frame]");
-        let config = config.replace("[CALIBRATION]", "[sensor.calibration]");
-        fs::write(path("wide.toml"), format!("[[sensor]]\n{config}")).unwrap();
+        fs::write(path("wide.toml"), config_of(side)).unwrap();
         // Features do not tell a bar along the rows from one along the columns.
         let bars = [[2, 8], [8, 2]];
         for (object, bar) in [bars[0], bars[0], bars[1], bars[1]].into_iter().enumerate() {
@@ -175,7 +184,7 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
         })
         .unwrap();
         let hrn = Arc::new(hrn);
-        for (bar, level) in bars.into_iter().zip(1..) {
+        for (bar, level, hardest) in [(bars[0], 1, 100), (bars[0], 1, 145), (bars[1], 2, 190)] {
             let mut playback = Playback::of_bytes(sensor.clone(), hrn.clone());
             let found = Found {
                 sensor: "wide".to_owned(),
@@ -183,17 +192,64 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
                     mono: std::time::Duration::ZERO,
                     wall: jiff::Timestamp::UNIX_EPOCH,
                 },
-                entry: Entry::Input(Input::Bytes(pressed(side, bar, 145))),
+                entry: Entry::Input(Input::Bytes(pressed(side, bar, hardest))),
             };
             let mut events = playback.feed(found).unwrap();
             events.extend(playback.end());
+            // The least and the greatest force of the training are within its range.
             let verdicts = events.into_iter().filter_map(|event| match event {
-                Event::Hardness(verdict) if verdict.phase == Phase::Final => verdict.level,
+                Event::Hardness(verdict) if verdict.phase == Phase::Final => Some(verdict),
                 _ => None,
             });
-            assert_eq!(verdicts.collect::<Vec<u8>>(), [level], "{side}");
+            let verdicts: Vec<(Option<u8>, Vec<Note>)> =
+                verdicts.map(|of| (of.level, of.notes)).collect();
+            assert_eq!(verdicts, [(Some(level), vec![])], "{side}");
         }
+        // The pitch is the model's.
+        let evaluate = "evaluate --split train --model m.onnx --data 0.npz";
+        let output = hrn_train_in(directory.path(), evaluate);
+        assert_eq!(
+            (output.status.code(), errors(&output)),
+            (Some(0), String::new())
+        );
+        // Presses of an array of another size have no parts of this one, and none are kept.
+        fs::write(path("less.toml"), config_of(side - 2)).unwrap();
+        fs::write(path("less.bin"), pressed(side - 2, bars[0], 100)).unwrap();
+        let append = "collect --sequences --append --config less.toml --level 1 --object 9 --out 0.npz less.bin";
+        let output = hrn_train_in(directory.path(), append);
+        let warning = "warning: not all presses have parts of one array";
+        assert!(errors(&output).starts_with(warning), "{output:?}");
+        let meta = presses::meta(&path("0.npz")).unwrap();
+        assert_eq!(
+            (&meta["grid"], meta.get("grid_pitch_mm")),
+            (&Value::Null, None)
+        );
+        assert_eq!(Presses::read(&[path("0.npz")]).unwrap().all.len(), 4);
     }
+}
+
+#[test]
+fn presses_scattered_on_a_large_array_are_no_model_of_its_taxels() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    fs::write(path("wide.toml"), config_of(64)).unwrap();
+    for object in 0..4_u8 {
+        for right in [0, 9, 18] {
+            let bytes = pressed_at(64, [4, 4], 100 + 20 * object, right);
+            fs::write(path(&format!("{object}{right}.bin")), bytes).unwrap();
+        }
+        let collect = format!(
+            "collect --sequences --config wide.toml --level {} --object {object} --out {object}.npz {object}0.bin \
+             {object}9.bin {object}18.bin",
+            object / 2 + 1
+        );
+        succeed_in(directory.path(), &collect);
+    }
+    let fit = "fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx";
+    let output = hrn_train_in(directory.path(), fit);
+    let text = String::from_utf8_lossy(&output.stdout);
+    let expected = "left out: presses fall on different places of a large array";
+    assert!(text.contains(expected), "{text}");
 }
 
 #[test]

@@ -98,7 +98,9 @@ fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Model) 
 
 /// Prints a warning if the data are of a sensor with another pitch than the model's.
 fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Model) {
-    let (of_model, of_data) = (hrn.card().pitch_mm, presses.pitch_mm() as f32);
+    let own = presses.grid().filter(|_| hrn.card().grid.is_some());
+    let of_data = own.map_or(presses.pitch_mm(), |grid| grid.pitch_mm) as f32;
+    let of_model = hrn.card().pitch_mm;
     if of_model != of_data {
         hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",

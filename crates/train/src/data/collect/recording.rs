@@ -47,6 +47,8 @@ pub struct Recording {
 #[derive(Debug)]
 pub(super) struct Watched {
     pub(super) sensor: Sensor,
+    /// Whether the recording has it with two arrays.
+    is_changed: bool,
     is_pressed: bool,
     /// The last frame before the first tare, and the two last ones between presses.
     untared: Vec<f32>,
@@ -201,9 +203,13 @@ impl Recording {
     fn watch(&mut self, sensor: Sensor) {
         let mut known = self.sensors.iter_mut();
         match known.find(|known| known.sensor.name() == sensor.name()) {
-            Some(known) => known.sensor = sensor,
+            Some(known) => {
+                known.is_changed |= grid(&known.sensor) != grid(&sensor);
+                known.sensor = sensor;
+            }
             None => self.sensors.push(Watched {
                 sensor,
+                is_changed: false,
                 is_pressed: false,
                 untared: Vec::new(),
                 at_rest: [Vec::new(), Vec::new()],
@@ -270,12 +276,14 @@ impl Recording {
                     before_s = moment.time_s.max(before_s.next_up());
                     (before_s, moment.approach_mm, moment.frame.newtons)
                 });
+                let has_parts = grid(&watched.sensor).is_some_and(|grid| !grid.is_kept());
+                let area =
+                    || best.contact_area_taxels(watched.sensor.thresholds().contact_threshold_n);
                 let press = Press {
                     best: ended.best,
                     unloaded: Some(watched.unloaded()),
-                    parts: grid(&watched.sensor)
-                        .filter(|grid| !grid.is_kept())
-                        .map(|_| ended.parts()),
+                    parts: has_parts.then(|| ended.parts()),
+                    contact_area_taxels: has_parts.then(area),
                     ..press
                 };
                 self.presses.push(press, moments);
@@ -297,7 +305,8 @@ impl Recording {
                 grid_mm(found)
             );
         }
-        let mut grids = self.sensors.iter().map(|of| grid(&of.sensor));
+        let one = |of: &Watched| grid(&of.sensor).filter(|_| !of.is_changed);
+        let mut grids = self.sensors.iter().map(one);
         let first = grids.next().flatten();
         Ok(Source {
             path: self.path.clone(),
@@ -361,9 +370,28 @@ fn grid_mm(sensor: &Sensor) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hardnessd_core::frame::Pitch;
     use hardnessd_core::tests::support::{hrn, of_a_press};
     use hardnessd_simulator::Split;
     use serde_json::json;
+
+    #[test]
+    fn a_recording_whose_sensor_changes_its_array_is_of_none() {
+        let (bytes, sensor) = of_a_press(|_| {}, None, false);
+        let path = Path::new("a.mcap");
+        let recording = Recording::played(path, &bytes, &sensor, Layout::OverTime, &hrn());
+        let mut recording = recording.unwrap();
+        assert!(recording.source().unwrap().grid.is_some());
+        let (_, finer) = of_a_press(
+            |described| described.sensor.calibration.pitch_mm = Pitch::square(2.0),
+            None,
+            false,
+        );
+        for sensor in [finer, sensor] {
+            recording.watch(sensor);
+            assert_eq!(recording.source().unwrap().grid, None);
+        }
+    }
 
     #[test]
     fn what_the_context_of_a_press_says_counts_more_than_the_labels() {

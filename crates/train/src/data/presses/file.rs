@@ -28,6 +28,9 @@ pub(in crate::data) const SHORE: RangeInclusive<f32> = 0.0..=100.0;
 /// Distances between taxels, in mm.
 const PITCHES_MM: RangeInclusive<f64> = 0.01..=1000.0;
 
+/// The array of the contact areas of presses that have parts.
+const AREAS: &str = "contact_area_taxels";
+
 /// An array may be so many times as large as its file, or up to [`FREE_BYTES`]. Frames of presses are packed to
 /// a tenth, and arrays of zeros to a thousandth.
 const MOST_PACKED: usize = 256;
@@ -143,6 +146,7 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
     let reference_mm = column(file, "reference_mm", count, &(0.0..=1e6_f32))?;
     let kind = column(file, "kind", count, &(0..=2_u8))?;
     let (mut unloaded, mut parts) = (Vec::<f32>::new(), Vec::<f32>::new());
+    let mut areas = Vec::<u32>::new();
     if let Some(grid) = presses.grid() {
         let Array { rows, cols } = grid.array;
         let of_each = file.find("unloaded", &[rows, cols], count..=count)?;
@@ -150,6 +154,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
         if !grid.is_kept() {
             parts = file.read("parts", &[PARTS, rows, cols], count..=count)?;
             within("parts", &parts, &FORCES)?;
+            areas = file.read(AREAS, &[], count..=count)?;
+            within(AREAS, &areas, &(0..=grid.array.taxels() as u32))?;
         }
     }
     let mut unloaded = unloaded.chunks((unloaded.len() / count).max(1));
@@ -214,6 +220,7 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
             reference: piece,
             unloaded: unloaded.next().map(<[f32]>::to_vec),
             parts: parts.next().map(<[f32]>::to_vec),
+            contact_area_taxels: areas.get(number).copied(),
             kind: match kind[number] {
                 Some(0) => Kind::Unknown,
                 Some(1) => Kind::Simulated,
@@ -260,14 +267,15 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
     let meta: Option<Meta> = serde_json::from_value(described(file)?)
         .map_err(|error| Unexpected::new("meta", error, "the keys of docs/formats.md"))?;
     let meta = meta.unwrap_or_default();
-    let mut pitches = [meta.pitch_mm, meta.grid_pitch_mm].into_iter().flatten();
-    if let Some(mm) = pitches.find(|mm| !PITCHES_MM.contains(mm)) {
-        let found = format!("pitch_mm {mm}");
-        return Err(Unexpected::new(
-            "meta",
-            found,
-            "millimetres from 0.01 to 1000",
-        ));
+    for (key, mm) in [
+        ("pitch_mm", meta.pitch_mm),
+        ("grid_pitch_mm", meta.grid_pitch_mm),
+    ] {
+        if let Some(mm) = mm.filter(|mm| !PITCHES_MM.contains(mm)) {
+            let found = format!("{key} {mm}");
+            let expected = "millimetres from 0.01 to 1000";
+            return Err(Unexpected::new("meta", found, expected));
+        }
     }
     let is_wrong = |of: &&Vec<Level>| !are_levels(of) || of.len() > MOST_LEVELS;
     if let Some(levels) = meta.levels.as_ref().filter(is_wrong) {
@@ -357,6 +365,8 @@ pub fn write<W: Write + Seek>(
     {
         let parts = parts.into_iter().flatten().copied();
         npz.add_each("parts", &[all.len(), PARTS, rows, cols], parts)?;
+        let area = |press: &Press| press.contact_area_taxels;
+        add(&mut npz, AREAS, all, None, area)?;
     }
     let is_known = |press: &Press| press.sensor > 0 || press.reference.is_some();
     if all.iter().any(is_known) {

@@ -114,6 +114,7 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     let parts: Vec<f32> = (0..8 * array.taxels()).map(|n| n as f32 / 7.0).collect();
     let press = Press {
         parts: Some(parts.clone()),
+        contact_area_taxels: Some(40),
         ..Press::default()
     };
     presses.push(
@@ -132,6 +133,7 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     let read = parse(&bytes_of(&presses, Layout::OverTime, &meta)).unwrap();
     assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 3.5));
     assert_eq!(read.parts(0, array), parts);
+    assert_eq!(read.all[0].contact_area_taxels, Some(40));
     // Without the distance the array says nothing.
     let read = parse(&bytes_of(
         &presses,
@@ -140,7 +142,9 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     ))
     .unwrap();
     assert_eq!(read.grid(), None);
-    presses.all[0].parts = None;
+    // Parts of another array are not written as those of this one.
+    presses.all[0].parts = Some(parts[1..].to_vec());
+    assert_eq!(presses.grid(), None);
     let expected = "array `parts`: found none, expected f32 [1,8,64,32]";
     assert_refused(&bytes_of(&presses, Layout::OverTime, &meta), expected);
 }
@@ -307,6 +311,10 @@ fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
     check(
         &with_meta(br#"{"pitch_mm":-1}"#),
         "array `meta`: found pitch_mm -1, expected millimetres from 0.01 to 1000",
+    );
+    check(
+        &with_meta(br#"{"grid_pitch_mm":0}"#),
+        "array `meta`: found grid_pitch_mm 0, expected",
     );
     for (level, expected) in [
         (0.5, "found 0.5 at 1, expected u8 [N]"),
