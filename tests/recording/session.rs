@@ -3,7 +3,7 @@
 use std::fs;
 use std::process::Command;
 
-use hardnessd_core::recording::Entry;
+use hardnessd_core::recording::{Entry, object_of};
 
 use serde_json::json;
 
@@ -126,7 +126,8 @@ fn assert_collects(bench: &Bench) {
         panic!("a recording begins with a state");
     };
     let labels = ["object", "name", "level"].map(|key| state.labels[key].as_str());
-    assert_eq!(labels, ["1", "Yoga mat", "4"]);
+    let object = object_of("Yoga mat").to_string();
+    assert_eq!(labels, [object.as_str(), "Yoga mat", "4"]);
 }
 
 #[test]

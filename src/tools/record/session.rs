@@ -20,7 +20,7 @@ use crate::daemon::record::Progress;
 use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
 use hardnessd_core::part;
-use hardnessd_core::recording::{Labels, check_label};
+use hardnessd_core::recording::{Labels, check_label, object_of};
 use hardnessd_core::verdict::{Borders, Level};
 
 /// The user at the terminal.
@@ -100,7 +100,8 @@ impl User<'_> {
         let level = level.map_or(0, |level| level.level);
         let path = directory.join(format!("{number:03}-{}.mcap", slug(&name)));
         let mut labels = Labels::from([
-            ("object".to_owned(), number.to_string()),
+            // The same name in another session is the same object.
+            ("object".to_owned(), object_of(&name).to_string()),
             ("name".to_owned(), name),
             ("level".to_owned(), level.to_string()),
         ]);

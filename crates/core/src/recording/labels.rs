@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use crate::verdict::sha256_hex;
 use crate::wording;
 
 /// Notes of the user by key, for example on the pressed object.
@@ -61,6 +62,14 @@ pub fn check_label(key: &str, value: &str) -> Result<(), String> {
         true => Ok(()),
         false => Err(format!("{key}: found {value:?}, expected {expected}")),
     }
+}
+
+/// The number of an object that only has a name, for the label `object`: the same in every recording.
+pub fn object_of(name: &str) -> u32 {
+    let hash = sha256_hex(name.as_bytes());
+    let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
+    // The numbers below 2^31 are left to people, who count up from 0.
+    number | 1 << 31
 }
 
 /// The keys of labels that mean something to `hrn-train` and `identify`.

@@ -22,7 +22,7 @@ use crate::data::presses::{self, Layout, Presses, file, read_one};
 use crate::data::source::{COLLECTOR, MOST_LEVELS};
 use crate::exit::unreadable;
 use hardnessd_core::npz::Writer;
-use hardnessd_core::recording::MAGIC;
+use hardnessd_core::recording::{MAGIC, object_of};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{BUILT_IN_HRN, Level, Model, sha256_hex};
 use hardnessd_core::wording;
@@ -236,7 +236,7 @@ impl Collection {
                 "{shown}: the same recording as {name}, whose presses are in the data set already"
             );
         }
-        let new = recording::object_of(sha256);
+        let new = object_of(sha256);
         let new = match settings.is_one_object {
             true => self.unnumbered.unwrap_or(new),
             false => new,

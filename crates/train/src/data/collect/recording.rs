@@ -16,7 +16,7 @@ use hardnessd_core::exit::USAGE;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::Input;
-use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader};
+use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader, object_of};
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::{Borders, Model, Piece, sha256_hex};
 
@@ -330,14 +330,6 @@ fn level(label: &str, of: &Settings) -> Option<u8> {
     let numbered = label.parse().ok();
     let numbered = numbered.filter(|level| usize::from(*level) <= MOST_LEVELS);
     named.map(|level| level.level).or(numbered)
-}
-
-/// The number of an object that only has a name: the same in every recording.
-pub(super) fn object_of(name: &str) -> u32 {
-    let hash = sha256_hex(name.as_bytes());
-    let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
-    // The numbers below 2^31 are left to people, who count up from 0.
-    number | 1 << 31
 }
 
 impl Watched {
