@@ -3,13 +3,15 @@
 //!
 //!     HARDNESSD_SOAK_MINUTES=120 cargo test --release --workspace --test program soak -- --ignored --nocapture
 //!
-//! Each sensor sends simulated presses over a pty, with a fault in every second press. There are
-//! subscribers of all kinds, recordings, and a reload every ten seconds. At the end, every press must
-//! have its verdict, or must be lost with the link, by its number. Memory, descriptors and threads must
-//! not have grown.
+//! Each sensor sends simulated presses over a pty, with a fault in every second press. Beside them, one
+//! UDP port gets frames at ten times the sensor's rate, and one gets noise. There are subscribers of
+//! all kinds, recordings, and a reload every ten seconds. At the end, every press must have its verdict,
+//! or must be lost with the link, by its number. Memory, descriptors and threads must not have grown,
+//! and the two UDP ports must not have filled the log.
 
 use std::fs;
 use std::io::{Read, Write};
+use std::net::{SocketAddr, UdpSocket};
 use std::os::unix::fs::symlink;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -19,7 +21,7 @@ use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, drain, sensor, wait_for, write_all};
+use crate::bench::{Bench, Daemon, Subscriber, drain, free_address, sensor, wait_for, write_all};
 use hardnessd_core::wire::{Layout, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
@@ -246,6 +248,16 @@ fn come_and_go(socket: &Path, seed: u64, over: &AtomicBool) {
     }
 }
 
+/// Sends a datagram every two milliseconds.
+fn flood(address: SocketAddr, over: &AtomicBool, mut datagram: impl FnMut() -> Vec<u8>) {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    while !over.load(Relaxed) {
+        // The daemon opens its ports again after a reload that changes them.
+        let _ = socket.send_to(&datagram(), address);
+        sleep(Duration::from_millis(2));
+    }
+}
+
 /// The daemon's memory in kB, descriptors and threads.
 fn usage(daemon: &Daemon) -> [u64; 3] {
     let directory = PathBuf::from(format!("/proc/{}", daemon.process.0.id()));
@@ -285,16 +297,20 @@ fn check_growth(samples: &[(Duration, [u64; 3])]) {
     }
 }
 
-fn configure(bench: &Bench, min_confidence: f64) {
+fn configure(bench: &Bench, udp: [SocketAddr; 2], min_confidence: f64) {
     let tables = (0..SENSORS).map(|number| {
         let name = format!("s{number}");
         sensor(&name, &name, 100) + "baud = 3000000\n"
     });
+    let udp = ["flood", "noise"]
+        .into_iter()
+        .zip(udp)
+        .map(|(name, address)| sensor(name, &format!("udp://{address}"), 50));
     let more = format!(
         "[model]\nmin_confidence = {min_confidence}\n\
          [record]\ndir = \"rec\"\nrotate_s = 20\nkeep_free_mb = 0\n"
     );
-    bench.configure(&tables.collect::<String>(), &more);
+    bench.configure(&tables.chain(udp).collect::<String>(), &more);
 }
 
 #[test]
@@ -319,7 +335,8 @@ fn soak() {
         }
     });
     let players: Vec<Player> = players.collect();
-    configure(&bench, 0.0);
+    let udp = [free_address(), free_address()];
+    configure(&bench, udp, 0.0);
     let mut daemon = bench.daemon_as_configured();
 
     // Subscribers that read everything until the daemon ends. The first one's links tell the players
@@ -340,6 +357,17 @@ fn soak() {
         let (socket, over) = (bench.path("events.sock"), Arc::clone(&over));
         thread::spawn(move || come_and_go(&socket, seed, &over))
     });
+    let rest = library.1.clone();
+    let floods = [0, 1].map(|number| {
+        let (over, rest) = (Arc::clone(&over), rest.clone());
+        let mut stream = Stream::new(number, "flood");
+        thread::spawn(move || match number {
+            0 => flood(udp[0], &over, || rest.clone()),
+            _ => flood(udp[1], &over, || {
+                (0..rest.len()).map(|_| stream.next_u64() as u8).collect()
+            }),
+        })
+    });
     let mut deaf = bench.subscriber();
     deaf.send_line(r#"{"subscribe":["frame","press","hardness","status"]}"#);
 
@@ -353,7 +381,7 @@ fn soak() {
     while playing.iter().any(|player| !player.is_finished()) {
         if start.elapsed().as_secs() / 10 > reloads {
             reloads += 1;
-            configure(&bench, 0.001 * (reloads % 2) as f64);
+            configure(&bench, udp, 0.001 * (reloads % 2) as f64);
             daemon.process.signal(Signal::HUP);
             for old in bench.recordings("").iter().rev().skip(KEPT) {
                 fs::remove_file(bench.path(old)).unwrap();
@@ -368,6 +396,7 @@ fn soak() {
         .collect();
     over.store(true, Relaxed);
     guests.into_iter().for_each(|guest| guest.join().unwrap());
+    floods.into_iter().for_each(|flood| flood.join().unwrap());
     // Let the subscribers read the events so far.
     sleep(Duration::from_secs(1));
     let log = daemon.end();
@@ -396,6 +425,14 @@ fn soak() {
     // Errors are above all those of refused reloads.
     let errors: Vec<&str> = log.lines().filter(|line| line.contains("ERROR")).collect();
     assert!(errors.is_empty(), "{errors:?}");
+    for name in ["flood", "noise"] {
+        let lines = log.matches(&format!("sensor=\"{name}\"")).count();
+        println!("{lines} lines of log about {name}");
+        assert!(
+            (lines as f64) < 50.0 * length.as_secs_f64() / 60.0,
+            "{name}"
+        );
+    }
     for recording in bench.recordings("") {
         assert!(!bench.entries(&recording).is_empty(), "{recording}");
     }
