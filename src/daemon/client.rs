@@ -247,7 +247,7 @@ async fn answer(
 /// The last line of an answer.
 fn end(done: Result<Done, String>, id: Option<Value>) -> Arc<Line> {
     Line::reply(&match done {
-        Ok((tare, blackbox)) => Reply::Ok {
+        Ok(Done { tare, blackbox }) => Reply::Ok {
             id,
             tare,
             blackbox: blackbox.map(|path| path.display().to_string()),

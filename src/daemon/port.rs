@@ -1,5 +1,5 @@
-//! What is known of a port without opening it: whether its line can carry the frames of its sensor, and whether
-//! the sensor is simulated.
+//! What is known of a port before the daemon opens it: whether its line can carry the frames of its sensor, and
+//! whether the sensor is simulated.
 
 use rustix::fs::{Mode, OFlags};
 

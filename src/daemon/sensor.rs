@@ -26,8 +26,12 @@ use hardnessd_core::tare::RetareError;
 use hardnessd_core::verdict::Model;
 use hardnessd_core::wording;
 
-/// The content of an `ok`: the tare that was taken, or the file that was written.
-pub(crate) type Done = (Option<Tared>, Option<PathBuf>);
+/// The content of an `ok`: the tare that was taken, or the black box that was written.
+#[derive(Debug, Default)]
+pub(crate) struct Done {
+    pub(crate) tare: Option<Tared>,
+    pub(crate) blackbox: Option<PathBuf>,
+}
 
 /// Where the answer to a command goes: what was done, or why it is refused, in words, because nobody tells reasons
 /// apart.
@@ -227,8 +231,13 @@ impl SensorCore {
 /// Logs the outcome of a tare that a client requested, and returns the answer.
 fn tared(sensor: &str, outcome: Result<Tared, RetareError>) -> Result<Done, String> {
     log::tare(sensor, &outcome);
-    let answer = outcome.map(|tared| (Some(tared), None));
-    answer.map_err(|refusal| format!("tare: {refusal}"))
+    match outcome {
+        Ok(tared) => Ok(Done {
+            tare: Some(tared),
+            ..Done::default()
+        }),
+        Err(refusal) => Err(format!("tare: {refusal}")),
+    }
 }
 
 /// Checks the keys of a context that say what is pressed, for a model with so many levels.

@@ -13,6 +13,7 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::{Job, Progress, Queued, Target};
+use crate::daemon::sensor::Done;
 use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
@@ -176,7 +177,10 @@ impl Worker {
             Job::Entry { sensor, at, entry } => self.entry(sensor, at, entry),
             Job::Event(event) => self.event(&event),
             Job::Blackbox { sensor, reply } => {
-                let written = self.blackbox(sensor).map(|path| (None, Some(path)));
+                let written = self.blackbox(sensor).map(|path| Done {
+                    blackbox: Some(path),
+                    ..Done::default()
+                });
                 // The client may have gone.
                 let _ = reply.send(written.map_err(|error| format!("blackbox: {error}")));
                 Ok(())
