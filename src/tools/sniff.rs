@@ -290,7 +290,8 @@ async fn listen(port: &Port, baud: u32, seconds: f64) -> Result<Capture, Failure
     }
 }
 
-/// A line has fewer framing errors than one in so many bytes, also if the port was opened within a byte.
+/// More framing errors than one in so many bytes mean another baud rate. Opening the port within a byte may give
+/// one.
 const FRAMED_BYTES: u64 = 100;
 
 /// The framing errors of `port` since the system started, if they are shown.

@@ -281,33 +281,6 @@ pub(crate) fn middle(frames: &[Vec<f32>]) -> Vec<f32> {
     (0..cells).map(value).collect()
 }
 
-/// How far the numbers of each frame are from rest, by what they change from frame to frame.
-pub(crate) fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
-    let rest = middle(frames);
-    let mut activity = vec![0.0; frames.len()];
-    for cell in 0..rest.len() {
-        let of = |frame: &Vec<f32>| frame[cell];
-        if !frames.iter().map(of).all(f32::is_finite) {
-            continue;
-        }
-        let mut steps: Vec<f32> = frames
-            .windows(2)
-            .map(|pair| (of(&pair[1]) - of(&pair[0])).abs())
-            .collect();
-        steps.sort_by(f32::total_cmp);
-        let usual = steps.get(steps.len() / 2)?.max(f32::MIN_POSITIVE);
-        for (sum, frame) in activity.iter_mut().zip(frames) {
-            *sum += f64::from(((of(frame) - rest[cell]).abs() / usual).min(64.0));
-        }
-    }
-    Some(
-        activity
-            .into_iter()
-            .map(|sum| (sum * 16.0) as u32)
-            .collect(),
-    )
-}
-
 /// Which binary digits some numbers have, as exponents of two.
 #[derive(Debug, Clone, Copy)]
 struct Digits {

@@ -19,7 +19,7 @@ use crate::model::{
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
-use crate::pictures::{Pictures, Presses, activity, energy, some};
+use crate::pictures::{Pictures, Presses, energy, middle, some};
 use crate::places::{Place, places};
 
 /// The longest side that is tried, so that an array that is too large is found.
@@ -428,6 +428,33 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
 
 /// A press stands out by so many times as much as frames at rest differ.
 const CONTRAST: f64 = 4.0;
+
+/// How far the numbers of each frame are from rest, by what they change from frame to frame.
+fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
+    let rest = middle(frames);
+    let mut activity = vec![0.0; frames.len()];
+    for cell in 0..rest.len() {
+        let of = |frame: &Vec<f32>| frame[cell];
+        if !frames.iter().map(of).all(f32::is_finite) {
+            continue;
+        }
+        let mut steps: Vec<f32> = frames
+            .windows(2)
+            .map(|pair| (of(&pair[1]) - of(&pair[0])).abs())
+            .collect();
+        steps.sort_by(f32::total_cmp);
+        let usual = steps.get(steps.len() / 2)?.max(f32::MIN_POSITIVE);
+        for (sum, frame) in activity.iter_mut().zip(frames) {
+            *sum += f64::from(((of(frame) - rest[cell]).abs() / usual).min(64.0));
+        }
+    }
+    Some(
+        activity
+            .into_iter()
+            .map(|sum| (sum * 16.0) as u32)
+            .collect(),
+    )
+}
 
 /// The bits of each press that no shape changes.
 fn later(pictures: &Pictures) -> Vec<f64> {
