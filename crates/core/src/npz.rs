@@ -11,7 +11,7 @@ use zip::result::ZipResult;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use crate::npy::{self, Element, Header};
+use crate::npy::{Element, Header};
 
 /// An array above this size gets 64-bit lengths in the archive. Packed bytes may be slightly more
 /// than unpacked ones, so it is less than 4 GiB.
@@ -55,14 +55,18 @@ impl<W: Write + Seek> Writer<W> {
         shape: &[usize],
         elements: &[T],
     ) -> io::Result<()> {
-        self.add_npy(name, &npy::to_bytes(shape, elements))
+        self.add_each(name, shape, elements.iter().copied())
     }
 
-    /// The same of elements that are made one by one. There must be as many as the shape says.
+    /// The same of elements that are made one by one.
     ///
     /// # Errors
     ///
     /// Returns the errors of writing.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the shape has another number of elements.
     pub fn add_each<T: Element>(
         &mut self,
         name: &str,
@@ -78,6 +82,7 @@ impl<W: Write + Seek> Writer<W> {
         let expected = header.count().unwrap_or(usize::MAX);
         let all_bytes = expected.saturating_mul(size_of::<T>());
         self.begin(name, all_bytes.saturating_add(bytes.len()))?;
+        bytes.reserve_exact(all_bytes.min(self.chunk_bytes));
         let mut found = 0;
         for element in elements {
             element.push(&mut bytes);

@@ -2,9 +2,10 @@
 //!
 //! In: settings and a seed. Out: [`dataset`], the labelled samples of the paper's Table 1 (force
 //! prescribed), `courses`, whole presses with the arm's motion, on one kind of sensor or on many,
-//! and [`Sequence`], raw frames as a sensor would send them (motion prescribed). Everything follows from the seed. Nothing here reads a clock,
-//! does I/O or keeps global state. The modules are in reading order: each uses only the modules above
-//! it. The head of each says what it models and what it does not.
+//! and [`Sequence`], raw frames as a sensor would send them (motion prescribed). Everything follows
+//! from the seed. Nothing here reads a clock, does I/O or keeps global state. The modules are in
+//! reading order: each uses only the modules above it. The head of each says what it models and what
+//! it does not.
 //!
 //! Two results differ from the intended values. The durometer gives the three foams mean moduli 10
 //! to 18 % lower: sponge 0.278 MPa (intended: 0.34), foam 0.763 (0.85), yoga mat 0.318 (0.38). And

@@ -182,12 +182,15 @@ static PROPERTIES: LazyLock<[Properties; 8]> = LazyLock::new(|| {
     }
     let table = include_str!("../materials.toml");
     toml::from_str::<Table>(table)
-        .expect("the table is right")
+        .expect("this crate's own file, which the tests read")
         .material
 });
 
 #[cfg(test)]
 mod tests {
+    use serde::de::IntoDeserializer;
+    use serde::de::value::{self, StrDeserializer};
+
     use super::*;
 
     #[test]
@@ -196,6 +199,14 @@ mod tests {
         assert_eq!(levels, [1, 2, 3, 4, 1, 2, 3, 4]);
         assert_eq!(Material::Sponge.split(), Split::Train);
         assert_eq!(Material::HardPlastic.split(), Split::Test);
+    }
+
+    #[test]
+    fn rows_have_the_order_of_the_materials() {
+        for material in Material::ALL {
+            let name: StrDeserializer<'_, value::Error> = material.name().into_deserializer();
+            assert_eq!(Material::deserialize(name), Ok(material));
+        }
     }
 
     #[test]

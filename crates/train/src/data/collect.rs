@@ -121,30 +121,37 @@ pub fn recordings(
     let bar = ProgressBar::new(paths.len() as u64);
     let bar = bar.with_style(style.expect("the template is right"));
     let hrn = Arc::new(Model::load(BUILT_IN_HRN)?);
-    let mut left_out = Vec::new();
+    let mut used = 0;
     for path in paths {
         let played = file::whole(path).and_then(|bytes| {
             let played = Recording::played(path, &bytes, sensor, layout, &hrn);
             played.with_context(|| path.display().to_string())
         });
-        match played {
-            Ok(recording) if recording.presses.all.is_empty() => left_out.push(anyhow!(
+        let left_out = match played {
+            Ok(recording) if recording.presses.all.is_empty() => Some(anyhow!(
                 "{}: no press found: was the sensor pressed, and is this its layout? `hardnessd replay` shows what is \
                  in a recording",
                 path.display()
             )),
             played => match played.and_then(&mut take) {
-                Err(error) if skips_unusable => left_out.push(error),
-                taken => taken?,
+                Err(error) if skips_unusable => Some(error),
+                taken => {
+                    taken?;
+                    used += 1;
+                    None
+                }
             },
+        };
+        // It is said at once, because a later file may end the call.
+        if let Some(error) = left_out {
+            bar.suspend(|| {
+                hardnessd_core::stderr_line!("left out: {}", wording::line(error.as_ref()));
+            });
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    for error in &left_out {
-        hardnessd_core::stderr_line!("left out: {}", wording::line(error.as_ref()));
-    }
-    Ok(paths.len() - left_out.len())
+    Ok(used)
 }
 
 /// A data set under construction.
@@ -324,8 +331,8 @@ impl Collection {
         Ok(presses::write(npz, &self.presses, layout, &meta.into())?)
     }
 
-    /// The levels of an earlier data set, of the configuration or the paper's, or as many as the presses have, with their numbers for
-    /// names.
+    /// The levels of an earlier data set, of the configuration or the paper's, or as many as the presses have, with
+    /// their numbers for names.
     fn levels(&self) -> Vec<Level> {
         let stated = self.presses.levels();
         let most = self.presses.all.iter().map(|press| press.level).max();

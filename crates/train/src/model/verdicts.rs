@@ -59,20 +59,20 @@ pub fn reference(presses: &Presses, (place, piece): (usize, Piece)) -> Reference
     }
 }
 
-/// The references beside the presses of each half of a sensor's objects, by sensor, and the objects that serve as
+/// The references for the presses of each half of a sensor's objects, by sensor, and the objects that serve as
 /// references with their hardness.
-type Beside = (BTreeMap<u32, [References; 2]>, BTreeSet<Option<u32>>);
+type BySensor = (BTreeMap<u32, [References; 2]>, BTreeSet<Option<u32>>);
 
 /// The references of each sensor that has some of these presses.
-fn beside(
+fn references_of_sensors(
     hrn: &Model,
     presses: &Presses,
     places: &[usize],
     given: Given,
-) -> anyhow::Result<Beside> {
-    let (mut beside, mut objects) = (BTreeMap::new(), BTreeSet::new());
+) -> anyhow::Result<BySensor> {
+    let (mut references, mut objects) = (BTreeMap::new(), BTreeSet::new());
     if hrn.most_references() == 0 || given == Given::default() {
-        return Ok((beside, objects));
+        return Ok((references, objects));
     }
     let mut by_sensor = BTreeMap::<u32, Vec<usize>>::new();
     for &place in places {
@@ -95,9 +95,9 @@ fn beside(
         let known: Vec<ReferencePress> = known.map(|own| reference(presses, own)).collect();
         let identified = hrn.identified(hrn.references(&known)?)?;
         let own = own_presses(hrn, presses, places, given.own)?;
-        beside.insert(sensor, own.map(|own| identified.references_with(&own)));
+        references.insert(sensor, own.map(|own| identified.references_with(&own)));
     }
-    Ok((beside, objects))
+    Ok((references, objects))
 }
 
 /// Own presses of a sensor, for each half of its objects from the other half: at most two of an object.
@@ -129,7 +129,8 @@ fn half_of(object: Option<u32>) -> usize {
     object.map_or(0, |object| object as usize % 2)
 }
 
-/// The verdicts of a model on labelled presses, beside the references of the press's sensor. A model of frames judges each press's best frame.
+/// The verdicts of a model on labelled presses, with the references of the press's sensor. A model of frames judges each
+/// press's best frame.
 ///
 /// # Errors
 ///
@@ -141,7 +142,7 @@ pub fn of(
     given: Given,
 ) -> anyhow::Result<Vec<Case>> {
     let levels = hrn.card().levels.len();
-    let (beside, objects) = beside(hrn, presses, places, given)?;
+    let (references, objects) = references_of_sensors(hrn, presses, places, given)?;
     let mut verdicts = Vec::new();
     for &place in places {
         let press = &presses.all[place];
@@ -164,9 +165,9 @@ pub fn of(
                 hrn.judge_taxels(&presses.parts(place, array))?
             }
             Format::Course { .. } => {
-                let beside = beside.get(&press.sensor);
+                let of_sensor = references.get(&press.sensor);
                 let none = References::NONE;
-                let references = beside.map_or(&none, |of| &of[half_of(press.object)]);
+                let references = of_sensor.map_or(&none, |of| &of[half_of(press.object)]);
                 hrn.judge_beside(&presses.course(place), references)?
             }
         };

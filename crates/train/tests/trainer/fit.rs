@@ -106,20 +106,13 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     assert_eq!(again.card().grid, hrn.card().grid);
 }
 
-/// The table of a sensor with so many taxels a side.
-fn table(side: usize) -> String {
-    format!(
-        "name = \"wide\"\nport = \"/dev/null\"\nframe_rate_hz = 20\n[FRAME]\nsync = \"AA 55 C3 3C\"\nlength = \"none\"\n\
-         checksum = \"none\"\ncell = \"u8\"\nrows = {side}\ncols = {side}\n[CALIBRATION]\nnewtons_per_count = 0.05\n\
-         pitch_mm = 2.0\n"
-    )
-}
-
-/// A configuration with it.
+/// The configuration of a sensor with so many taxels a side.
 fn config_of(side: usize) -> String {
-    let config = table(side).replace("[FRAME]", "[sensor.frame]");
-    let config = config.replace("[CALIBRATION]", "[sensor.calibration]");
-    format!("[[sensor]]\n{config}")
+    format!(
+        "[[sensor]]\nname = \"wide\"\nport = \"/dev/null\"\nframe_rate_hz = 20\n[sensor.frame]\nsync = \"AA 55 C3 3C\"\n\
+         length = \"none\"\nchecksum = \"none\"\ncell = \"u8\"\nrows = {side}\ncols = {side}\n[sensor.calibration]\n\
+         newtons_per_count = 0.05\npitch_mm = 2.0\n"
+    )
 }
 
 /// A press of a bar of so many rows and columns on that sensor, so far to the right of its middle, as raw bytes.
@@ -145,8 +138,8 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
     for side in [32, 64] {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
-        let table = table(side);
-        fs::write(path("wide.toml"), config_of(side)).unwrap();
+        let config = config_of(side);
+        fs::write(path("wide.toml"), &config).unwrap();
         // Features do not tell a bar along the rows from one along the columns.
         let bars = [[2, 8], [8, 2]];
         for (object, bar) in [bars[0], bars[0], bars[1], bars[1]].into_iter().enumerate() {
@@ -174,10 +167,8 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
             cols: side,
         };
         assert_eq!((hrn.card().grid, hrn.card().pitch_mm), (Some(array), 2.0));
-        let table = table
-            .replace("[FRAME]", "[frame]")
-            .replace("[CALIBRATION]", "[calibration]");
-        let sensor: sensor::Settings = toml::from_str(&table).unwrap();
+        let config: toml::Table = config.parse().unwrap();
+        let sensor: sensor::Settings = config["sensor"][0].clone().try_into().unwrap();
         let sensor = Sensor::new(Description {
             sensor,
             ..Description::default()

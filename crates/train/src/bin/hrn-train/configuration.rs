@@ -79,10 +79,18 @@ pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
     if levels.is_empty() {
         return Ok(None);
     }
-    if levels.len() > MOST_LEVELS || !are_levels(&levels) {
-        let expected = format!("2 to {MOST_LEVELS} with a label of plain text each");
-        let problem = format!("level: found {} tables, expected {expected}", levels.len());
+    if !(2..=MOST_LEVELS).contains(&levels.len()) {
+        let problem = format!(
+            "level: found {} tables, expected 2 to {MOST_LEVELS}",
+            levels.len()
+        );
         return Err(refused(path, problem));
+    }
+    if !are_levels(&levels) {
+        return Err(refused(
+            path,
+            "level: a label is empty, too long or not plain text",
+        ));
     }
     Borders::of(&levels).map_err(|error| refused(path, format_args!("level: {error}")))?;
     Ok(Some(levels))
