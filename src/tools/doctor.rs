@@ -1,8 +1,8 @@
 //! `hardnessd doctor`: finds why a port does not work. It prints each fault on one line, with the
 //! remedy.
 //!
-//! It opens no device, because opening one resets boards like an Arduino. The checks of a port read the file trees under a
-//! root, which is `/` except in tests.
+//! It opens no device, because opening one resets boards like an Arduino. The checks of a port read the file
+//! trees under a root, which is `/` except in tests.
 
 use std::ffi::OsStr;
 use std::fs;

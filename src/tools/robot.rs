@@ -26,9 +26,9 @@ const POINTS: usize = 2;
 /// How long the robot waits before it looks for the daemon again.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// Sends positions to the daemon at a control socket, for ever, on a thread of its own. `position` is where the arm is at
-/// a moment, in mm, and `None` while it does not move yet. Prints the first reason on
-/// stderr why a daemon does not take them.
+/// Sends positions to the daemon at a control socket, for ever, on a thread of its own. `position` is where the
+/// arm is at a moment, in mm, and `None` while it does not move yet. If a daemon does not take them, the first
+/// reason is printed on stderr.
 ///
 /// # Errors
 ///
