@@ -94,10 +94,12 @@ impl<W: Write + Seek> Writer<W> {
         }
         assert_eq!(found, expected, "{name}: {shape:?}");
         self.zip.write_all(&bytes)?;
+        // Without this the file would be a few bytes shorter, and not the same as that of which a
+        // model's card gives the SHA-256.
         self.zip.flush()
     }
 
-    /// Adds the bytes of an `.npy` file.
+    /// Adds the bytes of an `.npy` file, whose elements may be of any type.
     ///
     /// # Errors
     ///
@@ -105,8 +107,6 @@ impl<W: Write + Seek> Writer<W> {
     pub fn add_npy(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
         self.begin(name, bytes.len())?;
         self.zip.write_all(bytes)?;
-        // Without this the file would be a few bytes shorter, and not the same as that of which a
-        // model's card gives the SHA-256.
         self.zip.flush()
     }
 
