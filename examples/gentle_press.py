@@ -44,7 +44,8 @@ def press(arm, events, sensor, limit_n=15.0, sure=0.0):
             elif event["type"] == "hardness" and event["phase"] == "final":
                 return early, event, greatest_n
             elif event["type"] == "hardness" and loading and event["confidence"] >= sure:
-                early = event
+                # A press unlike those of the training has a confidence that says little.
+                early = None if "outside_training" in event["notes"] else event
             loading = loading and not early and greatest_n < limit_n and seconds < LONGEST_S
             # While nothing is known of the sensor, the arm goes back.
             wanted_mm = FAR_MM if loading and live else 0.0

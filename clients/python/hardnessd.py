@@ -884,17 +884,17 @@ class Control:
 
 
 def answer(event: Hardness, hello: Optional[Message] = None) -> str:
-    """What a verdict says: its level, such as "firm", or "firm?" if its confidence is below 0.7. For a
-    rejected verdict: the levels that it lies between, such as "firm or soft". Their labels are in the
-    client's `hello`."""
+    """What a verdict says: its level, such as "firm", or "firm?" if its confidence is below 0.7 or it has
+    the note `outside_training`. For a rejected verdict: the levels that it lies between, such as
+    "firm or soft". Their labels are in the client's `hello`."""
     levels = hello["model"]["levels"] if hello else []
 
     def named(level: int) -> str:
         return levels[level - 1]["label"] if level <= len(levels) else f"level {level}"
 
     if event["level"] is not None:
-        weak = "?" if event["confidence"] < CONFIDENT else ""
-        return (event["label"] or named(event["level"])) + weak
+        weak = event["confidence"] < CONFIDENT or "outside_training" in event["notes"]
+        return (event["label"] or named(event["level"])) + ("?" if weak else "")
     if event["rejected"] == "low_force":
         return "low force"
     between = event["levels"] or []

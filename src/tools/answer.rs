@@ -8,6 +8,8 @@ use serde_json::Value;
 /// A level with less confidence is marked as weak. Of simulated presses with at least this
 /// confidence, 87 to 98 % got the right level (`models/README.md`, "Accuracy").
 const CONFIDENT: f64 = 0.7;
+/// The note of a press that the model was not trained on. Its confidence says little, so its level is weak.
+const OUTSIDE: &str = "outside_training";
 
 /// What a `hardness` event says, such as `firm`, `firm?` or `firm or soft`, and whether it must not look like a sure
 /// level. `labels` are those of the model's levels, in order. A label may have hidden characters.
@@ -15,7 +17,8 @@ pub(super) fn answer(verdict: &Value, labels: &[String]) -> (String, bool) {
     if let Some(level) = verdict["level"].as_u64() {
         let label = verdict["label"].as_str().map(str::to_owned);
         let label = label.unwrap_or_else(|| named(level, labels));
-        let is_weak = verdict["confidence"].as_f64().unwrap_or_default() < CONFIDENT;
+        let is_weak = verdict["confidence"].as_f64().unwrap_or_default() < CONFIDENT
+            || items(verdict, "notes").any(|note| note == OUTSIDE);
         let mark = if is_weak { "?" } else { "" };
         return (label + mark, is_weak);
     }
