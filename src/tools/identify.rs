@@ -29,6 +29,9 @@ use hardnessd_core::verdict::{
     Borders, Level, MOST_REFERENCES, Model, Piece, ReferencePress, TimeSeries, Tried,
 };
 
+/// The most presses of a recording, each with up to 48 frames.
+const MOST_PRESSES: usize = 1000;
+
 /// Arguments of `identify`.
 #[derive(Debug, Clone, ClapArgs)]
 pub struct Args {
@@ -205,6 +208,11 @@ fn of_file(
         let ended = played.playback.ended().into_iter();
         let ended = ended.filter(|press| press.sensor == sensor.name());
         courses.extend(ended.map(|press| press.course(grid_mm)));
+        if courses.len() > MOST_PRESSES {
+            let path = path.display();
+            let many = format!("{path}: found more than {MOST_PRESSES} presses: record fewer");
+            return Err(Failure::new(FAILED, many));
+        }
         Ok(true)
     })?;
     let labels = played.playback.labels();

@@ -99,17 +99,6 @@ impl<W: Write + Seek> Writer<W> {
         self.zip.flush()
     }
 
-    /// Adds the bytes of an `.npy` file, whose elements may be of any type.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of writing.
-    pub fn add_npy(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
-        self.begin(name, bytes.len())?;
-        self.zip.write_all(bytes)?;
-        self.zip.flush()
-    }
-
     /// Begins an array of so many bytes.
     fn begin(&mut self, name: &str, bytes: usize) -> io::Result<()> {
         let options = SimpleFileOptions::default()
@@ -165,19 +154,23 @@ pub const ANY: RangeInclusive<usize> = 0..=usize::MAX;
 /// An `.npz` file being read.
 pub struct Reader<'a> {
     zip: ZipArchive<Cursor<&'a [u8]>>,
-    most_bytes: usize,
+    /// What further arrays may take.
+    left_bytes: usize,
 }
 
 impl<'a> Reader<'a> {
-    /// Begins to read a file, of whose arrays none may have more than `most_bytes`: a packed file may hold a
-    /// thousand times its size.
+    /// Begins to read a file, of which all arrays together may have `most_bytes`: a packed file may hold a thousand
+    /// times its size.
     ///
     /// # Errors
     ///
     /// Returns an error if the bytes are no such file.
     pub fn new(bytes: &'a [u8], most_bytes: usize) -> ZipResult<Self> {
         let zip = ZipArchive::new(Cursor::new(bytes))?;
-        Ok(Self { zip, most_bytes })
+        Ok(Self {
+            zip,
+            left_bytes: most_bytes,
+        })
     }
 
     /// Whether the file has this array.
@@ -231,9 +224,14 @@ impl<'a> Reader<'a> {
         let count = header.count().filter(|_| fits);
         let count = count.ok_or_else(|| header.unexpected_shape())?;
         let bytes = count.saturating_mul(size_of::<T>());
-        if bytes > self.most_bytes {
-            return Err(io::Error::other(format!("{bytes} bytes of a small file")));
-        }
+        let left = self.left_bytes.checked_sub(bytes);
+        self.left_bytes = left.ok_or_else(|| {
+            let found = format!(
+                "{bytes} bytes, where {} are left for a file of its size",
+                self.left_bytes
+            );
+            io::Error::other(found)
+        })?;
         header.elements(&mut reader)
     }
 }

@@ -39,7 +39,7 @@ pub enum Error {
 /// Returns an [`Error`] if the bytes are no such file, or have no press or more than
 /// [`MOST_REFERENCES`].
 pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
-    let mut file = Reader::new(bytes, MOST_PRESS_BYTES)?;
+    let mut file = Reader::new(bytes, MOST_REFERENCES * MOST_PRESS_BYTES)?;
     if !file.has("0") {
         let expected = "a press: make the file with `hardnessd identify`";
         return Err(Unexpected::new("0", "none", expected).into());

@@ -51,6 +51,8 @@ impl Press {
     }
 }
 
+/// The most memory of the presses of a file, in bytes.
+const MOST_BYTES: usize = 1 << 30;
 /// This long after a press, all its positions have come.
 const AFTER: Duration = Duration::from_millis(800);
 
@@ -68,7 +70,7 @@ pub(super) fn presses(
         if let Some(pipeline) = played.playback.pipeline(sensor.name()) {
             gathered.take(events, at, pipeline);
         }
-        Ok(true)
+        gathered.check_size(path).map(|()| true)
     })?;
     let taxels = sensor.layout().array().taxels();
     let mut frames = gathered.presses.iter().flat_map(|press| &press.frames);
@@ -84,6 +86,8 @@ pub(super) fn presses(
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
+    /// The memory of their frames.
+    bytes: usize,
     /// The frames of the press under way, and the newest frame.
     frames: Vec<(FrameEvent, Duration)>,
     /// The number of the first frame of the press under way.
@@ -137,10 +141,21 @@ impl Gathered {
             if own.contains(&frame.frame) {
                 press.moments.push(moment);
                 press.forces_n.push(frame.force_n.unwrap_or_default());
+                self.bytes += size_of_val(&frame.newtons[..]);
                 press.frames.push(frame.newtons);
             }
         }
         self.presses.push(press);
+    }
+
+    /// Refuses presses that fill the memory.
+    fn check_size(&self, path: &Path) -> Result<(), Failure> {
+        if self.bytes <= MOST_BYTES {
+            return Ok(());
+        }
+        let (path, most) = (path.display(), MOST_BYTES >> 30);
+        let many = format!("{path}: its presses take more than {most} GB of memory: record fewer");
+        Err(Failure::new(FAILED, many))
     }
 }
 
@@ -159,5 +174,20 @@ mod tests {
         let found = press.track.approach(press.moments[0], &press.moments, 0.0);
         let way = found.unwrap().last().copied().flatten();
         assert!((way.unwrap() - 4.0).abs() < 1e-6, "{way:?}");
+    }
+
+    #[test]
+    fn presses_that_fill_the_memory_are_refused() {
+        let of = |bytes| Gathered {
+            bytes,
+            ..Gathered::default()
+        };
+        let path = Path::new("x");
+        assert!(of(MOST_BYTES).check_size(path).is_ok());
+        let error = of(MOST_BYTES + 1).check_size(path).unwrap_err().line();
+        assert!(
+            error.contains("x: its presses take more than 1 GB"),
+            "{error}"
+        );
     }
 }

@@ -24,6 +24,8 @@ use super::source::{Grid, Kind, Object, PITCH_MM, Source, papers_levels};
 
 /// Newtons per unit of a file's `frames_mn`, and of the simulator's presses.
 const MILLINEWTON: f32 = 1e-3;
+/// What all presses of a call may take in memory, in bytes, and all arrays of a file.
+const MOST_BYTES: usize = 8 << 30;
 
 /// Labels and measurements of one press.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -109,6 +111,8 @@ pub struct Presses {
     time_s: Vec<f32>,
     /// The approach of the arm since that frame, in mm, where it is known.
     approach_mm: Vec<Option<f32>>,
+    /// What they take in memory.
+    bytes: usize,
     /// The files.
     pub sources: Vec<Source>,
 }
@@ -166,21 +170,39 @@ impl Presses {
         mut press: Press,
         moments: impl IntoIterator<Item = (f32, Option<f32>, F)>,
     ) {
-        let first = self.frames.len();
+        let (first, before) = (self.frames.len(), self.frames.bytes());
         for (time_s, approach_mm, newtons) in moments {
             self.frames.push(newtons.into_iter());
             self.time_s.push(time_s);
             self.approach_mm.push(approach_mm);
         }
         press.moments = first..self.frames.len();
+        self.bytes += size_of::<Press>() + self.frames.bytes() - before;
+        for array in [&press.unloaded, &press.parts].into_iter().flatten() {
+            self.bytes += size_of_val(&array[..]);
+        }
         self.all.push(press);
+    }
+
+    /// Refuses presses that fill the memory.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if there are too many.
+    pub(super) fn check_size(&self) -> anyhow::Result<()> {
+        ensure!(
+            self.bytes <= MOST_BYTES,
+            "the presses take more than {} GB of memory: use fewer at a time",
+            MOST_BYTES >> 30
+        );
+        Ok(())
     }
 
     /// Adds the presses of other files. Their objects and sensors are others than those that are there.
     ///
     /// # Errors
     ///
-    /// Returns an error if the sensors of the files have different pitches.
+    /// Returns an error if the sensors of the files have different pitches, or all presses are too many.
     pub fn join(&mut self, mut other: Self) -> anyhow::Result<()> {
         if self.all.is_empty() {
             *self = other;
@@ -209,7 +231,7 @@ impl Presses {
     ///
     /// # Errors
     ///
-    /// Returns an error if the sensors of the files have different pitches.
+    /// Returns an error if the sensors of the files have different pitches, or all presses are too many.
     pub(super) fn append(&mut self, other: Self) -> anyhow::Result<()> {
         let (found, expected) = (other.pitch_mm(), self.pitch_mm());
         ensure!(
@@ -222,13 +244,14 @@ impl Presses {
         self.frames.append(&other.frames);
         self.time_s.extend(other.time_s);
         self.approach_mm.extend(other.approach_mm);
+        self.bytes += other.bytes;
         self.all.extend(other.all.into_iter().map(|press| Press {
             source: press.source + sources,
             moments: press.moments.start + frames..press.moments.end + frames,
             ..press
         }));
         self.sources.extend(other.sources);
-        Ok(())
+        self.check_size()
     }
 
     /// The files, for an error.

@@ -185,6 +185,7 @@ impl Recording {
             }
             let events = playback.feed(found)?;
             self.take(events, &playback.ended());
+            self.presses.check_size()?;
         }
         let events = playback.end();
         self.take(events, &playback.ended());

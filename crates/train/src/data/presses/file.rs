@@ -1,6 +1,7 @@
 //! Presses as `.npz` files: arrays with the names, types and shapes of `docs/formats.md`.
 
-use std::io::{self, Seek, Write};
+use std::fs::File;
+use std::io::{self, Read as _, Seek, Write};
 use std::ops::RangeInclusive;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
@@ -9,7 +10,7 @@ use anyhow::{Context as _, anyhow};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::{MILLINEWTON, Press, Presses};
+use super::{MILLINEWTON, MOST_BYTES, Press, Presses};
 use crate::data::source::{Grid, Kind, MOST_LEVELS, PITCH_MM, SIMULATOR, Source};
 use crate::exit::unreadable;
 use hardnessd_core::frame::{Array, MOST_SIDE};
@@ -31,8 +32,10 @@ const PITCHES_MM: RangeInclusive<f64> = 0.01..=1000.0;
 /// The array of the contact areas of presses that have parts.
 const AREAS: &str = "contact_area_taxels";
 
-/// An array may be so many times as large as its file, or up to [`FREE_BYTES`]. Frames of presses are packed to
-/// a tenth, and arrays of zeros to a thousandth.
+/// The largest file that is read, in bytes.
+const MOST_FILE_BYTES: u64 = 4 << 30;
+/// All arrays of a file may be so many times as large as the file, or up to [`FREE_BYTES`], and never more than
+/// [`MOST_BYTES`]. Frames of presses are packed to a tenth, and arrays of zeros to a thousandth.
 const MOST_PACKED: usize = 256;
 const FREE_BYTES: usize = 16 << 20;
 
@@ -62,8 +65,8 @@ pub fn meta(path: &Path) -> anyhow::Result<Value> {
 }
 
 fn opened(bytes: &[u8]) -> anyhow::Result<Reader<'_>> {
-    let most_bytes = FREE_BYTES.max(bytes.len().saturating_mul(MOST_PACKED));
-    let file = Reader::new(bytes, most_bytes);
+    let most_bytes = bytes.len().saturating_mul(MOST_PACKED);
+    let file = Reader::new(bytes, most_bytes.clamp(FREE_BYTES, MOST_BYTES));
     file.map_err(|_| anyhow!("not an .npz file, or a damaged one"))
 }
 
@@ -92,11 +95,28 @@ fn column<T: Element + PartialOrd + std::fmt::Display>(
     Ok(values)
 }
 
-/// Reads a whole file. Refuses a device, such as a serial port, because it has no end.
+/// Reads a whole file. Refuses a device, such as a serial port, because it has no end, and a file that is too large
+/// for memory.
 pub(in crate::data) fn whole(path: &Path) -> anyhow::Result<Vec<u8>> {
-    let read = || match std::fs::metadata(path)?.file_type().is_char_device() {
-        true => Err(io::Error::other("found a device, expected a file")),
-        false => std::fs::read(path),
+    let read = || {
+        let found = std::fs::metadata(path)?;
+        if found.file_type().is_char_device() {
+            return Err(io::Error::other("found a device, expected a file"));
+        }
+        let mut bytes = Vec::new();
+        if found.len() <= MOST_FILE_BYTES {
+            bytes.reserve_exact(found.len() as usize);
+            // A pipe has no length.
+            let mut file = File::open(path)?.take(MOST_FILE_BYTES + 1);
+            file.read_to_end(&mut bytes)?;
+        }
+        match found.len().max(bytes.len() as u64) {
+            0..=MOST_FILE_BYTES => Ok(bytes),
+            _ => Err(io::Error::other(format!(
+                "found more than {} GB, expected less: name several smaller files",
+                MOST_FILE_BYTES >> 30
+            ))),
+        }
     };
     read().map_err(|error| unreadable(path, &error))
 }

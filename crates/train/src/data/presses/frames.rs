@@ -36,6 +36,13 @@ impl Frames {
         self.ends.extend(other.ends.iter().map(|end| before + end));
     }
 
+    /// What they take in memory, with the time and the approach of each.
+    pub(super) fn bytes(&self) -> usize {
+        let of_taxel = size_of::<u16>() + size_of::<f32>();
+        let of_frame = size_of::<usize>() + size_of::<(f32, Option<f32>)>();
+        self.places.len() * of_taxel + self.ends.len() * of_frame
+    }
+
     /// Place and newtons of the taxels of a frame that are not 0.
     pub(super) fn taxels(&self, number: usize) -> impl Iterator<Item = (u16, f32)> {
         let begin = number.checked_sub(1).map_or(0, |before| self.ends[before]);

@@ -1,6 +1,6 @@
 //! Tests of reading files back, and of joining them.
 
-use std::io::Cursor;
+use std::io::{Cursor, Write as _};
 
 use serde_json::{Value, json};
 
@@ -227,15 +227,19 @@ fn add_frames(npz: &mut Npz, n: usize, newtons: f32) {
     npz.add("frames", &[n, ROWS, COLS], &frames).unwrap();
 }
 
-/// Adds an array of a type that our own writer does not use.
-fn add_as(npz: &mut Npz, name: &str, descr: &str, shape: &[usize], bytes: &[u8]) {
+/// Adds an array of a type that our own writer does not use to a file.
+fn with_array(file: Vec<u8>, name: &str, descr: &str, shape: &[usize], bytes: &[u8]) -> Vec<u8> {
     let header = Header {
         descr: descr.to_owned(),
         fortran_order: false,
         shape: shape.to_vec(),
     };
-    npz.add_npy(name, &[&header.to_bytes(), bytes].concat())
-        .unwrap();
+    let mut zip = zip::ZipWriter::new_append(Cursor::new(file)).unwrap();
+    let options = zip::write::SimpleFileOptions::default();
+    zip.start_file(format!("{name}.npy"), options).unwrap();
+    zip.write_all(&header.to_bytes()).unwrap();
+    zip.write_all(bytes).unwrap();
+    zip.finish().unwrap().into_inner()
 }
 
 #[test]
@@ -243,10 +247,8 @@ fn arrays_may_be_missing_or_of_the_types_that_numpy_makes() {
     let taxels = (0..3 * TAXELS).flat_map(|place| (place as f64).to_le_bytes());
     let levels = [0_i64, 1, 4].into_iter().flat_map(i64::to_le_bytes);
     let (taxels, levels): (Vec<u8>, Vec<u8>) = (taxels.collect(), levels.collect());
-    let file = npz(|npz| {
-        add_as(npz, "frames", "<f8", &[3, ROWS, COLS], &taxels);
-        add_as(npz, "level", "<i8", &[3], &levels);
-    });
+    let file = with_array(npz(|_| {}), "frames", "<f8", &[3, ROWS, COLS], &taxels);
+    let file = with_array(file, "level", "<i8", &[3], &levels);
     let presses = parse(&file).unwrap();
     assert_eq!(presses.frame(2).newtons[3], (2 * TAXELS + 3) as f32);
     let mut all = presses.all.iter();
@@ -260,18 +262,42 @@ fn arrays_may_be_missing_or_of_the_types_that_numpy_makes() {
 #[test]
 fn a_small_file_cannot_fill_the_memory() {
     let shape = [9_999_999_999_999, ROWS, COLS];
-    let huge = npz(|npz| {
-        npz.add_list("level", &[1_u8]).unwrap();
-        add_as(npz, "frames", "<f4", &shape, &[0; 4 * TAXELS]);
-    });
+    let level = npz(|npz| npz.add_list("level", &[1_u8]).unwrap());
+    let huge = with_array(level, "frames", "<f4", &shape, &[0; 4 * TAXELS]);
     assert_refused(&huge, "array `frames`: found");
     // 32 MB of spaces are JSON too.
     let spaces = npz(|npz| npz.add_list("meta", &vec![b' '; 32 << 20]).unwrap());
     assert!(spaces.len() < 64 << 10, "{}", spaces.len());
     assert_refused(
         &spaces,
-        "array `meta`: found 33554432 bytes of a small file",
+        "array `meta`: found 33554432 bytes, where 16777216 are left",
     );
+    // Each array may be there, and not both.
+    let both = npz(|npz| {
+        add_frames(npz, 3000, 0.0);
+        npz.add_list("level", &[1_u8; 3000]).unwrap();
+        let array = vec![0.0_f32; 3000 * TAXELS];
+        npz.add("unloaded", &[3000, ROWS, COLS], &array).unwrap();
+        let meta = json!({"grid": [ROWS, COLS]}).to_string();
+        npz.add_list("meta", meta.as_bytes()).unwrap();
+    });
+    assert_refused(&both, "array `unloaded`: found 9408000 bytes, where ");
+}
+
+#[test]
+fn what_is_too_large_for_memory_is_refused() {
+    let mut full = Presses {
+        bytes: MOST_BYTES,
+        ..Presses::default()
+    };
+    let error = full.append(courses()).unwrap_err().to_string();
+    let expected = "the presses take more than 8 GB of memory: use fewer at a time";
+    assert_eq!(error, expected);
+    let file = tempfile::NamedTempFile::new().unwrap();
+    file.as_file().set_len(5 << 30).unwrap();
+    let error = read_one(file.path()).unwrap_err();
+    let expected = "found more than 4 GB, expected less: name several smaller files";
+    assert!(format!("{error:#}").ends_with(expected), "{error:#}");
 }
 
 #[test]
