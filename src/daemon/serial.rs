@@ -447,3 +447,46 @@ pub(crate) fn reason(port: &Port, error: &io::Error) -> String {
         _ => wording::line(error),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+
+    use super::*;
+    use hardnessd_core::sensor::Description;
+
+    #[tokio::test]
+    async fn datagrams_of_many_frames_are_passed_on_in_pieces_or_skipped() {
+        static DATAGRAM: [u8; 60_000] = [1; 60_000];
+        let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+        for (bytes_per_s, expected) in [(10_000.0, [120_000, 0]), (100.0, [60_000, 60_000])] {
+            let free = UdpSocket::bind("127.0.0.1:0").unwrap();
+            let address = free.local_addr().unwrap();
+            drop(free);
+            let mut described = Description::default();
+            described.sensor.port = format!("udp://{address}").parse().unwrap();
+            let settings = Settings {
+                bytes_at_once: 160,
+                bytes_per_s,
+                ..Settings::of(&Sensor::new(described).unwrap())
+            };
+            let mut sources = open(&Port::Udp(address), 9600, &[settings]);
+            assert_eq!(sources[0].next().await, Input::Opened);
+            for _ in 0..2 {
+                sender.send_to(&DATAGRAM, address).unwrap();
+            }
+            let [mut passed_on, mut skipped] = [0, 0];
+            while passed_on + skipped < 2 * DATAGRAM.len() {
+                match sources[0].next().await {
+                    Input::Bytes(bytes) => {
+                        assert!(bytes.len() <= 160, "{}", bytes.len());
+                        passed_on += bytes.len();
+                    }
+                    Input::Skipped(bytes) => skipped += bytes as usize,
+                    input => assert_eq!(input, Input::Opened),
+                }
+            }
+            assert_eq!([passed_on, skipped], expected);
+        }
+    }
+}

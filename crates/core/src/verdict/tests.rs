@@ -150,6 +150,9 @@ fn what_is_not_as_agreed_is_refused_with_what_was_found_and_expected() {
             edit(p, "hrn.range", |range| range["pitch"] = json!([1.5, 5]));
         }),
         ("`hrn.metrics`: found", |p| set(p, "hrn.metrics", "{")),
+        ("expected at most 1048576", |p| {
+            set(p, "hrn.metrics", &" ".repeat((1 << 20) + 1));
+        }),
         (
             "found 7 of other lengths or number, expected 8, or two a level, each with 4",
             |p| {

@@ -10,7 +10,7 @@ use hrn_train::data::presses::{Presses, meta, read_one};
 use rustix::process::{Pid, Signal};
 use serde_json::{Value, json};
 
-use crate::{data, errors, hrn_train_in, succeed_in, trainer, write_data};
+use crate::{data, errors, few, hrn_train_in, succeed_in, trainer, write_data};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
@@ -308,6 +308,28 @@ fn broad_data_say_their_levels() {
     assert!(evaluation["shore"]["rmse"].is_number(), "{evaluation}");
     let verdicts = fs::read_to_string(at.join("v.csv")).unwrap();
     assert_eq!(verdicts.lines().count(), 1 + 16, "{verdicts}");
+}
+
+#[test]
+fn forces_far_from_those_of_the_training_are_said() {
+    let (directory, path) = few();
+    let own = read_one(&path).unwrap();
+    let mut millinewtons = Presses::default();
+    for (place, press) in own.all.iter().enumerate() {
+        let newtons = own.frame(place).newtons.map(|newtons| 1000.0 * newtons);
+        millinewtons.push(press.clone(), [(0.0, None, newtons)]);
+    }
+    write_data(&directory.path().join("mn.npz"), &millinewtons, &json!({}));
+    fs::write(directory.path().join("m.onnx"), BUILT_IN_HRN).unwrap();
+    for (data, expected) in [("d.npz", false), ("mn.npz", true)] {
+        let evaluate = format!("evaluate --model m.onnx --data {data} --split train");
+        let said = errors(&hrn_train_in(directory.path(), &evaluate));
+        assert_eq!(
+            said.contains("presses are far from the "),
+            expected,
+            "{said}"
+        );
+    }
 }
 
 #[test]
