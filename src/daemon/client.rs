@@ -24,8 +24,6 @@ use tracing::debug;
 use super::accept::Serve;
 use super::hub::{Hub, Line, Subscriber};
 use super::lines::{LineError, Lines, lines};
-#[cfg(feature = "ros2")]
-use super::request::motion::ReportedPoint;
 use super::request::motion::{self, Positions};
 use super::request::{self, Context, Query, Request, Subscription};
 use super::sensor::{Answer, Command, Done, SensorHandle, Sensors};
@@ -218,9 +216,6 @@ impl Writer {
     }
 }
 
-/// The key of a sensor's name in a request with positions.
-const MOTION_KEY: &str = "motion.sensor";
-
 /// The answer to a query or a command.
 async fn answer(
     service: &Service,
@@ -268,7 +263,7 @@ async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Str
             // Read the clocks now, because the sensor's task may have other work to do first.
             let input = Input::Motion(motion::placed(&points, now())?);
             let command = |reply| Command::Take(input, reply);
-            ask(sensors, MOTION_KEY, &sensor, command).await
+            ask(sensors, "motion.sensor", &sensor, command).await
         }
         Request::Blackbox(sensor) => ask(sensors, "blackbox", &sensor, Command::Blackbox).await,
         // They change nothing.
@@ -283,21 +278,6 @@ pub(super) async fn set_context(
 ) -> Result<Done, String> {
     let command = |reply| Command::Take(Input::Context(context), reply);
     ask(sensors, "context.sensor", &sensor, command).await
-}
-
-/// Passes positions of the arm on to the task of their sensor, without waiting. If the task refuses them, it
-/// logs that.
-#[cfg(feature = "ros2")]
-pub(super) fn try_move_arm(
-    sensors: &Sensors,
-    sensor: &str,
-    points: &[ReportedPoint],
-) -> Result<(), String> {
-    let found = find(sensors, MOTION_KEY, sensor)?;
-    let (reply, _) = oneshot::channel();
-    let command = Command::Take(Input::Motion(motion::placed(points, now())?), reply);
-    let sent = found.commands.try_send(command);
-    sent.map_err(|_| "they come too fast".to_owned())
 }
 
 /// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's

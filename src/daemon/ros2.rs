@@ -2,30 +2,22 @@
 //!
 //! In: lines of the hub. Out: messages of the node `hardnessd`. ROS need not be installed. Verdicts
 //! and statuses are reliable, and a subscriber that comes later gets the last of each. Frames are
-//! best effort. If the configuration names topics with positions of the arm, the node subscribes to them.
-//! The node has no service and no parameter, so nothing else comes in.
+//! best effort. The node has no subscription, no service and no parameter, so nothing comes in.
 
 use std::collections::BTreeMap;
 
 use ros2_client::dds::rustdds::DomainParticipantBuilder;
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
-use ros2_client::{
-    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Subscription,
-};
+use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher};
 use serde::ser::SerializeTuple;
 use serde::{Serialize, Serializer};
-use tokio::runtime::{Builder, Runtime};
 use tracing::{info, warn};
 
 use super::Error;
-use super::client::try_move_arm;
 use super::config;
-use super::log;
 use super::relay::{Worker, each_event};
-use super::request::motion::ReportedTime;
 use super::sensor::{SensorHandle, Sensors};
 use hardnessd_core::event::{Event, Kind};
-use hardnessd_core::ros::position::{POSITION, PointStamped};
 use hardnessd_core::ros::{self, Topic};
 
 /// An error of the library.
@@ -37,9 +29,6 @@ const PRESSES_KEPT: usize = 16;
 /// The number of contacts that are kept for a subscriber that missed some. A subscriber that needs more misses
 /// them, because publishing does not wait for it.
 const CONTACTS_KEPT: usize = 5;
-
-/// The number of positions that are kept until the thread reads them.
-const POSITIONS_KEPT: usize = 256;
 
 /// Joins the domain as `settings` say and makes the topics of `sensors`.
 ///
@@ -57,15 +46,10 @@ pub(super) fn open(settings: &config::Ros2, sensors: &Sensors) -> Result<Worker,
             let opened = Ros2::open(&settings, domain, &sensors);
             opened.map_err(|error| Error::Io(format!("publish.ros2: {error}")))
         },
-        |(runtime, ros2), mut lines| {
-            // Meanwhile the runtime reads positions.
-            runtime.block_on(async {
-                while let Some(lines) = lines.recv().await {
-                    each_event("ros2", &lines, |event, _| ros2.publish(event));
-                }
-            });
-            // The tasks that read positions must end before their node.
-            drop(runtime);
+        |ros2, mut lines| {
+            while let Some(lines) = lines.blocking_recv() {
+                each_event("ros2", &lines, |event, _| ros2.publish(event));
+            }
         },
     )
 }
@@ -79,11 +63,7 @@ struct Ros2 {
 }
 
 impl Ros2 {
-    fn open(
-        settings: &config::Ros2,
-        domain: u16,
-        sensors: &Sensors,
-    ) -> Result<(Runtime, Self), Failure> {
+    fn open(settings: &config::Ros2, domain: u16, sensors: &Sensors) -> Result<Self, Failure> {
         let mut domain = DomainParticipantBuilder::new(domain);
         if !settings.networks.is_empty() {
             domain = domain.with_only_networks(settings.networks.iter().copied());
@@ -111,16 +91,10 @@ impl Ros2 {
                 topics.insert(topic.of(sensor), publisher);
             }
         }
-        let runtime = Builder::new_current_thread().enable_time().build()?;
-        for (sensor, topic) in &settings.motion {
-            let positions = subscription(&mut node, topic)?;
-            runtime.spawn(take_positions(sensor.clone(), positions, sensors.clone()));
-        }
-        let ros2 = Self {
+        Ok(Self {
             topics,
             _node: node,
-        };
-        Ok((runtime, ros2))
+        })
     }
 
     fn publish(&self, event: &Event) {
@@ -139,33 +113,6 @@ impl Ros2 {
     }
 }
 
-/// Reads positions of the arm of `sensor`, forever.
-async fn take_positions(sensor: String, positions: Subscription<PointStamped>, sensors: Sensors) {
-    loop {
-        let taken = match positions.async_take().await {
-            Ok((position, _)) => position.position(),
-            Err(error) => {
-                log::limited(
-                    "ros2",
-                    || warn!(sensor, %error, "found no position on ros2"),
-                );
-                continue;
-            }
-        };
-        match taken {
-            Some((at, mm)) => {
-                let points = [(ReportedTime::Wall(at), mm)];
-                if let Err(refused) = try_move_arm(&sensors, &sensor, &points) {
-                    log::limited("ros2", || warn!(sensor, %refused, "positions refused"));
-                }
-            }
-            None => log::limited("ros2", || {
-                warn!(sensor, "found a position on ros2 without a valid time");
-            }),
-        }
-    }
-}
-
 fn publisher(
     node: &mut Node,
     space: &str,
@@ -179,23 +126,6 @@ fn publisher(
         qos,
     )?;
     Ok(node.create_publisher(&made, Some(qos.clone()))?)
-}
-
-/// Subscribes to the positions of an arm. The subscription accepts reliable and best-effort
-/// publishers.
-fn subscription(node: &mut Node, topic: &str) -> Result<Subscription<PointStamped>, Failure> {
-    let (space, base) = topic.rsplit_once('/').unwrap_or_default();
-    let space = if space.is_empty() { "/" } else { space };
-    let (package, name) = POSITION.package_and_name();
-    let qos = QosProfile::subscription_default().history(History::KeepLast {
-        depth: POSITIONS_KEPT,
-    });
-    let made = node.create_topic(
-        &Name::new(space, base)?,
-        MessageTypeName::new(package, name),
-        &qos,
-    )?;
-    Ok(node.create_subscription(&made, Some(qos))?)
 }
 
 /// The quality of service for viewers. Publishing does not wait for a viewer that is too slow.

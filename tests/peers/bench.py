@@ -80,57 +80,6 @@ def same_messages(kind, messages, events):
     return len(told)
 
 
-class Arm:
-    """A stand-in for a control socket, at `path`: `simulate --motion PATH` tells it where the simulated arm is, and
-    `tell` is called with each list of [MONO_NS, MM]. What was told is in `told`."""
-
-    def __init__(self, path, tell):
-        self.told, self.tell = [], tell
-        self.listener = socket.socket(socket.AF_UNIX)
-        self.listener.bind(path)
-        self.listener.listen()
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def _serve(self):
-        connection, _ = self.listener.accept()
-        connection.sendall(b'{"type":"hello","protocol":1,"sensors":[{"name":"forearm"}]}\n')
-        for line in connection.makefile():
-            request = json.loads(line)
-            if "motion" in request:
-                points = request["motion"]["at"]
-                self.told += points
-                self.tell(points)
-
-
-def arm_reached_the_press(bench, daemon, arm, read_ros2_messages):
-    """A press whose positions `arm` told is judged on them, and the recording has the positions."""
-    sensor = bench.sensor("forearm", "--presses", "2", "--force", "15", "--seed", "3", "--motion", bench.path("arm.sock"))
-    lines = bench.tail("--types", "hardness", "--timeout", "60")
-    finals = []
-    for line in lines.stdout:
-        event = json.loads(line)
-        finals += [event] if event.get("phase") == "final" else []
-        if len(finals) == 2:
-            break
-    lines.kill()
-    sensor.wait(timeout=60)
-    assert [event["course"] for event in finals] == ["positions"] * 2, finals
-    daemon.terminate()
-    assert daemon.wait(timeout=10) == 0
-    (recording,) = [name for name in os.listdir(bench.path("rec")) if name.startswith("hardnessd-")]
-    recorded = {}
-    for found in read_ros2_messages(os.path.join(bench.path("rec"), recording)):
-        if found.channel.topic == "/tactile/forearm/motion":
-            recorded |= zip(found.ros_msg.at_ns, found.ros_msg.approach_mm, strict=True)
-    arrived, late_ns = 0, 0
-    for at_ns, mm in arm.told:
-        near = min(recorded, key=lambda other: abs(other - at_ns))
-        if abs(near - at_ns) < 1_000_000 and math.isclose(recorded[near], mm, abs_tol=1e-6):
-            arrived, late_ns = arrived + 1, max(late_ns, abs(near - at_ns))
-    assert arrived > 0.98 * len(arm.told) > 100, (arrived, len(arm.told), len(recorded))
-    return arrived, len(arm.told), late_ns
-
-
 def taken(binary, path, *sensor, more=""):
     """Writes the daemon's own recording of three presses to `path`. Gives what a subscriber read meanwhile."""
     import hardnessd

@@ -1,14 +1,13 @@
 #!/usr/bin/env python3
 """Events as ROS 2 topics, read by Cyclone DDS, the middleware under a ROS 2 installation.
 
-    python -m venv venv && venv/bin/pip install cyclonedds mcap mcap-ros2-support
+    python -m venv venv && venv/bin/pip install cyclonedds
     cargo build --features ros2 && venv/bin/python tests/peers/ros2_peer.py target/debug/hardnessd
 
 Claims: every field of every event, as the message files of clients/ros2 have it, is what the Unix socket
 says; contacts are what frames say, for reliable readers too;
-whoever comes late gets the last verdict and status; frames come best effort; positions of an arm reach the press
-and the recording; the node and its topics are in ROS's own discovery; a frozen reader costs no other subscriber an
-event, nor the stop its second.
+whoever comes late gets the last verdict and status; frames come best effort; the node and its topics are in ROS's own
+discovery; a frozen reader costs no other subscriber an event, nor the stop its second.
 """
 
 import math
@@ -24,16 +23,14 @@ os.environ["CYCLONEDDS_URI"] = """<CycloneDDS><Domain><General>
 </General><Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>20</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
-from bench import Arm, Bench, arm_reached_the_press, same_messages, wait_for  # noqa: E402
+from bench import Bench, same_messages, wait_for  # noqa: E402
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication  # noqa: E402
 from cyclonedds.core import Policy, Qos  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
 from cyclonedds.idl import make_idl_struct, types  # noqa: E402
-from cyclonedds.pub import DataWriter  # noqa: E402
 from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
 from cyclonedds.util import duration  # noqa: E402
-from mcap_ros2.reader import read_ros2_messages  # noqa: E402
 
 DOMAIN = 87
 MESSAGES = pathlib.Path(__file__).resolve().parents[2] / "clients/ros2/tactile_interfaces/msg"
@@ -75,9 +72,6 @@ OURS = {
     for kind in ("hardness", "press", "status")
 }
 CONTACT = message("tactile_interfaces", "Contact", (MESSAGES / "Contact.msg").read_text())
-message("geometry_msgs", "Point", "float64 x\nfloat64 y\nfloat64 z")
-POSITION = message("geometry_msgs", "PointStamped", "std_msgs/Header header\ngeometry_msgs/Point point")
-COURSE = pathlib.Path(__file__).resolve().parents[2] / "models/course.onnx"
 
 RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 LATCHED = Qos(RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(100))
@@ -174,37 +168,6 @@ def check_contacts(contacts, frames):
     return len(contacts)
 
 
-def an_arm(binary):
-    """Positions as a robot's controller publishes them."""
-    more = table() + f'motion = {{ forearm = "/arm_7/approach" }}\n[model]\npath = "{COURSE}"\n'
-    with Bench(binary, more=more + '[record]\ndir = "rec"\nkeep_free_mb = 0\n') as bench:
-        daemon = bench.daemon()
-        participant = DomainParticipant(DOMAIN)
-        topic = Topic(participant, "rt/arm_7/approach", POSITION)
-        writer = DataWriter(participant, topic, qos=VOLATILE)
-        wait_for("the daemon's subscription", lambda: writer.get_matched_subscriptions())
-
-        def point(mm, at_ns):
-            stamp = TYPES["builtin_interfaces/Time"](*divmod(at_ns, 1_000_000_000))
-            header = TYPES["std_msgs/Header"](stamp, "tool0")
-            return POSITION(header, TYPES["geometry_msgs/Point"](7.0, -3.0, mm / 1e3))
-
-        # Neither a number, nor of this minute, nor near.
-        for mm, at_ns in ((math.nan, time.time_ns()), (1.0, 0), (1e9, time.time_ns())):
-            writer.write(point(mm, at_ns))
-
-        def tell(points):
-            ahead = time.time_ns() - time.monotonic_ns()
-            for mono_ns, mm in points:
-                writer.write(point(mm, mono_ns + ahead))
-
-        reached = arm_reached_the_press(bench, daemon, Arm(bench.path("arm.sock"), tell), read_ros2_messages)
-        with open(bench.path("log")) as log:
-            said = log.read()
-        assert said.count("positions refused") == 3 and "found a moment" in said and said.count("expected at most") == 2, said
-        return reached
-
-
 def discovered(participant):
     """What a tool such as `ros2 topic list` goes by."""
     reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
@@ -246,5 +209,4 @@ if __name__ == "__main__":
     binary = os.path.abspath(sys.argv[1])
     compared, seen, found = same_as_the_socket(binary)
     print(f"{compared} messages, as on the socket; of frames {seen}; discovered: {' '.join(found)}")
-    print("an arm: %d of %d positions recorded, at most %d ns off" % an_arm(binary))
     print("a frozen reader: %d frames, none missed; verdicts after %d us at most; stop in %.2f s" % a_frozen_reader(binary))

@@ -5,7 +5,6 @@
 //! null, so a null of an event becomes 0, NaN or an empty string.
 
 mod frame;
-pub mod position;
 
 use byteorder::LittleEndian;
 use jiff::Timestamp;

@@ -135,22 +135,11 @@ fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> 
             && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
             && !token.contains("__")
     };
-    let is_topic = |name: &str| {
-        let tokens = name.strip_prefix('/');
-        tokens.is_some_and(|tokens| tokens.split('/').all(token))
-    };
     let namespace = &ros2.namespace;
-    let fits = namespace == "/" || is_topic(namespace);
+    let tokens = namespace.strip_prefix('/');
+    let fits = tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token));
     let expected = "a namespace of ROS such as \"/arm_7\"";
     range::check("publish.ros2.namespace", namespace, fits, expected)?;
-    for (sensor, topic) in &ros2.motion {
-        let is_known = sensors.iter().any(|known| known.name == *sensor);
-        let expected = "the name of a [[sensor]] before each topic";
-        range::check("publish.ros2.motion", sensor, is_known, expected)?;
-        let key = format!("publish.ros2.motion.{sensor}");
-        let expected = "a topic of ROS such as \"/arm_7/approach\"";
-        range::check(&key, topic, is_topic(topic), expected)?;
-    }
     let fits = |sensor: &&sensor::Settings| token(&sensor.name);
     match sensors.iter().find(|sensor| !fits(sensor)) {
         Some(sensor) => Err(Problem::found(

@@ -1,6 +1,5 @@
 //! The `[publish]` tables: all ways to publish events, except HTTP.
 
-use std::collections::BTreeMap;
 use std::env;
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -95,9 +94,6 @@ settings! {
         pub namespace: String = "/".to_owned();
         /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
         pub networks: Vec<IpAddr> = Vec::new();
-        /// The topic on which the robot reports the positions of its arm, by the sensor's name.
-        #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-        pub motion: BTreeMap<String, String> = BTreeMap::new();
     }
 }
 

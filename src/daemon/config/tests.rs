@@ -226,14 +226,6 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
         ("zenoh]\nsite = \"hall//3\"", "zenoh.site"),
         ("zenoh]\nsite = \"**\"", "zenoh.site"),
         (
-            "ros2]\nmotion = { foot = \"/approach\" }",
-            "ros2.motion: found \"foot\"",
-        ),
-        (
-            "ros2]\nmotion = { sensor = \"approach\" }",
-            "ros2.motion.sensor: found \"approach\"",
-        ),
-        (
             "ros2]\nnamespace = \"arm_7\"",
             "ros2.namespace: found \"arm_7\"",
         ),
