@@ -18,7 +18,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use self::error::Problem;
@@ -28,7 +27,7 @@ use super::log;
 use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
-use hardnessd_core::verdict::{self, BuiltIn, Format, Model};
+use hardnessd_core::verdict::{self, BuiltIn, Format, LevelTable, Model};
 use hardnessd_core::{motion, press, trial};
 
 settings! {
@@ -55,16 +54,6 @@ settings! {
         /// The format of the log.
         pub log: log::Settings = log::Settings::default();
     }
-}
-
-/// A `[[level]]` table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LevelTable {
-    /// The name of the level, such as `firm`.
-    pub label: String,
-    /// The least and the greatest Shore OO of the level.
-    pub shore: [f32; 2],
 }
 
 /// The largest number in `[record]`. As megabytes it is more than any disk has, and the number of

@@ -81,7 +81,10 @@ impl<W: Write + Seek> Writer<W> {
         let mut bytes = header.to_bytes();
         let expected = header.count().unwrap_or(usize::MAX);
         let all_bytes = expected.saturating_mul(size_of::<T>());
-        self.begin(name, all_bytes.saturating_add(bytes.len()))?;
+        let options = SimpleFileOptions::default()
+            .compression_method(CompressionMethod::Deflated)
+            .large_file(all_bytes > LARGE_BYTES);
+        self.zip.start_file(format!("{name}.npy"), options)?;
         bytes.reserve_exact(all_bytes.min(self.chunk_bytes));
         let mut found = 0;
         for element in elements {
@@ -97,14 +100,6 @@ impl<W: Write + Seek> Writer<W> {
         // Without this the file would be a few bytes shorter, and not the same as that of which a
         // model's card gives the SHA-256.
         self.zip.flush()
-    }
-
-    /// Begins an array of so many bytes.
-    fn begin(&mut self, name: &str, bytes: usize) -> io::Result<()> {
-        let options = SimpleFileOptions::default()
-            .compression_method(CompressionMethod::Deflated)
-            .large_file(bytes > LARGE_BYTES);
-        Ok(self.zip.start_file(format!("{name}.npy"), options)?)
     }
 
     /// Adds an array with one axis.

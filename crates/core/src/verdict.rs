@@ -40,7 +40,7 @@ pub(crate) use self::probabilities::softmax;
 pub(crate) use self::references::Reference;
 pub use self::references::{Knowledge, MOST_REFERENCES, PIECE, Piece, ReferencePress, References};
 pub use self::settings::{BuiltIn, Settings};
-pub use self::shore::{Borders, Distribution, Level, Shore};
+pub use self::shore::{Borders, Distribution, Level, LevelTable, Shore};
 pub use self::tried::Tried;
 
 /// The default model, built into the binary; `models/course.md` is its card.

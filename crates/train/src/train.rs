@@ -1,6 +1,5 @@
 //! One training, from data to a model file: read, split once, learn, calibrate, export.
 
-use std::fs;
 use std::path::PathBuf;
 
 use anyhow::{Context as _, bail, ensure};
@@ -9,7 +8,7 @@ use burn::tensor::Device;
 use crate::data::findings;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
-use crate::exit::{coded, unreadable};
+use crate::exit::coded;
 use crate::judge::evaluated::Evaluated;
 use crate::learn;
 use crate::learn::calibration::Calibration;
@@ -17,7 +16,7 @@ use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::progress::ensure_finite;
-use crate::run::{Description, Run};
+use crate::run::{Description, Run, disk};
 use crate::settings::{self, Profile};
 use hardnessd_core::exit::{UNAVAILABLE, USAGE};
 use hardnessd_simulator::Split;
@@ -98,7 +97,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let (recipe, profile, seed) = (asked.method, asked.profile, asked.seed);
     let given = match &asked.config {
         Some(path) => {
-            let text = fs::read_to_string(path).map_err(|error| unreadable(path, &error))?;
+            let text = disk::read_text(path)?;
             settings::parse(&text).with_context(|| path.display().to_string())?
         }
         None => toml::Table::new(),

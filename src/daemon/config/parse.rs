@@ -6,11 +6,11 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::Config;
 use super::error::{Error, MAX_BYTES, Problem, Text};
-use super::{Config, LevelTable};
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{self, Level, Model};
+use hardnessd_core::verdict::{self, LevelTable, Model};
 use hardnessd_core::{npy, range, references, sensor, trial, wording};
 
 /// The configuration at `path` with its paths resolved and its gains read, and its text.
@@ -159,13 +159,7 @@ pub(super) fn model(config: &Config, most: Duration) -> Result<Model, Problem> {
     if config.levels.is_empty() {
         return Ok(hrn);
     }
-    let level = |(level, table): (u8, &LevelTable)| Level {
-        level,
-        label: table.label.clone(),
-        shore: format!("{}-{}", table.shore[0], table.shore[1]),
-    };
-    let levels: Vec<Level> = (1..=u8::MAX).zip(&config.levels).map(level).collect();
-    let levelled = hrn.with_levels(levels);
+    let levelled = hrn.with_levels(LevelTable::levels(&config.levels));
     levelled.map_err(|error| Problem::because("level", error))
 }
 

@@ -21,6 +21,28 @@ pub struct Level {
     pub shore: String,
 }
 
+/// A `[[level]]` table of a configuration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LevelTable {
+    /// The name of the level, such as `firm`.
+    pub label: String,
+    /// The least and the greatest Shore OO of the level.
+    pub shore: [f32; 2],
+}
+
+impl LevelTable {
+    /// The levels of these tables, the hardest first.
+    pub fn levels(tables: &[Self]) -> Vec<Level> {
+        let level = |(level, table): (u8, &Self)| Level {
+            level,
+            label: table.label.clone(),
+            shore: format!("{}-{}", table.shore[0], table.shore[1]),
+        };
+        (1..=u8::MAX).zip(tables).map(level).collect()
+    }
+}
+
 /// The end of the scale.
 const MOST: f32 = 100.0;
 

@@ -1,12 +1,15 @@
 //! Files that are complete at all times, and directories locked for one process.
 
 use std::fs::File;
-use std::io;
+use std::io::{self, Read as _};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::part::Part;
 use rustix::fs::FlockOperation;
+
+use crate::exit::{coded, unreadable};
 
 /// Writes a file under another name, flushes it and renames it, so that it is complete at all times, also
 /// after SIGKILL or a full disk. It may replace an earlier file. A link stays, and its target is written.
@@ -17,6 +20,37 @@ use rustix::fs::FlockOperation;
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let written = Part::over(path).and_then(|part| part.write(bytes));
     written.with_context(|| path.display().to_string())
+}
+
+/// The longest settings or configuration that is read, in bytes.
+const MOST_TEXT_BYTES: usize = 1 << 20;
+
+/// Reads a file of the command line, and of a longer one than `most` bytes only the beginning, with one byte more.
+///
+/// # Errors
+///
+/// Returns an error with an exit code of its own if the file cannot be read.
+pub fn read(path: &Path, most: usize) -> anyhow::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let opened = File::open(path).map(|file| file.take(most as u64 + 1));
+    let read = opened.and_then(|mut file| file.read_to_end(&mut bytes));
+    read.map_err(|error| unreadable(path, &error))?;
+    Ok(bytes)
+}
+
+/// Reads settings or a configuration of the command line.
+///
+/// # Errors
+///
+/// Returns an error with an exit code of its own if the file cannot be read, or is too long.
+pub fn read_text(path: &Path) -> anyhow::Result<String> {
+    let bytes = read(path, MOST_TEXT_BYTES)?;
+    if bytes.len() > MOST_TEXT_BYTES {
+        let path = path.display();
+        let long = format_args!("{path}: found more than {MOST_TEXT_BYTES} bytes");
+        return Err(coded(CONFIG, long));
+    }
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// Returns an error if a directory has files that a command would replace, but not the one that the

@@ -394,6 +394,8 @@ fn bad_input_has_its_exit_code_and_one_line() {
         66 | train hrn100 missing | missing
         66 | train hrn100 tiny.npz --config missing | missing
         78 | train hrn100 tiny.npz --config text.toml | text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`
+        78 | train hrn100 tiny.npz --config /dev/zero | /dev/zero: found more than 1048576 bytes
+        78 | fit tiny.npz --out m.onnx --config /dev/zero | /dev/zero: found more than 1048576 bytes
         78 | train hrn100 tiny.npz --config zero.toml | zero.toml: training.epochs: found 0
         78 | train hrn100 tiny.npz --config log.toml | log.toml: log_above_n: found 1e-40
         2 | train hrn100 tiny.npz --labels 3 | --labels: found 3, expected at least 4

@@ -1,6 +1,7 @@
 //! The sensor that a configuration of the daemon describes first, and its levels.
 
-use std::fs;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::Path;
 
 use hardnessd_core::exit::CONFIG;
@@ -8,16 +9,20 @@ use hardnessd_core::npy;
 use hardnessd_core::press;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{Borders, Level, are_levels};
+use hardnessd_core::verdict::{Borders, Level, LevelTable, are_levels};
 use hardnessd_core::wording;
 use hrn_train::data::source::MOST_LEVELS;
-use hrn_train::exit::{coded, unreadable};
+use hrn_train::exit::coded;
+use hrn_train::run::disk::read_text;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
+/// The most bytes of a file of gains.
+const MOST_GAINS_BYTES: u64 = 1 << 20;
+
 /// Tables of a configuration. The daemon's `check` checks the rest.
 fn tables<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let text = fs::read_to_string(path).map_err(|error| unreadable(path, &error))?;
+    let text = read_text(path)?;
     toml::from_str(&text).map_err(|error| refused(path, wording::of_toml(&text, &error)))
 }
 
@@ -40,7 +45,8 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
     let mut sensor = sensor.ok_or_else(|| refused(path, "has no [[sensor]] table"))?;
     if let Some(Gains::File(file)) = &sensor.calibration.gains {
         let file = path.with_file_name("").join(file);
-        let rows = fs::read(&file).and_then(|bytes| npy::table(&mut bytes.as_slice()));
+        let opened = File::open(&file);
+        let rows = opened.and_then(|file| npy::table(&mut file.take(MOST_GAINS_BYTES)));
         let rows = rows.map_err(|error| {
             refused(
                 path,
@@ -60,22 +66,12 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
 /// The levels of the `[[level]]` tables, which a data set can have. `None` without such tables.
 pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
     #[derive(Deserialize)]
-    struct Named {
-        label: String,
-        shore: [f64; 2],
-    }
-    #[derive(Deserialize)]
     struct Tables {
         #[serde(default)]
-        level: Vec<Named>,
+        level: Vec<LevelTable>,
     }
     let tables: Tables = tables(path)?;
-    let levels = tables.level.into_iter().zip(1..).map(|(of, level)| Level {
-        level,
-        label: of.label,
-        shore: format!("{}-{}", of.shore[0], of.shore[1]),
-    });
-    let levels: Vec<Level> = levels.collect();
+    let levels = LevelTable::levels(&tables.level);
     if levels.is_empty() {
         return Ok(None);
     }

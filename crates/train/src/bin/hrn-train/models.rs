@@ -3,16 +3,17 @@
 use std::path::Path;
 
 use hardnessd_core::trial;
-use hardnessd_core::verdict::Model;
+use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
 use hardnessd_core::{exit, wording};
 use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
 use hrn_train::model::verdicts;
+use hrn_train::run::disk::read;
 
 use super::account;
 use super::arguments::Evaluate;
-use super::files::{check_new, load, read, write};
+use super::files::{check_new, load, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let models = arguments.model.iter().map(|path| Ok(load(path)?.0));
@@ -121,7 +122,7 @@ pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
 
 /// Checks a model file. The time limit for a verdict follows from the frame rate.
 pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> anyhow::Result<String> {
-    let bytes = read(path)?;
+    let bytes = read(path, MAX_FILE_BYTES)?;
     let shown = path.display();
     // Try to run it as the daemon does, with its memory and time.
     let most = trial::verdict_most(frame_rate_hz);

@@ -8,9 +8,10 @@ use hardnessd_simulator::{BroadSensors, CourseSettings, DatasetSettings};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::simulated;
 use hrn_train::exit::coded;
+use hrn_train::run::disk::read_text;
 
 use super::arguments::Simulate;
-use super::files::{check_new, read, write};
+use super::files::{check_new, write};
 
 /// The settings that the options name.
 fn asked(arguments: &Simulate) -> CourseSettings {
@@ -42,7 +43,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let mut settings = asked(arguments);
     settings.check().map_err(|error| coded(USAGE, error))?;
     if let Some(path) = &arguments.config {
-        let text = String::from_utf8_lossy(&read(path)?).into_owned();
+        let text = read_text(path)?;
         let configured = simulated::configured(&settings, &text);
         settings = configured.with_context(|| path.display().to_string())?;
         if settings.sensors.is_some() != arguments.sensors.is_some() {
