@@ -69,7 +69,7 @@ use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
-use hardnessd_core::sensor::{Sensor, Settings};
+use hardnessd_core::sensor::Sensor;
 
 /// How long subscribers may take to fetch their last lines. This is short, because the daemon must
 /// end within 1 s.
@@ -273,8 +273,8 @@ impl Daemon {
             validation = self.setup.hrn.card().validation.as_str(),
             "started"
         );
-        for sensor in &self.setup.config.sensors {
-            announce_sensor(&self.setup, sensor);
+        for index in 0..self.setup.config.sensors.len() {
+            announce_sensor(&self.setup, index);
         }
     }
 
@@ -352,7 +352,7 @@ impl Daemon {
                 continue;
             };
             info!(sensor = sensor.name(), "stopped");
-            announce_sensor(&self.setup, &self.setup.config.sensors[index]);
+            announce_sensor(&self.setup, index);
             core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
             core.recorder.begin_anew(&core.pipeline, now());
             anew.push(core);
@@ -414,9 +414,17 @@ fn raise_descriptors() {
     }
 }
 
-fn announce_sensor(setup: &Setup, sensor: &Settings) {
+fn announce_sensor(setup: &Setup, index: usize) {
+    let sensor = &setup.config.sensors[index];
     let name = sensor.name.as_str();
     info!(sensor = name, port = %sensor.port, "sensor");
+    let guesses = setup.guesses(index).join(" and ");
+    if !guesses.is_empty() {
+        warn!(
+            sensor = name,
+            "{guesses}: not written: the default is a guess, and a wrong one gives wrong verdicts: measure it"
+        );
+    }
     if setup.ignores_references_of(name) {
         warn!(
             sensor = name,

@@ -28,6 +28,7 @@ use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
 use hardnessd_core::verdict::{self, BuiltIn, Format, LevelTable, Model};
+use hardnessd_core::wire::Preset;
 use hardnessd_core::{motion, press, trial};
 
 settings! {
@@ -340,6 +341,19 @@ impl Setup {
         is_same
             && self.config.press == other.config.press
             && at_its_port(self) == at_its_port(other)
+    }
+
+    /// What the configuration leaves out of the sensor at `index`, so that a default stands for it: its pitch and its
+    /// scale, unless its preset is one of an array whose pitch and scale are the defaults.
+    pub fn guesses(&self, index: usize) -> Vec<&'static str> {
+        let preset = self.config.sensors[index].frame.preset();
+        let is_of_array = matches!(preset, Preset::Jx255n | Preset::Jx255nU16);
+        let keys = ["pitch_mm", "newtons_per_count"].into_iter();
+        let is_guess = |key: &&str| {
+            let key = format!("sensor.calibration.{key}");
+            !is_of_array && !self.text.is_written(index, &key)
+        };
+        keys.filter(is_guess).collect()
     }
 
     /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.

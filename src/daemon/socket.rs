@@ -127,7 +127,7 @@ fn refuse_living(key: &str, path: &Path) -> Result<(), Error> {
         }
         _ => Err(Error::Io(format!(
             "{key}: a daemon serves {} already: stop it (the package's with `sudo systemctl stop hardnessd`), \
-             or set another path",
+             or set another path in [publish.unix], or another XDG_RUNTIME_DIR",
             path.display()
         ))),
     }

@@ -15,8 +15,8 @@ use hardnessd_core::wording::as_written;
 /// What `--help` says below the options.
 const MORE: &str = "\
     It refuses what `run` would refuse, with the same exit code, as far as no port has to be opened \
-    for it. It warns of taxels of another pitch than the model's, of a full scale that no film has, and \
-    of keys that change no verdict of this model. Below what would run, it prints every key in force and \
+    for it. It warns of a pitch and a scale that are not written, of taxels of another pitch than the model's, \
+    of a full scale that no film has, and of keys that change no verdict of this model. Below what would run, it prints every key in force and \
     where it comes from: written, a preset, or the default.";
 
 /// Arguments of `check`.
@@ -40,8 +40,17 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         .map_err(|error| Failure::of(error.exit_code(), path.display(), error))?;
     let mut lines = format!("robot {}\n", setup.config.robot);
     let mut warnings = Vec::new();
-    for (sensor, checked) in setup.config.sensors.iter().zip(&setup.sensors) {
+    let sensors = setup.config.sensors.iter().zip(&setup.sensors);
+    for (index, (sensor, checked)) in sensors.enumerate() {
         lines += &line_of(sensor, checked.layout());
+        let guesses = setup.guesses(index).join(" and ");
+        if !guesses.is_empty() {
+            warnings.push(format!(
+                "sensor.calibration of {:?}: {guesses} not written: the default is a guess, and a wrong one gives \
+                 wrong verdicts: measure it",
+                sensor.name
+            ));
+        }
         warnings.extend(pitch_warning(sensor, setup.hrn.card()));
         warnings.extend(scale_warning(sensor, checked.layout()));
         if setup.ignores_references_of(&sensor.name) {

@@ -191,7 +191,8 @@ const PAGE: &str = "\n# [http]\n# listen = \"127.0.0.1:8256\"  # a live page for
 /// The part below `[sensor.frame]`, with values where the defaults would take the sensor at rest for a touch.
 fn newtons(scale: &Scale) -> String {
     let mut text = String::new();
-    text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n";
+    text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n\
+             # The bytes say neither the pitch nor the newtons of a count. A wrong one gives wrong verdicts.\n";
     if let Some(newtons) = scale.newtons_per_count {
         text += &format!(
             "newtons_per_count = {newtons:.6}  # a guess from counts up to {}: measure it with weights\n",

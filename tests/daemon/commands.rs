@@ -48,6 +48,10 @@ fn check_warns_of_what_the_model_or_the_film_does_not_know() {
             "255 counts are 10200.000 N on a taxel",
         ),
         (hrn, "sensor.arm of \"palm\": changes no verdict"),
+        (
+            "[sensor.frame]\nsync = \"A5\"\n".to_owned(),
+            "sensor.calibration of \"palm\": pitch_mm and newtons_per_count not written",
+        ),
     ];
     for (tables, expected) in odd {
         let (_, message) = checked(&tables);
@@ -56,7 +60,12 @@ fn check_warns_of_what_the_model_or_the_film_does_not_know() {
     let (printed, message) = checked(&format!("[model]\npath = \"{COURSE}\"\n"));
     let needs = "judges whole presses, best with the arm's positions";
     assert!(printed.contains(needs), "{printed}");
-    for warning in ["on a taxel", "expected the model's", "changes no verdict"] {
+    for warning in [
+        "on a taxel",
+        "expected the model's",
+        "changes no verdict",
+        "not written",
+    ] {
         assert!(!message.contains(warning), "{message}");
     }
 }

@@ -1,29 +1,40 @@
 #!/usr/bin/env python3
 """Streams of boards that nobody knows, through `sniff` and the daemon's own decoder.
 
-    PYTHON tests/peers/layouts.py target/debug/hardnessd [--streams N] [--seed S]
+    PYTHON tests/peers/layouts.py target/debug/hardnessd [--streams N] [--seed S] [--run]
 
 A generator that shares no code with the product: arrays, cells, axes, marks, counters, lengths, checksums, SLIP,
 COBS and text by chance, with rests and noise, pressed at a few places. Claims: the share that is right, and that
 hardly any is sure and wrong. Right is: rows, columns and cell as sent, and a replay that reads the frames, tares at
-once and has presses.
+once and has presses. With `--run`, each stream that is right also enters `hardnessd run` through a pty, TCP or UDP, by
+its own pace, with the proposal as its configuration: the sensor is live, tares at once and has presses.
 """
 
 import argparse
 import binascii
 import collections
+import contextlib
 import functools
+import itertools
 import json
 import operator
+import os
 import pathlib
+import pty
+import re
+import socket
 import struct
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
+import tty
 import zlib
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
+from bench import Bench, free_port, wait_for
 from boards import crc16_modbus
 
 GRIDS = [
@@ -88,7 +99,7 @@ def axes(rng, load, value, full):
 
 
 def stream(seed):
-    """What was sent in words, and the bytes."""
+    """What was sent in words, and the bytes of each frame. The first ones are cut."""
     rng = np.random.default_rng(seed)
     rows, cols = GRIDS[rng.integers(len(GRIDS))]
     cell, framing = str(rng.choice(list(CELLS))), str(rng.choice(FRAMINGS))
@@ -103,13 +114,13 @@ def stream(seed):
     rest = rng.uniform(0, 0.12) if not is_signed or rng.random() < 0.5 else rng.uniform(-0.02, 0.02)
     rest = full * (rest + rng.normal(0, 0.01, (rows, cols)) * (rng.random() < 0.6))
     noise = full * rng.uniform(0, 0.006)
-    load, out, began = pressed(rng, rows, cols, frames, rate_hz, full), b"", int(rng.integers(1 << 20))
+    load, out, began = pressed(rng, rows, cols, frames, rate_hz, full), [], int(rng.integers(1 << 20))
     for frame in range(frames):
         value = rest + load[frame] + rng.normal(0, noise, (rows, cols))
         if framing == "text":
             separator = " ,"[seed % 2]
             counts = np.clip(np.round(value * min(10, 4095 / full)), 0, 4095).astype(int)
-            out += ("\n".join(separator.join(map(str, row)) for row in counts) + "\n\n").encode()
+            out.append(("\n".join(separator.join(map(str, row)) for row in counts) + "\n\n").encode())
             continue
         if has_axes:
             value = axes(rng, load[frame], value, full)
@@ -121,19 +132,21 @@ def stream(seed):
         if framing == "marked":
             lengths = [b"", b"", struct.pack("<H", len(body)), struct.pack(">H", len(body))]
             body = mark + lengths[length] + body
-            out += body + CHECKSUMS[checksum](body) + (b"\r\n" if tail == 0 else b"")
+            out.append(body + CHECKSUMS[checksum](body) + (b"\r\n" if tail == 0 else b""))
         else:
-            out += {"slip": slip, "cobs": cobs}[framing](body + CHECKSUMS[checksum](body))
+            out.append({"slip": slip, "cobs": cobs}[framing](body + CHECKSUMS[checksum](body)))
     sent = {"rows": rows, "cols": cols, "cell": cell, "framing": framing, "checksum": checksum, "frames": frames}
     sent["stride"] = 3 * np.dtype(numbers).itemsize if has_axes else None
-    return sent, out[int(rng.integers(40)) :]
+    sent["rate_hz"] = rate_hz
+    ends = np.cumsum([len(frame) for frame in out]) - int(rng.integers(40))
+    whole = b"".join(out)[len(b"".join(out)) - ends[-1] :]
+    return sent, [whole[begin:end] for begin, end in itertools.pairwise([0, *ends.clip(0)])]
 
 
 def judged(binary, directory, sent, data):
     """`right`, `wrong`, `not sure` or `no tare or no press`, and what was said."""
     capture, config = directory / "capture.bin", directory / "found.toml"
     capture.write_bytes(data)
-    config.unlink(missing_ok=True)
     done = subprocess.run([binary, "sniff", capture, "--out", config], capture_output=True, text=True)
     if done.returncode != 0:
         return "not sure", done.stderr.strip()
@@ -150,28 +163,105 @@ def judged(binary, directory, sent, data):
         return "wrong", json.dumps(found)
     if not (is_array and is_cell and frames >= 0.95 * sent["frames"] - 2):
         return "wrong", json.dumps(found)
+    why = untared_or_unpressed(events)
+    return ("no tare or no press", why) if why else ("right", "")
+
+
+def untared_or_unpressed(events):
+    """Why the tare did not pass at once, or that nothing presses. Empty if it did and something does."""
     untared = [event["reason"] for event in events if (event.get("reason") or "").startswith("tare")]
-    if untared or not any(event["type"] == "press" for event in events):
-        return "no tare or no press", json.dumps(untared[:1])
-    return "right", ""
+    has_press = any(event["type"] == "press" for event in events)
+    return json.dumps(untared[:1]) if untared else "" if has_press else "no press"
+
+
+@contextlib.contextmanager
+def line_of(kind):
+    """A port of the daemon, and what sends bytes to it once the daemon has opened it."""
+    if kind == "udp":
+        port = free_port()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
+            yield f"udp://127.0.0.1:{port}", lambda data: ours.sendto(data, ("127.0.0.1", port))
+    elif kind == "tcp":
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            accepted = functools.cache(lambda: listener.accept()[0])
+            yield f"tcp://127.0.0.1:{listener.getsockname()[1]}", lambda data: accepted().sendall(data)
+    else:
+        ours, theirs = pty.openpty()
+        tty.setraw(theirs)
+
+        def send(data):
+            while data:
+                data = data[os.write(ours, data) :]
+
+        yield os.ttyname(theirs), send
+        os.close(theirs)
+        os.close(ours)
+
+
+def live(binary, config, sent, frames, kind):
+    """Whether the sensor is `live` in `run` with this proposal, tares at once and has presses, and what was said."""
+    # The daemon ends before its port: it would open the next pty of this name.
+    with line_of(kind) as (port, send), Bench(binary, sensors=()) as bench:
+        text = re.sub(r'(?m)^port = ".*"', f'port = "{port}"', config.read_text())
+        text = re.sub(r"(?m)^# frame_rate_hz = .*", f"frame_rate_hz = {sent['rate_hz']}.0", text)
+        pathlib.Path(bench.path("hardnessd.toml")).write_text(text + '[publish.unix]\npath = "events.sock"\n')
+        bench.daemon()
+        tail = bench.events("--types", "status,press")
+        begin = time.monotonic()
+        for number, frame in enumerate(frames):
+            time.sleep(max(0, begin + number / sent["rate_hz"] - time.monotonic()))
+            send(frame)
+        states = lambda: [event for event in tail.events if event["type"] == "status"]
+        with contextlib.suppress(AssertionError):
+            wait_for("the end", lambda: states() and states()[-1]["state"] == "stale")
+            time.sleep(1)
+        tail.kill()
+        tail.thread.join()
+    # Between frames of a busy machine a sensor may be stale, and a datagram may find no room.
+    least = (0.5 if kind == "udp" else 0.95) * sent["frames"] - 2
+    is_silent = lambda event: (event["reason"] or "").startswith("no frame for")
+    found = [event for event in states() if event["state"] != "connecting"]
+    is_live = any(event["state"] == "live" for event in found)
+    is_live &= all(event["state"] == "live" or is_silent(event) for event in found)
+    if not is_live or found[-1]["frames"] + found[-1]["frames_dropped"] < least:
+        return "not live", json.dumps(states()[-2:])
+    why = untared_or_unpressed(tail.events)
+    return ("not live", why) if why else ("right", "")
+
+
+def tried(given, seed):
+    """What is said of the stream of a seed, and a line about it where that is not `right`."""
+    sent, frames = stream(seed)
+    with tempfile.TemporaryDirectory() as directory:
+        directory = pathlib.Path(directory)
+        said, why = judged(given.binary, directory, sent, b"".join(frames))
+        if said == "right" and given.run:
+            kind = ["pty", "pty", "tcp", "udp"][seed % 4]
+            said, why = live(given.binary, directory / "found.toml", sent, frames, kind)
+            if "held by another process" in why:
+                # Another program waits for a pty that had this name before.
+                said, why = live(given.binary, directory / "found.toml", sent, frames, "tcp")
+            why = f"{kind}: {why}"
+    return said, f"{seed}: {said}: {json.dumps(sent)}: {why[:300]}"
 
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("binary", type=pathlib.Path)
+    parser.add_argument("binary", type=lambda path: pathlib.Path(path).resolve())
     parser.add_argument("--streams", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--run", action="store_true", help="play what is right into `hardnessd run`")
+    parser.add_argument("--at-once", type=int, default=1, help="streams at a time")
     given = parser.parse_args()
     counts = collections.Counter()
-    with tempfile.TemporaryDirectory() as directory:
-        for seed in range(given.seed, given.seed + given.streams):
-            sent, data = stream(seed)
-            said, why = judged(given.binary.resolve(), pathlib.Path(directory), sent, data)
+    with ProcessPoolExecutor(given.at_once) as pool:
+        seeds = range(given.seed, given.seed + given.streams)
+        for said, line in pool.map(functools.partial(tried, given), seeds):
             counts[said] += 1
             if said != "right":
-                print(f"{seed}: {said}: {json.dumps(sent)}: {why[:300]}", flush=True)
+                print(line, flush=True)
     print(dict(counts))
-    wrong = counts["wrong"] + counts["no tare or no press"]
+    wrong = counts["wrong"] + counts["no tare or no press"] + counts["not live"]
     is_as_claimed = counts["right"] >= RIGHT * given.streams and wrong <= WRONG * given.streams
     sys.exit(not is_as_claimed)
 

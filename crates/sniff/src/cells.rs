@@ -3,6 +3,8 @@
 //! In: frames in which something presses or rests, a place, and a type. Out: yes or no. A cell is no
 //! number without a sign if it wraps below 0, and no part of a longer number.
 
+use std::collections::BTreeSet;
+
 use hardnessd_core::wire::Cell;
 
 use crate::numbers::{self, is_signed};
@@ -12,6 +14,22 @@ use crate::pictures::Presses;
 /// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
 const MANY: usize = 10;
 const LITTLE: usize = 4;
+/// So many cells change their sign, at so many moments.
+const CROSSING_CELLS: usize = 2;
+const CROSSING_MOMENTS: usize = 3;
+/// So many bytes of a frame are looked at for it.
+const CROSSING_BYTES: usize = 4096;
+/// The largest of floats of 16 bits is at least 0.03 and finite: as a count it is between these.
+const LEAST_HALF: f32 = 10_240.0;
+const MOST_HALF: f32 = 31_743.0;
+/// No number is between 0 and so much of the largest.
+const GAP: f32 = 0.3;
+/// Numbers from such a share of the largest on are large and those below the other one small. Where these have
+/// noise, it is so many times as much.
+const LARGE_HALF: f32 = 0.875;
+const SMALL_HALF: f32 = 0.75;
+const NOISY: f32 = 8.0;
+const NOISIER: f32 = 2.0;
 /// One of so many numbers that wraps is no damage.
 const WRAPS: usize = 1000;
 /// The fewest bytes that show whether bytes are parts of longer numbers.
@@ -32,7 +50,7 @@ pub(crate) struct Cells<'a> {
 impl<'a> Cells<'a> {
     /// Whether they may be taxels of so many numbers of this type.
     pub(crate) fn may_be(&self, cell: Cell, channels: usize) -> bool {
-        let wraps = self.wraps(cell, channels);
+        let wraps = self.wraps(cell, channels) || self.crosses_zero(cell);
         let is_sign_right = match is_signed(cell) {
             true => wraps || self.has_negative(cell),
             false => !wraps,
@@ -62,6 +80,84 @@ impl<'a> Cells<'a> {
             much += usize::from(number < -quarter);
         }
         little * MANY > all && little > LITTLE * much
+    }
+
+    /// Whether numbers are below 0 for a moment, or above it, by little. One that is may be a broken taxel, and all of
+    /// one moment are taxels that saturate: without a sign, the number before 0 is the largest.
+    fn crosses_zero(&self, cell: Cell) -> bool {
+        let cell = match cell {
+            Cell::U8 | Cell::I8 => Cell::I8,
+            Cell::U16le | Cell::I16le => Cell::I16le,
+            Cell::U16be | Cell::I16be => Cell::I16be,
+            _ => return false,
+        };
+        let quarter = 2.0_f32.powi(8 * cell.bytes() as i32 - 2);
+        let numbers = |index| {
+            let bytes = self.of_frame(index);
+            numbers::numbers(cell, &bytes[..bytes.len().min(CROSSING_BYTES)])
+        };
+        let (mut cells, mut moments) = (BTreeSet::new(), BTreeSet::new());
+        let looked_at = self.presses.idle().chain(self.presses.frames());
+        let last = self.frames.len() - 1;
+        for moment in looked_at.filter(|moment| (1..last).contains(moment)) {
+            let [before, now, after] = [moment - 1, moment, moment + 1].map(numbers);
+            for at in 0..now.len() {
+                let [before, now, after] = [before[at], now[at], after[at]];
+                let is_little = [before, now, after]
+                    .iter()
+                    .all(|number| number.abs() < quarter);
+                let is_below = now < 0.0;
+                if is_little && is_below != (before < 0.0) && is_below != (after < 0.0) {
+                    cells.insert(at);
+                    moments.insert(moment);
+                }
+            }
+        }
+        cells.len() >= CROSSING_CELLS && moments.len() >= CROSSING_MOMENTS
+    }
+
+    /// Whether numbers of 16 bits look like floats, which the daemon does not read: between 0 and the larger ones
+    /// none is, or the larger ones have the less noise. A float has a step of its own for each power of two.
+    pub(crate) fn may_be_halves(&self, cell: Cell) -> bool {
+        match cell.bytes() {
+            // They may be halves of them.
+            1 => self.may_be_halves(Cell::U16le) || self.may_be_halves(Cell::U16be),
+            2 => self.are_like_halves(cell),
+            _ => false,
+        }
+    }
+
+    fn are_like_halves(&self, cell: Cell) -> bool {
+        let numbers = |index| numbers::numbers(cell, self.of_frame(index));
+        let moments = self.presses.frames().chain(self.presses.idle());
+        let pairs: Vec<[Vec<f32>; 2]> = moments
+            .filter_map(|index| Some([index.checked_sub(1)?, index].map(numbers)))
+            .collect();
+        let all = || pairs.iter().flat_map(|[_, now]| now).copied();
+        let most = all().fold(0.0, f32::max);
+        if !(LEAST_HALF..=MOST_HALF).contains(&most) {
+            return false;
+        }
+        let zeros = all().filter(|&number| number == 0.0).count();
+        let least = all().filter(|&number| number != 0.0).fold(most, f32::min);
+        if zeros * MANY > all().count() && least > GAP * most {
+            return true;
+        }
+        let noise = |is_there: &dyn Fn(f32) -> bool| {
+            let both = pairs
+                .iter()
+                .flat_map(|[before, now]| before.iter().zip(now));
+            let there = both.filter(|&(&before, &now)| is_there(before) && is_there(now));
+            let mut steps: Vec<f32> = there.map(|(before, now)| (now - before).abs()).collect();
+            steps.sort_by(f32::total_cmp);
+            // The lower quarter, for a press moves most of the larger ones.
+            (steps.len() >= FEWEST_PARTS).then(|| steps[steps.len() / 4])
+        };
+        // What saturates has no noise either.
+        let of_large = noise(&|number| (LARGE_HALF * most..most).contains(&number));
+        let of_small = noise(&|number| number < SMALL_HALF * most);
+        let less = |(small, large): (f32, f32)| small >= NOISY && small > NOISIER * large;
+        of_small.zip(of_large).is_some_and(less)
     }
 
     /// Whether numbers without a sign jump by more than half of their range: at rest, or as one of several

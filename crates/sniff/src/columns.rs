@@ -325,7 +325,7 @@ impl Number {
         // Damage may make it smaller too, but not by a step.
         let wraps = pairs.iter().any(|(a, b)| {
             let (before, after) = (value(a), value(b));
-            after < before && after.wrapping_sub(before) & mask <= 2 * step
+            after < before && after.wrapping_sub(before) & mask <= step.saturating_mul(2)
         });
         (step > 0 && steps.len() >= 8 && 10 * steady >= 9 * steps.len()).then_some(Self {
             at,

@@ -8,6 +8,7 @@
 pub(crate) struct Presses {
     presses: Vec<Vec<usize>>,
     rest: Vec<usize>,
+    idle: Vec<usize>,
 }
 
 /// The share of the strongest press at which a frame makes a picture.
@@ -16,6 +17,8 @@ const STRONG: f64 = 0.12;
 const PRESSES: usize = 16;
 const PICTURES: usize = 4;
 const RESTS: usize = 15;
+/// The most frames with hardly a press.
+const IDLE: usize = 60;
 /// The correlation from which numbers are alike.
 const ALIKE: f64 = 0.9;
 
@@ -50,6 +53,9 @@ impl Presses {
         let noise = (quarter + 2.0 * (quarter - least)).min(over(0.5));
         let is_strong = |frame: &usize| f64::from(activity[*frame]) > over(STRONG).max(noise);
         let strong: Vec<usize> = (0..activity.len()).filter(is_strong).collect();
+        let idle: Vec<usize> = (0..activity.len())
+            .filter(|frame| !is_strong(frame))
+            .collect();
         let moments = |press: &[usize]| -> Vec<usize> {
             let most = press
                 .iter()
@@ -76,6 +82,7 @@ impl Presses {
         (!presses.is_empty()).then(|| Self {
             presses: some(&presses, PRESSES),
             rest: some(&rest, RESTS),
+            idle: some(&idle, IDLE),
         })
     }
 
@@ -87,6 +94,11 @@ impl Presses {
     /// Some frames in which nothing presses.
     pub(crate) fn rest(&self) -> impl Iterator<Item = usize> + '_ {
         self.rest.iter().copied()
+    }
+
+    /// Some frames with hardly a press, also those that are less quiet than the rest.
+    pub(crate) fn idle(&self) -> impl Iterator<Item = usize> + '_ {
+        self.idle.iter().copied()
     }
 }
 
@@ -147,8 +159,15 @@ impl Pictures {
             .iter()
             .map(of_press)
             .collect::<Option<_>>()?;
-        let all = rests.iter().chain(pressed.iter().flatten().flatten());
-        let digits = Digits::of(all.flatten().copied());
+        let all: Vec<&Vec<f32>> = rests
+            .iter()
+            .chain(pressed.iter().flatten().flatten())
+            .collect();
+        // A constant, such as a mark beside the cells, says nothing of how fine the numbers are.
+        let all = &all;
+        let varies = |at: &usize| all.iter().any(|numbers| numbers[*at] != all[0][*at]);
+        let varying = (0..all[0].len()).filter(varies);
+        let digits = Digits::of(varying.flat_map(|at| all.iter().map(move |numbers| numbers[at])));
         let step = 2.0_f32.powi(digits.step());
         let rest = middle(&rests);
         let change = |numbers: &Vec<f32>| -> Vec<f32> {

@@ -172,6 +172,15 @@ impl Search<'_> {
         Pictures::of(presses, numbers)
     }
 
+    fn cells(&self, place: &Place) -> Cells<'_> {
+        Cells {
+            frames: self.frames,
+            presses: &self.presses,
+            start: place.start,
+            bytes: place.bytes,
+        }
+    }
+
     /// The bits of a candidate, if the presses have these.
     fn score(
         &self,
@@ -250,12 +259,7 @@ impl Search<'_> {
             let formats =
                 formats[place.start % 4].get_or_insert_with(|| self.formats(&place, known));
             for &mut format in formats {
-                let cells = Cells {
-                    frames: self.frames,
-                    presses: &self.presses,
-                    start: place.start,
-                    bytes: place.bytes,
-                };
+                let cells = self.cells(&place);
                 let is_likely = known.cell.is_some() || cells.may_be(format.cell, format.channels);
                 if !is_likely || !place.bytes.is_multiple_of(format.bytes()) {
                     continue;
@@ -356,12 +360,17 @@ impl Search<'_> {
             }
             let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
             if !proposal.is_board && !known.is_complete() {
+                let half = "they look like floats of 16 bits, which the daemon does not read: say --cell if they are \
+                            not, or let a bridge send them as text";
+                let cells = self.cells(&candidate.place);
+                let are_halves = known.cell.is_none() && cells.may_be_halves(format.cell);
                 let long = "they look like numbers of 64 bits, which the daemon does not read";
                 own_doubt = own_doubt
                     .or_else(|| {
                         (format.channels == 1 && self.columns.are_of_64_bits)
                             .then(|| long.to_owned())
                     })
+                    .or_else(|| are_halves.then(|| half.to_owned()))
                     .or_else(|| several_numbers(&pictures, array, format))
                     .or_else(|| other_cells(candidate, candidates));
             }

@@ -269,6 +269,116 @@ fn numbers_of_64_bits_are_taken_for_no_shorter_ones() {
     }
 }
 
+/// What is surely found in frames that begin with these bytes, with cells that `cell` makes of a count and noise.
+fn found_of(
+    seed: u64,
+    array: Array,
+    mark: &[u8],
+    cell: impl Fn(f64, f64) -> Vec<u8>,
+) -> Option<(Array, Option<Cell>)> {
+    let mut stream = Stream::new(seed, "cells");
+    let (pressed, _) = frames(array, 250, &mut stream);
+    let mut bytes = Vec::new();
+    for frame in &pressed {
+        bytes.extend(mark);
+        for &count in &frame.counts {
+            bytes.extend(cell(count.into(), stream.normal()));
+        }
+    }
+    let found = of(&bytes, Known::default()).ok()?;
+    found
+        .doubt
+        .is_none()
+        .then_some((found.best.array, found.best.cell))
+}
+
+#[test]
+fn cells_that_are_below_0_for_moments_have_a_sign() {
+    let array = Array { rows: 6, cols: 14 };
+    let mut sure = 0;
+    for seed in 0..12 {
+        let below = std::cell::Cell::new(0);
+        let found = found_of(seed, array, &[0xE9, 0xD9, 0x45], |count, noise| {
+            let number = (0.4 * count + 1.2 + 0.7 * noise).round() as i8;
+            below.set(below.get() + usize::from(number < 0));
+            vec![number.cast_unsigned()]
+        });
+        if let Some(found) = found
+            && below.get() > 9
+        {
+            assert_eq!(
+                found,
+                (array, Some(Cell::I8)),
+                "{seed}: {} below 0",
+                below.get()
+            );
+            sure += 1;
+        }
+    }
+    assert!(sure >= 4, "{sure}");
+}
+
+#[test]
+fn a_mark_is_no_large_float() {
+    let array = Array { rows: 12, cols: 32 };
+    // As a float, the first four bytes are 733,828.
+    let mark = [0x3C, 0x28, 0x33, 0x49, 0x06, 0x02];
+    let found = (0..4).filter_map(|seed| {
+        found_of(seed, array, &mark, |count, noise| {
+            ((0.08 * count + 0.03 * noise) as f32)
+                .to_le_bytes()
+                .to_vec()
+        })
+    });
+    let found: Vec<_> = found.collect();
+    assert!(
+        found.len() >= 3 && found.iter().all(|sure| *sure == (array, Some(Cell::F32le))),
+        "{found:?}"
+    );
+}
+
+/// A float of 16 bits, of a number from 2^-14 on. Below it is 0.
+fn half(number: f64) -> u16 {
+    let exponent = number.log2().floor().max(-15.0);
+    let fraction = ((number / exponent.exp2() - 1.0) * 1024.0).round() as u16;
+    if exponent < -14.0 {
+        0
+    } else {
+        ((exponent as i16 + 15) as u16).wrapping_shl(10) + fraction
+    }
+}
+
+#[test]
+fn floats_of_16_bits_are_seldom_taken_for_counts() {
+    let (mut searched, mut sure) = (0, 0);
+    for (seed, rest_n) in (0..40).flat_map(|seed| [0.0, 0.4].map(|rest_n| (seed, rest_n))) {
+        let mut stream = Stream::new(seed, "half");
+        let array = Array { rows: 6, cols: 14 };
+        let (pressed, rest) = frames(array, 250, &mut stream);
+        // Floats without zeros and without noise are like counts.
+        if rest > 0 {
+            continue;
+        }
+        let mut bytes = Vec::new();
+        // A press is held for a while.
+        for frame in pressed.iter().flat_map(|frame| [frame; 3]) {
+            bytes.extend([0xE9, 0xD9, 0x45]);
+            for &count in &frame.counts {
+                let newtons = f64::from(count) / 12.5 + rest_n * (1.0 + 0.1 * stream.normal());
+                bytes.extend(half(newtons).to_le_bytes());
+            }
+        }
+        let found = of(&bytes, Known::default());
+        sure += usize::from(found.is_ok_and(|found| found.doubt.is_none()));
+        searched += 1;
+    }
+    // Little noise and no zeros look like counts.
+    assert!(
+        searched >= 8 && 10 * sure <= searched,
+        "{sure} of {searched}"
+    );
+}
+
 #[test]
 fn each_failure_has_its_own_message() {
     let check = |bytes: &[u8], part: &str| {
