@@ -141,7 +141,8 @@ mod tests {
         drop(opened);
         open(pty.path(), 250_000).unwrap();
         // Another program keeps the port for itself, without a lock. Root could open it nevertheless.
-        let flags = OFlags::RDWR | OFlags::NOCTTY;
+        // The programs of other tests must not inherit it.
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
         let other = rustix::fs::open(pty.path(), flags, Mode::empty()).unwrap();
         rustix::termios::ioctl_tiocexcl(&other).unwrap();
         let mut command = Command::new("sleep");
