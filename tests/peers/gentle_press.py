@@ -19,7 +19,8 @@ from bench import Bench
 ROOT = pathlib.Path(__file__).parents[2]
 LIVE = {"type": "status", "sensor": "forearm", "state": "live"}
 FRAME = {"type": "frame", "sensor": "forearm", "force_n": 3.0}
-EARLY = {"type": "hardness", "sensor": "forearm", "phase": "early", "confidence": 0.9}
+EARLY = {"type": "hardness", "sensor": "forearm", "phase": "early", "confidence": 0.9, "notes": []}
+UNLIKE = {**EARLY, "notes": ["outside_training"]}
 FINAL = {"type": "hardness", "sensor": "forearm", "phase": "final", "confidence": 0.9, "advice": None}
 LOST = {"type": "press", "sensor": "forearm", "state": "aborted", "reason": "lost"}
 
@@ -53,13 +54,16 @@ def goes_back_whatever_ends_a_press(gentle_press):
     for events, raised in [
         ([LIVE, FRAME, EARLY, FRAME, FINAL], None),
         ([LIVE, FRAME, FINAL], None),
+        ([LIVE, FRAME, UNLIKE, FRAME, FINAL], None),
         ([LIVE, FRAME, {**FRAME, "force_n": 16.0}, FINAL], None),
         ([LIVE, FRAME, LOST], RuntimeError),
         (interrupted(), KeyboardInterrupt),
     ]:
         arm, ended = Arm(), None
         try:
-            gentle_press.press(arm, iter(events), "forearm")
+            early, _, _ = gentle_press.press(arm, iter(events), "forearm")
+            # A press unlike those of the training ends none early.
+            assert (early == EARLY) == (EARLY in events), early
         except (RuntimeError, KeyboardInterrupt) as error:
             ended = type(error)
         assert ended == raised, (ended, raised)
