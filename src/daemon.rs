@@ -418,12 +418,8 @@ fn announce_sensor(setup: &Setup, index: usize) {
     let sensor = &setup.config.sensors[index];
     let name = sensor.name.as_str();
     info!(sensor = name, port = %sensor.port, "sensor");
-    let guesses = setup.guesses(index).join(" and ");
-    if !guesses.is_empty() {
-        warn!(
-            sensor = name,
-            "{guesses}: not written: the default is a guess, and a wrong one gives wrong verdicts: measure it"
-        );
+    if let Some(warning) = setup.guess_warning(index) {
+        warn!(sensor = name, "{warning}");
     }
     if setup.ignores_references_of(name) {
         warn!(

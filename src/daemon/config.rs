@@ -343,9 +343,9 @@ impl Setup {
             && at_its_port(self) == at_its_port(other)
     }
 
-    /// What the configuration leaves out of the sensor at `index`, so that a default stands for it: its pitch and its
-    /// scale, unless its preset is one of an array whose pitch and scale are the defaults.
-    pub fn guesses(&self, index: usize) -> Vec<&'static str> {
+    /// A warning if the configuration leaves out the pitch or the scale of the sensor at `index`, unless its preset
+    /// is one of an array whose pitch and scale are the defaults.
+    pub fn guess_warning(&self, index: usize) -> Option<String> {
         let preset = self.config.sensors[index].frame.preset();
         let is_of_array = matches!(preset, Preset::Jx255n | Preset::Jx255nU16);
         let keys = ["pitch_mm", "newtons_per_count"].into_iter();
@@ -353,7 +353,13 @@ impl Setup {
             let key = format!("sensor.calibration.{key}");
             !is_of_array && !self.text.is_written(index, &key)
         };
-        keys.filter(is_guess).collect()
+        let guesses: Vec<&str> = keys.filter(is_guess).collect();
+        let guesses = guesses.join(" and ");
+        (!guesses.is_empty()).then(|| {
+            format!(
+                "{guesses} not written: the default is a guess, and a wrong one gives wrong verdicts: measure it"
+            )
+        })
     }
 
     /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.

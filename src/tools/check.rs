@@ -43,14 +43,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let sensors = setup.config.sensors.iter().zip(&setup.sensors);
     for (index, (sensor, checked)) in sensors.enumerate() {
         lines += &line_of(sensor, checked.layout());
-        let guesses = setup.guesses(index).join(" and ");
-        if !guesses.is_empty() {
-            warnings.push(format!(
-                "sensor.calibration of {:?}: {guesses} not written: the default is a guess, and a wrong one gives \
-                 wrong verdicts: measure it",
-                sensor.name
-            ));
-        }
+        let guess = setup.guess_warning(index);
+        warnings
+            .extend(guess.map(|guess| format!("sensor.calibration of {:?}: {guess}", sensor.name)));
         warnings.extend(pitch_warning(sensor, setup.hrn.card()));
         warnings.extend(scale_warning(sensor, checked.layout()));
         if setup.ignores_references_of(&sensor.name) {

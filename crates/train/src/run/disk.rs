@@ -1,4 +1,5 @@
-//! Files that are complete at all times, and directories locked for one process.
+//! Files that are complete at all times, files of the command line that are read up to a bound, and directories
+//! locked for one process.
 
 use std::fs::File;
 use std::io::{self, Read as _};
