@@ -159,9 +159,9 @@ def main():
     check(b"", "no ", endless=b"x", slowly=0.05)
     check(hello, "no ", endless=line({"type": "hail"}), slowly=0.005)
 
-    by_control(b"", hardnessd.LineTooLong, "longer than", endless=endless)
+    by_control(b"", hardnessd.LineTooLong, "longer than", timeout_s=30, endless=endless)
     by_control(hello, TimeoutError, "in time", endless=b"x", slowly=0.05)
-    by_control(hello, hardnessd.ProtocolError, "too many lines", endless=line({"type": "hail"}))
+    by_control(hello, hardnessd.ProtocolError, "too many lines", timeout_s=30, endless=line({"type": "hail"}))
     # Fewer lines than the daemon may send, but more bytes.
     long = line({"type": "hail", "of": "z" * 1_000_000})
     by_control(hello, hardnessd.ProtocolError, "too many lines", timeout_s=30, endless=long)
