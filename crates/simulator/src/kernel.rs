@@ -4,6 +4,7 @@
 //! displacement in mm is the value here times cell_mm / E* times the cell's pressure.
 
 use std::f64::consts::PI;
+use std::sync::LazyLock;
 
 /// Displacement at offset (`x`, `y`) cells from the centre of a cell under unit pressure on an
 /// elastic half-space (Love 1929; Johnson, Contact Mechanics, eq. 3.25).
@@ -47,34 +48,12 @@ pub(super) struct Layer {
 impl Layer {
     /// The layer of Poisson's ratio `nu` on `base`.
     pub(super) fn new(nu: f64, base: Base) -> Self {
-        // Composite Gauss-Legendre quadrature with 5 points per panel. At the end, 1 - S is below
-        // 1e-9.
-        const POINTS: [(f64, f64); 5] = [
-            (0.0, 0.568_888_888_888_889),
-            (0.538_469_310_105_683, 0.478_628_670_499_366),
-            (-0.538_469_310_105_683, 0.478_628_670_499_366),
-            (0.906_179_845_938_664, 0.236_926_885_056_189),
-            (-0.906_179_845_938_664, 0.236_926_885_056_189),
-        ];
-        let (end, panels) = (16.0, 64);
-        let half = 0.5 * end / f64::from(panels);
-        let nodes: Vec<(f64, f64)> = (0..panels)
-            .flat_map(|panel| {
-                let middle = half * f64::from(2 * panel + 1);
-                POINTS.map(|(at, weight)| {
-                    let x = middle + half * at;
-                    (x, weight * half * (1.0 - layer_ratio(x, nu, base)))
-                })
-            })
+        let weights: Vec<f64> = (NODES.iter())
+            .map(|&(x, weight)| weight * (1.0 - layer_ratio(x, nu, base)))
             .collect();
-        let count = (REACH / STEP) as usize + 3;
-        let phi = (0..count)
-            .map(|k| {
-                nodes
-                    .iter()
-                    .map(|&(x, w)| w * libm::j0(x * STEP * k as f64))
-                    .sum()
-            })
+        let phi = BESSEL
+            .chunks_exact(weights.len())
+            .map(|values| weights.iter().zip(values).map(|(w, j0)| w * j0).sum())
             .collect();
         Self {
             phi,
@@ -107,6 +86,37 @@ impl Layer {
         self.phi[k] * (1.0 - part) + self.phi[k + 1] * part
     }
 }
+
+/// The nodes and weights of an integral over x from 0 to 16, where 1 - S is below 1e-9: composite
+/// Gauss-Legendre quadrature with 5 points on each of 64 panels.
+static NODES: LazyLock<Vec<(f64, f64)>> = LazyLock::new(|| {
+    const POINTS: [(f64, f64); 5] = [
+        (0.0, 0.568_888_888_888_889),
+        (0.538_469_310_105_683, 0.478_628_670_499_366),
+        (-0.538_469_310_105_683, 0.478_628_670_499_366),
+        (0.906_179_845_938_664, 0.236_926_885_056_189),
+        (-0.906_179_845_938_664, 0.236_926_885_056_189),
+    ];
+    let (end, panels) = (16.0, 64);
+    let half = 0.5 * end / f64::from(panels);
+    let nodes = (0..panels).flat_map(|panel| {
+        let middle = half * f64::from(2 * panel + 1);
+        POINTS.map(|(at, weight)| (middle + half * at, weight * half))
+    });
+    nodes.collect()
+});
+
+/// J0(x s) for each s of the table of phi and each node x, `[steps, nodes]`. It is the same for all layers, and
+/// dear: without it, a sixth of a simulation went there.
+static BESSEL: LazyLock<Vec<f64>> = LazyLock::new(|| {
+    let count = (REACH / STEP) as usize + 3;
+    let of_step = |k: usize| {
+        NODES
+            .iter()
+            .map(move |&(x, _)| libm::j0(x * STEP * k as f64))
+    };
+    (0..count).flat_map(of_step).collect()
+});
 
 /// Distance in layer heights beyond which the layer does not move, because its Green's function has
 /// decayed.
