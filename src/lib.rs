@@ -3,5 +3,6 @@
 pub mod thread;
 mod maybe;
 mod holders;
+mod score;
 pub mod daemon;
 pub mod tools;

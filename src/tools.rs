@@ -22,7 +22,6 @@ pub mod recover;
 pub mod replay;
 mod readable;
 mod robot;
-mod score;
 pub mod simulate;
 pub mod sniff;
 pub mod tail;

@@ -19,6 +19,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
 use self::worker::Worker;
 use super::sensor::Answer;
 use super::{Error, config};
+use crate::score::Score;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::Event;
 use hardnessd_core::frame::Stamp;
@@ -58,10 +59,8 @@ pub struct Progress {
     pub tared: u64,
     /// The number of presses that were not aborted, so that they have a verdict.
     pub presses: u64,
-    /// The number of final verdicts, and how many of them have the level of the label `level`.
-    pub verdicts: u64,
-    /// See [`Self::verdicts`].
-    pub right: u64,
+    /// The final verdicts beside the level of the label `level`.
+    pub(crate) score: Score,
     /// The level of the last verdict. `None` if it was rejected.
     pub said: Option<u8>,
 }

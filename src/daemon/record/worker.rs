@@ -236,9 +236,9 @@ impl Worker {
                     Target::File { labels, .. } => labels.get("level").and_then(|l| l.parse().ok()),
                     Target::Directory(_) => None,
                 };
-                let is_right = verdict.level.is_some() && verdict.level == truth;
-                self.progress.verdicts += 1;
-                self.progress.right += u64::from(is_right);
+                self.progress
+                    .score
+                    .take(verdict.level.map(u64::from), truth);
                 self.progress.said = verdict.level;
             }
             _ => {}

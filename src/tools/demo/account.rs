@@ -4,8 +4,8 @@
 
 use serde_json::Value;
 
+use crate::score::Score;
 use crate::tools::answer::{self, answer, with_shore};
-use crate::tools::score::Score;
 use hardnessd_simulator::{Pressed, SequenceSettings};
 
 /// The counts of the presses so far.

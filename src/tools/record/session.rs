@@ -17,6 +17,7 @@ use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::Progress;
+use crate::score::Score;
 use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
 use hardnessd_core::part;
@@ -145,8 +146,8 @@ pub(super) async fn run(
     let mut user = User::at_terminal(shutdown)?;
     print("One recording for each object. `q` ends the session.\n");
     let levels = &setup.hrn.card().levels;
-    // The verdicts on objects whose level the user named, and how many of them are right.
-    let mut score = (0, 0);
+    // The verdicts on objects whose level the user named.
+    let mut score = Score::default();
     let (mut number, mut goes_on) = (first, true);
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
@@ -158,9 +159,8 @@ pub(super) async fn run(
     let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
     print(&format!("\nrecorded {recorded} in this session\n"));
-    let (verdicts, right) = score;
-    if verdicts > 0 {
-        print(&format!("{right} of {verdicts} right\n"));
+    if score.verdicts > 0 {
+        print(&format!("{}\n", score.in_words()));
     }
     if count > 0 {
         let directory = shown(directory);
@@ -203,7 +203,7 @@ async fn record_object(
     object: &Object,
     setup: &Setup,
     sockets: Sockets,
-    score: &mut (u64, u64),
+    score: &mut Score,
 ) -> Result<bool, Failure> {
     let path = &object.path;
     let file = create(path)?;
@@ -218,8 +218,7 @@ async fn record_object(
         part::remove(path, &file);
         print("no press was recorded\n");
     } else if object.level > 0 {
-        score.0 += progress.verdicts;
-        score.1 += progress.right;
+        score.add(progress.score);
     }
     recorded.map(|()| goes_on)
 }
@@ -244,18 +243,18 @@ async fn wait_for_user(
                 Some(_) => {}
             },
             Ok(()) = counted.changed() => {
-                let Progress { tared, verdicts, right, said, .. } = *counted.borrow_and_update();
+                let Progress { tared, score, said, .. } = *counted.borrow_and_update();
                 if tared > 0 && !is_tared {
                     is_tared = true;
                     print("the zero is taken: press now (Enter: next object, q: quit)\n");
                 }
-                if verdicts > shown {
-                    shown = verdicts;
+                if score.verdicts > shown {
+                    shown = score.verdicts;
                     let beside = match object.level {
                         0 => String::new(),
-                        level => format!(", you said {}; {right} of {verdicts} right", label(level)),
+                        level => format!(", you said {}; {}", label(level), score.in_words()),
                     };
-                    print(&format!("verdict {verdicts}: {}{beside}\n", label(said.unwrap_or(0))));
+                    print(&format!("verdict {shown}: {}{beside}\n", label(said.unwrap_or(0))));
                 }
             }
         }

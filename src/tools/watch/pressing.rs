@@ -5,8 +5,8 @@
 
 use serde_json::{Map, Value, json};
 
+use crate::score::Score;
 use crate::tools::answer::{level_of, named};
-use crate::tools::score::Score;
 
 /// What is being pressed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

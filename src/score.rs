@@ -2,8 +2,8 @@
 
 /// The verdicts so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Score {
-    pub(super) verdicts: u64,
+pub(crate) struct Score {
+    pub(crate) verdicts: u64,
     right: u64,
     /// The verdicts without a level.
     without: u64,
@@ -11,7 +11,7 @@ pub(super) struct Score {
 
 impl Score {
     /// Counts a verdict of a level, or of none. Returns its mark.
-    pub(super) fn take(&mut self, level: Option<u64>, truth: Option<u64>) -> &'static str {
+    pub(crate) fn take(&mut self, level: Option<u64>, truth: Option<u64>) -> &'static str {
         self.verdicts += 1;
         match level {
             None => {
@@ -26,8 +26,15 @@ impl Score {
         }
     }
 
+    /// Counts the verdicts of `other` too.
+    pub(crate) fn add(&mut self, other: Self) {
+        self.verdicts += other.verdicts;
+        self.right += other.right;
+        self.without += other.without;
+    }
+
     /// Such as `3 of 4 right, 0 wrong, 1 without a level`.
-    pub(super) fn in_words(self) -> String {
+    pub(crate) fn in_words(self) -> String {
         let Self {
             verdicts,
             right,
