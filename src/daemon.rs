@@ -58,7 +58,7 @@ use self::config::{Publish, Setup};
 use self::hub::Hub;
 use self::own::Store;
 use self::publish::Publishers;
-use self::record::{Progress, Recorder, Target};
+use self::record::{Progress, Recorder, Target, WithoutSensor};
 use self::reload::Refusal;
 pub use self::reload::Reload;
 use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
@@ -168,8 +168,8 @@ impl Daemon {
     }
 
     /// A daemon with `sockets` that records into `file`, an empty file at `path`, and reports in
-    /// `progress` what the file holds. The daemon ends by itself if a sensor is missing at the
-    /// start, or when all sensors are lost.
+    /// `progress` what the file holds. If a sensor is missing at the start, or all are lost, it does
+    /// what `without_sensor` says.
     ///
     /// # Errors
     ///
@@ -181,6 +181,7 @@ impl Daemon {
         labels: Labels,
         progress: watch::Sender<Progress>,
         sockets: Sockets,
+        without_sensor: WithoutSensor,
     ) -> Result<Self, Error> {
         let mut unix = setup.config.publish.unix;
         unix.enabled &= sockets == Sockets::Configured;
@@ -195,6 +196,7 @@ impl Daemon {
             file,
             labels,
             progress,
+            without_sensor,
         };
         Self::start_with(setup, Some(target))
     }

@@ -38,16 +38,26 @@ const STATE_EVERY_BYTES: usize = 4 << 20;
 /// The target of a recording.
 #[derive(Debug)]
 pub(crate) enum Target {
-    /// One file, which the caller has made. The recording ends when the file cannot be written or
-    /// when there is no sensor left.
+    /// One file, which the caller has made. The recording ends when the file cannot be written, and
+    /// `without_sensor` as it says.
     File {
         path: PathBuf,
         file: File,
         labels: Labels,
         progress: watch::Sender<Progress>,
+        without_sensor: WithoutSensor,
     },
     /// Files in the directory of the configuration.
     Directory(config::Record),
+}
+
+/// What a recording into one file does if a sensor is missing at the start, or all are lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WithoutSensor {
+    /// It ends.
+    End,
+    /// It waits, as a daemon does.
+    Wait,
 }
 
 /// The content of one file so far.
@@ -59,6 +69,10 @@ pub struct Progress {
     pub tared: u64,
     /// The number of presses that were not aborted, so that they have a verdict.
     pub presses: u64,
+    /// The number of presses that were under way when their sensor was lost.
+    pub lost: u64,
+    /// The number of sensors that are missing now.
+    pub missing: usize,
     /// The final verdicts beside the level of the label `level`.
     pub(crate) score: Score,
     /// The level of the last verdict. `None` if it was rejected.

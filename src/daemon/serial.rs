@@ -246,7 +246,7 @@ impl Task {
     /// Opens and reads the port, again and again.
     async fn serve(mut self) {
         loop {
-            let ended = match self.open().await {
+            let ended = match open_line(&self.port, self.baud).await {
                 Ok(line) => Input::Lost(self.read(line).await),
                 Err(reason) => Input::Unavailable(reason),
             };
@@ -254,20 +254,6 @@ impl Task {
             tokio::time::sleep(self.pause).await;
             self.pause = (self.pause * 2).min(LONGEST_PAUSE);
         }
-    }
-
-    /// Opens the port in a thread of its own, because a driver or a network may be slow. The error says why
-    /// it cannot be opened.
-    async fn open(&self) -> Result<Line, String> {
-        let (port, baud, runtime) = (self.port.clone(), self.baud, Handle::current());
-        let opening = spawn_thread("port", move || {
-            let _in_runtime = runtime.enter();
-            Line::open(&port, baud)
-        });
-        let opening =
-            opening.map_err(|NoThread(error)| format!("no thread to open it: {error}"))?;
-        let opened = opening.await.map_err(|ended| ended.to_string())?;
-        opened.map_err(|error| reason(&self.port, &error))
     }
 
     /// Reads the open port until it is lost. Returns the reason.
@@ -426,6 +412,24 @@ impl Line {
             Self::Tcp(_) => "closed by the other end",
         }
     }
+}
+
+/// Opens a port in a thread of its own, because a driver or a network may be slow. The error says why
+/// it cannot be opened.
+async fn open_line(port: &Port, baud: u32) -> Result<Line, String> {
+    let (opened, runtime) = (port.clone(), Handle::current());
+    let opening = spawn_thread("port", move || {
+        let _in_runtime = runtime.enter();
+        Line::open(&opened, baud)
+    });
+    let opening = opening.map_err(|NoThread(error)| format!("no thread to open it: {error}"))?;
+    let opened = opening.await.map_err(|ended| ended.to_string())?;
+    opened.map_err(|error| reason(port, &error))
+}
+
+/// Opens a port for a moment. The error says why it cannot be opened.
+pub(crate) async fn try_port(port: &Port, baud: u32) -> Result<(), String> {
+    open_line(port, baud).await.map(drop)
 }
 
 /// Opens a port that is no device for a moment. Returns whether a telnet server is at its other end.

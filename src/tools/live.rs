@@ -16,7 +16,7 @@ use super::exit::{Fail, Failure};
 use super::record;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
-use crate::daemon::record::Progress;
+use crate::daemon::record::{Progress, WithoutSensor};
 use crate::thread;
 use hardnessd_core::exit::IO;
 use hardnessd_core::recording::Labels;
@@ -98,7 +98,8 @@ async fn record(
         }
     };
     let (sockets, labels) = (Sockets::Configured, Labels::new());
-    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, enough).await;
+    let without = WithoutSensor::End;
+    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, without, enough).await;
     recorded?;
     if let Some(signal) = stopped {
         return Err(Failure::interrupted(signal));

@@ -20,12 +20,13 @@ use super::exit::{Fail as _, Failure};
 use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::Progress;
+use crate::daemon::record::{Progress, WithoutSensor};
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, misspelt};
+use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
 
@@ -114,7 +115,8 @@ pub async fn run(
             () = maybe::until(maybe::after(args.seconds)) => {}
         }
     };
-    let (recorded, progress) = record(setup, sockets, &path, &file, labels, end).await;
+    let without = WithoutSensor::End;
+    let (recorded, progress) = record(setup, sockets, &path, &file, labels, without, end).await;
     let (frames, presses) = (progress.frames, progress.presses);
     if recorded.is_err() && frames == 0 {
         // The path must be free for the next try.
@@ -142,14 +144,16 @@ fn create(path: &Path) -> Result<File, Failure> {
     File::create_new(path).of(format!("{}: name a new file", path.display()), IO)
 }
 
-/// Records into `file`, which is at `path`, until `end` is over or no sensor is left. Returns what the file holds too.
-/// Where a sensor is missing at the start, nothing is worth keeping: the file holds nothing then.
+/// Records into `file`, which is at `path`, until `end` is over, or until no sensor is left if it does not wait for them.
+/// Returns what the file holds too. Where a sensor is missing at the start, nothing is worth keeping: the file holds
+/// nothing then.
 pub(super) async fn record(
     setup: Setup,
     sockets: Sockets,
     path: &Path,
     file: &File,
     labels: Labels,
+    without_sensor: WithoutSensor,
     end: impl AsyncFnOnce(watch::Receiver<Progress>),
 ) -> (Result<(), Failure>, Progress) {
     let (progress, counted) = watch::channel(Progress::default());
@@ -158,7 +162,9 @@ pub(super) async fn record(
         let file = file.try_clone();
         let file =
             file.map_err(|error| daemon::Error::Io(format!("{}: {error}", path.display())))?;
-        let daemon = Daemon::recording(setup, path.to_owned(), file, labels, progress, sockets)?;
+        let path = path.to_owned();
+        let daemon =
+            Daemon::recording(setup, path, file, labels, progress, sockets, without_sensor)?;
         daemon.run(end(counted.clone()), None).await
     };
     let recorded = recorded.await;
@@ -166,16 +172,18 @@ pub(super) async fn record(
     match recorded {
         Err(daemon::Error::Unavailable { sensor, reason }) => {
             let known = sensors.into_iter().find(|known| known.name == sensor);
-            let port = known
-                .expect("a missing sensor is one of the configuration")
-                .port;
-            let obstacle = doctor::obstacle(&port).unwrap_or(reason);
-            let problem = format!("sensor {sensor:?}: {port}: {obstacle}");
-            let failure = Failure::new(UNAVAILABLE, problem);
-            (Err(failure), Progress::default())
+            let known = known.expect("a missing sensor is one of the configuration");
+            (Err(unavailable(&known, reason)), Progress::default())
         }
         recorded => (recorded.map_err(Failure::from), progress),
     }
+}
+
+/// The failure of a sensor whose port cannot be opened for this reason.
+fn unavailable(sensor: &sensor::Settings, reason: String) -> Failure {
+    let (name, port) = (&sensor.name, &sensor.port);
+    let obstacle = doctor::obstacle(port).unwrap_or(reason);
+    Failure::new(UNAVAILABLE, format!("sensor {name:?}: {port}: {obstacle}"))
 }
 
 fn shown(path: &Path) -> String {

@@ -113,6 +113,43 @@ fn a_reading_gives_the_level_and_no_line_of_the_log_cuts_through_a_question() {
     assert!(bench.path("own/001-foam.mcap").exists());
 }
 
+#[test]
+fn a_session_needs_its_sensor_before_the_first_question_and_then_waits_for_it() {
+    let bench = Bench::new();
+    let mut daemon = bench.daemon();
+    let mut sensor = bench.sensor("");
+    bench
+        .subscriber()
+        .until(&json!({"type": "status", "state": "live"}));
+    let mut refused = session(&bench, "");
+    let before = refused.sees("held by process");
+    assert_eq!(refused.process.exit_code(), Some(69));
+    assert!(!before.contains("object 1"), "{before:?}");
+    daemon.end();
+
+    let mut session = session(&bench, "--sockets");
+    talk(
+        &mut session,
+        &[
+            ("object 1: its name: ", "foam"),
+            ("its Shore OO reading, ", ""),
+        ],
+    );
+    session.sees("press now");
+    let mut subscriber = bench.subscriber();
+    session.sees("verdict 1: ");
+    subscriber.until(&json!({"type": "press", "state": "begin", "press": 2}));
+    bench.unplug(&mut sensor);
+    for line in ["waiting for it", "press again"] {
+        session.sees(line);
+    }
+    let _sensor = bench.sensor("");
+    session.sees("the sensor is back");
+    talk(&mut session, &[("verdict 2: ", "q")]);
+    session.sees("recorded 1 object in");
+    session.ends();
+}
+
 /// `hrn-train` accepts the recordings unchanged.
 fn assert_collects(bench: &Bench) {
     let takes = ["001-yoga-mat.mcap", "002-a--b---c.mcap"].map(|name| bench.path("own").join(name));

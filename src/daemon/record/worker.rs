@@ -12,13 +12,14 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::{Job, Progress, Queued, Target};
+use super::{Job, Progress, Queued, Target, WithoutSensor};
 use crate::daemon::sensor::Done;
 use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::part;
 use hardnessd_core::pipeline::Input;
+use hardnessd_core::press::End;
 use hardnessd_core::recording::{self, About, Entry, Ring, Writer};
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
@@ -130,11 +131,15 @@ impl Worker {
         }
     }
 
-    /// Ends a recording into one file, because there is no sensor to record.
+    /// Ends a recording into one file, because there is no sensor to record, unless it waits.
     fn end_because(&mut self, gone: Error) {
-        if self.directory().is_some() {
+        let Target::File {
+            without_sensor: WithoutSensor::End,
+            ..
+        } = self.target
+        else {
             return;
-        }
+        };
         self.gone.get_or_insert(gone);
         self.stop = None;
     }
@@ -202,11 +207,14 @@ impl Worker {
                 gone = (self.sensors.iter().all(is_gone)).then_some(Error::Lost { sensor, reason });
             }
             Entry::Input(Input::Unavailable(reason)) if watched.is_open.is_none() => {
+                watched.is_open = Some(false);
                 let (sensor, reason) = (name(), reason.clone());
                 gone = Some(Error::Unavailable { sensor, reason });
             }
             Entry::Input(_) => {}
         }
+        let missing = self.sensors.iter().filter(|one| one.is_open == Some(false));
+        self.progress.missing = missing.count();
         if let Some(gone) = gone {
             self.end_because(gone);
         }
@@ -231,6 +239,7 @@ impl Worker {
                 self.progress.tared += u64::from(frame.tared);
             }
             Event::Press(press) if press.state == PressState::End => self.progress.presses += 1,
+            Event::Press(press) if press.reason == End::Lost.reason() => self.progress.lost += 1,
             Event::Hardness(verdict) if verdict.phase == Phase::Final => {
                 let truth = match &self.target {
                     Target::File { labels, .. } => labels.get("level").and_then(|l| l.parse().ok()),

@@ -12,11 +12,12 @@ use std::pin::Pin;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{counted_in_words, create, record, shown};
+use super::{counted_in_words, create, record, shown, unavailable};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::Progress;
+use crate::daemon::record::{Progress, WithoutSensor};
+use crate::daemon::serial;
 use crate::score::Score;
 use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
@@ -127,14 +128,15 @@ struct Object {
 ///
 /// # Errors
 ///
-/// Fails as [`super::run`] does, or if there is no terminal or the directory cannot be read or written.
+/// Fails if there is no terminal, a sensor is missing at the start, or the directory or a file cannot be read or
+/// written.
 pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
     setup: &Setup,
     sockets: Sockets,
     log: &Log,
-    shutdown: Pin<&mut dyn Future<Output = ()>>,
+    mut shutdown: Pin<&mut dyn Future<Output = ()>>,
 ) -> Result<(), Failure> {
     if !(io::stdin().is_terminal() && io::stderr().is_terminal()) {
         let problem = "`record --session` needs a terminal on stdin and stderr: use --out and \
@@ -143,6 +145,14 @@ pub(super) async fn run(
     }
     let first = next_number(directory);
     let first = first.of(format!("--session: {}", directory.display()), IO)?;
+    // The user must not answer questions in vain.
+    for sensor in &setup.config.sensors {
+        let opened = tokio::select! {
+            opened = serial::try_port(&sensor.port, sensor.baud) => opened,
+            () = &mut shutdown => return Ok(()),
+        };
+        opened.map_err(|reason| unavailable(sensor, reason))?;
+    }
     let mut user = User::at_terminal(shutdown)?;
     print("One recording for each object. `q` ends the session.\n");
     let levels = &setup.hrn.card().levels;
@@ -212,7 +222,8 @@ async fn record_object(
     let levels = &setup.hrn.card().levels;
     let end = async |counted| goes_on = wait_for_user(user, counted, object, levels).await;
     let labels = object.labels.clone();
-    let (recorded, progress) = record(setup.clone(), sockets, path, &file, labels, end).await;
+    let (setup, without) = (setup.clone(), WithoutSensor::Wait);
+    let (recorded, progress) = record(setup, sockets, path, &file, labels, without, end).await;
     if progress.presses == 0 {
         // It would stop `hrn-train collect`.
         part::remove(path, &file);
@@ -234,7 +245,7 @@ async fn wait_for_user(
         let known = levels.iter().find(|known| known.level == level);
         known.map_or("no level", |known| known.label.as_str())
     };
-    let (mut shown, mut is_tared) = (0, false);
+    let (mut shown, mut is_tared, mut is_missing, mut lost_before) = (0, false, false, 0);
     loop {
         tokio::select! {
             answer = user.line() => match answer.as_deref() {
@@ -243,7 +254,18 @@ async fn wait_for_user(
                 Some(_) => {}
             },
             Ok(()) = counted.changed() => {
-                let Progress { tared, score, said, .. } = *counted.borrow_and_update();
+                let Progress { tared, lost, missing, score, said, .. } = *counted.borrow_and_update();
+                if (missing > 0) != is_missing {
+                    is_missing = missing > 0;
+                    print(match is_missing {
+                        true => "a sensor is missing: waiting for it (q: quit)\n",
+                        false => "the sensor is back\n",
+                    });
+                }
+                if lost > lost_before {
+                    lost_before = lost;
+                    print("the press under way is lost: press again\n");
+                }
                 if tared > 0 && !is_tared {
                     is_tared = true;
                     print("the zero is taken: press now (Enter: next object, q: quit)\n");
