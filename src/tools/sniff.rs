@@ -30,6 +30,7 @@ use hardnessd_core::port::Port;
 use hardnessd_core::recording::{Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::stderr_line;
+use hardnessd_core::tare::NEWTONS_PER_COUNT;
 use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::{escaped, name, named};
 
@@ -193,12 +194,13 @@ fn newtons(scale: &Scale) -> String {
     let mut text = String::new();
     text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n\
              # The bytes say neither the pitch nor the newtons of a count. A wrong one gives wrong verdicts.\n";
-    if let Some(newtons) = scale.newtons_per_count {
-        text += &format!(
+    text += &match scale.newtons_per_count {
+        Some(newtons) => format!(
             "newtons_per_count = {newtons:.6}  # a guess from counts up to {}: measure it with weights\n",
             scale.most_counts
-        );
-    }
+        ),
+        None => format!("# newtons_per_count = {NEWTONS_PER_COUNT}  # measure it with weights\n"),
+    };
     if let Some(most) = scale.tare_max_n {
         text += &format!("tare_max_n = {most:.3}  # taxels at rest differ\n");
     }

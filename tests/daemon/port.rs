@@ -1,5 +1,7 @@
 //! `sniff` and `doctor` in use: the real binary, with recordings and ptys of the simulator.
 
+use std::fs;
+
 use crate::bench::{Bench, command, ran};
 use rustix::process::Signal;
 
@@ -9,19 +11,17 @@ fn a_recording_of_an_unknown_layout_is_named_and_the_proposal_runs() {
     let simulate = "simulate --presses 4 --fps 20 --seed 5";
     for preset in ["jx255n", "jq-u16", "csv"] {
         bench.succeeds(&format!("{simulate} --to {preset}.bin --preset {preset}"));
-        let toml = bench.succeeds(&format!("sniff {preset}.bin"));
+        bench.succeeds(&format!("sniff {preset}.bin --out {preset}.toml"));
+        let toml = fs::read_to_string(bench.path(&format!("{preset}.toml"))).unwrap();
         assert!(toml.contains("[sensor.frame]"), "{toml}");
         // Without a checksum, a header and a tail look the same in the middle of a stream.
         let named = format!("preset = \"{preset}\"");
         let is_named = toml.contains(&named) || preset.starts_with("jq");
         assert!(is_named, "{preset} is not named in\n{toml}");
+        assert!(toml.contains("newtons_per_count = "), "{toml}");
         // A capture decodes with the proposed layout.
-        bench.write(
-            "proposed.toml",
-            format!("[[sensor]]\nport = \"port\"\n{toml}"),
-        );
-        bench.succeeds("check --config proposed.toml");
-        let events = bench.succeeds(&format!("replay {preset}.bin --config proposed.toml"));
+        bench.succeeds(&format!("check --config {preset}.toml"));
+        let events = bench.succeeds(&format!("replay {preset}.bin --config {preset}.toml"));
         let presses = events.matches("\"state\":\"begin\"").count();
         assert_eq!(presses, 4, "{preset}: {toml}");
     }
