@@ -249,35 +249,21 @@ mod tests {
 
     #[test]
     fn a_value_that_no_sensor_has_is_refused_with_its_key() {
-        type Change = fn(&mut Description);
-        let cases: [(Change, &str); 8] = [
+        for (keys, expected) in [
+            ("name = 'Arm'", "sensor.name: found \"Arm\""),
+            ("frame_rate_hz = nan", "sensor.frame_rate_hz"),
+            ("frame.rows = 65", "sensor.frame.rows"),
+            ("frame.request_ms = 5", "sensor.frame.request_ms"),
             (
-                |d| d.sensor.name = "Arm".to_owned(),
-                "sensor.name: found \"Arm\"",
-            ),
-            (
-                |d| d.sensor.name = "a".repeat(300),
-                "sensor.name: found 300",
-            ),
-            (
-                |d| d.sensor.frame_rate_hz = f64::NAN,
-                "sensor.frame_rate_hz",
-            ),
-            (|d| d.sensor.frame.rows = Some(65), "sensor.frame.rows"),
-            (
-                |d| d.sensor.frame.request_ms = Some(5),
-                "sensor.frame.request_ms",
-            ),
-            (
-                |d| d.sensor.calibration.dead_taxels = vec![[28, 0]],
+                "calibration.dead_taxels = [[28, 0]]",
                 "sensor.calibration.dead_taxels: found [28, 0]",
             ),
-            (|d| d.press.end_frames = 0, "press.end_frames: found 0"),
-            (|d| d.model.min_confidence = 1.5, "model.min_confidence"),
-        ];
-        for (change, expected) in cases {
-            let mut described = Description::default();
-            change(&mut described);
+            ("press.end_frames = 0", "press.end_frames: found 0"),
+            ("model.min_confidence = 1.5", "model.min_confidence"),
+        ] {
+            // A description has all its tables.
+            let text = format!("{keys}\npress.min_frames = 2\nmodel.min_force_n = 0.0");
+            let described: Description = toml::from_str(&text).unwrap();
             let error = Sensor::new(described).unwrap_err().to_string();
             assert!(error.starts_with(expected), "{error}");
         }

@@ -519,27 +519,6 @@ fn a_verdict_became_possible_with_the_last_byte_it_rests_on() {
 }
 
 #[test]
-fn a_press_that_the_model_fails_on_ends_without_a_verdict_and_that_is_told() {
-    let mut pipeline = ready(|_| {});
-    // A model whose check was not tried gives no number.
-    let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
-    let mut weights = file.graph.as_mut().unwrap().initializer.iter_mut();
-    let bias = weights.find(|tensor| tensor.name == "head.bias").unwrap();
-    bias.raw_data[..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    let failing = Model::read(&file.encode_to_vec()).unwrap();
-    judge_by(&mut pipeline, Arc::new(failing));
-    let events = play(&mut pipeline, 5, &short_press());
-    assert_eq!(events, ["Begin 1", "End 1"]);
-    let told = pipeline.unjudged();
-    let [failed] = &told[..] else {
-        panic!("{told:?}");
-    };
-    assert_eq!((failed.press, failed.phase), (1, Phase::Final));
-    assert!(failed.error.to_string().contains("not finite"));
-    assert!(pipeline.unjudged().is_empty(), "told once");
-}
-
-#[test]
 fn the_rate_is_measured_over_the_last_frames() {
     let mut pipeline = pipeline(Preset::Jx255n);
     let mut rates = vec![pipeline.status(at(0)).frame_rate_hz];

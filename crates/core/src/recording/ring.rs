@@ -110,10 +110,7 @@ mod tests {
     use crate::tests::support;
 
     fn at(seconds: u64) -> Stamp {
-        Stamp {
-            mono: Duration::from_secs(seconds),
-            wall: jiff::Timestamp::UNIX_EPOCH,
-        }
+        support::at(1000 * seconds)
     }
 
     fn state() -> Entry {

@@ -244,6 +244,11 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
     };
     assert_eq!(fed("/format", json!(FORMAT)), Ok(()));
     let no_state = "sensor \"forearm\": state: found what no pipeline can have come to";
+    let known = "/at_rest/judge/objects/known";
+    let cup = |shore_sums: Value| {
+        let log_sums = [0.0; 4];
+        json!([{"name": "cup", "presses": 1, "log_sums": log_sums, "shore_sums": shore_sums}])
+    };
     for (place, value, expected) in [
         (
             "/format",
@@ -264,11 +269,8 @@ fn a_state_that_no_pipeline_came_to_is_refused() {
             json!({"model": "", "presses": [{"reference": {"knowledge": "own", "features": ""}, "shore": 1e39}]}),
             "found other JSON",
         ),
-        (
-            "/at_rest/judge/objects/known",
-            json!([{"name": "cup", "presses": 1, "log_sums": [0, 0, 0, 0], "shore_sums": [9.0, 9.0, 9.0, -1.0]}]),
-            no_state,
-        ),
+        (known, cup(json!([9.0, 9.0, 9.0, -1.0])), no_state),
+        (known, cup(json!([3e38, 9.0, 9.0, 1.0])), no_state),
         ("/at_rest/tare/baseline", json!([0.0]), no_state),
         ("/at_rest/motion/0", json!([0, 1e9]), no_state),
         ("/at_rest/frames", json!(u64::MAX), no_state),
@@ -367,6 +369,11 @@ fn what_is_no_recording_is_refused_in_words() {
     assert_eq!(nothing.messages, 0);
 }
 
+fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
+    let length = (body.len() as u64).to_le_bytes();
+    [&[opcode][..], &length, body].concat()
+}
+
 /// A chunk of ours whose header says `unpacked` bytes.
 fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
     let mut body = vec![0; 16];
@@ -375,10 +382,13 @@ fn chunk(unpacked: u64, packed: &[u8]) -> Vec<u8> {
     body.extend(b"\x04\0\0\0zstd");
     body.extend((packed.len() as u64).to_le_bytes());
     body.extend(packed);
-    let mut record = vec![mcap::records::op::CHUNK];
-    record.extend((body.len() as u64).to_le_bytes());
-    record.extend(body);
-    record
+    record(mcap::records::op::CHUNK, &body)
+}
+
+/// A whole file with more bytes before its fourth chunk.
+fn with(file: &[u8], more: &[u8]) -> Vec<u8> {
+    let (before, after) = file.split_at(chunk_starts(file)[3]);
+    [before, more, after].concat()
 }
 
 #[test]
@@ -388,10 +398,7 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
     // 250 MB of zeros pack into some kilobytes.
     let zeros = packed(&[], 250 << 20);
     assert!(zeros.len() < 32 << 10, "{}", zeros.len());
-    let middle = chunk_starts(&file)[3];
-    let mut bomb = file[..middle].to_vec();
-    bomb.extend(chunk(250 << 20, &zeros));
-    bomb.extend(&file[middle..]);
+    let bomb = with(&file, &chunk(250 << 20, &zeros));
     let (found, good) = recover(Cursor::new(&bomb), Vec::new()).unwrap();
     assert_eq!(found.messages, whole.messages);
     assert_eq!(found.lost.len(), 1, "{found:?}");
@@ -404,28 +411,38 @@ fn a_chunk_that_would_fill_the_memory_is_lost_and_no_other() {
         "{error}"
     );
     // A chunk whose header says too few bytes is refused too.
-    let mut lie = file[..middle].to_vec();
-    lie.extend(chunk(1 << 20, &zeros));
-    lie.extend(&file[middle..]);
+    let lie = with(&file, &chunk(1 << 20, &zeros));
     let (found, _) = recover(Cursor::new(&lie), Vec::new()).unwrap();
     assert_eq!(found.messages, whole.messages);
 }
 
 #[test]
-fn an_attachment_is_passed_over_whatever_its_lengths_are() {
+fn an_attachment_is_passed_over_whatever_its_lengths_are_and_what_is_in_it() {
+    use mcap::records::op::{ATTACHMENT, MESSAGE_INDEX};
     let (file, _) = recorded(10, 7);
-    let middle = chunk_starts(&file)[3];
-    for data in [0_u64, 3, u64::MAX] {
+    let lengths = |data: u64| {
         let body = [&[0; 24][..], &data.to_le_bytes(), &[0; 3]].concat();
-        let mut with = file[..middle].to_vec();
-        with.push(mcap::records::op::ATTACHMENT);
-        with.extend((body.len() as u64).to_le_bytes());
-        with.extend(&body);
-        with.extend(&file[middle..]);
-        assert_eq!(play(&with), play(&file), "{data}");
+        record(ATTACHMENT, &body)
+    };
+    // The indexes of another program may be long.
+    let index_bytes = 5_u32 << 20;
+    let mut index = vec![0; 6 + index_bytes as usize];
+    index[2..6].copy_from_slice(&index_bytes.to_le_bytes());
+    for (name, more) in [
+        ("empty", lengths(0)),
+        ("short", lengths(3)),
+        ("endless", lengths(u64::MAX)),
+        (
+            "recording",
+            record(ATTACHMENT, &[&[0; 80][..], &file].concat()),
+        ),
+        ("index", record(MESSAGE_INDEX, &index)),
+    ] {
+        let with = with(&file, &more);
+        assert_eq!(play(&with), play(&file), "{name}");
         let (found, good) = recover(Cursor::new(&with), Vec::new()).unwrap();
-        assert!(found.lost.is_empty(), "{data}: {found:?}");
-        assert_eq!(play(&good), play(&file));
+        assert!(found.is_whole(), "{name}: {found:?}");
+        assert_eq!(play(&good), play(&file), "{name}");
     }
 }
 

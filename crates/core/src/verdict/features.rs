@@ -510,53 +510,6 @@ mod tests {
 
     use super::*;
 
-    /// Places of a press's numbers.
-    const TIMES: usize = FRAME;
-    const DEPTHS: usize = TIMES + 5;
-    const LAWS: usize = DEPTHS + 7 + 8 * LOADING.len() + 3 * APPROACHES_MM.len();
-    const RELAXATION: usize = LAWS + 10 + 11;
-
-    /// A ball on an elastic half space, on an arm of 10 N/mm: loaded in 20 steps, held for 10 while the
-    /// force falls by a tenth, and unloaded.
-    fn ball() -> Vec<Moment<FrameFeatures>> {
-        let moment = |step: u8, depth_mm: f32, share: f32| {
-            let force_n = 5.0 * depth_mm.powf(1.5);
-            Moment {
-                frame: frame_of(20.0 * depth_mm, share * force_n),
-                time_s: 0.05 * f32::from(step),
-                approach_mm: Some(depth_mm + force_n / 10.0),
-            }
-        };
-        let up = (1..=20).map(|step| moment(step, 0.1 * f32::from(step), 1.0));
-        let hold = (21..=30).map(|step| moment(step, 2.0, 1.0 - 0.01 * f32::from(step - 20)));
-        let down = (31..50).map(|step| moment(step, 0.1 * f32::from(50 - step), 0.8));
-        up.chain(hold).chain(down).collect()
-    }
-
-    #[test]
-    fn a_press_on_a_ball_follows_hertz() {
-        let found = of_press(&ball(), 10.0);
-        let near = |place: usize, expected: f32, slack: f32| {
-            let found = found[place];
-            assert!(
-                (found - expected).abs() < slack,
-                "{place}: {found} {expected}"
-            );
-        };
-        // Force and area grow with the indentation to the power of 3/2 and 1. What is added to
-        // lengths and forces takes something off the exponents.
-        near(LAWS, 1.5, 0.15);
-        near(LAWS + 2, 0.66, 0.05);
-        // The slope of F^(2/3) is 5^(2/3).
-        near(LAWS + 8, f32::ln(5.0_f32.powf(2.0 / 3.0)), 0.1);
-        // The indentation at the greatest force, as a logarithm and as it is.
-        near(DEPTHS + 4, f32::ln(2.1), 0.01);
-        near(DEPTHS + 6, 2.0, 0.01);
-        // At the end of the hold the force is a tenth lower.
-        near(RELAXATION + 9, f32::ln(0.9), 0.08);
-        assert_eq!(found[DEPTHS..DEPTHS + 2], [1.0, 1.0]);
-    }
-
     proptest! {
         #[test]
         fn every_press_has_finite_features(

@@ -55,24 +55,6 @@ fn changed(bytes: &[u8], change: impl FnOnce(&mut pb::ModelProto)) -> Vec<u8> {
     proto.encode_to_vec()
 }
 
-/// Four frames, or fewer or more, at 5 frames/s. The arm goes 1 mm from frame to frame, and is of
-/// 7.5 N/mm.
-fn course(length: usize, approach: bool) -> TimeSeries {
-    let moments = (0..length).map(|place| {
-        let mut frame = ModelFrame::default();
-        frame.newtons[500..510].fill(0.3 * (1 + place) as f32);
-        Moment {
-            time_s: 0.2 * place as f32,
-            approach_mm: approach.then_some(place as f32),
-            frame,
-        }
-    });
-    TimeSeries {
-        moments: moments.collect(),
-        arm_n_per_mm: 7.5,
-    }
-}
-
 #[test]
 fn the_built_in_models_load_and_judge() {
     for bytes in [BUILT_IN, BUILT_IN_HRN] {
@@ -88,6 +70,9 @@ fn the_built_in_models_load_and_judge() {
             assert!((verdict.probabilities.iter().sum::<f32>() - 1.0).abs() < 1e-5);
         }
     }
+    let hrn = Model::load(BUILT_IN_HRN).unwrap();
+    let error = hrn.judge_course(&TimeSeries::default()).unwrap_err();
+    assert!(error.to_string().contains("the model takes no courses"));
 }
 
 #[test]
@@ -351,27 +336,10 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
 }
 
 #[test]
-fn a_model_takes_courses_or_frames() {
-    for most in [3, 48] {
-        let hrn = Model::read(&course_model(most, &[])).unwrap();
-        assert_eq!(hrn.format(), Format::Course { most_frames: most });
-    }
-    let hrn = Model::load(BUILT_IN_HRN).unwrap();
-    let error = hrn.judge_course(&course(4, true)).unwrap_err().to_string();
-    assert!(error.contains("the model takes no courses"), "{error}");
-    let verdict = hrn.judge_check(0).unwrap();
-    assert!(verdict.shore.is_some() && verdict.levels.is_none());
-}
-
-#[test]
 fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
     let tail = TAIL;
     let set = |threshold, probabilities: &[f32]| Limits { threshold, tail }.set(probabilities);
     assert_eq!(set(0.2, &[0.5, 0.2, 0.1, 0.2]), [1, 2, 4]);
     assert_eq!(set(0.9, &[0.3, 0.4, 0.3]), [2]);
     assert_eq!(set(0.0, &[1.0, 0.0]), [1, 2]);
-    let more = [("hrn.conformal", json!({"alpha": 0.1, "threshold": 0.25}))];
-    let hrn = Model::read(&course_model(8, &more)).unwrap();
-    let verdict = hrn.judge_course(&course(8, true)).unwrap();
-    assert_eq!(verdict.levels, Some(vec![2, 3]));
 }

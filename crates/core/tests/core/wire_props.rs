@@ -293,49 +293,24 @@ fn every_part_of_a_frame_stands_where_it_should() {
 
 #[test]
 fn a_layout_that_cannot_work_is_refused_with_its_key() {
-    for (text, expected) in [
-        ("rows = 65", "rows: found 65, expected 1 to 64"),
-        (
-            "length = 'u8'",
-            "length: found 784 payload bytes, expected at most 255",
-        ),
-        ("mask = 0x1FF", "mask: found 511, expected 1 to 255"),
-        (
-            "preset = 'csv'\ntail = 'FF'",
-            "tail: found a value, expected none: frames of preset csv have no such part",
-        ),
-        (
-            "header_bytes = 8193",
-            "header_bytes: found 8193, expected 0 to 8192",
-        ),
-        (
-            "preset = 'jq-glove'\nsync = ''\ntail = 'AA'",
-            "packets: found no sync, or framing, expected sync",
-        ),
-        (
-            "preset = 'jq-glove'\npackets = { count = 3 }",
-            "packets.count: found 3, expected 1 to 256 that divides the 256 cells evenly",
-        ),
-        (
-            "packets = { count = 2 }",
-            "packets.number_at: found 0, expected a place",
-        ),
-        (
-            "header_bytes = 1\npackets = { count = 2, step = 0 }",
-            "packets.step: found 0, expected at least 1",
-        ),
-        (
-            "header_bytes = 1\npackets = { count = 2, first = 255 }",
-            "packets.first: found 255, and 256 for the last packet, expected at most 255",
-        ),
-        (
-            "preset = 'jq-tail'\nlength = 'u16le'",
-            "length: found a length field without sync",
-        ),
-    ] {
-        let error = Layout::new(&toml::from_str(text).unwrap());
-        let error = error.unwrap_err().to_string();
-        assert!(error.starts_with(expected), "{text}: {error}");
+    // The keys of the layout, and what is said of them.
+    let cases = "
+        rows = 65 | rows: found 65, expected 1 to 64
+        length = 'u8' | length: found 784 payload bytes, expected at most 255
+        mask = 0x1FF | mask: found 511, expected 1 to 255
+        preset = 'csv', tail = 'FF' | tail: found a value, expected none: frames of preset csv have no such part
+        header_bytes = 8193 | header_bytes: found 8193, expected 0 to 8192
+        preset = 'jq-glove', sync = '', tail = 'AA' | packets: found no sync, or framing, expected sync
+        preset = 'jq-glove', packets.count = 3 | packets.count: found 3, expected 1 to 256 that divides the 256 cells evenly
+        packets.count = 2 | packets.number_at: found 0, expected a place
+        header_bytes = 1, packets.count = 2, packets.step = 0 | packets.step: found 0, expected at least 1
+        header_bytes = 1, packets.count = 2, packets.first = 255 | packets.first: found 255, and 256 for the last packet, expected at most 255
+        preset = 'jq-tail', length = 'u16le' | length: found a length field without sync";
+    for case in cases.trim().lines() {
+        let (keys, expected) = case.trim().split_once(" | ").unwrap();
+        let settings = toml::from_str(&keys.replace(", ", "\n")).unwrap();
+        let error = Layout::new(&settings).unwrap_err().to_string();
+        assert!(error.starts_with(expected), "{keys}: {error}");
     }
     for (text, expected) in [
         ("sync = 'B'", "pairs of hex digits"),

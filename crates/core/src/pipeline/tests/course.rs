@@ -321,12 +321,15 @@ fn a_press_that_cannot_be_kept_has_its_verdict() {
 }
 
 #[test]
-fn a_press_without_a_verdict_is_remembered() {
+fn a_press_without_a_verdict_is_told_once_and_remembered() {
     // The model fails on an arm of 10 N/mm. That of its checks is at most 6 N/mm.
     let bytes = encoded(8, &[], |proto| spoil(proto, "second", 7.0, "arm_n_per_mm"));
     let mut pipeline = tared(&[], |described| described.sensor.arm.speed_mm_s = Some(5.0));
     judge_by(&mut pipeline, Arc::new(Model::read(&bytes).unwrap()));
-    assert_eq!(judged(&mut pipeline, |_| Vec::new()), []);
-    assert!(!pipeline.unjudged().is_empty());
+    assert_eq!(play(&mut pipeline, 6, &press()), ["Begin 1", "End 1"]);
+    let told = pipeline.unjudged();
+    assert_eq!(told.last().unwrap().phase, Phase::Final);
+    assert!(told[0].error.to_string().contains("not finite"));
+    assert!(pipeline.unjudged().is_empty(), "told once");
     assert_ne!(pipeline.judge.kept.own, OwnPresses::default());
 }

@@ -80,20 +80,6 @@ fn a_baseline_that_follows_keeps_drift_from_being_a_press() {
 }
 
 #[test]
-fn a_press_is_never_followed_however_slow_or_long() {
-    // The press is held for an hour, far beyond its timeout. After the timeout it waits for its
-    // release.
-    let mut pipeline = following(true);
-    let (published, _) = play_at_2_hz(&mut pipeline, 10, HOUR, |_| 0.0, &TOUCHED);
-    assert!(
-        published.contains(&"End 1 (timeout)".to_owned()),
-        "{published:?}"
-    );
-    let (_, most_n) = play_at_2_hz(&mut pipeline, HOUR + 10, 1, |_| 0.0, &TOUCHED);
-    assert!((most_n - 1.0).abs() < 1e-4, "{most_n}");
-}
-
-#[test]
 fn a_gap_and_a_busy_sensor_do_not_speed_it_up() {
     let mut pipeline = following(true);
     let raised = even(1);

@@ -1,6 +1,6 @@
 //! Recordings that another program has rewritten.
 
-use mcap::records::{Record, op};
+use mcap::records::Record;
 use mcap::{Compression, WriteOptions};
 
 use super::*;
@@ -47,32 +47,6 @@ fn a_recording_that_another_program_rewrote_is_read_and_recovered() {
         assert!(found.is_whole(), "{name}: {found:?}");
         assert_eq!(play(&good), events, "{name}");
     }
-}
-
-#[test]
-fn a_recording_with_another_one_in_an_attachment_is_recovered_whole() {
-    let (file, _) = recorded(10, 7);
-    let events = play(&file);
-    let magic = mcap::MAGIC.len();
-    let attachment = [&[0; 80][..], &file].concat();
-    // The indexes of another program may be long.
-    let index_bytes = 5_u32 << 20;
-    let mut index = vec![0; 6 + index_bytes as usize];
-    index[2..6].copy_from_slice(&index_bytes.to_le_bytes());
-    let record = |opcode: u8, body: &[u8]| {
-        let length = (body.len() as u64).to_le_bytes();
-        [&[opcode][..], &length, body].concat()
-    };
-    let before = [
-        record(op::ATTACHMENT, &attachment),
-        record(op::MESSAGE_INDEX, &index),
-    ];
-    let header_end = magic + 9 + usize::from(file[magic + 1]);
-    let (header, rest) = file.split_at(header_end);
-    let with = [header, &before.concat(), rest].concat();
-    let (found, good) = recover(Cursor::new(&with), Vec::new()).unwrap();
-    assert!(found.is_whole(), "{found:?}");
-    assert_eq!(play(&good), events);
 }
 
 #[test]
