@@ -2,16 +2,13 @@
 
 use std::path::Path;
 
+use hardnessd_core::verdict::BUILT_IN_HRN;
 use prost::Message as _;
 use tract_onnx::pb;
 
 use crate::hrn_train_in;
 
-fn check(path: &Path) -> (Option<i32>, String) {
-    check_at(path, "")
-}
-
-fn check_at(path: &Path, more: &str) -> (Option<i32>, String) {
+fn check(path: &Path, more: &str) -> (Option<i32>, String) {
     let command = format!("check-model {} {more}", path.display());
     let output = hrn_train_in(Path::new("."), &command);
     let lines = [output.stdout, output.stderr].concat();
@@ -22,7 +19,7 @@ fn check_at(path: &Path, more: &str) -> (Option<i32>, String) {
 fn the_built_in_models_pass() {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
     for name in ["hrn.onnx", "course.onnx"] {
-        let (code, lines) = check(&models.join(name));
+        let (code, lines) = check(&models.join(name), "");
         assert!(
             code == Some(0) && lines.contains("a model that hardnessd loads"),
             "{lines}"
@@ -33,9 +30,7 @@ fn the_built_in_models_pass() {
 /// The built-in model of one frame with two convolutions of 128 channels beside it, whose result is nothing.
 fn slow() -> Vec<u8> {
     const CHANNELS: usize = 128;
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
-    let bytes = std::fs::read(models.join("hrn.onnx")).unwrap();
-    let mut model = pb::ModelProto::decode(&*bytes).unwrap();
+    let mut model = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     let graph = model.graph.as_mut().unwrap();
     for (name, dims, value) in [
         ("first", &[CHANNELS, 1, 5, 5][..], 0.01_f32),
@@ -80,10 +75,10 @@ fn a_slow_model_passes_for_a_slow_sensor_alone() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("slow.onnx");
     std::fs::write(&path, slow()).unwrap();
-    let (code, lines) = check_at(&path, "--fps 5");
+    let (code, lines) = check(&path, "--fps 5");
     let expected = "a model that hardnessd loads, for sensors of up to 5 frames/s";
     assert!(code == Some(0) && lines.contains(expected), "{lines}");
-    let (code, lines) = check_at(&path, "--fps 1000");
+    let (code, lines) = check(&path, "--fps 1000");
     let expected =
         "ms for a verdict: expected at most 1.0 ms, a tenth of the fastest sensor's frame period";
     assert!(code == Some(78) && lines.contains(expected), "{lines}");
@@ -93,9 +88,7 @@ fn a_slow_model_passes_for_a_slow_sensor_alone() {
 fn all_errors_of_a_file_are_said_at_once() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("m.onnx");
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
-    let bytes = std::fs::read(models.join("hrn.onnx")).unwrap();
-    let mut model = tract_onnx::pb::ModelProto::decode(&*bytes).unwrap();
+    let mut model = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     model
         .metadata_props
         .retain(|entry| entry.key != "hrn.pitch_mm");
@@ -108,7 +101,7 @@ fn all_errors_of_a_file_are_said_at_once() {
     graph.input[0].name = "image".to_owned();
     graph.output[0].name = "result".to_owned();
     std::fs::write(&path, model.encode_to_vec()).unwrap();
-    let (code, lines) = check(&path);
+    let (code, lines) = check(&path, "");
     assert_eq!((code, lines.lines().count()), (Some(78), 1), "{lines}");
     for part in [
         "pitch_mm",
@@ -121,6 +114,6 @@ fn all_errors_of_a_file_are_said_at_once() {
     }
 
     std::fs::write(&path, "not a model").unwrap();
-    assert_eq!(check(&path).0, Some(78));
-    assert_eq!(check(&directory.path().join("none.onnx")).0, Some(66));
+    assert_eq!(check(&path, "").0, Some(78));
+    assert_eq!(check(&directory.path().join("none.onnx"), "").0, Some(66));
 }

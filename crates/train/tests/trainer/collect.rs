@@ -15,7 +15,7 @@ use hrn_train::data::source::Kind;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
 
-use crate::{errors, hrn_train_in, succeed_in, write_data};
+use crate::{errors, hrn_train_in, json_in, succeed_in, write_data};
 
 const FIXTURES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fixtures");
 const COURSE_MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/course.onnx");
@@ -209,8 +209,7 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     let is_new = |press: &Press| press.object == new && press.shore.is_none();
     assert!(new != Some(7) && all[1..].iter().all(is_new));
     let evaluate = format!("evaluate --json --data courses.npz --model {COURSE_MODEL}");
-    let figures: Value = serde_json::from_str(&succeed_in(desk.0.path(), &evaluate)).unwrap();
-    assert_eq!(figures["n"], all.len());
+    assert_eq!(json_in(desk.0.path(), &evaluate)["n"], all.len());
 
     // One file cannot hold both single frames and presses over time.
     let expected = "has whole presses, not single frames";

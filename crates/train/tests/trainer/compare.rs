@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 
 use serde_json::Value;
 
-use crate::{data, errors, hrn_train_in, succeed_in};
+use crate::{data, errors, hrn_train_in, json_in, succeed_in};
 
 /// The directory of the data.
 fn at() -> &'static Path {
@@ -91,8 +91,7 @@ fn results_have_the_documented_fields_and_agree_with_evaluate() {
         }
     }
     let model = "evaluate --json --model whole/runs/hrn100-1/hrn.onnx --data tiny.npz";
-    let evaluated: Value = serde_json::from_str(&succeed_in(at(), model)).unwrap();
-    assert_eq!(evaluated, results[0]["paper_split"]);
+    assert_eq!(json_in(at(), model), results[0]["paper_split"]);
 }
 
 #[test]

@@ -3,13 +3,13 @@
 
 use std::path::Path;
 
-use hardnessd_core::verdict::{Checks, Format, Model, References};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Checks, Format, Model, References};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{Presses, read_one};
 use prost::Message as _;
 use serde_json::Value;
 
-use crate::{errors, hrn_train_in, succeed_in};
+use crate::{errors, hrn_train_in, json_in, succeed_in};
 
 const SETTINGS: &str = "
     [training]
@@ -64,22 +64,16 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     let uninformed = hrn.judge_course(&course).unwrap();
     assert_ne!(known.probabilities, uninformed.probabilities);
 
-    let json = succeed_in(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
-    let evaluation: Value = serde_json::from_str(&json).unwrap();
+    let evaluation = json_in(at, "evaluate --model whole/hrn.onnx --data d.npz --json");
     let known: Value =
         serde_json::from_slice(&std::fs::read(at.join("whole/evaluation.json")).unwrap()).unwrap();
     assert_eq!(evaluation["accuracy"], known["accuracy"]);
     let rmse = |evaluation: &Value| evaluation["shore"]["rmse"].as_f64().unwrap() as f32;
-    assert!(rmse(&evaluation) < spread_of_shore(&presses), "{json}");
+    assert!(rmse(&evaluation) < spread_of_shore(&presses));
     // A model of one frame judges each press's best frame of the same file.
-    let json = succeed_in(
-        at,
-        "evaluate --model ../../models/hrn.onnx --data d.npz --json"
-            .replace("../..", concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
-            .as_str(),
-    );
-    let evaluation: Value = serde_json::from_str(&json).unwrap();
-    assert!(rmse(&evaluation) < spread_of_shore(&presses), "{json}");
+    std::fs::write(at.join("m.onnx"), BUILT_IN_HRN).unwrap();
+    let evaluation = json_in(at, "evaluate --model m.onnx --data d.npz --json");
+    assert!(rmse(&evaluation) < spread_of_shore(&presses));
     assert_eq!(evaluation["sets"], Value::Null);
     assert_eq!(evaluation["n"], known["n"]);
 
@@ -138,15 +132,14 @@ fn a_course_model_takes_the_references_of_each_sensor() {
     let [with, without] = [&identified, &hrn].map(|hrn| hrn.judge_course(press).unwrap());
     assert_ne!(with.probabilities, without.probabilities);
 
-    let accuracy = |given: &str| {
+    let count = |given: &str| {
         let evaluate = format!("evaluate --model run/hrn.onnx --data d.npz --json {given}");
-        let evaluation: Value = serde_json::from_str(&succeed_in(at, &evaluate)).unwrap();
-        evaluation["n"].as_u64().unwrap()
+        json_in(at, &evaluate)["n"].as_u64().unwrap()
     };
-    let all = accuracy("");
-    assert_eq!(accuracy("--rigid 2"), all);
+    let all = count("");
+    assert_eq!(count("--rigid 2"), all);
     // Objects that are references are not judged.
-    assert!(accuracy("--labelled 1") < all);
+    assert!(count("--labelled 1") < all);
 }
 
 #[test]

@@ -18,7 +18,7 @@ use hardnessd_simulator::Split;
 use hrn_train::data::presses::{self, Layout, Press, Presses};
 use serde_json::{Value, json};
 
-use crate::{errors, hrn_train_in, succeed_in};
+use crate::{errors, hrn_train_in, json_in, succeed_in};
 
 /// Five presses of each object on an array of 4x4 taxels. Each object is its level and the column of the array
 /// that feels it, 0 to 3.
@@ -65,10 +65,6 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
 
 const PAPERS: [&str; 4] = ["hard", "firm", "soft", "very-soft"];
 
-fn parsed(text: &str) -> Value {
-    serde_json::from_str(text).unwrap()
-}
-
 #[test]
 fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     let directory = tempfile::tempdir().unwrap();
@@ -76,8 +72,7 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     // What is pressed looks the same from every column, so only the taxels tell the level.
     let objects = [(1, 0), (1, 0), (2, 2), (2, 2), (2, 2)];
     write(&path("d.npz"), &objects, &PAPERS);
-    let report = succeed_in(directory.path(), "fit d.npz --out m.onnx --json");
-    let report = parsed(&report);
+    let report = json_in(directory.path(), "fit d.npz --out m.onnx --json");
     let found = |name: &str, by: &str| {
         let mut rows = report["candidates"].as_array().unwrap().iter();
         let row = rows.find(|row| row["name"] == name).unwrap();
@@ -96,7 +91,7 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     assert_eq!(hrn.format(), Format::Parts);
     assert_eq!(hrn.card().grid, Some(Array { rows: 4, cols: 4 }));
     let evaluation = "evaluate --json --split train --model m.onnx --data d.npz";
-    let evaluation = parsed(&succeed_in(directory.path(), evaluation));
+    let evaluation = json_in(directory.path(), evaluation);
     assert_eq!(evaluation["accuracy"], 1.0);
     // The same through `train`, which takes no copies of presses.
     write(&path("e.npz"), &[(1, 0), (1, 1), (2, 2), (2, 3)], &PAPERS);
@@ -155,7 +150,7 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
             succeed_in(directory.path(), &collect);
         }
         let fit = "fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx --json";
-        let report = parsed(&succeed_in(directory.path(), fit));
+        let report = json_in(directory.path(), fit);
         assert_eq!(
             (&report["best"], &report["writes"]),
             (&json!("taxels"), &json!("model"))

@@ -47,6 +47,12 @@ fn succeed_in(directory: &Path, arguments: &str) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
+/// The JSON that the trainer prints.
+#[track_caller]
+fn json_in(directory: &Path, arguments: &str) -> Value {
+    serde_json::from_str(&succeed_in(directory, arguments)).unwrap()
+}
+
 fn errors(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }

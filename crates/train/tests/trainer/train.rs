@@ -10,7 +10,7 @@ use hrn_train::data::presses::{Presses, meta, read_one};
 use rustix::process::{Pid, Signal};
 use serde_json::{Value, json};
 
-use crate::{data, errors, few, hrn_train_in, succeed_in, trainer, write_data};
+use crate::{data, errors, few, hrn_train_in, json_in, succeed_in, trainer, write_data};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
@@ -112,8 +112,7 @@ fn a_run_learns_and_leaves_what_it_promises() {
         fs::read(at.join("copy.onnx")).unwrap(),
         trial.read("hrn.onnx")
     );
-    let printed = succeed_in(at, "evaluate --model copy.onnx --data tiny.npz --json");
-    let printed: Value = serde_json::from_str(&printed).unwrap();
+    let printed = json_in(at, "evaluate --model copy.onnx --data tiny.npz --json");
     let written: Value = serde_json::from_slice(&trial.read("evaluation.json")).unwrap();
     assert_eq!(printed, written);
     assert_eq!(printed["n"], 40);
@@ -304,7 +303,7 @@ fn broad_data_say_their_levels() {
     }
     fs::write(at.join("m.onnx"), BUILT_IN_HRN).unwrap();
     let evaluate = "evaluate --model m.onnx --data d.npz --split train --json --verdicts v.csv";
-    let evaluation: Value = serde_json::from_str(&succeed_in(at, evaluate)).unwrap();
+    let evaluation = json_in(at, evaluate);
     assert!(evaluation["shore"]["rmse"].is_number(), "{evaluation}");
     let verdicts = fs::read_to_string(at.join("v.csv")).unwrap();
     assert_eq!(verdicts.lines().count(), 1 + 16, "{verdicts}");
