@@ -161,15 +161,3 @@ fn as_in(config: &Path, path: &Path) -> String {
         .and_then(|directory| path.strip_prefix(directory).ok());
     beside.unwrap_or(&path).display().to_string()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_directory_is_refused_in_the_system_s_words() {
-        let directory = tempfile::tempdir().unwrap();
-        let refused = open(directory.path()).unwrap_err();
-        assert!(refused.line().ends_with(": cannot read: Is a directory"));
-    }
-}

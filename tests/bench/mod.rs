@@ -184,6 +184,17 @@ impl Bench {
         }
     }
 
+    /// The same for each line of a table: the command, its exit code, and the parts, with ` | ` between.
+    pub fn fails_each(&self, table: &str) {
+        for row in table.trim().lines() {
+            let row: Vec<&str> = row.trim().split(" | ").collect();
+            let [line, code, parts @ ..] = &row[..] else {
+                panic!("{row:?}");
+            };
+            self.fails(line, code.parse().unwrap(), parts);
+        }
+    }
+
     /// The final verdicts of a replay.
     pub fn finals(&self, arguments: &str) -> Vec<Value> {
         let mut events = events(&self.succeeds(&format!("replay --json {arguments}")));

@@ -32,22 +32,16 @@ fn sniff_says_why_it_has_no_proposal() {
     let bench = Bench::new();
     // A port in place of a file would be read for ever.
     let _sensor = bench.sensor("");
-    let found = "found a serial port or a terminal";
-    for (line, code, part) in [
-        ("sniff /no/such.bin", 66, "/no/such.bin"),
-        ("sniff port", 66, found),
-        ("replay port", 66, found),
-        ("recover --out new.mcap port", 66, found),
-        ("sniff /etc/passwd", 1, "text, but no array"),
-        (
-            "sniff --port /dev/no-such",
-            69,
-            "/dev/no-such: no such device",
-        ),
-        ("sniff x.bin --port y", 2, "cannot be used with"),
-    ] {
-        bench.fails(line, code, &[part]);
-    }
+    bench.fails_each(
+        "
+        sniff /no/such.bin | 66 | /no/such.bin
+        sniff port | 66 | found a serial port or a terminal
+        replay port | 66 | found a serial port or a terminal
+        recover --out new.mcap port | 66 | found a serial port or a terminal
+        sniff /etc/passwd | 1 | text, but no array
+        sniff --port /dev/no-such | 69 | /dev/no-such: no such device
+        sniff x.bin --port y | 2 | cannot be used with",
+    );
 }
 
 #[test]

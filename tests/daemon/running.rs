@@ -219,32 +219,20 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
     bench.configure_forearm("");
     bench.succeeds(CHECK);
     bench.configure(&sensor("forearm", "/dev/ttyUSB99", 20), "");
-    for (line, code, parts) in [
-        (CHECK, 78, ["line 5: sensor.frame_rate_hz of", "14.58"]),
-        ("run --config /no/such.toml", 66, ["/no/such.toml", ""]),
-        ("check --config .", 66, ["cannot read: Is a directory", ""]),
-        ("replay /no/such.bin", 66, ["/no/such.bin", ""]),
-        (
-            "simulate --faults /dev/zero",
-            1,
-            ["found more than 1048576 bytes", ""],
-        ),
-        ("simulate --fps 20 --baud 115200", 2, ["--baud", "158000"]),
-        (
-            "run x.toml",
-            2,
-            ["argument 'x.toml'", "tip: --config x.toml"],
-        ),
-        ("simulate --force 1000", 2, ["--force", ""]),
-        ("demo --speed 0.0001", 2, ["--speed", ""]),
-        (
-            "record --config x.toml --out x --label note=\u{202e}7",
-            2,
-            ["--label", "found \"\\u{202e}7\""],
-        ),
-    ] {
-        bench.fails(line, code, &parts);
-    }
+    bench.fails_each(
+        "
+        check --config hardnessd.toml | 78 | line 5: sensor.frame_rate_hz of | 14.58
+        run --config /no/such.toml | 66 | /no/such.toml
+        check --config . | 66 | cannot read: Is a directory
+        replay . | 66 | .: cannot read: Is a directory
+        replay /no/such.bin | 66 | /no/such.bin
+        simulate --faults /dev/zero | 1 | found more than 1048576 bytes
+        simulate --fps 20 --baud 115200 | 2 | --baud | 158000
+        run x.toml | 2 | argument 'x.toml' | tip: --config x.toml
+        simulate --force 1000 | 2 | --force
+        demo --speed 0.0001 | 2 | --speed
+        record --config x.toml --out x --label note=\u{202e}7 | 2 | --label | found \"\\u{202e}7\"",
+    );
     let (code, _, help) = run("");
     assert_eq!(code, 2, "{help}");
     assert!(help.contains("Usage: hardnessd <COMMAND>"), "{help}");
