@@ -76,13 +76,16 @@ fn pitch_warning(sensor: &Settings, card: &Card) -> Option<String> {
     if is_models(pitch.rows_mm) && is_models(pitch.cols_mm) {
         return None;
     }
+    let taken = match card.grid {
+        None => "forces are shared out over the model's taxels",
+        Some(_) => "frames are taken as they are",
+    };
     let unknown = match card.holds(pitch) {
         true => "",
         false => ", and the model was not trained on such a pitch",
     };
     Some(format!(
-        "sensor.calibration.pitch_mm of {:?}: found {pitch}, expected the model's {:?}: forces are shared out \
-         over the model's taxels{unknown}",
+        "sensor.calibration.pitch_mm of {:?}: found {pitch}, expected the model's {:?}: {taken}{unknown}",
         sensor.name, card.pitch_mm
     ))
 }

@@ -75,9 +75,10 @@ impl Card {
 
     /// Whether the model was trained on sensors of this pitch. Taxels that are finer than the
     /// model's add up to what the model's would read, so only coarser ones are foreign to a model
-    /// that knows one pitch.
+    /// that knows one pitch. A model with a grid of its own takes them as they are.
     pub fn holds(&self, pitch: Pitch) -> bool {
-        let [least, most] = self.range.pitch_mm.unwrap_or([0.0, self.pitch_mm]);
+        let finest = self.grid.map_or(0.0, |_| self.pitch_mm);
+        let [least, most] = self.range.pitch_mm.unwrap_or([finest, self.pitch_mm]);
         let known = f64::from(least) * 0.98..=f64::from(most) * 1.02;
         known.contains(&pitch.rows_mm) && known.contains(&pitch.cols_mm)
     }

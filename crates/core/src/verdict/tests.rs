@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
-use crate::frame::Array;
+use crate::frame::{Array, Pitch};
 use crate::tests::course_model::{course_model, encoded};
 use crate::tests::graph::{indices, int, node, value};
 
@@ -193,6 +193,12 @@ fn of_grid(grid: &str) -> Vec<u8> {
 fn a_model_of_frames_as_they_are_has_one_array() {
     let card = Model::load(&of_grid("[28, 28]")).unwrap().card().clone();
     assert!(card.check_array(Array::JX255N).is_ok());
+    // Finer taxels do not add up to its own.
+    let hrn = Model::load(BUILT_IN_HRN).unwrap();
+    for (mm, own, others) in [(1.75, false, true), (3.5, true, true), (7.0, false, false)] {
+        let pitch = Pitch::square(mm);
+        assert_eq!((card.holds(pitch), hrn.card().holds(pitch)), (own, others));
+    }
     let refused = card.check_array(Array { rows: 2, cols: 3 }).unwrap_err();
     let expected = "the model takes frames of 28x28 taxels as they are, and the sensor has 2x3: use the model of \
                     this sensor, or none";

@@ -334,6 +334,13 @@ impl Presses {
         self.frames.frame(moments.start + best)
     }
 
+    /// The force of that frame. Of an array that is larger than the frames here, a frame may lack a part of the contact.
+    pub fn force_n(&self, press: usize) -> f32 {
+        let Press { parts, force_n, .. } = &self.all[press];
+        let whole = parts.as_ref().and(*force_n);
+        whole.unwrap_or_else(|| self.frame(press).newtons.iter().sum())
+    }
+
     /// The course of a press as the daemon would give it to a model: from the frame that began it.
     pub fn course(&self, press: usize) -> TimeSeries {
         let moment = |row: usize| Moment {

@@ -83,7 +83,7 @@ fn judge(arguments: &Evaluate, presses: &Presses, hrn: &Model) -> anyhow::Result
 fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Model) {
     let [least_n, most_n] = hrn.card().range.force_n;
     let is_outside = |&&place: &&usize| {
-        let newtons: f32 = presses.frame(place).newtons.iter().sum();
+        let newtons = presses.force_n(place);
         newtons < 0.5 * least_n || newtons > 2.0 * most_n
     };
     let outside = places.iter().filter(is_outside).count();

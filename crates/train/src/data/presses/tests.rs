@@ -115,6 +115,7 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     let press = Press {
         parts: Some(parts.clone()),
         contact_area_taxels: Some(40),
+        force_n: Some(900.0),
         ..Press::default()
     };
     presses.push(
@@ -134,6 +135,7 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 3.5));
     assert_eq!(read.parts(0, array), parts);
     assert_eq!(read.all[0].contact_area_taxels, Some(40));
+    assert_eq!(read.force_n(0), 900.0);
     // Without the distance the array says nothing.
     let read = parse(&bytes_of(
         &presses,
