@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use super::{Learning, Outputs};
-use crate::data::presses::Presses;
+use crate::data::presses::{Presses, Unit};
 use crate::net::network::Weights;
 use hardnessd_core::verdict::{Conformal, Knowledge, Limits, TAIL};
 use hardnessd_simulator::random::Stream;
@@ -28,6 +28,8 @@ pub struct Calibration {
     pub limits: BTreeMap<Knowledge, Limits>,
     /// The number of held-out units, and of those whose Shore hardness was measured.
     units: [usize; 2],
+    /// What a unit is.
+    unit: Unit,
 }
 
 /// What the network says of a press of a held-out object.
@@ -78,10 +80,14 @@ impl Calibration {
             let of_knowledge = asked.iter().zip(rows).enumerate().map(one).collect();
             judged.insert(knowledge, of_knowledge);
         }
-        Self::on(&judged, &learning.outputs(), stream)
+        let unit = presses.units(held_out).map(|(unit, _)| unit);
+        Self {
+            unit: unit.unwrap_or(Unit::Object),
+            ..Self::on(&judged, &learning.outputs(), stream)
+        }
     }
 
-    /// Calibrates on these.
+    /// Calibrates on these, whose units are objects.
     pub(crate) fn on(
         judged: &BTreeMap<Knowledge, Vec<Judged>>,
         outputs: &Outputs,
@@ -129,6 +135,7 @@ impl Calibration {
             temperature,
             limits,
             units,
+            unit: Unit::Object,
         }
     }
 
@@ -159,9 +166,13 @@ impl Calibration {
             true => ("", units, "there are no sets of levels, and "),
             false => (" with a measured Shore hardness", measured, ""),
         };
+        let unit = match self.unit {
+            Unit::Object => "objects",
+            Unit::Cover => "covers",
+        };
         (found < LEAST_UNITS).then(|| {
             format!(
-                "held-out objects{of}: found {found}, expected at least {LEAST_UNITS}: {lost}nothing promises that \
+                "held-out {unit}{of}: found {found}, expected at least {LEAST_UNITS}: {lost}nothing promises that \
                  the interval of the Shore hardness holds"
             )
         })

@@ -104,7 +104,7 @@ fn a_course_model_takes_the_references_of_each_sensor() {
     let bytes = std::fs::read(at.join("run/hrn.onnx")).unwrap();
     let hrn = Model::load(&bytes).unwrap();
     // Two covers are too few for any promise of 90 %.
-    let expected = "held-out objects: found 2, expected at least 9: there are no sets";
+    let expected = "held-out covers: found 2, expected at least 9: there are no sets";
     assert!(errors(&output).contains(expected), "{output:?}");
     assert_eq!(hrn.card().conformal, None);
     let not_promised = &hrn.card().metrics["not_promised"];
