@@ -70,6 +70,22 @@ pub struct Run {
     _lock: File,
 }
 
+/// Returns an error if a directory without a run has files. A run that was killed before it had its settings leaves
+/// only a part of a file.
+fn refuse_to_continue(directory: &Path) -> anyhow::Result<()> {
+    for entry in fs::read_dir(directory)? {
+        let name = entry?.file_name();
+        let name = name.to_string_lossy();
+        ensure!(
+            name.ends_with(".part"),
+            "{}: has {name} but no settings.toml, so there is no run to continue: leave out --resume, or choose \
+             another --out",
+            directory.display()
+        );
+    }
+    Ok(())
+}
+
 impl Run {
     /// The description of the run in a directory. `None` if there is no run.
     ///
@@ -98,8 +114,8 @@ impl Run {
     /// # Errors
     ///
     /// Returns an error if there is a run and `resume` is not set, if that run has another
-    /// description, if another process works in the directory, or if the directory cannot be
-    /// written.
+    /// description, if `resume` is set and the directory has files but no run, if another process works
+    /// in the directory, or if the directory cannot be written.
     pub fn open(directory: &Path, description: &Description, resume: bool) -> anyhow::Result<Self> {
         fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
         let run = Self {
@@ -108,6 +124,9 @@ impl Run {
         };
         let before = Self::description_at(directory)?;
         refuse_foreign(directory, "settings.toml", &OF_A_RUN)?;
+        if resume && before.is_none() {
+            refuse_to_continue(directory)?;
+        }
         ensure!(
             before.is_none() || resume,
             "{}: has a run already: continue it with --resume, or choose another --out",
