@@ -31,7 +31,7 @@ pub use self::course::{COURSE_FRAMES, Moment, TimeSeries};
 pub use self::error::{CHECK_TOLERANCE, MAX_FILE_BYTES, MIN_OPSET, ModelError, SHORE_TOLERANCE};
 use self::error::{JUDGING, RUNNING};
 use self::file::File;
-pub use self::file::{are_levels, check_line};
+pub use self::file::check_line;
 pub use self::grid::{COLS, ModelFrame, ROWS, Resampling, TAXELS};
 use self::inputs::{Input, Query};
 pub use self::probabilities::argmax;
@@ -40,7 +40,7 @@ pub(crate) use self::probabilities::softmax;
 pub(crate) use self::references::Reference;
 pub use self::references::{Knowledge, MOST_REFERENCES, PIECE, Piece, ReferencePress, References};
 pub use self::settings::{BuiltIn, Settings};
-pub use self::shore::{Borders, Distribution, Level, LevelTable, Shore};
+pub use self::shore::{Borders, Distribution, Level, LevelTable, MOST_LEVELS, Shore, are_levels};
 pub use self::tried::Tried;
 
 /// The default model, built into the binary; `models/course.md` is its card.

@@ -13,11 +13,6 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
     check_robot(&config.robot)?;
     let sensors = check_sensors(config)?;
     check_model(&config.model)?;
-    let levels = config.levels.len();
-    if !(levels == 0 || (2..=MOST_LEVELS).contains(&levels)) {
-        let found = format!("{levels} tables");
-        return Err(Problem::found("level", found, "none, or 2 to 16"));
-    }
     check_unix(&publish.unix)?;
     if let Some(record) = &config.record {
         let ranges = record.check_ranges();
@@ -61,9 +56,6 @@ fn check_robot(robot: &str) -> Result<(), Problem> {
     let fits = !robot.is_empty() && wording::is_plain(robot);
     Ok(range::check("robot", robot, fits, expected)?)
 }
-
-/// As many as a model may have.
-const MOST_LEVELS: usize = 16;
 
 /// Twice as many sensors as a core can read at 100 frames/s.
 const MOST_SENSORS: usize = 1000;

@@ -159,7 +159,8 @@ pub(super) fn model(config: &Config, most: Duration) -> Result<Model, Problem> {
     if config.levels.is_empty() {
         return Ok(hrn);
     }
-    let levelled = hrn.with_levels(LevelTable::levels(&config.levels));
+    let levels = LevelTable::levels(&config.levels);
+    let levelled = levels.and_then(|levels| hrn.with_levels(levels));
     levelled.map_err(|error| Problem::because("level", error))
 }
 

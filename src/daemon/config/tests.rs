@@ -45,10 +45,6 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
             "[[sensor]]\nname = \"b\"\nport = \"/dev/ttyUSB0\"\nbaud = 9600",
             "line 6: sensor.baud of \"b\": found 9600, expected 115200 as for \"sensor\"",
         ),
-        (
-            "[[level]]\nlabel = \"a\"\nshore = [0, 50]",
-            "line 3: level: found 1 tables, expected none",
-        ),
         ("bauds = 9", "line 3, column 1"),
         ("bauds = 9", "`bauds`: did you mean `baud`?"),
         (
@@ -117,6 +113,24 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         let error = load(&text).unwrap_err();
         // A name that is too long is not repeated.
         assert!(error.contains(expected) && error.len() < 200, "{error}");
+    }
+}
+
+#[test]
+fn levels_that_no_model_can_have_are_refused() {
+    let level = |label, shore| format!("[[level]]\nlabel = \"{label}\"\nshore = {shore}\n");
+    for (first, second, expected) in [
+        ("stiff", "", "found 1 tables, expected none, or 2 to 16"),
+        ("\\u202E", "[0, 50]", "a label is empty, too long"),
+        ("stiff", "[0, 60]", "which is not softer than"),
+    ] {
+        let mut text = LEAST.to_owned() + &level(first, "[50, 100]");
+        if !second.is_empty() {
+            text += &level("limp", second);
+        }
+        let config = load(&text).unwrap();
+        let error = Setup::of(config, Path::new("a.toml")).unwrap_err();
+        assert!(error.to_string().contains(expected), "{error}");
     }
 }
 

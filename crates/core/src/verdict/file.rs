@@ -16,12 +16,10 @@ use super::course::COURSE_FRAMES;
 use super::error::{MIN_OPSET, ModelError};
 use super::inputs::{Input, Lengths};
 use super::references::{Knowledge, MOST_REFERENCES};
-use super::shore::{Borders, Level};
+use super::shore::{Borders, Level, are_levels};
 use crate::frame::{Array, MOST_SIDE};
 use crate::wording::{is_plain, named};
 
-/// The longest `label` and `shore` of a level: every event carries a label.
-const LONGEST_LABEL_BYTES: usize = 255;
 /// The longest part of a name or a text in a message.
 const NAME_CHARS: usize = 60;
 /// The longest text that people read.
@@ -455,15 +453,6 @@ fn is_promise(conformal: &Conformal) -> bool {
         .map(|known| conformal.limits(known));
     let is_share = conformal.alpha > 0.0 && conformal.alpha < 1.0;
     is_share && limits.all(fits) && (0.0..=1.0).contains(&conformal.threshold)
-}
-
-/// Whether a model may have these levels: numbers from 1, and labels that can be shown.
-pub fn are_levels(levels: &[Level]) -> bool {
-    let numbers = levels.iter().map(|level| level.level);
-    let mut texts = levels.iter().flat_map(|level| [&level.label, &level.shore]);
-    levels.len() >= 2
-        && numbers.eq((1..=u8::MAX).take(levels.len()))
-        && texts.all(|text| (1..=LONGEST_LABEL_BYTES).contains(&text.len()) && is_plain(text))
 }
 
 /// The beginning of a text, quoted.

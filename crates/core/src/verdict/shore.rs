@@ -8,6 +8,13 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ModelError;
 use super::probabilities::{argmax, softmax};
+use crate::wording::is_plain;
+
+/// The most hardness levels that data or a configuration may have.
+pub const MOST_LEVELS: usize = 16;
+
+/// The longest `label` and `shore` of a level: every event carries a label.
+const LONGEST_LABEL_BYTES: usize = 255;
 
 /// One hardness level, as `hello` publishes it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,14 +40,41 @@ pub struct LevelTable {
 
 impl LevelTable {
     /// The levels of these tables, the hardest first.
-    pub fn levels(tables: &[Self]) -> Vec<Level> {
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the tables are fewer than 2 or more than [`MOST_LEVELS`], a label cannot be shown, or
+    /// the levels are no parts of the scale.
+    pub fn levels(tables: &[Self]) -> Result<Vec<Level>, ModelError> {
+        let found = tables.len();
+        if !(2..=MOST_LEVELS).contains(&found) {
+            let expected = format!("none, or 2 to {MOST_LEVELS}");
+            return Err(ModelError::new(format!(
+                "found {found} tables, expected {expected}"
+            )));
+        }
         let level = |(level, table): (u8, &Self)| Level {
             level,
             label: table.label.clone(),
             shore: format!("{}-{}", table.shore[0], table.shore[1]),
         };
-        (1..=u8::MAX).zip(tables).map(level).collect()
+        let levels: Vec<Level> = (1..=u8::MAX).zip(tables).map(level).collect();
+        if !are_levels(&levels) {
+            let problem = "a label is empty, too long or not plain text";
+            return Err(ModelError::new(problem));
+        }
+        Borders::of(&levels)?;
+        Ok(levels)
     }
+}
+
+/// Whether a model may have these levels: numbers from 1, and labels that can be shown.
+pub fn are_levels(levels: &[Level]) -> bool {
+    let numbers = levels.iter().map(|level| level.level);
+    let mut texts = levels.iter().flat_map(|level| [&level.label, &level.shore]);
+    levels.len() >= 2
+        && numbers.eq((1..=u8::MAX).take(levels.len()))
+        && texts.all(|text| (1..=LONGEST_LABEL_BYTES).contains(&text.len()) && is_plain(text))
 }
 
 /// The end of the scale.

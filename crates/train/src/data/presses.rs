@@ -294,10 +294,7 @@ impl Presses {
 
     /// How a file keeps them.
     pub fn layout(&self) -> Layout {
-        match self.are_over_time() {
-            true => Layout::OverTime,
-            false => Layout::Frames,
-        }
+        Layout::of(self.are_over_time())
     }
 
     /// Whether a press has more than one moment.

@@ -10,8 +10,6 @@ use hardnessd_simulator::{LEVELS, LevelRange};
 
 /// The distance between taxels, unless a file names another one.
 pub const PITCH_MM: f64 = Pitch::JX255N.rows_mm;
-/// The most hardness levels.
-pub const MOST_LEVELS: usize = 16;
 /// The name of our simulator in `meta.generator`.
 pub const SIMULATOR: &str = "hardnessd simulator";
 /// The name of `hrn-train collect` in `meta.generator`.

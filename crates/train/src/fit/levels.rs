@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use anyhow::ensure;
 
-use crate::data::source::{MOST_LEVELS, papers_levels};
+use crate::data::source::papers_levels;
 use hardnessd_core::recording::Labels;
-use hardnessd_core::verdict::Level;
+use hardnessd_core::verdict::{Level, MOST_LEVELS};
 
 /// The levels that the labels of recordings name. Numbers alone are those of the paper's levels, or of as
 /// many as there are. Names are put in the order of the Shore hardness that was measured, the hardest first, or

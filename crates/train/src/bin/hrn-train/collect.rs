@@ -2,7 +2,6 @@
 
 use anyhow::{Context as _, ensure};
 use hardnessd_core::part::Part;
-use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::verdict::Borders;
 use hrn_train::data::collect::{self, Collection, Settings};
 use hrn_train::data::presses::Layout;
@@ -10,14 +9,11 @@ use hrn_train::data::source::papers_levels;
 use hrn_train::run::disk::lock;
 
 use super::arguments::Collect;
-use super::configuration::{first_sensor, levels};
+use super::configuration::described;
 use super::files::check_new;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
-    let (sensor, levels) = match &arguments.config {
-        Some(config) => (first_sensor(config)?, levels(config)?),
-        None => (Sensor::new(Description::default())?, None),
-    };
+    let (sensor, levels) = described(arguments.config.as_deref())?;
     let captures = collect::captures(&arguments.captures)?;
     let out = &arguments.out;
     let earlier = Some(out.as_path()).filter(|out| arguments.append && out.exists());
@@ -26,10 +22,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     }
     // No other call adds to the data set meanwhile, because the later one would undo the earlier one.
     let _locked = earlier.map(lock).transpose()?;
-    let layout = match arguments.sequences {
-        true => Layout::OverTime,
-        false => Layout::Frames,
-    };
+    let layout = Layout::of(arguments.sequences);
     let mut collection = match earlier {
         Some(earlier) => Collection::of(earlier, layout)?,
         None => Collection::default(),

@@ -9,49 +9,48 @@ use hardnessd_core::npy;
 use hardnessd_core::press;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tare::Gains;
-use hardnessd_core::verdict::{Borders, Level, LevelTable, are_levels};
+use hardnessd_core::verdict::{Level, LevelTable};
 use hardnessd_core::wording;
-use hrn_train::data::source::MOST_LEVELS;
 use hrn_train::exit::coded;
 use hrn_train::run::disk::read_text;
 use serde::Deserialize;
-use serde::de::DeserializeOwned;
 
 /// The most bytes of a file of gains.
 const MOST_GAINS_BYTES: u64 = 1 << 20;
 
 /// Tables of a configuration. The daemon's `check` checks the rest.
-fn tables<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+#[derive(Deserialize)]
+struct Tables {
+    #[serde(default)]
+    sensor: Vec<sensor::Settings>,
+    #[serde(default)]
+    press: press::Settings,
+    #[serde(default)]
+    level: Vec<LevelTable>,
+}
+
+/// The first sensor of a configuration, and the levels of its `[[level]]` tables if it has some. Without a
+/// configuration, the sensor is a JX255N.
+pub(super) fn described(path: Option<&Path>) -> anyhow::Result<(Sensor, Option<Vec<Level>>)> {
+    let Some(path) = path else {
+        return Ok((Sensor::new(Description::default())?, None));
+    };
     let text = read_text(path)?;
-    toml::from_str(&text).map_err(|error| refused(path, wording::of_toml(&text, &error)))
+    let tables = toml::from_str(&text).map_err(|error| wording::of_toml(&text, &error));
+    let read = tables.and_then(|tables| read(tables, path));
+    read.map_err(|problem| coded(CONFIG, format_args!("{}: {problem}", path.display())))
 }
 
-/// The error of a configuration.
-fn refused(path: &Path, problem: impl std::fmt::Display) -> anyhow::Error {
-    coded(CONFIG, format_args!("{}: {problem}", path.display()))
-}
-
-/// Reads the first `[[sensor]]` table and the `[press]` table.
-pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
-    #[derive(Deserialize)]
-    struct Tables {
-        #[serde(default, rename = "sensor")]
-        sensors: Vec<sensor::Settings>,
-        #[serde(default)]
-        press: press::Settings,
-    }
-    let tables: Tables = tables(path)?;
-    let sensor = tables.sensors.into_iter().next();
-    let mut sensor = sensor.ok_or_else(|| refused(path, "has no [[sensor]] table"))?;
+fn read(tables: Tables, path: &Path) -> Result<(Sensor, Option<Vec<Level>>), String> {
+    let sensor = tables.sensor.into_iter().next();
+    let mut sensor = sensor.ok_or("has no [[sensor]] table")?;
     if let Some(Gains::File(file)) = &sensor.calibration.gains {
         let file = path.with_file_name("").join(file);
         let opened = File::open(&file);
         let rows = opened.and_then(|file| npy::table(&mut file.take(MOST_GAINS_BYTES)));
         let rows = rows.map_err(|error| {
-            refused(
-                path,
-                format_args!("sensor.calibration.gains: {}: {error}", file.display()),
-            )
+            let file = file.display();
+            format!("sensor.calibration.gains: {file}: {error}")
         })?;
         sensor.calibration.gains = Some(Gains::Taxels(rows));
     }
@@ -60,34 +59,8 @@ pub(super) fn first_sensor(path: &Path) -> anyhow::Result<Sensor> {
         press: tables.press,
         ..Description::default()
     };
-    Sensor::new(description).map_err(|error| refused(path, error))
-}
-
-/// The levels of the `[[level]]` tables, which a data set can have. `None` without such tables.
-pub(super) fn levels(path: &Path) -> anyhow::Result<Option<Vec<Level>>> {
-    #[derive(Deserialize)]
-    struct Tables {
-        #[serde(default)]
-        level: Vec<LevelTable>,
-    }
-    let tables: Tables = tables(path)?;
-    let levels = LevelTable::levels(&tables.level);
-    if levels.is_empty() {
-        return Ok(None);
-    }
-    if !(2..=MOST_LEVELS).contains(&levels.len()) {
-        let problem = format!(
-            "level: found {} tables, expected 2 to {MOST_LEVELS}",
-            levels.len()
-        );
-        return Err(refused(path, problem));
-    }
-    if !are_levels(&levels) {
-        return Err(refused(
-            path,
-            "level: a label is empty, too long or not plain text",
-        ));
-    }
-    Borders::of(&levels).map_err(|error| refused(path, format_args!("level: {error}")))?;
-    Ok(Some(levels))
+    let sensor = Sensor::new(description).map_err(|error| error.to_string())?;
+    let levels = (!tables.level.is_empty()).then(|| LevelTable::levels(&tables.level));
+    let levels = levels.transpose();
+    Ok((sensor, levels.map_err(|error| format!("level: {error}"))?))
 }

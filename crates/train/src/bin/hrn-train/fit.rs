@@ -5,24 +5,20 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail};
 use hardnessd_core::exit::USAGE;
-use hardnessd_core::sensor::{Description, Sensor};
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Borders, Level};
 use hrn_train::exit::coded;
 use hrn_train::fit::{self, Division, Estimate, Report, Row, Written};
 
 use super::arguments::Fit;
-use super::configuration::{first_sensor, levels};
+use super::configuration::described;
 use super::files::{check_new, write};
 
 /// The most wrongly judged presses that are listed.
 const LISTED: usize = 20;
 
 pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
-    let (sensor, levels) = match &arguments.config {
-        Some(config) => (first_sensor(config)?, levels(config)?),
-        None => (Sensor::new(Description::default())?, None),
-    };
+    let (sensor, levels) = described(arguments.config.as_deref())?;
     let out = arguments.out.display();
     if arguments
         .out

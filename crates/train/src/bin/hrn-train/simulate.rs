@@ -54,10 +54,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
         let text = "--objects and --test-objects: found 0 and 0, expected one or more of either";
         return Err(coded(USAGE, text));
     }
-    let layout = match arguments.sequences {
-        true => Layout::OverTime,
-        false => Layout::Frames,
-    };
+    let layout = Layout::of(arguments.sequences);
     check_new(&arguments.out)?;
     let begun = Instant::now();
     let (presses, left_out) = simulated::simulate(&settings, layout);

@@ -11,14 +11,14 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::{MILLINEWTON, MOST_BYTES, Press, Presses};
-use crate::data::source::{Grid, Kind, MOST_LEVELS, PITCH_MM, SIMULATOR, Source};
+use crate::data::source::{Grid, Kind, PITCH_MM, SIMULATOR, Source};
 use crate::exit::unreadable;
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::npy::Element;
 use hardnessd_core::npz::{ANY, Reader, Unexpected, Writer, within};
 use hardnessd_core::verdict::parts::PARTS;
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, Piece, ROWS, TAXELS, are_levels, sha256_hex,
+    COLS, COURSE_FRAMES, Level, MOST_LEVELS, Piece, ROWS, TAXELS, are_levels, sha256_hex,
 };
 use hardnessd_simulator::{BroadSensors, Split};
 
@@ -46,6 +46,16 @@ pub enum Layout {
     Frames,
     /// All moments of each press, in millinewtons.
     OverTime,
+}
+
+impl Layout {
+    /// The layout of presses that are whole, or single frames.
+    pub fn of(are_over_time: bool) -> Self {
+        match are_over_time {
+            true => Self::OverTime,
+            false => Self::Frames,
+        }
+    }
 }
 
 /// Reads a file of either layout.
