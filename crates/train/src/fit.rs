@@ -13,7 +13,6 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use anyhow::{Context as _, ensure};
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
 use self::candidate::Candidate;
@@ -24,6 +23,7 @@ use crate::data::collect::{self, Collection, Settings};
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
 use crate::model::export::{Learnt, validation};
+use crate::progress;
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::verdict::Level;
@@ -74,9 +74,7 @@ pub fn fit(
     let usable = candidates.iter().filter(|(_, candidate)| candidate.is_ok());
     let an_entry: usize = divisions.iter().flatten().map(Vec::len).sum();
     let work = an_entry * (usable.count() + usize::from(control.is_some()));
-    let bar = ProgressBar::new(work as u64);
-    let style = ProgressStyle::with_template("{msg:10} {bar:30} {pos}/{len} fits, {eta} left");
-    bar.set_style(style.expect("the template is right"));
+    let bar = progress::bar("{msg:10} {bar:30} {pos}/{len} fits, {eta} left", work);
     let compare = |name, candidate: Result<&Candidate, &String>| -> anyhow::Result<Row> {
         bar.set_message(name);
         let judge = |folds: &Option<Vec<Fold>>| {
@@ -166,10 +164,7 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
         .into_iter()
         .partition(|path| collect::is_data_set(path));
     let mut sets = Presses::read(&sets)?;
-    let layout = match sets.all.is_empty() {
-        true => Layout::OverTime,
-        false => sets.layout(),
-    };
+    let layout = Layout::of(sets.all.is_empty() || sets.are_over_time());
     let mut played = Vec::new();
     collect::recordings(&recordings, sensor, layout, false, |recording| {
         played.push(recording);

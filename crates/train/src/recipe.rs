@@ -93,11 +93,6 @@ impl Recipe {
         self.from_ustgan || self.pretrained || is_gan
     }
 
-    /// Whether the method needs labelled samples of every level.
-    pub fn needs_every_level(&self) -> bool {
-        self.pretrained
-    }
-
     /// The settings of a run that learns from `samples` presses. Those of the recipe come on top of the
     /// profile's, and the `given` ones on top of the recipe's.
     ///

@@ -6,7 +6,6 @@
 pub mod checkpoint;
 pub mod disk;
 pub mod history;
-pub mod progress;
 
 use std::fs::{self, File};
 use std::io::ErrorKind;

@@ -14,8 +14,8 @@ use crate::learn;
 use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
+use crate::progress::ensure_finite;
 use crate::recipe::{self, Kind, Recipe};
-use crate::run::progress::ensure_finite;
 use crate::run::{Description, Run, disk};
 use crate::settings::{self, Profile};
 use hardnessd_core::exit::{UNAVAILABLE, USAGE};
@@ -212,7 +212,7 @@ fn check(recipe: &Recipe, presses: &Presses, parts: &Parts) -> anyhow::Result<()
             .of(&parts.train)
             .any(|press| press.level == level.level);
         ensure!(
-            !recipe.needs_every_level() || has_own,
+            !recipe.pretrained || has_own,
             "no labelled training presses of level {} for its STGAN: label some, or choose a method \
              without STGANs",
             level.level

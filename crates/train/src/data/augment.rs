@@ -20,41 +20,26 @@ pub fn vary(frame: &ModelFrame, settings: Augmentation, stream: &mut Stream) -> 
     let reach = isize::from(settings.shift_taxels);
     let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;
     let (rows, columns) = (shift(), shift());
-    shifted(&turned(frame, symmetry), rows, columns)
+    moved(frame, symmetry, rows, columns)
 }
 
-/// The image of `frame` under symmetry 0..8; 0 is the identity.
-fn turned(frame: &ModelFrame, symmetry: usize) -> ModelFrame {
+/// The image of `frame` under symmetry 0..8, of which 0 is the identity, moved down by `rows` and right by
+/// `columns`.
+fn moved(frame: &ModelFrame, symmetry: usize, rows: isize, columns: isize) -> ModelFrame {
     const { assert!(ROWS == COLS, "a transposed frame must fit") };
     let mut image = ModelFrame::default();
-    for row in 0..ROWS {
-        for column in 0..COLS {
-            let (r, c) = if symmetry & 4 == 0 {
-                (row, column)
-            } else {
-                (column, row)
-            };
-            let r = if symmetry & 1 == 0 { r } else { ROWS - 1 - r };
-            let c = if symmetry & 2 == 0 { c } else { COLS - 1 - c };
-            image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
-        }
-    }
-    image
-}
-
-/// `frame` moved down by `rows` and right by `columns`.
-fn shifted(frame: &ModelFrame, rows: isize, columns: isize) -> ModelFrame {
-    let mut image = ModelFrame::default();
-    for row in 0..ROWS {
-        for column in 0..COLS {
-            let from = (
-                row.checked_add_signed(-rows),
-                column.checked_add_signed(-columns),
-            );
-            if let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = from {
-                image.newtons[row * COLS + column] = frame.newtons[r * COLS + c];
-            }
-        }
+    for (place, newtons) in image.newtons.iter_mut().enumerate() {
+        let from = (
+            (place / COLS).checked_add_signed(-rows),
+            (place % COLS).checked_add_signed(-columns),
+        );
+        let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = from else {
+            continue;
+        };
+        let (r, c) = if symmetry & 4 == 0 { (r, c) } else { (c, r) };
+        let r = if symmetry & 1 == 0 { r } else { ROWS - 1 - r };
+        let c = if symmetry & 2 == 0 { c } else { COLS - 1 - c };
+        *newtons = frame.newtons[r * COLS + c];
     }
     image
 }
@@ -71,7 +56,7 @@ mod tests {
 
     #[test]
     fn the_symmetries_are_eight_different_ones_that_keep_force_and_area() {
-        let images: Vec<ModelFrame> = (0..SYMMETRIES).map(|s| turned(&corner(), s)).collect();
+        let images: Vec<ModelFrame> = (0..SYMMETRIES).map(|s| moved(&corner(), s, 0, 0)).collect();
         assert_eq!(images[0], corner());
         for (index, image) in images.iter().enumerate() {
             assert_eq!(image.force_n(), 1.0);
@@ -84,9 +69,9 @@ mod tests {
 
     #[test]
     fn a_shift_brings_in_background_and_loses_what_leaves() {
-        let moved = shifted(&corner(), 3, -2);
-        assert_eq!(moved.newtons[4 * COLS], 1.0);
-        assert_eq!(moved.force_n(), 1.0);
-        assert_eq!(shifted(&corner(), 0, -3).force_n(), 0.0);
+        let image = moved(&corner(), 0, 3, -2);
+        assert_eq!(image.newtons[4 * COLS], 1.0);
+        assert_eq!(image.force_n(), 1.0);
+        assert_eq!(moved(&corner(), 0, 0, -3).force_n(), 0.0);
     }
 }

@@ -8,23 +8,24 @@
 
 mod recording;
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{ErrorKind, Read as _, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow, bail, ensure};
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Map, Value, json};
+use walkdir::WalkDir;
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::{COLLECTOR, MOST_LEVELS};
+use crate::data::source::COLLECTOR;
 use crate::exit::unreadable;
+use crate::progress;
 use hardnessd_core::npz::Writer;
 use hardnessd_core::recording::{MAGIC, object_of};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{BUILT_IN_HRN, Level, Model, sha256_hex};
+use hardnessd_core::verdict::{BUILT_IN_HRN, Level, MOST_LEVELS, Model, sha256_hex};
 use hardnessd_core::wording;
 use hardnessd_simulator::Split;
 
@@ -61,31 +62,20 @@ pub fn captures(paths: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
             all.push(path.clone());
             continue;
         }
-        let mut found = Vec::new();
-        find_below(path, &mut found)?;
+        let before = all.len();
+        for entry in WalkDir::new(path).sort_by_file_name() {
+            let entry = entry.map_err(|error| unreadable(path, &error.into()))?;
+            if entry.path().is_file() && begins(entry.path(), MAGIC) {
+                all.push(entry.into_path());
+            }
+        }
         ensure!(
-            !found.is_empty(),
+            all.len() > before,
             "{}: no recording is in this directory",
             path.display()
         );
-        found.sort();
-        all.append(&mut found);
     }
     Ok(all)
-}
-
-fn find_below(directory: &Path, found: &mut Vec<PathBuf>) -> anyhow::Result<()> {
-    let failed = |error| unreadable(directory, &error);
-    for entry in fs::read_dir(directory).map_err(failed)? {
-        let entry = entry.map_err(failed)?;
-        let path = entry.path();
-        if entry.file_type().map_err(failed)?.is_dir() {
-            find_below(&path, found)?;
-        } else if path.is_file() && begins(&path, MAGIC) {
-            found.push(path);
-        }
-    }
-    Ok(())
 }
 
 /// Whether a file is a data set, which its first bytes say.
@@ -117,9 +107,8 @@ pub fn recordings(
     skips_unusable: bool,
     mut take: impl FnMut(Recording) -> anyhow::Result<()>,
 ) -> anyhow::Result<usize> {
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} recordings, {eta} left");
-    let bar = ProgressBar::new(paths.len() as u64);
-    let bar = bar.with_style(style.expect("the template is right"));
+    let template = "{bar:30} {pos}/{len} recordings, {eta} left";
+    let bar = progress::bar(template, paths.len());
     let hrn = Arc::new(Model::load(BUILT_IN_HRN)?);
     let mut used = 0;
     for path in paths {

@@ -11,12 +11,12 @@ use hardnessd_core::npz::Writer;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
 use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Materials};
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
 use crate::data::presses::{self, Layout, Presses};
 use crate::data::source::{self, SIMULATOR};
 use crate::exit::coded;
+use crate::progress;
 use crate::settings::overridden;
 
 /// Settings with the values of a file in place of their own.
@@ -36,8 +36,7 @@ pub fn configured(settings: &CourseSettings, text: &str) -> anyhow::Result<Cours
 /// the number of presses that no sensor saw, or that lasted too long.
 pub fn simulate(settings: &CourseSettings, layout: Layout) -> (Presses, usize) {
     let jobs = std::thread::available_parallelism().map_or(1, usize::from);
-    let style = ProgressStyle::with_template("{bar:30} {percent} %, {eta} left");
-    let bar = ProgressBar::new(0).with_style(style.expect("the template is right"));
+    let bar = progress::bar("{bar:30} {percent} %, {eta} left", 0);
     let progress = |done: usize, all: usize| {
         bar.set_length(all as u64);
         bar.set_position(done as u64);

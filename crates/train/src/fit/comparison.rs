@@ -244,15 +244,8 @@ pub(super) fn calibration(
 ) -> Calibration {
     let judged = judged.iter().map(|(place, row)| {
         let press = &presses.all[*place];
-        let object = press.object.map_or(u64::MAX - *place as u64, |object| {
-            u64::from(object) << 8 | u64::from(press.level)
-        });
-        calibration::Judged {
-            unit: object,
-            level: usize::from(press.level) - 1,
-            shore: press.shore,
-            row: row.clone(),
-        }
+        let of_level = |object| u64::from(object) << 8 | u64::from(press.level);
+        calibration::Judged::of(presses, *place, press.object.map(of_level), row.clone())
     });
     let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
     Calibration::on(&judged, outputs, stream)

@@ -45,6 +45,19 @@ pub(crate) struct Judged {
     pub(crate) row: Vec<f32>,
 }
 
+impl Judged {
+    /// What it says of a press. A press without a known unit is of a unit of its own.
+    pub(crate) fn of(presses: &Presses, place: usize, unit: Option<u64>, row: Vec<f32>) -> Self {
+        let press = &presses.all[place];
+        Self {
+            unit: unit.unwrap_or(u64::MAX - place as u64),
+            level: usize::from(press.level) - 1,
+            shore: press.shore,
+            row,
+        }
+    }
+}
+
 impl Calibration {
     /// Calibrates on the presses `held_out`, varied and with references like the training presses. Without
     /// any, it changes nothing and promises nothing.
@@ -66,16 +79,8 @@ impl Calibration {
             let asked: Vec<usize> = asked.copied().collect();
             let units = presses.units(&asked);
             let one = |(number, (&place, row)): (usize, (&usize, Vec<f32>))| {
-                let press = &presses.all[place];
-                Judged {
-                    // A press without a known object is of an object of its own.
-                    unit: units
-                        .as_ref()
-                        .map_or(u64::MAX - place as u64, |units| units.1[number].into()),
-                    level: usize::from(press.level) - 1,
-                    shore: press.shore,
-                    row,
-                }
+                let unit = units.as_ref().map(|units| units.1[number].into());
+                Judged::of(presses, place, unit, row)
             };
             let of_knowledge = asked.iter().zip(rows).enumerate().map(one).collect();
             judged.insert(knowledge, of_knowledge);

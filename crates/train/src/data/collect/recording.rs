@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::{ARCHIVE, Settings};
 use crate::data::presses::file::SHORE;
 use crate::data::presses::{Layout, Press, Presses};
-use crate::data::source::{Grid, Kind, MOST_LEVELS, PITCH_MM, Source};
+use crate::data::source::{Grid, Kind, PITCH_MM, Source};
 use crate::exit::coded;
 use hardnessd_core::event::{self, Event, PressState};
 use hardnessd_core::exit::USAGE;
@@ -18,7 +18,7 @@ use hardnessd_core::judge::EndedPress;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, FileKind, Found, Labels, Playback, Reader, object_of};
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::verdict::{Borders, Model, Piece, sha256_hex};
+use hardnessd_core::verdict::{Borders, MOST_LEVELS, Model, Piece, sha256_hex};
 
 /// The moment of raw bytes, whose times come from the frame rate.
 const NOT_LOOKED_AT: Stamp = Stamp {

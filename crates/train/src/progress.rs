@@ -1,4 +1,4 @@
-//! The progress of a stage as a bar or lines, and the end of a stage that has diverged.
+//! Progress as a bar or lines, and the end of a stage that has diverged.
 
 use anyhow::ensure;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -17,14 +17,16 @@ pub(crate) fn ensure_finite(stage: &str, epoch: u32, what: &str, found: f64) -> 
     Ok(())
 }
 
-/// A bar over a stage's steps.
+/// A bar, which indicatif draws on a terminal only.
+pub(crate) fn bar(template: &str, length: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template(template).expect("the template is right");
+    ProgressBar::new(length as u64).with_style(style)
+}
+
+/// A bar over a stage's steps. Elsewhere than on a terminal, [`report`] prints lines.
 pub(crate) fn progress_bar(stage: &str, steps: u64, done: u64) -> ProgressBar {
     let template = "{prefix} {bar:30} {pos}/{len} steps, {eta} left {msg}";
-    let style = ProgressStyle::with_template(template).expect("the template is right");
-    // indicatif draws on a terminal only. Elsewhere `report` prints lines.
-    let bar = ProgressBar::new(steps)
-        .with_style(style)
-        .with_prefix(stage.to_owned());
+    let bar = bar(template, steps as usize).with_prefix(stage.to_owned());
     bar.set_position(done);
     bar.reset_eta();
     bar
