@@ -66,7 +66,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             hardnessd_core::stderr_line!("hardnessd: {}", error.line());
-            ExitCode::from(error.code())
+            ExitCode::from(error.code)
         }
     }
 }

@@ -79,7 +79,7 @@ pub fn usage(error: &clap::Error) -> ExitCode {
         Ok(_) => ExitCode::SUCCESS,
         Err(failure) => {
             hardnessd_core::stderr_line!("hardnessd: {}", failure.line());
-            ExitCode::from(failure.code())
+            ExitCode::from(failure.code)
         }
     }
 }

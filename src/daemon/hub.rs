@@ -125,7 +125,7 @@ impl Subscriber {
                 if !lines.is_empty() {
                     return Some(lines);
                 }
-                if log.is_closed() {
+                if log.is_closed {
                     return None;
                 }
             }

@@ -24,7 +24,6 @@ use tracing_subscriber::{Registry, reload};
 
 use self::lines::Lines;
 use super::Error;
-use crate::thread::NoThread;
 use hardnessd_core::allowance::Allowance;
 use hardnessd_core::event::{Event, LinkState, Phase, PressState, Status, Tared, name, round_3};
 use hardnessd_core::tare::RetareError;
@@ -79,7 +78,7 @@ impl Log {
         let filter = filter(&std::env::var("RUST_LOG").unwrap_or_default(), level)?;
         // The filter is a layer beside the output: a filter inside the output would be lost when
         // the output is exchanged.
-        let lines = Lines::start().map_err(NoThread)?;
+        let lines = Lines::start()?;
         let (layer, output) = reload::Layer::new(output(settings, &lines));
         tracing_subscriber::registry()
             .with(layer)

@@ -99,14 +99,14 @@ impl Publishers {
         let _on_their_thread = clients.enter();
         if let Some(settings) = &publish.tcp {
             let tcp = Tcp::bind("publish.tcp.listen", settings.listen)?;
-            addresses.push(("tcp", tcp.address()));
+            addresses.push(("tcp", tcp.address));
             let tcp = accept(tcp, most, service(None), stop.clone());
             serving.push((clients, Box::pin(tcp)));
         }
         let mut http = None;
         if let Some(settings) = &config.http {
             let tcp = Tcp::bind("http.listen", settings.listen)?;
-            let address = *http.insert(tcp.address());
+            let address = *http.insert(tcp.address);
             addresses.push(("http", address));
             let setter = settings.set_context.then(|| sensors.clone());
             let service = Http::new(address, hub.clone(), setter, stop.clone());

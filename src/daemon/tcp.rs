@@ -26,7 +26,8 @@ const PROBES: u32 = 5;
 #[derive(Debug)]
 pub(crate) struct Tcp {
     listener: TcpListener,
-    address: SocketAddr,
+    /// The listener's address. If the configured port was 0, it has the port that the system chose.
+    pub(crate) address: SocketAddr,
 }
 
 impl Tcp {
@@ -43,12 +44,6 @@ impl Tcp {
         };
         let failed = |error| format!("{key}: cannot listen on {address}: {error}");
         bound().map_err(|error: io::Error| Error::Io(failed(error)))
-    }
-
-    /// The listener's address. If the configured port was 0, the address has the port that the
-    /// system chose.
-    pub(crate) fn address(&self) -> SocketAddr {
-        self.address
     }
 }
 
@@ -90,7 +85,7 @@ mod tests {
     #[tokio::test]
     async fn a_connection_ends_when_its_other_end_takes_nothing_for_long() {
         let mut listener = Tcp::bind("key", "127.0.0.1:0".parse().unwrap()).unwrap();
-        let _client = std::net::TcpStream::connect(listener.address()).unwrap();
+        let _client = std::net::TcpStream::connect(listener.address).unwrap();
         let stream = listener.accept().await.unwrap();
         assert_eq!(sockopt::tcp_user_timeout(&stream).unwrap(), 60_000);
     }

@@ -11,7 +11,8 @@ use hardnessd_core::wording;
 #[derive(Debug)]
 pub struct Failure {
     error: anyhow::Error,
-    code: u8,
+    /// The exit code.
+    pub code: u8,
 }
 
 impl Failure {
@@ -37,11 +38,6 @@ impl Failure {
     /// The error and its causes on one line.
     pub fn line(&self) -> String {
         wording::line(&*self.error)
-    }
-
-    /// The exit code.
-    pub fn code(&self) -> u8 {
-        self.code
     }
 }
 

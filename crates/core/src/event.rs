@@ -34,22 +34,19 @@ pub const CONTEXT_LEVELS: usize = 16;
 /// than [`CONTEXT_LEVELS`].
 pub fn check_context(context: &Value) -> Result<(), String> {
     let (bytes, levels) = (context.to_string().len(), levels(context));
-    let (found, expected) = if !context.is_object() {
-        ("no object".to_owned(), "one".to_owned())
+    if !context.is_object() {
+        Err("found no object, expected one".to_owned())
     } else if bytes >= CONTEXT_BYTES {
-        (
-            format!("{bytes} bytes"),
-            format!("fewer than {CONTEXT_BYTES}"),
-        )
+        Err(format!(
+            "found {bytes} bytes, expected fewer than {CONTEXT_BYTES}"
+        ))
     } else if levels > CONTEXT_LEVELS {
-        (
-            format!("{levels} levels"),
-            format!("at most {CONTEXT_LEVELS}"),
-        )
+        Err(format!(
+            "found {levels} levels, expected at most {CONTEXT_LEVELS}"
+        ))
     } else {
-        return Ok(());
-    };
-    Err(format!("found {found}, expected {expected}"))
+        Ok(())
+    }
 }
 
 /// The levels of objects and lists in a value. A number or a text has none.

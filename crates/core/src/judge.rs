@@ -342,7 +342,7 @@ impl Judge {
         let card = self.hrn.card();
         let range = &card.range;
         // The range of areas is in taxels of the model's grid.
-        let area = if resampling.is_resampled() {
+        let area = if resampling.is_resampled {
             resampling
                 .apply(&peak.frame)
                 .contact_area_taxels(card.contact_threshold_n())
@@ -354,7 +354,7 @@ impl Judge {
         let is_trained = (least_n..=most_n).contains(&peak.force_n)
             && (least_taxels..=most_taxels).contains(&area)
             && card.holds(self.sensor.calibration().pitch_mm);
-        let is_resampled = resampling.is_resampled() && card.grid.is_none();
+        let is_resampled = resampling.is_resampled && card.grid.is_none();
         let are_ignored = self.hrn.known_references().are_ignored();
         [
             (Note::AtEdge, peak.at_edge),

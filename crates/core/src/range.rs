@@ -6,7 +6,7 @@
 use std::fmt::{Debug, Display};
 
 use crate::frame::Pitch;
-use crate::wording::{as_written, cut};
+use crate::wording::cut;
 
 /// A value that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -108,18 +108,17 @@ impl Range {
             is_open,
             unit,
         } = self;
-        let fits = |number: f64| number <= most && (number > least || !is_open && number == least);
-        let Some(found) = value.numbers().into_iter().find(|&number| !fits(number)) else {
+        let fits = |text: &str| {
+            let number: f64 = text.parse().unwrap_or(f64::NAN);
+            number <= most && (number > least || !is_open && number == least)
+        };
+        let Some(found) = value.numbers().into_iter().find(|text| !fits(text)) else {
             return Ok(());
         };
         let expected = match is_open {
             true => format!("a number above {least} and at most {most}"),
             false if most == f64::MAX => format!("{least} or more"),
             false => format!("{least} to {most} {unit}"),
-        };
-        let found = match T::IS_WHOLE {
-            true => found.to_string(),
-            false => format!("{found:?}"),
         };
         let expected = expected.trim_end();
         Err(OutOfRange::because(
@@ -131,46 +130,32 @@ impl Range {
 
 /// A value whose numbers have a range.
 pub trait Ranged {
-    /// Whether the numbers are whole ones.
-    const IS_WHOLE: bool;
-    /// The numbers of the value. Without a value, there are none.
-    fn numbers(&self) -> Vec<f64>;
+    /// The numbers of the value, as they are written. Without a value, there are none.
+    fn numbers(&self) -> Vec<String>;
 }
 
 macro_rules! ranged {
-    ($($kind:ty, $number:expr, $is_whole:literal;)*) => {
+    ($($kind:ty)*) => {
         $(impl Ranged for $kind {
-            const IS_WHOLE: bool = $is_whole;
-
-            fn numbers(&self) -> Vec<f64> {
-                vec![$number(*self)]
+            fn numbers(&self) -> Vec<String> {
+                vec![format!("{self:?}")]
             }
         })*
     };
 }
 
-ranged! {
-    f64, f64::from, false;
-    f32, as_written, false;
-    u8, f64::from, true;
-    u16, f64::from, true;
-    u32, f64::from, true;
-    u64, |number| number as f64, true;
-    usize, |number| number as f64, true;
-}
+ranged!(f64 f32 u8 u16 u32 u64 usize);
 
 impl Ranged for Pitch {
-    const IS_WHOLE: bool = false;
-
-    fn numbers(&self) -> Vec<f64> {
-        vec![self.rows_mm, self.cols_mm]
+    fn numbers(&self) -> Vec<String> {
+        [self.rows_mm, self.cols_mm]
+            .map(|mm| format!("{mm:?}"))
+            .into()
     }
 }
 
 impl<T: Ranged> Ranged for Option<T> {
-    const IS_WHOLE: bool = T::IS_WHOLE;
-
-    fn numbers(&self) -> Vec<f64> {
+    fn numbers(&self) -> Vec<String> {
         self.as_ref().map_or_else(Vec::new, T::numbers)
     }
 }

@@ -79,7 +79,7 @@ impl Kind {
 
 impl Columns {
     pub(crate) fn new(frames: &Frames) -> Self {
-        let period = frames.period();
+        let period = frames.period;
         let mut counts = vec![[0_u32; 256]; period];
         for frame in frames.iter() {
             for (count, &byte) in counts.iter_mut().zip(frame) {

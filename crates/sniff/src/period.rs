@@ -85,7 +85,7 @@ fn recurrences(bytes: &[u8], length: usize) -> Vec<(usize, usize, usize)> {
 #[derive(Debug, Clone)]
 pub(crate) struct Frames<'a> {
     bytes: &'a [u8],
-    period: usize,
+    pub(crate) period: usize,
     /// Where the frames begin, in order.
     starts: Vec<usize>,
 }
@@ -165,10 +165,6 @@ impl<'a> Frames<'a> {
 
     pub(crate) fn len(&self) -> usize {
         self.starts.len()
-    }
-
-    pub(crate) fn period(&self) -> usize {
-        self.period
     }
 
     /// The bytes of a frame.

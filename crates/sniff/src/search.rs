@@ -116,7 +116,7 @@ pub(crate) fn in_frames(
     capture: &Capture,
     known: Known,
 ) -> Result<Found, Failure> {
-    let period = frames.period();
+    let period = frames.period;
     // At a wrong distance, hardly a frame begins where the one before it ended.
     if frames.len() < LEAST_FRAMES || 2 * frames.pairs().count() < frames.len() {
         return Err(Failure::NotPeriodic(capture.bytes.len()));
@@ -300,7 +300,7 @@ impl Search<'_> {
             return place;
         }
         let indices: Vec<usize> = (0..self.frames.len()).collect();
-        let (period, length) = (self.frames.period(), place.beside.len());
+        let (period, length) = (self.frames.period, place.beside.len());
         let first = (place.start + period - length) % period;
         let span = |&index: &usize| self.frames.from(index, first, period + length);
         let spans: Vec<&[u8]> = some(&indices, CHECKED).iter().map(span).collect();
@@ -384,7 +384,7 @@ impl Search<'_> {
                 own_doubt,
             });
         }
-        Found::among(ranked, known.is_complete()).ok_or(Failure::NoArray(self.frames.period()))
+        Found::among(ranked, known.is_complete()).ok_or(Failure::NoArray(self.frames.period))
     }
 }
 
@@ -482,7 +482,7 @@ fn added(mut a: Vec<f64>, b: &[f64]) -> Vec<f64> {
 
 /// The packets of a frame, if their number shows: what presses is in the same packet of each frame.
 fn packets(frames: &Frames, columns: &Columns) -> Option<Failure> {
-    let bytes = frames.period();
+    let bytes = frames.period;
     (0..bytes).find_map(|at| {
         let values = || frames.iter().map(|frame| frame[at]);
         let (first, last) = (values().min()?, values().max()?);

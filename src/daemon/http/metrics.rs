@@ -158,7 +158,7 @@ fn presses(registry: &mut Registry, now: &Snapshot) {
     ] {
         let series = now.sensors.iter().flat_map(|one| {
             let zeros = first_series(now).into_iter().map(|series| (series, 0));
-            let counted = one.counts.0.clone().into_iter();
+            let counted = one.counts.clone().into_iter();
             let all = zeros.chain(counted);
             let named = all.filter(|((metric, _), _)| *metric == name);
             named.map(|((_, labels), count)| (of(one, labels), count))

@@ -85,27 +85,24 @@ pub(super) struct Entry {
 pub(crate) type Series = (&'static str, Vec<(&'static str, String)>);
 
 /// Counts of one sensor.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Counts(pub(crate) BTreeMap<Series, u64>);
+pub(crate) type Counts = BTreeMap<Series, u64>;
 
-impl Counts {
-    /// Counts an event of this sensor.
-    fn count(&mut self, event: &Event) {
-        let series = match event {
-            Event::Status(_) | Event::Frame(_) => return,
-            Event::Press(press) => ("presses", vec![("state", name(&press.state))]),
-            Event::Hardness(verdict) => {
-                let phase = ("phase", name(&verdict.phase));
-                match (&verdict.rejected, verdict.level) {
-                    (Some(reason), _) => {
-                        ("verdicts_rejected", vec![phase, ("reason", name(reason))])
-                    }
-                    (None, Some(level)) => ("verdicts", vec![phase, ("level", level.to_string())]),
-                    (None, None) => return,
+/// The series that an event counts in.
+fn series_of(event: &Event) -> Option<Series> {
+    match event {
+        Event::Status(_) | Event::Frame(_) => None,
+        Event::Press(press) => Some(("presses", vec![("state", name(&press.state))])),
+        Event::Hardness(verdict) => {
+            let phase = ("phase", name(&verdict.phase));
+            match (&verdict.rejected, verdict.level) {
+                (Some(reason), _) => {
+                    Some(("verdicts_rejected", vec![phase, ("reason", name(reason))]))
+                }
+                (None, level) => {
+                    level.map(|level| ("verdicts", vec![phase, ("level", level.to_string())]))
                 }
             }
-        };
-        *self.0.entry(series).or_default() += 1;
+        }
     }
 }
 
@@ -188,7 +185,7 @@ pub(crate) struct Log {
     joined: u64,
     gaps: u64,
     dropped: u64,
-    is_closed: bool,
+    pub(super) is_closed: bool,
 }
 
 impl Log {
@@ -233,7 +230,9 @@ impl Log {
         }
         let sensor: Arc<str> = event.sensor().into();
         let of_sensor = self.sensors.entry(Arc::clone(&sensor)).or_default();
-        of_sensor.counts.count(&event);
+        if let Some(series) = series_of(&event) {
+            *of_sensor.counts.entry(series).or_default() += 1;
+        }
         log::event(&event);
         let is_final = matches!(&event, Event::Hardness(verdict) if verdict.phase == Phase::Final);
         let line = Line::of_event(event);
@@ -334,10 +333,6 @@ impl Log {
         for subscriber in self.subscribers.values() {
             subscriber.changed.notify_one();
         }
-    }
-
-    pub(super) fn is_closed(&self) -> bool {
-        self.is_closed
     }
 
     /// The number of sensors that are live, and of all.

@@ -14,6 +14,8 @@ use std::time::{Duration, Instant};
 
 use tracing_subscriber::fmt::MakeWriter;
 
+use crate::thread::{NoThread, start};
+
 /// The most lines that wait, about 150 kB.
 const WAITING: usize = 1024;
 
@@ -38,13 +40,11 @@ impl Lines {
     /// # Errors
     ///
     /// Fails if the system cannot make the thread.
-    pub(super) fn start() -> io::Result<Self> {
+    pub(super) fn start() -> Result<Self, NoThread> {
         let (thread, lines) = sync_channel(WAITING);
         let counts = Arc::new(Counts::default());
         let of_thread = Arc::clone(&counts);
-        std::thread::Builder::new()
-            .name("log".to_owned())
-            .spawn(move || write(&lines, &of_thread))?;
+        start("log", move || write(&lines, &of_thread))?;
         Ok(Self { thread, counts })
     }
 

@@ -88,7 +88,8 @@ pub struct Resampling {
     /// For each row of the array, the model's rows that it covers, and the share on each; likewise the columns.
     rows: Vec<Vec<(usize, f32)>>,
     cols: Vec<Vec<(usize, f32)>>,
-    is_resampled: bool,
+    /// Whether taxels of another pitch are shared out.
+    pub is_resampled: bool,
 }
 
 impl Resampling {
@@ -107,11 +108,6 @@ impl Resampling {
             cols: shares(cols, width, COLS, col),
             is_resampled: (height, width) != (1.0, 1.0),
         }
-    }
-
-    /// Whether taxels of another pitch are shared out.
-    pub fn is_resampled(&self) -> bool {
-        self.is_resampled
     }
 
     /// The frame on the model's grid.
@@ -184,7 +180,7 @@ mod tests {
         let mut frame = touched(Array::JX255N, 3, 20, 6);
         frame.newtons[783] = 1e-7;
         let resampling = Resampling::new(&frame, Pitch::JX255N, 3.5);
-        assert!(!resampling.is_resampled());
+        assert!(!resampling.is_resampled);
         assert_eq!(resampling.apply(&frame).newtons[..], frame.newtons[..]);
     }
 
