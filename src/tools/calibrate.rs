@@ -22,13 +22,13 @@ use self::gather::Press;
 use super::configuration::Configuration;
 use super::exit::{Fail, Failure};
 use super::live;
-use super::simulate::within;
 use crate::daemon::config::Setup;
 use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
+use hardnessd_core::wording::within;
 
 /// What `--help` says below the options.
 const MORE: &str = "\

@@ -74,7 +74,8 @@ const LONGEST_LINE_BYTES: usize = 1 << 20;
 
 /// A connection to a daemon. Its calls block, so it has a thread of its own.
 pub(super) struct Connection {
-    address: Address,
+    /// The daemon's address.
+    pub(super) address: Address,
     input: BufReader<File>,
     /// What has come of the next line.
     begun: Vec<u8>,
@@ -82,7 +83,7 @@ pub(super) struct Connection {
 
 impl Source {
     /// Connects to the daemon that the command line names, or else to the first daemon found.
-    /// [`Connection::address`] gives its address.
+    /// [`Connection`] has its address.
     ///
     /// # Errors
     ///
@@ -161,11 +162,6 @@ impl Connection {
             input: BufReader::new(stream.into()),
             begun: Vec::new(),
         })
-    }
-
-    /// The daemon's address.
-    pub(super) fn address(&self) -> &Address {
-        &self.address
     }
 
     /// The first line of a daemon, its `hello`. A web server answers only if something was sent before.

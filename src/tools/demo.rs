@@ -30,7 +30,6 @@ use super::exit::{Fail, Failure};
 use super::faults::Faults;
 use super::player::{self, Player};
 use super::robot;
-use super::simulate::within;
 use crate::daemon::Daemon;
 use crate::daemon::config::{Config, Http, Setup};
 use crate::daemon::port::BITS_A_BYTE;
@@ -40,6 +39,7 @@ use hardnessd_core::motion;
 use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
 use hardnessd_core::wire::Layout;
+use hardnessd_core::wording::within;
 use hardnessd_simulator::{ARM_N_PER_MM, SequenceSettings};
 
 /// What `--help` says below the options.

@@ -17,7 +17,6 @@ use tokio::sync::watch;
 use super::configuration::Configuration;
 use super::doctor;
 use super::exit::{Fail as _, Failure};
-use super::simulate::positive;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::{Progress, WithoutSensor};
@@ -28,7 +27,7 @@ use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, misspelt};
 use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
-use hardnessd_core::wording::escaped;
+use hardnessd_core::wording::{escaped, positive};
 
 /// What `--help` says below the options.
 const MORE: &str = "\

@@ -17,11 +17,11 @@ use super::configuration::ModelFile;
 use super::exit::Failure;
 use super::played::Played;
 use super::readable::printed;
-use super::simulate::positive;
 use crate::daemon::config::{Config, Setup};
 use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::sensor;
 use hardnessd_core::stderr_line;
+use hardnessd_core::wording::positive;
 
 /// Arguments of `replay`.
 #[derive(Debug, Clone, ClapArgs)]

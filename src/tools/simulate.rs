@@ -20,7 +20,7 @@ use hardnessd_core::part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::verdict::Piece;
 use hardnessd_core::wire::{Layout, Preset, Settings as Frame};
-use hardnessd_core::wording::named;
+use hardnessd_core::wording::{named, positive, within};
 use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 
 /// Arguments of `simulate`.
@@ -201,23 +201,6 @@ fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
             Err(Failure::new(USAGE, problem))
         }
     }
-}
-
-/// Parses a number in this range.
-pub(super) fn within(
-    least: f64,
-    most: f64,
-) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
-    move |text| {
-        let number = text.parse::<f64>().ok();
-        let number = number.filter(|number| (least..=most).contains(number));
-        number.ok_or_else(|| format!("expected a number from {least} to {most}"))
-    }
-}
-
-/// Parses a number above 0 that is so near to 1 that a clock can count seconds made of it.
-pub(super) fn positive(text: &str) -> Result<f64, String> {
-    within(1e-6, 1e9)(text)
 }
 
 #[cfg(test)]

@@ -18,7 +18,6 @@ use clap::{ArgGroup, Args as ClapArgs};
 use hardnessd_sniff::{Capture, Found, Known, Proposal, Ranked, Scale, sniff};
 
 use super::exit::{Fail, Failure};
-use super::simulate::positive;
 use super::{absolute, cannot_read, doctor};
 use crate::daemon::serial;
 use crate::thread::spawn_thread;
@@ -32,7 +31,7 @@ use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::stderr_line;
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
 use hardnessd_core::wire::Cell;
-use hardnessd_core::wording::{escaped, name, named};
+use hardnessd_core::wording::{escaped, name, named, positive};
 
 /// What `--help` says below the options.
 const MORE: &str = "\
@@ -62,13 +61,13 @@ pub struct Args {
         value_parser = positive)]
     seconds: f64,
     /// Rows of the array, if you know them
-    #[arg(long, value_name = "R", value_parser = side)]
-    rows: Option<usize>,
+    #[arg(long, value_name = "R", value_parser = clap::value_parser!(u8).range(1..=MOST_SIDE as i64))]
+    rows: Option<u8>,
     /// Columns of the array, if you know them
-    #[arg(long, value_name = "C", value_parser = side)]
-    cols: Option<usize>,
+    #[arg(long, value_name = "C", value_parser = clap::value_parser!(u8).range(1..=MOST_SIDE as i64))]
+    cols: Option<u8>,
     /// Type of a cell, if you know it, as in `[sensor.frame]`
-    #[arg(long, value_name = "T", value_parser = cell)]
+    #[arg(long, value_name = "T", value_parser = named::<Cell>)]
     cell: Option<Cell>,
     /// Write a whole configuration to this new file, instead of a [sensor.frame] on stdout
     #[arg(long, value_name = "TOML")]
@@ -122,8 +121,8 @@ impl Args {
 fn propose(args: &Args, captured: &Capture) -> Result<(), Failure> {
     let path = &args.source();
     let known = Known {
-        rows: args.rows,
-        cols: args.cols,
+        rows: args.rows.map(usize::from),
+        cols: args.cols.map(usize::from),
         cell: args.cell,
     };
     let found = sniff(captured, known);
@@ -369,18 +368,6 @@ fn array_in_words(ranked: &Ranked) -> String {
         Some(cell) => format!("{} {}", ranked.array, name(&cell)),
         None => format!("{} decimals", ranked.array),
     }
-}
-
-fn cell(text: &str) -> Result<Cell, String> {
-    named(text).map_err(|_| "expected a name such as u8, i16le or f32be".to_owned())
-}
-
-fn side(text: &str) -> Result<usize, String> {
-    let found = text
-        .parse()
-        .ok()
-        .filter(|side| (1..=MOST_SIDE).contains(side));
-    found.ok_or_else(|| format!("expected 1 to {MOST_SIDE}"))
 }
 
 #[cfg(test)]

@@ -15,13 +15,12 @@ use super::answer;
 use super::connect::Source;
 use super::exit::Failure;
 use super::readable::printed;
-use super::simulate::positive;
 use crate::maybe;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::Kind;
 use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
-use hardnessd_core::wording;
+use hardnessd_core::wording::{escaped, named, positive};
 
 /// What `--help` says below the options.
 const MORE: &str = "\
@@ -49,14 +48,10 @@ pub struct Args {
         long,
         value_name = "T,...",
         value_delimiter = ',',
-        value_parser = kind,
+        value_parser = named::<Kind>,
         default_value = "hardness,press,status"
     )]
     types: Vec<Kind>,
-}
-
-fn kind(name: &str) -> Result<Kind, &'static str> {
-    wording::named(name).map_err(|_| "expected hardness, press, status or frame")
 }
 
 /// Prints until the count is reached, `shutdown` comes or nobody reads stdout.
@@ -91,7 +86,7 @@ fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
     if args.source.given().is_none() {
         stderr_line!(
             "hardnessd: events of {}",
-            wording::escaped(&daemon.address().to_string())
+            escaped(&daemon.address.to_string())
         );
     }
     let mut found = 0;
@@ -100,7 +95,7 @@ fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
         let event: Value = serde_json::from_str(&line).unwrap_or_default();
         let kind = event["type"].as_str().unwrap_or_default();
         // Events that were queued before the subscription took effect are left out.
-        let counts = wording::named::<Kind>(kind).is_ok_and(|kind| args.types.contains(&kind));
+        let counts = named::<Kind>(kind).is_ok_and(|kind| args.types.contains(&kind));
         if !counts && kind != "gap" {
             continue;
         }

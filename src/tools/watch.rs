@@ -110,7 +110,7 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
     if source.given().is_none()
         && let Ok(connection) = source.connect()
     {
-        let address = connection.address().to_string();
+        let address = connection.address.to_string();
         stderr_line!("hardnessd: watching {}", escaped(&address));
     }
     let mut view = View::new();
@@ -190,7 +190,7 @@ fn read(mut daemon: Connection, news: &SyncSender<Input>) -> Result<Infallible, 
     let types = ["hardness", "press", "status", "frame"];
     let since = format!("{}:0", hello["run"].as_str().unwrap_or_default());
     let request = json!({"subscribe": types, "since": since});
-    send(news, Input::Hello(daemon.address().clone(), hello));
+    send(news, Input::Hello(daemon.address.clone(), hello));
     daemon.send(&request.to_string())?;
     let mut asked = Instant::now();
     loop {

@@ -132,5 +132,5 @@ fn the_user_chooses_between_two_pictures() {
     assert!(toml.ends_with("rows = 12\ncols = 8\n"), "{toml}");
     // A file that exists is not overwritten.
     assert_eq!(bench.run(&format!("{known} --out open.bin")).0, 74);
-    bench.fails("sniff open.bin --rows 65", 2, &["expected 1 to 64"]);
+    bench.fails("sniff open.bin --rows 65", 2, &["65 is not in 1..=64"]);
 }

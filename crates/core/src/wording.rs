@@ -46,6 +46,20 @@ pub fn named<T: DeserializeOwned>(name: &str) -> Result<T, value::Error> {
     T::deserialize(name.into_deserializer())
 }
 
+/// The parser of a number in this range, as commands have it.
+pub fn within(least: f64, most: f64) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
+    move |text| {
+        let number = text.parse::<f64>().ok();
+        let number = number.filter(|number| (least..=most).contains(number));
+        number.ok_or_else(|| format!("expected a number from {least} to {most}"))
+    }
+}
+
+/// Parses a number above 0 that is so near to 1 that a clock can count seconds made of it.
+pub fn positive(text: &str) -> Result<f64, String> {
+    within(1e-6, 1e9)(text)
+}
+
 /// The text of an error on one line, with every cause that the text does not contain already.
 pub fn line(error: &(dyn Error + 'static)) -> String {
     let mut line = error.to_string();
@@ -63,15 +77,12 @@ pub fn line(error: &(dyn Error + 'static)) -> String {
 /// Removes the numbers of the system's errors, such as ` (os error 2)`: the system's words are
 /// there already.
 fn without_numbers(text: &str) -> String {
-    let mut parts = text.split(" (os error ");
-    let mut kept = parts.next().unwrap_or_default().to_owned();
-    for part in parts {
-        match part.split_once(')') {
-            Some((number, rest)) if number.bytes().all(|digit| digit.is_ascii_digit()) => {
-                kept += rest;
-            }
-            _ => kept = kept + " (os error " + part,
-        }
+    let mut kept = text.to_owned();
+    while let Some((before, after)) = kept.split_once(" (os error ")
+        && let Some((number, rest)) = after.split_once(')')
+        && number.bytes().all(|digit| digit.is_ascii_digit())
+    {
+        kept = format!("{before}{rest}");
     }
     kept
 }

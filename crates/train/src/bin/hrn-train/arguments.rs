@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
-use hardnessd_core::wording::named;
+use hardnessd_core::wording::{named, within};
 use hardnessd_simulator::{
     DatasetSettings, Materials, SensorDesigns, SensorProfile, Shapes, Split,
 };
@@ -70,7 +70,7 @@ pub(super) enum Command {
         /// The model file
         model: PathBuf,
         /// Frames/s of the fastest sensor that it shall judge for
-        #[arg(long, value_name = "FPS", default_value_t = 5.0, value_parser = frame_rate)]
+        #[arg(long, value_name = "FPS", default_value_t = 5.0, value_parser = within(0.01, 10_000.0))]
         fps: f64,
     },
     /// Check a model file as the daemon does and print its card
@@ -200,13 +200,6 @@ pub(super) struct Evaluate {
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
-}
-
-fn frame_rate(text: &str) -> Result<f64, String> {
-    let found = text.parse().ok();
-    found
-        .filter(|hz| (0.01..=10_000.0).contains(hz))
-        .ok_or_else(|| "expected frames/s, 0.01 to 10000".to_owned())
 }
 
 #[cfg(test)]
