@@ -970,9 +970,11 @@ def _with_shore(event: Hardness, hello: Optional[Message]) -> str:
         return answer(event, hello)
     value, low, high = shore["value"], shore["low"], shore["high"]
     below, above = value - low, high - value
-    # Outside the middle half of the interval, one number for both sides would hide that one side is short.
-    if min(below, above) >= (high - low) / 4:
-        return f"{value:.0f} +- {max(below, above):.0f} OO, {answer(event, hello)}"
+    most = max(below, above)
+    # Outside the middle half of the interval, one number for both sides would hide that one side is short. The scale
+    # ends at 0 and 100.
+    if most <= min(value, 100 - value) and min(below, above) >= (high - low) / 4:
+        return f"{value:.0f} +- {most:.0f} OO, {answer(event, hello)}"
     return f"{value:.0f} OO ({low:.0f} to {high:.0f}), {answer(event, hello)}"
 
 

@@ -30,15 +30,18 @@ pub(super) fn answer(verdict: &Value, labels: &[String]) -> (String, bool) {
 }
 
 /// What a verdict says, with its Shore hardness first: `63 +- 6 OO, firm`, where the interval of 90 % lies within
-/// these limits, or `92 OO (24 to 99), firm`, where the estimate is outside the middle half of its interval.
+/// these limits, or `92 OO (24 to 99), firm`, where the estimate is outside the middle half of its interval, or a limit
+/// would be beyond the scale of 0 to 100.
 pub(super) fn with_shore(answer: &str, verdict: &Value) -> String {
     let shore = |key| verdict["shore"][key].as_f64();
     let (Some(value), Some(low), Some(high)) = (shore("value"), shore("low"), shore("high")) else {
         return answer.to_owned();
     };
     let (below, above) = (value - low, high - value);
-    match below.min(above) >= (high - low) / 4.0 {
-        true => format!("{value:.0} +- {:.0} OO, {answer}", below.max(above)),
+    let most = below.max(above);
+    let is_on_scale = most <= value.min(100.0 - value);
+    match is_on_scale && below.min(above) >= (high - low) / 4.0 {
+        true => format!("{value:.0} +- {most:.0} OO, {answer}"),
         false => format!("{value:.0} OO ({low:.0} to {high:.0}), {answer}"),
     }
 }
