@@ -127,10 +127,8 @@ fn nominal_force_n(lowest_n: f32, step: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::level::level_of;
     use super::super::material::{Material, Split};
     use super::super::object::Shapes;
-    use super::super::settings::Materials;
     use super::*;
 
     fn small(shapes: Shapes) -> DatasetSettings {
@@ -212,29 +210,6 @@ mod tests {
         let objects: std::collections::BTreeSet<u32> =
             samples.iter().map(|s| s.labels.object).collect();
         assert_eq!(objects.len(), 12);
-    }
-
-    #[test]
-    fn broad_objects_are_labelled_by_their_shore() {
-        let settings = DatasetSettings {
-            materials: Materials::Broad,
-            ..small(Shapes::Wide)
-        };
-        let samples = dataset(&settings, 3, |_, _| ());
-        assert_eq!(samples.len(), 4 * (1 + 2) * 9);
-        for sample in &samples {
-            assert_eq!(
-                sample.labels.level,
-                level_of(f64::from(sample.labels.shore))
-            );
-            assert!((8..12).contains(&sample.labels.material));
-            assert!(begins_press(&sample.frame), "{sample:?}");
-            // Training objects are 0 to 3.
-            assert_eq!(
-                sample.labels.split == Split::Train,
-                sample.labels.object < 4
-            );
-        }
     }
 
     #[test]
