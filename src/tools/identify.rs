@@ -340,12 +340,7 @@ mod tests {
 
     #[test]
     fn a_text_names_a_piece() {
-        let level = |level, label: &str, shore: &str| Level {
-            level,
-            label: label.to_owned(),
-            shore: shore.to_owned(),
-        };
-        let levels = [level(1, "hard", ">70"), level(2, "soft", "0-70")];
+        let levels = [Level::new(1, "hard", ">70"), Level::new(2, "soft", "0-70")];
         for (text, expected) in [
             ("flat:20", Piece::Flat { width_mm: 20.0 }),
             ("ball: 7.5", Piece::Ball { radius_mm: 7.5 }),

@@ -2,6 +2,5 @@
 
 #[cfg(test)]
 pub(crate) mod course_model;
-#[cfg(test)]
-pub(crate) mod graph;
+pub mod graph;
 pub mod support;

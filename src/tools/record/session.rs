@@ -333,19 +333,17 @@ mod tests {
 
     #[test]
     fn a_reading_and_a_name_have_the_level_that_a_verdict_has() {
-        let level = |level, label: &str, shore: &str| Level {
-            level,
-            label: label.to_owned(),
-            shore: shore.to_owned(),
-        };
         let four = [
-            level(1, "hard", ">70"),
-            level(2, "firm", "61-70"),
-            level(3, "soft", "51-60"),
-            level(4, "very-soft", "<=50"),
+            Level::new(1, "hard", ">70"),
+            Level::new(2, "firm", "61-70"),
+            Level::new(3, "soft", "51-60"),
+            Level::new(4, "very-soft", "<=50"),
         ];
         // A reading beyond the stated ranges belongs to the level at that end.
-        let inside = [level(1, "hard", "70-90"), level(2, "soft", "40-60")];
+        let inside = [
+            Level::new(1, "hard", "70-90"),
+            Level::new(2, "soft", "40-60"),
+        ];
         for (levels, answer, expected) in [
             (&four[..], "70.5", Some((true, 1))),
             (&four, "70", Some((true, 2))),

@@ -6,7 +6,7 @@ use super::*;
 use crate::event::{Event, Press, PressState};
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
-use crate::tests::support::{at, hrn, labels, sensor};
+use crate::tests::support::{about, at, hrn, labels, sensor};
 use crate::wire;
 
 mod rewritten;
@@ -65,24 +65,13 @@ fn story() -> Vec<(Stamp, Input)> {
     story
 }
 
-/// What begins a recording of the sensor.
-fn about(hrn: &Model) -> About {
-    About {
-        robot: "arm-7".to_owned(),
-        run: "r".to_owned(),
-        boot_id: "b".to_owned(),
-        reason: None,
-        labels: labels(),
-        sensors: vec![RecordedSensor::new(&sensor(), hrn)],
-    }
-}
-
 /// A recording of the story, and its events during recording. It has a state every `states` inputs, or
 /// at the next rest, and a chunk ends after every `chunk` inputs. Between the presses, the
 /// configuration is read again.
 fn recorded(states: usize, chunk: usize) -> (Vec<u8>, Vec<Event>) {
     let hrn = hrn();
-    let mut writer = Writer::new(Vec::new(), &about(&hrn)).unwrap();
+    let about = about(&labels(), RecordedSensor::new(&sensor(), &hrn));
+    let mut writer = Writer::new(Vec::new(), &about).unwrap();
     let mut pipeline = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
     let (mut events, mut is_due) = (Vec::new(), false);
     for (index, (at, input)) in story().into_iter().enumerate() {

@@ -5,7 +5,7 @@ use tract_onnx::pb::attribute_proto::AttributeType;
 use tract_onnx::pb::tensor_proto::DataType;
 
 /// A node of this operator. It has the name of its first output.
-pub(crate) fn node(
+pub fn node(
     op: &str,
     inputs: &[&str],
     outputs: &[&str],
@@ -23,7 +23,7 @@ pub(crate) fn node(
 }
 
 /// An attribute with one integer.
-pub(crate) fn int(name: &str, value: i64) -> pb::AttributeProto {
+pub fn int(name: &str, value: i64) -> pb::AttributeProto {
     pb::AttributeProto {
         name: name.to_owned(),
         r#type: AttributeType::Int as i32,
@@ -33,7 +33,7 @@ pub(crate) fn int(name: &str, value: i64) -> pb::AttributeProto {
 }
 
 /// An attribute with a list of integers.
-pub(crate) fn ints(name: &str, values: &[i64]) -> pb::AttributeProto {
+pub fn ints(name: &str, values: &[i64]) -> pb::AttributeProto {
     pb::AttributeProto {
         name: name.to_owned(),
         r#type: AttributeType::Ints as i32,
@@ -43,7 +43,7 @@ pub(crate) fn ints(name: &str, values: &[i64]) -> pb::AttributeProto {
 }
 
 /// An f32 input or output of this shape.
-pub(crate) fn value(name: &str, shape: &[usize]) -> pb::ValueInfoProto {
+pub fn value(name: &str, shape: &[usize]) -> pb::ValueInfoProto {
     use pb::tensor_shape_proto::{Dimension, dimension};
     let dim = shape.iter().map(|&length| Dimension {
         value: Some(dimension::Value::DimValue(length as i64)),
@@ -65,7 +65,7 @@ pub(crate) fn value(name: &str, shape: &[usize]) -> pb::ValueInfoProto {
 }
 
 /// A constant list of integers.
-pub(crate) fn indices(name: &str, values: &[i64]) -> pb::TensorProto {
+pub fn indices(name: &str, values: &[i64]) -> pb::TensorProto {
     pb::TensorProto {
         name: name.to_owned(),
         dims: vec![values.len() as i64],
@@ -76,7 +76,7 @@ pub(crate) fn indices(name: &str, values: &[i64]) -> pb::TensorProto {
 }
 
 /// A constant number.
-pub(crate) fn number(name: &str, value: f32) -> pb::TensorProto {
+pub fn number(name: &str, value: f32) -> pb::TensorProto {
     pb::TensorProto {
         name: name.to_owned(),
         dims: vec![1],

@@ -75,14 +75,7 @@ pub fn of_a_labelled_press(
     described.sensor.name = "forearm".to_owned();
     change(&mut described);
     let (sensor, hrn) = (Sensor::new(described).unwrap(), hrn());
-    let about = About {
-        robot: "arm-7".to_owned(),
-        run: "r".to_owned(),
-        boot_id: "b".to_owned(),
-        reason: None,
-        labels: labels.clone(),
-        sensors: vec![RecordedSensor::new(&sensor, &hrn)],
-    };
+    let about = about(labels, RecordedSensor::new(&sensor, &hrn));
     let mut writer = Writer::new(Vec::new(), &about).unwrap();
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
     let bytes = |counts: u16| {
@@ -119,6 +112,18 @@ pub fn of_a_labelled_press(
         writer.entry(0, came, &Entry::Input(input)).unwrap();
     }
     (writer.finish().unwrap(), sensor)
+}
+
+/// What begins a recording of a sensor.
+pub fn about(labels: &Labels, sensor: RecordedSensor) -> About {
+    About {
+        robot: "arm-7".to_owned(),
+        run: "r".to_owned(),
+        boot_id: "b".to_owned(),
+        reason: None,
+        labels: labels.clone(),
+        sensors: vec![sensor],
+    }
 }
 
 /// Labels of a recording.

@@ -176,15 +176,6 @@ mod tests {
     }
 
     #[test]
-    fn the_models_own_array_is_laid_as_it_is() {
-        let mut frame = touched(Array::JX255N, 3, 20, 6);
-        frame.newtons[783] = 1e-7;
-        let resampling = Resampling::new(&frame, Pitch::JX255N, 3.5);
-        assert!(!resampling.is_resampled);
-        assert_eq!(resampling.apply(&frame).newtons[..], frame.newtons[..]);
-    }
-
-    #[test]
     fn a_small_array_lies_in_the_middle_and_a_large_one_around_the_contact() {
         let small = touched(Array { rows: 10, cols: 13 }, 0, 0, 1);
         let resampled = Resampling::new(&small, Pitch::JX255N, 3.5).apply(&small);

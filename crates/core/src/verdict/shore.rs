@@ -28,6 +28,17 @@ pub struct Level {
     pub shore: String,
 }
 
+impl Level {
+    /// A level with its number, its name and the range that it covers.
+    pub fn new(level: u8, label: impl Into<String>, shore: impl Into<String>) -> Self {
+        Self {
+            level,
+            label: label.into(),
+            shore: shore.into(),
+        }
+    }
+}
+
 /// A `[[level]]` table of a configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,10 +64,9 @@ impl LevelTable {
                 "found {found} tables, expected {expected}"
             )));
         }
-        let level = |(level, table): (u8, &Self)| Level {
-            level,
-            label: table.label.clone(),
-            shore: format!("{}-{}", table.shore[0], table.shore[1]),
+        let level = |(level, table): (u8, &Self)| {
+            let shore = format!("{}-{}", table.shore[0], table.shore[1]);
+            Level::new(level, &table.label, shore)
         };
         let levels: Vec<Level> = (1..=u8::MAX).zip(tables).map(level).collect();
         if !are_levels(&levels) {
@@ -279,11 +289,7 @@ mod tests {
     use crate::verdict::TAIL;
 
     fn levels(ranges: &[&str]) -> Vec<Level> {
-        let level = |(level, shore): (u8, &&str)| Level {
-            level,
-            label: format!("l{level}"),
-            shore: (*shore).to_owned(),
-        };
+        let level = |(level, shore): (u8, &&str)| Level::new(level, format!("l{level}"), *shore);
         (1..).zip(ranges).map(level).collect()
     }
 

@@ -81,31 +81,3 @@ impl Settings {
         })
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::wire::{Checksum, LengthField};
-
-    #[test]
-    fn a_layout_of_ones_own_inherits_nothing() {
-        let in_force = |table: &str| {
-            let settings: Settings = toml::from_str(table).unwrap();
-            settings.in_force().unwrap()
-        };
-        let own = in_force("sync = 'AA 55'\nrows = 4");
-        assert_eq!(own.preset, Some(Preset::None));
-        assert_eq!(own.length, Some(LengthField::None));
-        assert_eq!(own.checksum, Some(Checksum::None));
-        assert_eq!(own, in_force("preset = 'none'\nsync = 'AA 55'\nrows = 4"));
-        let jx255n = in_force("rows = 4");
-        assert_eq!(jx255n.preset, Some(Preset::Jx255n));
-        assert_eq!(
-            (jx255n.length, jx255n.rows),
-            (Some(LengthField::U16le), Some(4))
-        );
-        // A preset that is written is kept, whatever the other keys are.
-        let tail = in_force("preset = 'jx255n'\ntail = '0D'");
-        assert_eq!((tail.sync, tail.length), (jx255n.sync, jx255n.length));
-    }
-}

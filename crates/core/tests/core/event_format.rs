@@ -236,11 +236,7 @@ fn replies_are_frozen() {
         model: ModelCard {
             sha256: "00".to_owned(),
             validation: "simulated data only".to_owned(),
-            levels: vec![Level {
-                level: 1,
-                label: "hard".to_owned(),
-                shore: ">70".to_owned(),
-            }],
+            levels: vec![Level::new(1, "hard", ">70")],
             name: "built in".to_owned(),
             needs: "judges single frames, needs no arm".to_owned(),
             without_effect: vec!["sensor.arm of \"forearm\"".to_owned()],

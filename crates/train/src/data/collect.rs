@@ -329,11 +329,7 @@ impl Collection {
         if usize::from(most) <= stated.len() {
             return stated;
         }
-        let level = |level: u8| Level {
-            level,
-            label: level.to_string(),
-            shore: "-".to_owned(),
-        };
+        let level = |level: u8| Level::new(level, level.to_string(), "-");
         (1..=most.min(MOST_LEVELS as u8)).map(level).collect()
     }
 }

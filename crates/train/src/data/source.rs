@@ -17,11 +17,7 @@ pub const COLLECTOR: &str = "hrn-train collect";
 
 /// The four hardness levels, each with the interval of Shore that `shore` picks.
 pub(super) fn levels(shore: fn(&LevelRange) -> &'static str) -> Vec<Level> {
-    let level = |(level, range): (u8, &LevelRange)| Level {
-        level,
-        label: range.label.to_owned(),
-        shore: shore(range).to_owned(),
-    };
+    let level = |(level, range): (u8, &LevelRange)| Level::new(level, range.label, shore(range));
     (1..).zip(&LEVELS).map(level).collect()
 }
 

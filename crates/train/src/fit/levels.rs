@@ -56,11 +56,7 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
     };
     let measured = measured(&named).filter(|_| most == 0);
     let levels = measured.unwrap_or_else(unmeasured);
-    let level = |(level, (label, shore)): (u8, (String, String))| Level {
-        level,
-        label,
-        shore,
-    };
+    let level = |(level, (label, shore)): (u8, (String, String))| Level::new(level, label, shore);
     Ok((1..).zip(levels).map(level).collect())
 }
 

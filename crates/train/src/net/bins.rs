@@ -94,11 +94,7 @@ mod tests {
 
     /// Levels that touch, as in simulated data.
     fn touching() -> Borders {
-        let level = |(level, shore): (u8, &str)| Level {
-            level,
-            label: level.to_string(),
-            shore: shore.to_owned(),
-        };
+        let level = |(level, shore): (u8, &str)| Level::new(level, "any", shore);
         let ranges = [">70", "60-70", "50-60", "<=50"];
         let levels: Vec<Level> = (1..).zip(ranges).map(level).collect();
         Borders::of(&levels).unwrap()

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use hardnessd_core::tests::graph::node;
 use hardnessd_core::verdict::BUILT_IN_HRN;
 use prost::Message as _;
 use tract_onnx::pb;
@@ -49,23 +50,16 @@ fn slow() -> Vec<u8> {
     for node in logits.filter(|node| node.output[0] == "logits") {
         node.output[0] = "fast".to_owned();
     }
-    let node = |op: &str, inputs: &[&str], output: &str| pb::NodeProto {
-        name: format!("slow {output}"),
-        op_type: op.to_owned(),
-        input: inputs.iter().map(|&input| input.to_owned()).collect(),
-        output: vec![output.to_owned()],
-        ..Default::default()
-    };
     let beside = [
-        node("Conv", &["frame", "first"], "wide"),
-        node("Conv", &["wide", "second"], "deep"),
-        node("GlobalAveragePool", &["deep"], "mean"),
-        node("Flatten", &["mean"], "flat"),
-        node("MatMul", &["flat", "nothing"], "zero"),
+        node("Conv", &["frame", "first"], &["wide"], &[]),
+        node("Conv", &["wide", "second"], &["deep"], &[]),
+        node("GlobalAveragePool", &["deep"], &["mean"], &[]),
+        node("Flatten", &["mean"], &["flat"], &[]),
+        node("MatMul", &["flat", "nothing"], &["zero"], &[]),
     ];
     graph.node.splice(0..0, beside);
     let place = graph.node.iter().position(|node| node.output[0] == "fast");
-    let sum = node("Add", &["fast", "zero"], "logits");
+    let sum = node("Add", &["fast", "zero"], &["logits"], &[]);
     graph.node.insert(place.unwrap() + 1, sum);
     model.encode_to_vec()
 }

@@ -7,12 +7,13 @@ use std::path::Path;
 use std::sync::Arc;
 
 use hardnessd_core::event::{Event, Note, Phase};
-use hardnessd_core::frame::{Array, Stamp};
+use hardnessd_core::frame::Array;
 use hardnessd_core::npz::Writer;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Found, Playback};
 use hardnessd_core::references;
 use hardnessd_core::sensor::{self, Description, Sensor};
+use hardnessd_core::tests::support::at;
 use hardnessd_core::verdict::{Format, Model, ModelFrame};
 use hardnessd_simulator::Split;
 use hrn_train::data::presses::{self, Layout, Press, Presses};
@@ -174,10 +175,7 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
             let mut playback = Playback::of_bytes(sensor.clone(), hrn.clone());
             let found = Found {
                 sensor: "wide".to_owned(),
-                at: Stamp {
-                    mono: std::time::Duration::ZERO,
-                    wall: jiff::Timestamp::UNIX_EPOCH,
-                },
+                at: at(0),
                 entry: Entry::Input(Input::Bytes(pressed(side, bar, hardest))),
             };
             let mut events = playback.feed(found).unwrap();

@@ -172,17 +172,12 @@ mod tests {
 
     #[test]
     fn levels_are_written_as_the_configuration_takes_them() {
-        let level = |(level, label, shore): (u8, &str, &str)| Level {
-            level,
-            label: label.to_owned(),
-            shore: shore.to_owned(),
-        };
         let levels = [
-            (1, "green", ">65"),
-            (2, "half \"ripe\"", "40-65"),
-            (3, "ripe", "<=40"),
+            Level::new(1, "green", ">65"),
+            Level::new(2, "half \"ripe\"", "40-65"),
+            Level::new(3, "ripe", "<=40"),
         ];
-        let text = of_levels(&levels.map(level)).unwrap();
+        let text = of_levels(&levels).unwrap();
         let tables: toml::Table = text.parse().unwrap();
         let shore = |place: usize| tables["level"][place]["shore"].as_array().unwrap().clone();
         assert_eq!(shore(0), [65.0, 100.0].map(toml::Value::from));

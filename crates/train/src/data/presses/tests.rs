@@ -107,10 +107,24 @@ fn a_file_gives_back_what_was_written() {
     }
 }
 
+/// A press of two frames on an array of its own.
+fn of_grid(array: Array, pitch_mm: f64, press: Press, frames: [[f32; TAXELS]; 2]) -> Presses {
+    let mut presses = Presses::default();
+    let times_s = [0.0, 1.0].into_iter();
+    let moments = times_s
+        .zip(frames)
+        .map(|(time_s, newtons)| (time_s, None, newtons));
+    presses.push(press, moments);
+    presses.sources.push(Source {
+        grid: Some(Grid { array, pitch_mm }),
+        ..Source::default()
+    });
+    presses
+}
+
 #[test]
 fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
     let array = Array { rows: 64, cols: 32 };
-    let mut presses = Presses::default();
     let parts: Vec<f32> = (0..8 * array.taxels()).map(|n| n as f32 / 7.0).collect();
     let press = Press {
         parts: Some(parts.clone()),
@@ -118,66 +132,42 @@ fn an_array_larger_than_the_frames_has_its_parts_beside_them() {
         force_n: Some(900.0),
         ..Press::default()
     };
-    presses.push(
-        press,
-        [(0.0, None, [0.5; TAXELS]), (0.1, None, [0.5; TAXELS])],
-    );
-    let grid = Grid {
-        array,
-        pitch_mm: 1.5,
-    };
-    presses.sources.push(Source {
-        grid: Some(grid),
-        ..Source::default()
-    });
+    let mut presses = of_grid(array, 1.5, press, [[0.5; TAXELS]; 2]);
+    let read = |presses: &Presses, grid: Value| bytes_of(presses, Layout::OverTime, &grid);
     let meta = json!({"grid": [64, 32], "grid_pitch_mm": 1.5});
-    let read = parse(&bytes_of(&presses, Layout::OverTime, &meta)).unwrap();
-    assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 3.5));
-    assert_eq!(read.parts(0, array), parts);
-    assert_eq!(read.all[0].contact_area_taxels, Some(40));
-    assert_eq!(read.force_n(0), 900.0);
+    let found = parse(&read(&presses, meta.clone())).unwrap();
+    assert_eq!((found.grid(), found.pitch_mm()), (presses.grid(), 3.5));
+    assert_eq!(found.parts(0, array), parts);
+    assert_eq!(found.all[0].contact_area_taxels, Some(40));
+    assert_eq!(found.force_n(0), 900.0);
     // Without the distance the array says nothing.
-    let read = parse(&bytes_of(
-        &presses,
-        Layout::OverTime,
-        &json!({"grid": [64, 32]}),
-    ))
-    .unwrap();
-    assert_eq!(read.grid(), None);
+    let found = parse(&read(&presses, json!({"grid": [64, 32]}))).unwrap();
+    assert_eq!(found.grid(), None);
     // Parts of another array are not written as those of this one.
     presses.all[0].parts = Some(parts[1..].to_vec());
     assert_eq!(presses.grid(), None);
     let expected = "array `parts`: found none, expected f32 [1,8,64,32]";
-    assert_refused(&bytes_of(&presses, Layout::OverTime, &meta), expected);
+    assert_refused(&read(&presses, meta), expected);
 }
 
 #[test]
 fn the_array_and_what_it_reads_unloaded_come_back() {
     let array = Array { rows: 3, cols: 2 };
-    let grid = Grid {
-        array,
-        pitch_mm: 5.0,
-    };
-    let mut presses = Presses::default();
-    let moments = [0.0, 1.0].map(|time_s| {
-        let mut frame = ModelFrame::default();
+    let frames = [1.0, 2.0].map(|first| {
+        let mut newtons = [0.0; TAXELS];
         // The array lies in the middle: its first taxel is at row 12 and column 13.
-        frame.newtons[12 * COLS + 13] = 1.0 + time_s;
-        frame.newtons[14 * COLS + 14] = -0.5;
-        (time_s, None, frame.newtons)
+        newtons[12 * COLS + 13] = first;
+        newtons[14 * COLS + 14] = -0.5;
+        newtons
     });
     let press = Press {
         unloaded: Some(vec![0.0, 0.25, 0.0, 0.0, 0.0, 3.0]),
         ..Press::default()
     };
-    presses.push(press, moments);
-    presses.sources.push(Source {
-        grid: Some(grid),
-        ..Source::default()
-    });
+    let presses = of_grid(array, 5.0, press, frames);
     let meta = json!({"grid": [3, 2], "pitch_mm": 5.0});
     let read = parse(&bytes_of(&presses, Layout::OverTime, &meta)).unwrap();
-    assert_eq!((read.grid(), read.pitch_mm()), (Some(grid), 5.0));
+    assert_eq!((read.grid(), read.pitch_mm()), (presses.grid(), 5.0));
     assert_eq!(read.all[0].unloaded, presses.all[0].unloaded);
     let parts = read.parts(0, array);
     assert_eq!(parts[..6], [1.0, 0.0, 0.0, 0.0, 0.0, -0.5]);
