@@ -153,9 +153,9 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use hardnessd_core::frame::Stamp;
     use hardnessd_core::pipeline::{Clock, Input};
     use hardnessd_core::sensor::{Description, Sensor};
+    use hardnessd_core::tests::support::at;
     use hardnessd_core::verdict::{BUILT_IN, Model};
     use hardnessd_simulator::{Sequence, SequenceSettings};
 
@@ -188,10 +188,6 @@ mod tests {
     fn own_presses_outlive_the_daemon_and_not_another_calibration() {
         let directory = tempfile::tempdir().unwrap();
         let mut first = pipeline(|_| {});
-        let at = Stamp {
-            mono: Duration::ZERO,
-            wall: jiff::Timestamp::UNIX_EPOCH,
-        };
         let frames = Sequence::new(SequenceSettings {
             presses: Some(3),
             ..SequenceSettings::default()
@@ -199,7 +195,7 @@ mod tests {
         for frame in frames {
             let mut bytes = Vec::new();
             first.sensor().layout().encode(&frame.raw, &mut bytes);
-            first.take(Input::Bytes(bytes), at).unwrap();
+            first.take(Input::Bytes(bytes), at(0)).unwrap();
         }
         assert_eq!(first.own_presses().count(), 3);
         let saving = store(directory.path());

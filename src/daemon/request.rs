@@ -205,34 +205,18 @@ mod tests {
 
     #[test]
     fn an_unusable_line_says_what_was_found_and_echoes_its_id() {
-        for (fields, found) in [
-            (
-                r#""subscribe":["touch"]"#,
-                "subscribe: unknown variant `touch`",
-            ),
-            (
-                r#""subscribe":[],"policy":"all""#,
-                "`all`, expected `queue` or `latest`",
-            ),
-            (
-                r#""subscribe":[],"since":"ab:-7""#,
-                "since: found \"ab:-7\", expected \"RUN:SEQ\"",
-            ),
-            (r#""subscribe":[],"sinse":"ab:7""#, "unknown field `sinse`"),
-            (
-                r#""tare":"a","context":{}"#,
-                "expected map with a single key",
-            ),
-            (
-                r#""context":{"tag":"x"}"#,
-                "context: sensor: found null, expected a sensor's name",
-            ),
-            (
-                r#""retare":"a""#,
-                "retare: unknown variant `retare`, expected one of `subscribe`",
-            ),
-            (r#""motion":{"sensor":"a"}"#, "motion: missing field `at`"),
-        ] {
+        // The fields of a line, and what is said of them.
+        let cases = r#"
+            "subscribe":["touch"] | subscribe: unknown variant `touch`
+            "subscribe":[],"policy":"all" | `all`, expected `queue` or `latest`
+            "subscribe":[],"since":"ab:-7" | since: found "ab:-7", expected "RUN:SEQ"
+            "subscribe":[],"sinse":"ab:7" | unknown field `sinse`
+            "tare":"a","context":{} | expected map with a single key
+            "context":{"tag":"x"} | context: sensor: found null, expected a sensor's name
+            "retare":"a" | retare: unknown variant `retare`, expected one of `subscribe`
+            "motion":{"sensor":"a"} | motion: missing field `at`"#;
+        for case in cases.trim().lines() {
+            let (fields, found) = case.trim().split_once(" | ").unwrap();
             let (id, request) = parse(format!(r#"{{{fields},"id":"a"}}"#).as_bytes());
             let message = request.unwrap_err();
             assert!(message.contains(found), "{message}");

@@ -281,36 +281,21 @@ mod tests {
 
     #[test]
     fn a_script_that_cannot_be_played_says_why() {
-        for (fault, expected) in [
-            ("at_s = 1.0\nkind = \"melt\"", "unknown variant `melt`"),
-            (
-                "at_s = 1.0\nkind = \"flip\"\nbit = 3",
-                "unknown field `bit`",
-            ),
-            (
-                "at_s = 1.0\nkind = \"unplug\"\nbits = 3",
-                "unknown field `bits`",
-            ),
-            (
-                "at_s = -1.0\nkind = \"flip\"",
-                "line 2: found at_s = -1.0 and for_s = inf, expected at_s from 0 on",
-            ),
-            ("kind = \"flip\"", "missing field `at_s`"),
-            (
-                "at_s = \"soon\"\nkind = \"flip\"",
-                "invalid type: string \"soon\"",
-            ),
-            (
-                "at_s = 1.0\nkind = \"flip\"\nbits = 65536",
-                "expected a whole number from 0 to 65535",
-            ),
-            (
-                "at_s = 1.0\nkind = \"silence\"\nfor_s = 0",
-                "for_s = 0.0, expected at_s from 0 on and for_s above 0",
-            ),
-        ] {
+        // A fault, and what is said of it.
+        let cases = "
+            at_s = 1.0, kind = 'melt' | unknown variant `melt`
+            at_s = 1.0, kind = 'flip', bit = 3 | unknown field `bit`
+            at_s = 1.0, kind = 'unplug', bits = 3 | unknown field `bits`
+            at_s = -1.0, kind = 'flip' | found at_s = -1.0 and for_s = inf, expected at_s from 0 on
+            kind = 'flip' | missing field `at_s`
+            at_s = 'soon', kind = 'flip' | invalid type: string \"soon\"
+            at_s = 1.0, kind = 'flip', bits = 65536 | expected a whole number from 0 to 65535
+            at_s = 1.0, kind = 'silence', for_s = 0 | for_s = 0.0, expected at_s from 0 on and for_s above 0";
+        for case in cases.trim().lines() {
+            let (fault, expected) = case.trim().split_once(" | ").unwrap();
+            let keys = fault.replace(", ", "\n");
+            let problem = parse(&format!("\n[[fault]]\n{keys}")).unwrap_err();
             // Each error names a line of its fault.
-            let problem = parse(&format!("\n[[fault]]\n{fault}")).unwrap_err();
             let line = problem
                 .strip_prefix("line ")
                 .and_then(|rest| rest[..1].parse().ok());

@@ -32,31 +32,20 @@ fn check_warns_of_what_the_model_or_the_film_does_not_know() {
         assert_eq!(code, 0, "{message}");
         (printed, message)
     };
-    let hrn = format!("[sensor.arm]\nspeed_mm_s = 5.0\n[model]\npath = \"{HRN}\"\n");
-    let calibration = |key: &str| format!("[sensor.calibration]\n{key}\n");
-    let odd = [
-        (
-            calibration("pitch_mm = [3.5, 9.0]"),
-            "found [3.5, 9.0], expected the model's 3.5",
-        ),
-        (
-            calibration("newtons_per_count = 0.001"),
-            "255 counts are 0.255 N on a taxel",
-        ),
-        (
-            calibration("newtons_per_count = 40.0"),
-            "255 counts are 10200.000 N on a taxel",
-        ),
-        (hrn, "sensor.arm of \"palm\": changes no verdict"),
-        (
-            "[sensor.frame]\nsync = \"A5\"\n".to_owned(),
-            "sensor.calibration of \"palm\": pitch_mm and newtons_per_count not written",
-        ),
-    ];
-    for (tables, expected) in odd {
-        let (_, message) = checked(&tables);
+    let odd = "
+        calibration.pitch_mm = [3.5, 9.0] | found [3.5, 9.0], expected the model's 3.5
+        calibration.newtons_per_count = 0.001 | 255 counts are 0.255 N on a taxel
+        calibration.newtons_per_count = 40.0 | 255 counts are 10200.000 N on a taxel
+        frame.sync = 'A5' | sensor.calibration of \"palm\": pitch_mm and newtons_per_count not written";
+    for odd in odd.trim().lines() {
+        let (key, expected) = odd.trim().split_once(" | ").unwrap();
+        let (_, message) = checked(key);
         assert!(message.contains(expected), "{message}");
     }
+    let hrn = format!("arm.speed_mm_s = 5.0\n[model]\npath = \"{HRN}\"\n");
+    let (_, message) = checked(&hrn);
+    let expected = "sensor.arm of \"palm\": changes no verdict";
+    assert!(message.contains(expected), "{message}");
     let (printed, message) = checked(&format!("[model]\npath = \"{COURSE}\"\n"));
     let needs = "judges whole presses, best with the arm's positions";
     assert!(printed.contains(needs), "{printed}");

@@ -1,10 +1,10 @@
 //! A bad model file, with the real binary: `check` and a start refuse it in one line, and a running
 //! daemon keeps its model. The unit tests of the core have every kind of bad file.
 
+use hardnessd_core::tests::graph::{indices, node};
 use hardnessd_core::verdict::{BUILT_IN, BUILT_IN_HRN};
 use prost::Message as _;
 use tract_onnx::pb;
-use tract_onnx::pb::tensor_proto::DataType;
 
 use crate::bench::Bench;
 
@@ -12,28 +12,16 @@ use crate::bench::Bench;
 fn bad_file() -> Vec<u8> {
     let mut model = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     let graph = model.graph.as_mut().unwrap();
-    graph.initializer.push(pb::TensorProto {
-        name: "huge".to_owned(),
-        dims: vec![1],
-        data_type: DataType::Int64 as i32,
-        raw_data: (1_i64 << 62).to_le_bytes().to_vec(),
-        ..Default::default()
-    });
+    graph.initializer.push(indices("huge", &[1 << 62]));
     for node in &mut graph.node {
         for input in node.input.iter_mut().filter(|input| *input == "frame") {
             *input = "changed frame".to_owned();
         }
     }
-    let operator = |name: &str, inputs: &[&str], output: &str| pb::NodeProto {
-        op_type: name.to_owned(),
-        input: inputs.iter().map(|&input| input.to_owned()).collect(),
-        output: vec![output.to_owned()],
-        ..Default::default()
-    };
     let added = [
-        operator("ConstantOfShape", &["huge"], "zeros"),
-        operator("ReduceSum", &["zeros"], "number"),
-        operator("Add", &["frame", "number"], "changed frame"),
+        node("ConstantOfShape", &["huge"], &["zeros"], &[]),
+        node("ReduceSum", &["zeros"], &["number"], &[]),
+        node("Add", &["frame", "number"], &["changed frame"], &[]),
     ];
     graph.node.splice(0..0, added);
     model.encode_to_vec()

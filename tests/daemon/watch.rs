@@ -1,6 +1,7 @@
 //! `hardnessd watch` on a real pty, with a real daemon: what the watch shows, and that it is
 //! restored.
 
+use std::collections::HashSet;
 use std::fs::File;
 use std::io::Read;
 use std::time::{Duration, Instant};
@@ -25,12 +26,12 @@ impl Watch {
         }
     }
 
-    /// Waits until `there` is true for the screen.
-    fn until(&mut self, what: &str, there: impl Fn(&str) -> bool) -> String {
+    /// Waits until `there` is true for the screen. Returns its text.
+    fn until(&mut self, what: &str, there: impl Fn(&vt100::Screen) -> bool) -> String {
         let start = Instant::now();
         loop {
             let text = self.screen.screen().contents();
-            if there(&text) {
+            if there(self.screen.screen()) {
                 return text;
             }
             assert!(
@@ -43,31 +44,8 @@ impl Watch {
         }
     }
 
-    /// Waits until the screen has at least so many colours.
-    fn colours(&mut self, most: usize) {
-        let start = Instant::now();
-        loop {
-            let screen = self.screen.screen();
-            let cells = (0..24).flat_map(|row| (0..80).map(move |col| (row, col)));
-            let cells = cells.filter_map(|(row, col)| screen.cell(row, col));
-            let mut found: Vec<String> = cells
-                .flat_map(|cell| [cell.fgcolor(), cell.bgcolor()])
-                .map(|colour| format!("{colour:?}"))
-                .collect();
-            found.sort_unstable();
-            found.dedup();
-            if found.len() >= most {
-                return;
-            }
-            assert!(start.elapsed() < PATIENCE, "{found:?}");
-            if let Some(bytes) = self.terminal.read(Duration::from_millis(50)) {
-                self.screen.process(&bytes);
-            }
-        }
-    }
-
     fn shows(&mut self, part: &str) -> String {
-        self.until(part, |text| text.contains(part))
+        self.until(part, |screen| screen.contents().contains(part))
     }
 
     /// Asserts that `watch` ends by itself and restores the terminal.
@@ -86,6 +64,15 @@ impl Watch {
     }
 }
 
+/// The number of different colours.
+fn colours(screen: &vt100::Screen) -> usize {
+    let cells = (0..24).flat_map(|row| (0..80).map(move |col| (row, col)));
+    let cells = cells.filter_map(|(row, col)| screen.cell(row, col));
+    let found = cells.flat_map(|cell| [cell.fgcolor(), cell.bgcolor()]);
+    let found: HashSet<String> = found.map(|colour| format!("{colour:?}")).collect();
+    found.len()
+}
+
 /// Whether a line is that of the final verdict of a press. It ends with the force, an early one with `early`.
 fn is_final(line: &str, press: u32) -> bool {
     line.contains(&format!(" {press} ")) && line.contains(" OO") && !line.contains("early")
@@ -102,8 +89,9 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     watch.shows("LIVE");
     watch.shows("in contact for");
     // The map is nothing but colours. The terminal's user has NO_COLOR.
-    watch.colours(10);
-    watch.until("a final verdict", |text| {
+    watch.until("a map", |screen| colours(screen) >= 10);
+    watch.until("a final verdict", |screen| {
+        let text = screen.contents();
         text.lines().any(|line| is_final(line, 1))
     });
     let text = watch.shows("LIVE");

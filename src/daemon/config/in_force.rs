@@ -85,11 +85,14 @@ mod tests {
         let path = directory.path().join("hardnessd.toml");
         let text = "[[sensor]]\nport = \"/dev/ttyACM0\"\n[sensor.frame]\npreset = \"jq\"\nrows = 9\n\
                     [[sensor]]\nname = \"own\"\nport = \"/dev/ttyACM1\"\n\
-                    frame = { sync = \"A5\" }\n[press]\nmax_seconds = 5.0\n";
+                    frame = { sync = \"A5\" }\n\
+                    [[sensor]]\nname = \"film\"\nport = \"/dev/ttyACM2\"\nframe = { rows = 9 }\n\
+                    [press]\nmax_seconds = 5.0\n";
         std::fs::write(&path, text).unwrap();
         let setup = Setup::load(&path, None).unwrap();
         let lines = setup.in_force();
-        let (first, own) = lines.split_once("name = \"own\"").unwrap();
+        let (first, rest) = lines.split_once("name = \"own\"").unwrap();
+        let (own, film) = rest.split_once("name = \"film\"").unwrap();
         for (part, line) in [
             (first, "baud = 115200  # default"),
             (first, "stale_after_ms = 600.0  # default"),
@@ -100,11 +103,15 @@ mod tests {
             (first, "newtons_per_count = 0.04  # default"),
             (own, "preset = \"none\"  # default"),
             (own, "sync = \"A5\"  # written"),
+            (own, "length = \"none\"  # default"),
             (own, "checksum = \"none\"  # default"),
             (own, "rows = 28  # default"),
-            (own, "max_seconds = 5.0  # written"),
-            (own, "contact_threshold_n = 0.07  # default"),
-            (own, "mode = \"0660\"  # default"),
+            (film, "preset = \"jx255n\"  # default"),
+            (film, "length = \"u16le\"  # preset jx255n"),
+            (film, "rows = 9  # written"),
+            (film, "max_seconds = 5.0  # written"),
+            (film, "contact_threshold_n = 0.07  # default"),
+            (film, "mode = \"0660\"  # default"),
         ] {
             assert!(part.contains(&format!("{line}\n")), "{line} in {part}");
         }

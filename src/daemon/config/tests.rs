@@ -36,47 +36,24 @@ fn every_key_but_port_has_a_default() {
 
 #[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
-    for (text, expected) in [
-        (
-            "[[sensor]]\nname = \"b\"",
-            "line 3: sensor.port of \"b\": found none, expected a path",
-        ),
-        (
-            "[[sensor]]\nname = \"b\"\nport = \"/dev/ttyUSB0\"\nbaud = 9600",
-            "line 6: sensor.baud of \"b\": found 9600, expected 115200 as for \"sensor\"",
-        ),
-        ("bauds = 9", "line 3, column 1"),
-        ("bauds = 9", "`bauds`: did you mean `baud`?"),
-        (
-            "[[sensor]]\nport = \"q\"",
-            "sensor.name of \"sensor\": two sensors have this name",
-        ),
-        (
-            "stale_after_ms = 0",
-            "line 3: sensor.stale_after_ms of \"sensor\": found 0.0, expected 0.1 to",
-        ),
-        (
-            "[sensor.frame]\npreset = \"csv\"\nsync = \"AA\"",
-            "line 5: sensor.frame.sync of \"sensor\": found",
-        ),
-        (
-            "[press]\nend_area_taxels = 9",
-            "line 4: press.end_area_taxels: found 9",
-        ),
-        (
-            "[publish.unix]\nmode = \"0999\"",
-            "found \"0999\", expected octal permissions",
-        ),
-        ("[publish.tcp]\nlisten = \"here:8255\"", "line 4, column 10"),
-        (
-            "[publish.tcp]\nlisten = \"here:8255\"",
-            "expected ADDRESS:PORT, such as",
-        ),
-        (
-            "[publish.unix]\npath = \"/control.sock\"",
-            "publish.unix.control_path: /control.sock is the",
-        ),
-    ] {
+    // What follows the sensor's port, and what is said of it.
+    let cases = "
+        [[sensor]]; name = 'b' | line 3: sensor.port of \"b\": found none, expected a path
+        [[sensor]]; name = 'b'; port = '/dev/ttyUSB0'; baud = 9600 | line 6: sensor.baud of \"b\": found 9600, expected 115200 as for \"sensor\"
+        bauds = 9 | line 3, column 1
+        bauds = 9 | `bauds`: did you mean `baud`?
+        [sensor.frame]; checksum = 'crc-16' | unknown variant `crc-16`, expected one of `none`
+        [[sensor]]; port = 'q' | sensor.name of \"sensor\": two sensors have this name
+        stale_after_ms = 0 | line 3: sensor.stale_after_ms of \"sensor\": found 0.0, expected 0.1 to
+        [sensor.frame]; preset = 'csv'; sync = 'AA' | line 5: sensor.frame.sync of \"sensor\": found
+        [press]; end_area_taxels = 9 | line 4: press.end_area_taxels: found 9
+        [publish.unix]; mode = '0999' | found \"0999\", expected octal permissions
+        [publish.tcp]; listen = 'here:8255' | line 4, column 10
+        [publish.tcp]; listen = 'here:8255' | expected ADDRESS:PORT, such as
+        [publish.unix]; path = '/control.sock' | publish.unix.control_path: /control.sock is the";
+    for case in cases.trim().lines() {
+        let (keys, expected) = case.trim().split_once(" | ").unwrap();
+        let text = keys.replace("; ", "\n");
         let error = load(&format!("{LEAST}{text}")).unwrap_err();
         assert!(
             !error.contains('\n') && error.contains("hardnessd.toml:"),

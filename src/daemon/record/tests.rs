@@ -3,7 +3,7 @@ use std::sync::mpsc::Receiver;
 use super::*;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
-use hardnessd_core::tests::support;
+use hardnessd_core::tests::support::{self, at};
 
 /// A recorder with room for so many bytes.
 fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) {
@@ -17,13 +17,6 @@ fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) 
         bytes: 0,
     };
     (SensorRecorder(Some(Box::new(active))), pipeline)
-}
-
-fn at(ms: u64) -> Stamp {
-    Stamp {
-        mono: Duration::from_millis(ms),
-        wall: jiff::Timestamp::UNIX_EPOCH,
-    }
 }
 
 /// The count of the recorded inputs, and the numbers of those that follow a gap without a state
