@@ -14,7 +14,8 @@ use std::path::Path;
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TimeSeries, parts,
+    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TAXELS, TimeSeries,
+    parts,
 };
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Split};
 
@@ -95,6 +96,13 @@ impl Press {
 /// A frame of the simulated sensor, on the model's grid.
 pub fn resampled(frame: &Frame) -> ModelFrame {
     Resampling::new(frame, Pitch::JX255N, PITCH_MM).apply(frame)
+}
+
+/// The taxels of an array in the middle of a frame.
+fn in_the_middle(frame: &[f32; TAXELS], Array { rows, cols }: Array) -> Vec<f32> {
+    let (top, left) = ((ROWS - rows) / 2, (COLS - cols) / 2);
+    let lines = (top..top + rows).map(|row| &frame[row * COLS + left..][..cols]);
+    lines.flatten().copied().collect()
 }
 
 /// File, level, number and material of an object.
@@ -327,8 +335,7 @@ impl Presses {
 
     /// The frame of a press with the largest contact area.
     pub fn frame(&self, press: usize) -> ModelFrame {
-        let Press { moments, best, .. } = &self.all[press];
-        self.frames.frame(moments.start + best)
+        self.frames.frame(self.best_row(press))
     }
 
     /// The force of that frame. Of an array that is larger than the frames here, a frame may lack a part of the contact.
@@ -338,7 +345,12 @@ impl Presses {
         whole.unwrap_or_else(|| self.frame(press).newtons.iter().sum())
     }
 
-    /// The course of a press as the daemon would give it to a model: from the frame that began it.
+    fn best_row(&self, press: usize) -> usize {
+        let Press { moments, best, .. } = &self.all[press];
+        moments.start + best
+    }
+
+    /// The course of a press as the daemon would give it to a model of the same pitch: from the frame that began it.
     pub fn course(&self, press: usize) -> TimeSeries {
         let moment = |row: usize| Moment {
             time_s: self.time_s[row],
@@ -349,6 +361,36 @@ impl Presses {
             moments: self.rows(press).map(moment).collect(),
             arm_n_per_mm: self.all[press].arm_n_per_mm,
         }
+    }
+
+    /// The course of a press as the daemon would give it to a model of this pitch, which has no grid of its own.
+    pub fn course_on(&self, press: usize, model_mm: f64) -> TimeSeries {
+        let resampled = self.resampled(press, model_mm);
+        let mut course = self.course(press);
+        for (moment, row) in course.moments.iter_mut().zip(self.rows(press)) {
+            moment.frame = resampled(row);
+        }
+        course
+    }
+
+    /// The same of the frame with the largest contact area.
+    pub fn frame_on(&self, press: usize, model_mm: f64) -> ModelFrame {
+        self.resampled(press, model_mm)(self.best_row(press))
+    }
+
+    /// What resamples the frames of a press. The array that sent them lies in their middle. If it is not known, or
+    /// larger than they are, they are as large as they look.
+    fn resampled(&self, press: usize, model_mm: f64) -> impl Fn(usize) -> ModelFrame {
+        let source = self.sources.get(self.all[press].source);
+        let kept = source.and_then(|source| source.grid).filter(Grid::is_kept);
+        let array = kept.map_or(Array::JX255N, |grid| grid.array);
+        let own = move |row: usize| Frame {
+            array,
+            newtons: in_the_middle(&self.frames.frame(row).newtons, array).into(),
+        };
+        let pitch = Pitch::square(source.map_or(PITCH_MM, Source::pitch));
+        let resampling = Resampling::new(&own(self.best_row(press)), pitch, model_mm);
+        move |row| resampling.apply(&own(row))
     }
 
     /// Place and bits of the newtons of the taxels that are not 0, of each frame of a press.
@@ -373,15 +415,13 @@ impl Presses {
     }
 
     /// The input `parts` of a model on the grid of the presses' own array.
-    pub fn parts(&self, press: usize, Array { rows, cols }: Array) -> Vec<f32> {
+    pub fn parts(&self, press: usize, array: Array) -> Vec<f32> {
         if let Some(parts) = &self.all[press].parts {
             return parts.clone();
         }
-        let (top, left) = ((ROWS - rows) / 2, (COLS - cols) / 2);
         let own = |row: usize| -> (f32, Vec<f32>) {
             let frame = self.frames.frame(row).newtons;
-            let lines = (top..top + rows).map(|row| &frame[row * COLS + left..][..cols]);
-            (self.time_s[row], lines.flatten().copied().collect())
+            (self.time_s[row], in_the_middle(&frame, array))
         };
         let frames: Vec<(f32, Vec<f32>)> = self.rows(press).map(own).collect();
         let moments = frames.iter().map(|(time_s, frame)| (*time_s, &frame[..]));

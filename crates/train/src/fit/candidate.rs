@@ -11,6 +11,7 @@ use crate::data::split::Parts;
 use crate::learn::regression::{Regression, Seen};
 use crate::learn::{self, Learning, Question};
 use crate::methods::{Stages, last_stage};
+use crate::model::verdicts;
 use crate::net::network::Weights;
 use crate::recipe;
 use crate::run::{Description, Run};
@@ -128,10 +129,14 @@ impl Candidate {
     ) -> anyhow::Result<Vec<Vec<f32>>> {
         match self {
             Self::BuiltIn(hrn) => {
+                let model_mm = hrn.card().pitch_mm.into();
                 let references = references(hrn, presses, &fold.train)?;
                 // As the daemon does, which uses no references that are worse than none.
                 let (hrn, _) = hrn.identified_by(&references)?;
-                let judge = |&press: &usize| Ok(hrn.judge_course(&presses.course(press))?.logits);
+                let judge = |&press: &usize| {
+                    let course = presses.course_on(press, model_mm);
+                    Ok(hrn.judge_course(&course)?.logits)
+                };
                 fold.test.iter().map(judge).collect()
             }
             Self::Regression(_) | Self::Hrn => {
@@ -248,10 +253,8 @@ pub fn references(
             Some(shore) => [shore; 2],
             None => borders.part(usize::from(press.level) - 1),
         };
-        ReferencePress {
-            course: presses.course(place),
-            piece: Piece::Shore { range },
-        }
+        let own = (place, Piece::Shore { range });
+        verdicts::reference(presses, hrn.card().pitch_mm.into(), own)
     };
     Ok(chosen.take(most).map(reference).collect())
 }

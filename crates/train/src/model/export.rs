@@ -183,7 +183,7 @@ impl Learnt<'_> {
         Checks::Courses(CourseCheck {
             presses: checked.collect(),
             references: references
-                .map(|&own| reference(self.presses, own))
+                .map(|&own| reference(self.presses, self.presses.pitch_mm(), own))
                 .collect(),
         })
     }

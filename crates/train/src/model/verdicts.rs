@@ -51,10 +51,14 @@ pub fn rigid(presses: &Presses, sensor: u32, given: Given) -> Vec<(usize, Piece)
     spread(flats).chain(spread(balls)).collect()
 }
 
-/// A press as a reference of its sensor.
-pub fn reference(presses: &Presses, (place, piece): (usize, Piece)) -> ReferencePress {
+/// A press as a reference of its sensor, for a model of this pitch.
+pub fn reference(
+    presses: &Presses,
+    model_mm: f64,
+    (place, piece): (usize, Piece),
+) -> ReferencePress {
     ReferencePress {
-        course: presses.course(place),
+        course: presses.course_on(place, model_mm),
         piece,
     }
 }
@@ -92,7 +96,9 @@ fn references_of_sensors(
             }
         }
         let known = known.into_iter().take(hrn.most_references());
-        let known: Vec<ReferencePress> = known.map(|own| reference(presses, own)).collect();
+        let known: Vec<ReferencePress> = known
+            .map(|own| reference(presses, hrn.card().pitch_mm.into(), own))
+            .collect();
         let identified = hrn.identified(hrn.references(&known)?)?;
         let own = own_presses(hrn, presses, places, given.own)?;
         references.insert(sensor, own.map(|own| identified.references_with(&own)));
@@ -116,7 +122,7 @@ fn own_presses(
         let of_object = of_object.entry(object).or_default();
         *of_object += 1;
         if *of_object <= 2 && half.len() < count {
-            half.push(presses.course(place));
+            half.push(presses.course_on(place, hrn.card().pitch_mm.into()));
         }
     }
     let [first, second] = of_half;
@@ -141,7 +147,7 @@ pub fn of(
     places: &[usize],
     given: Given,
 ) -> anyhow::Result<Vec<Case>> {
-    let levels = hrn.card().levels.len();
+    let (levels, model_mm) = (hrn.card().levels.len(), hrn.card().pitch_mm.into());
     let (references, objects) = references_of_sensors(hrn, presses, places, given)?;
     let mut verdicts = Vec::new();
     for &place in places {
@@ -157,7 +163,11 @@ pub fn of(
         let verdict = match hrn.format() {
             Format::Frame => {
                 hrn.card().check_array(Array::JX255N)?;
-                hrn.judge_taxels(&presses.frame(place).newtons)?
+                let frame = match hrn.card().grid {
+                    Some(_) => presses.frame(place),
+                    None => presses.frame_on(place, model_mm),
+                };
+                hrn.judge_taxels(&frame.newtons)?
             }
             Format::Parts => {
                 let array = presses.grid().map_or(Array::JX255N, |grid| grid.array);
@@ -168,7 +178,7 @@ pub fn of(
                 let of_sensor = references.get(&press.sensor);
                 let none = References::NONE;
                 let references = of_sensor.map_or(&none, |of| &of[half_of(press.object)]);
-                hrn.judge_beside(&presses.course(place), references)?
+                hrn.judge_beside(&presses.course_on(place, model_mm), references)?
             }
         };
         verdicts.push((place, verdict));

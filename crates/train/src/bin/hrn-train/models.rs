@@ -97,11 +97,13 @@ fn warn_of_force(data: &Path, presses: &Presses, places: &[usize], hrn: &Model) 
     }
 }
 
-/// Prints a warning if the data are of a sensor with another pitch than the model's.
+/// Prints a warning if the model takes the frames of its own array as they are, and the data are of another pitch.
+/// Other models have them resampled, as the daemon does.
 fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Model) {
-    let own = presses.grid().filter(|_| hrn.card().grid.is_some());
-    let of_data = own.map_or(presses.pitch_mm(), |grid| grid.pitch_mm) as f32;
-    let of_model = hrn.card().pitch_mm;
+    let Some(of_data) = presses.grid().filter(|_| hrn.card().grid.is_some()) else {
+        return;
+    };
+    let (of_data, of_model) = (of_data.pitch_mm as f32, hrn.card().pitch_mm);
     if of_model != of_data {
         hardnessd_core::stderr_line!(
             "warning: {}: taxel pitch: found {of_data} mm, expected {of_model} mm, that of the model",

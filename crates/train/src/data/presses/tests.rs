@@ -172,6 +172,20 @@ fn the_array_and_what_it_reads_unloaded_come_back() {
     let parts = read.parts(0, array);
     assert_eq!(parts[..6], [1.0, 0.0, 0.0, 0.0, 0.0, -0.5]);
     assert_eq!(parts[42..], [2.0, 0.0, 0.0, 0.0, 0.0, -0.5]);
+
+    // A model of another pitch gets what the daemon would give it.
+    let own = |first: f32| Frame {
+        array,
+        newtons: [first, 0.0, 0.0, 0.0, 0.0, -0.5].into(),
+    };
+    let resampling = Resampling::new(&own(1.0), Pitch::square(5.0), 3.5);
+    let course = read.course_on(0, 3.5).moments;
+    let found: Vec<ModelFrame> = course.iter().map(|moment| moment.frame).collect();
+    let expected = [1.0, 2.0].map(|first| resampling.apply(&own(first)));
+    assert_eq!(found, expected);
+    assert_eq!(read.frame_on(0, 3.5), expected[0]);
+    assert_ne!(read.frame_on(0, 3.5), read.frame(0));
+    assert_eq!(read.frame_on(0, 5.0), read.frame(0));
 }
 
 #[test]
