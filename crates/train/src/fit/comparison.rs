@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::candidate::Candidate;
 use super::folds::Fold;
-use crate::data::presses::Presses;
+use crate::data::presses::{Presses, Unit};
 use crate::judge::interval::{self, Drawn, Mean};
 use crate::learn::Outputs;
 use crate::learn::calibration::{self, Calibration};
@@ -248,7 +248,7 @@ pub(super) fn calibration(
         calibration::Judged::of(presses, *place, press.object.map(of_level), row.clone())
     });
     let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
-    Calibration::on(&judged, outputs, stream)
+    Calibration::on(&judged, Unit::Object, outputs, stream)
 }
 
 /// All that was compared.

@@ -18,6 +18,8 @@ pub const ALPHA: f32 = 0.1;
 const LEAST_UNITS: usize = 9;
 /// A quantile is the mean over this many draws of one press from each unit.
 const DRAWS: usize = 50;
+/// The share of the covers, the worst ones, whose confidence is calibrated: a robot's own cover may be one.
+const WORST_COVERS: f64 = 0.1;
 
 /// The calibration computed from the held-out presses.
 #[derive(Debug, Clone, PartialEq)]
@@ -86,15 +88,14 @@ impl Calibration {
             judged.insert(knowledge, of_knowledge);
         }
         let unit = presses.units(held_out).map(|(unit, _)| unit);
-        Self {
-            unit: unit.unwrap_or(Unit::Object),
-            ..Self::on(&judged, &learning.outputs(), stream)
-        }
+        let unit = unit.unwrap_or(Unit::Object);
+        Self::on(&judged, unit, &learning.outputs(), stream)
     }
 
-    /// Calibrates on these, whose units are objects.
+    /// Calibrates on these.
     pub(crate) fn on(
         judged: &BTreeMap<Knowledge, Vec<Judged>>,
+        unit: Unit,
         outputs: &Outputs,
         stream: &mut Stream,
     ) -> Self {
@@ -107,12 +108,23 @@ impl Calibration {
         for judged in all() {
             *counts.entry(judged.level).or_default() += 1.0;
         }
+        // A cover's loss is the mean over its presses. Objects are too small for a mean of their own.
         let loss = |temperature: f64| {
-            let loss = all().map(|judged| {
+            let mut units = BTreeMap::<u64, [f64; 2]>::new();
+            for judged in all() {
                 let p = of_truth(judged, temperature as f32).max(f32::MIN_POSITIVE);
-                -f64::from(p).ln() / counts[&judged.level]
-            });
-            loss.sum::<f64>()
+                let own = match unit {
+                    Unit::Cover => judged.unit,
+                    Unit::Object => 0,
+                };
+                let [sum, weight] = units.entry(own).or_default();
+                *sum -= f64::from(p).ln() / counts[&judged.level];
+                *weight += 1.0 / counts[&judged.level];
+            }
+            let mut losses: Vec<f64> = units.values().map(|[sum, weight]| sum / weight).collect();
+            losses.sort_by(|one, other| other.total_cmp(one));
+            let worst = (WORST_COVERS * losses.len() as f64).ceil() as usize;
+            losses[..worst].iter().sum::<f64>()
         };
         let temperature = match all().next() {
             None => 1.0,
@@ -140,7 +152,7 @@ impl Calibration {
             temperature,
             limits,
             units,
-            unit: Unit::Object,
+            unit,
         }
     }
 
@@ -184,8 +196,8 @@ impl Calibration {
     }
 }
 
-/// The temperature of least loss, between 1/8 and 8. The loss of logits is convex in 1/T, so a
-/// shrinking bracket finds its minimum.
+/// The temperature of least loss, between 1/8 and 8. The loss of logits is convex in 1/T, and so is the sum of the
+/// greatest of several. So a shrinking bracket finds its minimum.
 fn least(loss: impl Fn(f64) -> f64) -> f32 {
     let (mut low, mut high) = (0.125_f64, 8.0_f64);
     for _ in 0..60 {
@@ -267,8 +279,30 @@ mod tests {
         });
         let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
         let stream = &mut Stream::new(1, "calibration");
-        let found = Calibration::on(&judged, &Outputs::Levels, stream);
+        let found = Calibration::on(&judged, Unit::Object, &Outputs::Levels, stream);
         assert!((found.temperature - 4.0).abs() < 1e-2, "{found:?}");
+    }
+
+    #[test]
+    fn the_temperature_is_that_of_the_worst_covers() {
+        // The larger logit is right in 9 of 10 presses under most covers, and in 6 of 10 under one of ten.
+        let judged = (0..200).map(|press| {
+            let (unit, level) = (press / 10, usize::from(press % 2 == 0));
+            let right = if unit % 10 == 0 { 6 } else { 9 };
+            let mut row = vec![0.0; 2];
+            row[if press % 10 < right { level } else { 1 - level }] = 9.0_f32.ln();
+            Judged {
+                unit,
+                level,
+                shore: None,
+                row,
+            }
+        });
+        let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
+        let stream = &mut Stream::new(1, "calibration");
+        let found = Calibration::on(&judged, Unit::Cover, &Outputs::Levels, stream);
+        let expected = 9.0_f32.ln() / 1.5_f32.ln();
+        assert!((found.temperature - expected).abs() < 0.05, "{found:?}");
     }
 
     #[test]
@@ -283,7 +317,7 @@ mod tests {
             let judged = (0..3 * objects).map(press).collect();
             let judged = BTreeMap::from([(Knowledge::None, judged)]);
             let stream = &mut Stream::new(1, "calibration");
-            Calibration::on(&judged, &Outputs::Levels, stream)
+            Calibration::on(&judged, Unit::Object, &Outputs::Levels, stream)
         };
         let enough = of(9, 9);
         let threshold =
