@@ -99,7 +99,8 @@ fn references_of_sensors(
         let known: Vec<ReferencePress> = known
             .map(|own| reference(presses, hrn.card().pitch_mm.into(), own))
             .collect();
-        let identified = hrn.identified(hrn.references(&known)?)?;
+        // As the daemon does, which uses no references that are worse than none.
+        let (identified, _) = hrn.identified_by(&known)?;
         let own = own_presses(hrn, presses, places, given.own)?;
         references.insert(sensor, own.map(|own| identified.references_with(&own)));
     }
