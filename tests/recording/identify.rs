@@ -148,10 +148,10 @@ fn a_recording_keeps_the_references_that_presses_of_now_gave() {
 #[test]
 fn references_that_make_verdicts_worse_are_not_used_and_everybody_says_so() {
     let bench = bench();
-    let simulate = "simulate --fps 20 --piece flat:20 --seed";
+    let simulate = "simulate --fps 20 --piece flat:40 --seed";
     bench.succeeds(&format!("{simulate} 6 --presses 8 --to flat.bin"));
     bench.succeeds(&format!("{simulate} 5 --presses 20 --to again.bin"));
-    let text = bench.succeeds(&format!("{IDENTIFY} --as flat:20 flat.bin"));
+    let text = bench.succeeds(&format!("{IDENTIFY} --as flat:40 flat.bin"));
     assert!(text.contains("the daemon will not use them"), "{text}");
     let (code, _, warnings) = bench.run("check --config hardnessd.toml");
     assert!(code == 0 && warnings.contains("sensor.references of \"forearm\": not used"));
