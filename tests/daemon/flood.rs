@@ -56,7 +56,7 @@ fn stale_beside_six_floods() -> Option<u64> {
     let short = [frame(0.0).repeat(4), frame(60.0).repeat(4)].concat();
     let done = AtomicBool::new(false);
     let (mut stale, mut next) = (0, 0);
-    let longest = thread::scope(|scope| {
+    let (longest, flood) = thread::scope(|scope| {
         let until_the_end = Done(&done);
         for flood in floods {
             scope.spawn(|| {
@@ -78,12 +78,13 @@ fn stale_beside_six_floods() -> Option<u64> {
                 next += 1;
             }
         }
+        // While they flood: some seconds later nothing is said of it any more.
+        let flood = bench.subscriber().status("s1");
         drop(until_the_end);
-        playing.join().unwrap()
+        (playing.join().unwrap(), flood)
     });
     assert_eq!(next, u64::from(FRAMES), "frames in time");
     let metrics = get(daemon.address("http"), "/metrics").body;
-    let flood = bench.subscriber().status("s1");
     let log = daemon.end();
     for number in 1..=FLOODS {
         let lines = log.matches(&format!("sensor=\"s{number}\"")).count();
