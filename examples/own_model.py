@@ -268,7 +268,8 @@ if importlib.util.find_spec("torch"):
             self.classify = nn.Sequential(nn.Flatten(), nn.Linear(32 * 7 * 7, 64), nn.ReLU(), nn.Linear(64, 4))
 
         def forward(self, frame):  # [batch, 1, 28, 28], newtons
-            logits = self.classify(self.features(torch.log1p(20 * frame)))
+            # Noise around a contact is below 0 at times, where a logarithm is no number.
+            logits = self.classify(self.features(torch.log1p(20 * frame.clamp(min=0))))
             return logits, torch.softmax(logits, dim=1)
 
     def tensors(presses):

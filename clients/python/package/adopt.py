@@ -314,6 +314,11 @@ def probabilities_of(original: Any, given: Tuple[str, List[int]], data: Dict[str
         row = np.asarray(row, np.float64).reshape(-1)
         if "probabilities" not in outputs and "logits" in outputs:
             row = np.exp(row - row.max()) / np.exp(row - row.max()).sum()
+        if not np.isfinite(row).all():
+            raise Refused(
+                "outputs: a probability of a check frame is no number: did the network learn, and does it take newtons "
+                "below 0 (PyTorch: `frame.clamp(min=0)`)?"
+            )
         if abs(row.sum() - 1) > 1e-3:
             raise Refused(
                 f"outputs: the probabilities of a check frame add up to {row.sum():.3g}, expected 1: these are scores "
