@@ -150,3 +150,35 @@ fn transpose(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Stream;
+
+    #[test]
+    fn convolution_equals_the_double_sum_in_free_space() {
+        let width = 24;
+        let kernel = |i: usize, j: usize| 1.0 / (1.0 + (i * i + 2 * j * j) as f64);
+        let mut convolver = Convolver::new(width);
+        let spectrum = convolver.spectrum(kernel);
+        let mut random = Stream::new(1, "convolution");
+        let input: Vec<f32> = (0..width * width)
+            .map(|_| random.uniform() as f32)
+            .collect();
+        let mut output = vec![0.0; width * width];
+        convolver.convolve(&spectrum, &input, &mut output);
+        for (i, j) in [(0, 0), (5, 17), (23, 23), (12, 0)] {
+            let expected: f64 = (0..width * width)
+                .map(|k| {
+                    f64::from(input[k]) * kernel((k / width).abs_diff(i), (k % width).abs_diff(j))
+                })
+                .sum();
+            let seen = f64::from(output[i * width + j]);
+            assert!(
+                (seen - expected).abs() < 1e-5 * expected,
+                "({i}, {j}): {seen}, {expected}"
+            );
+        }
+    }
+}
