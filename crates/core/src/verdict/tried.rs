@@ -9,11 +9,11 @@ use super::{Borders, Format, Model, ModelError, argmax};
 
 /// A probability below it counts as this.
 const LEAST_PROBABILITY: f32 = 0.01;
-/// References are worse if the mean logarithm of the probability of the truth falls by more than this, or if so many
-/// more presses are judged wrongly. Of four presses one is chance: with that and 0.1, good references were ignored, and
-/// verdicts on unseen sensors lost 2 points.
-const MOST_LOSS: f32 = 0.5;
+/// References are worse if so many more of them are judged wrongly. One of four is chance.
 const LEAST_WRONG: u32 = 2;
+/// They are worse, too, if the mean logarithm of the probability of the truth falls by more than this. With 0.1 and one
+/// press, good references were ignored, and verdicts on unseen sensors lost 2 points.
+const MOST_LOSS: f32 = 0.5;
 
 /// How references judge each other.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]

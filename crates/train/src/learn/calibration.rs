@@ -261,26 +261,34 @@ mod tests {
         }
     }
 
+    /// A press whose larger logit is the logarithm of these odds, at its level if it is right.
+    fn judged(unit: u64, level: usize, is_right: bool, odds: f32) -> Judged {
+        let mut row = vec![0.0; 2];
+        row[if is_right { level } else { 1 - level }] = odds.ln();
+        Judged {
+            unit,
+            level,
+            shore: None,
+            row,
+        }
+    }
+
+    fn temperature(judged: impl Iterator<Item = Judged>, unit: Unit) -> f32 {
+        let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
+        let stream = &mut Stream::new(1, "calibration");
+        Calibration::on(&judged, unit, &Outputs::Levels, stream).temperature
+    }
+
     #[test]
     fn the_temperature_undoes_overconfidence() {
         // The larger logit is right in 3 of 4 cases, but the logits are 4 times those of
         // probability 3/4.
-        let honest = 3.0_f32.ln();
         let judged = (0..16).map(|unit| {
             let level = usize::from(unit % 2 == 0);
-            let mut row = vec![0.0; 2];
-            row[if unit % 8 < 2 { 1 - level } else { level }] = 4.0 * honest;
-            Judged {
-                unit,
-                level,
-                shore: None,
-                row,
-            }
+            judged(unit, level, unit % 8 >= 2, 3.0_f32.powi(4))
         });
-        let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
-        let stream = &mut Stream::new(1, "calibration");
-        let found = Calibration::on(&judged, Unit::Object, &Outputs::Levels, stream);
-        assert!((found.temperature - 4.0).abs() < 1e-2, "{found:?}");
+        let found = temperature(judged, Unit::Object);
+        assert!((found - 4.0).abs() < 1e-2, "{found}");
     }
 
     #[test]
@@ -289,20 +297,11 @@ mod tests {
         let judged = (0..200).map(|press| {
             let (unit, level) = (press / 10, usize::from(press % 2 == 0));
             let right = if unit % 10 == 0 { 6 } else { 9 };
-            let mut row = vec![0.0; 2];
-            row[if press % 10 < right { level } else { 1 - level }] = 9.0_f32.ln();
-            Judged {
-                unit,
-                level,
-                shore: None,
-                row,
-            }
+            judged(unit, level, press % 10 < right, 9.0)
         });
-        let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
-        let stream = &mut Stream::new(1, "calibration");
-        let found = Calibration::on(&judged, Unit::Cover, &Outputs::Levels, stream);
+        let found = temperature(judged, Unit::Cover);
         let expected = 9.0_f32.ln() / 1.5_f32.ln();
-        assert!((found.temperature - expected).abs() < 0.05, "{found:?}");
+        assert!((found - expected).abs() < 0.05, "{found}");
     }
 
     #[test]
