@@ -14,8 +14,8 @@ use std::path::Path;
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TAXELS, TimeSeries,
-    parts,
+    COLS, COURSE_FRAMES, Card, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TAXELS,
+    TimeSeries, parts,
 };
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Split};
 
@@ -363,9 +363,9 @@ impl Presses {
         }
     }
 
-    /// The course of a press as the daemon would give it to a model of this pitch, which has no grid of its own.
-    pub fn course_on(&self, press: usize, model_mm: f64) -> TimeSeries {
-        let resampled = self.resampled(press, model_mm);
+    /// The course of a press as the daemon would give it to this model.
+    pub fn course_for(&self, press: usize, model: &Card) -> TimeSeries {
+        let resampled = self.resampler(press, model);
         let mut course = self.course(press);
         for (moment, row) in course.moments.iter_mut().zip(self.rows(press)) {
             moment.frame = resampled(row);
@@ -373,14 +373,18 @@ impl Presses {
         course
     }
 
-    /// The same of the frame with the largest contact area.
-    pub fn frame_on(&self, press: usize, model_mm: f64) -> ModelFrame {
-        self.resampled(press, model_mm)(self.best_row(press))
+    /// The frame with the largest contact area as the daemon would give it to this model. A model with a grid of its
+    /// own takes it as it is.
+    pub fn frame_for(&self, press: usize, model: &Card) -> ModelFrame {
+        match model.grid {
+            Some(_) => self.frame(press),
+            None => self.resampler(press, model)(self.best_row(press)),
+        }
     }
 
     /// What resamples the frames of a press. The array that sent them lies in their middle. If it is not known, or
     /// larger than they are, they are as large as they look.
-    fn resampled(&self, press: usize, model_mm: f64) -> impl Fn(usize) -> ModelFrame {
+    fn resampler(&self, press: usize, model: &Card) -> impl Fn(usize) -> ModelFrame {
         let source = self.sources.get(self.all[press].source);
         let kept = source.and_then(|source| source.grid).filter(Grid::is_kept);
         let array = kept.map_or(Array::JX255N, |grid| grid.array);
@@ -389,7 +393,7 @@ impl Presses {
             newtons: in_the_middle(&self.frames.frame(row).newtons, array).into(),
         };
         let pitch = Pitch::square(source.map_or(PITCH_MM, Source::pitch));
-        let resampling = Resampling::new(&own(self.best_row(press)), pitch, model_mm);
+        let resampling = Resampling::new(&own(self.best_row(press)), pitch, model.pitch_mm.into());
         move |row| resampling.apply(&own(row))
     }
 

@@ -129,12 +129,11 @@ impl Candidate {
     ) -> anyhow::Result<Vec<Vec<f32>>> {
         match self {
             Self::BuiltIn(hrn) => {
-                let model_mm = hrn.card().pitch_mm.into();
                 let references = references(hrn, presses, &fold.train)?;
                 // As the daemon does, which uses no references that are worse than none.
                 let (hrn, _) = hrn.identified_by(&references)?;
                 let judge = |&press: &usize| {
-                    let course = presses.course_on(press, model_mm);
+                    let course = presses.course_for(press, hrn.card());
                     Ok(hrn.judge_course(&course)?.logits)
                 };
                 fold.test.iter().map(judge).collect()
@@ -254,7 +253,7 @@ pub fn references(
             None => borders.part(usize::from(press.level) - 1),
         };
         let own = (place, Piece::Shore { range });
-        verdicts::reference(presses, hrn.card().pitch_mm.into(), own)
+        verdicts::reference(presses, hrn.card(), own)
     };
     Ok(chosen.take(most).map(reference).collect())
 }

@@ -10,7 +10,7 @@ use anyhow::Context as _;
 use serde_json::json;
 
 use super::file;
-use super::verdicts::{self, Given, reference, rigid};
+use super::verdicts::{self, Given, rigid};
 use crate::data::presses::{Press, Presses};
 use crate::data::source::{Kind, Source};
 use crate::judge::evaluated::Evaluated;
@@ -21,8 +21,8 @@ use crate::net::network::Weights;
 use crate::run::{Description, Run};
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::verdict::{
-    Card, Check, CheckedCourse, Checks, CourseCheck, Knowledge, Model, Piece, Range, TAIL,
-    check_line,
+    Card, Check, CheckedCourse, Checks, CourseCheck, Knowledge, Model, Piece, Range,
+    ReferencePress, TAIL, check_line,
 };
 use hardnessd_simulator::Split;
 
@@ -183,7 +183,10 @@ impl Learnt<'_> {
         Checks::Courses(CourseCheck {
             presses: checked.collect(),
             references: references
-                .map(|&own| reference(self.presses, self.presses.pitch_mm(), own))
+                .map(|&(place, piece)| ReferencePress {
+                    course: self.presses.course(place),
+                    piece,
+                })
                 .collect(),
         })
     }

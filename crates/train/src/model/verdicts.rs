@@ -8,7 +8,7 @@ use crate::data::presses::Presses;
 use crate::judge::evaluated::{Case, cases};
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
-use hardnessd_core::verdict::{Format, Model, Piece, ReferencePress, References, TimeSeries};
+use hardnessd_core::verdict::{Card, Format, Model, Piece, ReferencePress, References, TimeSeries};
 use hardnessd_simulator::random::Stream;
 
 /// The references of its sensor that a model is given beside a press.
@@ -51,14 +51,14 @@ pub fn rigid(presses: &Presses, sensor: u32, given: Given) -> Vec<(usize, Piece)
     spread(flats).chain(spread(balls)).collect()
 }
 
-/// A press as a reference of its sensor, for a model of this pitch.
+/// A press as a reference of its sensor, for this model.
 pub fn reference(
     presses: &Presses,
-    model_mm: f64,
+    model: &Card,
     (place, piece): (usize, Piece),
 ) -> ReferencePress {
     ReferencePress {
-        course: presses.course_on(place, model_mm),
+        course: presses.course_for(place, model),
         piece,
     }
 }
@@ -97,7 +97,7 @@ fn references_of_sensors(
         }
         let known = known.into_iter().take(hrn.most_references());
         let known: Vec<ReferencePress> = known
-            .map(|own| reference(presses, hrn.card().pitch_mm.into(), own))
+            .map(|own| reference(presses, hrn.card(), own))
             .collect();
         // As the daemon does, which uses no references that are worse than none.
         let (identified, _) = hrn.identified_by(&known)?;
@@ -123,7 +123,7 @@ fn own_presses(
         let of_object = of_object.entry(object).or_default();
         *of_object += 1;
         if *of_object <= 2 && half.len() < count {
-            half.push(presses.course_on(place, hrn.card().pitch_mm.into()));
+            half.push(presses.course_for(place, hrn.card()));
         }
     }
     let [first, second] = of_half;
@@ -148,7 +148,7 @@ pub fn of(
     places: &[usize],
     given: Given,
 ) -> anyhow::Result<Vec<Case>> {
-    let (levels, model_mm) = (hrn.card().levels.len(), hrn.card().pitch_mm.into());
+    let levels = hrn.card().levels.len();
     let (references, objects) = references_of_sensors(hrn, presses, places, given)?;
     let mut verdicts = Vec::new();
     for &place in places {
@@ -164,11 +164,7 @@ pub fn of(
         let verdict = match hrn.format() {
             Format::Frame => {
                 hrn.card().check_array(Array::JX255N)?;
-                let frame = match hrn.card().grid {
-                    Some(_) => presses.frame(place),
-                    None => presses.frame_on(place, model_mm),
-                };
-                hrn.judge_taxels(&frame.newtons)?
+                hrn.judge_taxels(&presses.frame_for(place, hrn.card()).newtons)?
             }
             Format::Parts => {
                 let array = presses.grid().map_or(Array::JX255N, |grid| grid.array);
@@ -179,7 +175,7 @@ pub fn of(
                 let of_sensor = references.get(&press.sensor);
                 let none = References::NONE;
                 let references = of_sensor.map_or(&none, |of| &of[half_of(press.object)]);
-                hrn.judge_beside(&presses.course_on(place, model_mm), references)?
+                hrn.judge_beside(&presses.course_for(place, hrn.card()), references)?
             }
         };
         verdicts.push((place, verdict));

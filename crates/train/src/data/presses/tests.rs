@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::*;
 use hardnessd_core::npy::Header;
 use hardnessd_core::npz::Writer;
-use hardnessd_core::verdict::TAXELS;
+use hardnessd_core::verdict::{BUILT_IN_HRN, Model, TAXELS};
 use hardnessd_simulator::{CourseSettings, DatasetSettings, Materials};
 
 /// Single frames: 4 levels x 2 objects x 3 presses.
@@ -179,13 +179,15 @@ fn the_array_and_what_it_reads_unloaded_come_back() {
         newtons: [first, 0.0, 0.0, 0.0, 0.0, -0.5].into(),
     };
     let resampling = Resampling::new(&own(1.0), Pitch::square(5.0), 3.5);
-    let course = read.course_on(0, 3.5).moments;
+    let mut model = Model::load(BUILT_IN_HRN).unwrap().card().clone();
+    let course = read.course_for(0, &model).moments;
     let found: Vec<ModelFrame> = course.iter().map(|moment| moment.frame).collect();
     let expected = [1.0, 2.0].map(|first| resampling.apply(&own(first)));
     assert_eq!(found, expected);
-    assert_eq!(read.frame_on(0, 3.5), expected[0]);
-    assert_ne!(read.frame_on(0, 3.5), read.frame(0));
-    assert_eq!(read.frame_on(0, 5.0), read.frame(0));
+    assert_eq!(read.frame_for(0, &model), expected[0]);
+    assert_ne!(read.frame_for(0, &model), read.frame(0));
+    model.pitch_mm = 5.0;
+    assert_eq!(read.frame_for(0, &model), read.frame(0));
 }
 
 #[test]
