@@ -14,6 +14,7 @@ use crate::learn::gan::{self, Gan};
 use crate::learn::hrn::{Frames, Hrn};
 use crate::learn::regression::{Regression, Seen};
 use crate::learn::{self, Learning};
+use crate::model::start::Start;
 use crate::net::generator;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
@@ -42,6 +43,8 @@ pub struct Stages<'a> {
     pub settings: &'a Settings,
     /// Seed of everything random.
     pub seed: u64,
+    /// The model from which a course model starts, in place of random weights.
+    pub start: Option<&'a Start>,
     /// The run's directory, to which the stages write.
     pub run: &'a Run,
     /// The device that computes.
@@ -70,7 +73,8 @@ pub fn last_stage<'a>(
             Box::new(Regression::new(presses, seen, parts, device))
         }
         Kind::Course => {
-            let course = Course::new(presses, parts, stages.settings, stages.seed, device);
+            let (settings, seed) = (stages.settings, stages.seed);
+            let course = Course::new(presses, parts, settings, seed, stages.start, device);
             Box::new(course.context("levels of the data")?)
         }
         Kind::Hrn => {

@@ -3,3 +3,4 @@
 pub mod file;
 pub mod verdicts;
 pub mod export;
+pub mod start;

@@ -14,6 +14,7 @@ use crate::learn;
 use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
+use crate::model::start::Start;
 use crate::progress::ensure_finite;
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::{Description, Run, disk};
@@ -34,6 +35,9 @@ pub struct Train {
     /// Directory of the run
     #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
+    /// Start from the weights of this course model, not from random ones
+    #[arg(long, value_name = "M.onnx")]
+    start: Option<PathBuf>,
     /// Seed of everything random
     // TOML, which keeps it, has no larger numbers.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
@@ -103,6 +107,16 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         None => toml::Table::new(),
     };
     let device = &asked.device.device()?;
+    let start = match &asked.start {
+        Some(_) if recipe.learning != Kind::Course => {
+            return Err(coded(
+                USAGE,
+                "--start: only the method course starts from a model",
+            ));
+        }
+        Some(path) => Some(Start::read(path, device)?),
+        None => None,
+    };
     let presses = Presses::read(&asked.data)?;
     let labels = asked.labels(&presses)?;
     let share = recipe.settings(profile, labels, &given)?.held_out;
@@ -114,7 +128,9 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     if !warnings.is_empty() {
         hardnessd_core::stderr_line!("{}", warnings.trim_end());
     }
-    export::check_sources(&presses.sources)?;
+    let mut data = presses.sources.clone();
+    data.extend(start.as_ref().map(|start| start.source.clone()));
+    export::check_sources(&data)?;
 
     let description = Description {
         method: recipe.name.clone(),
@@ -122,7 +138,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         seed,
         labels,
         settings,
-        data: presses.sources.clone(),
+        data,
     };
     let run = Run::open(&asked.out, &description, asked.resume)?;
     if !warnings.is_empty() {
@@ -134,6 +150,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         parts: &parts,
         settings: &settings,
         seed,
+        start: start.as_ref(),
         run: &run,
         device,
     };

@@ -208,6 +208,7 @@ fn with_hrn<T>(
         parts: &parts(train),
         settings: &settings,
         seed,
+        start: None,
         run: &run,
         device: &Device::flex(),
     };

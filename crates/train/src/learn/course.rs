@@ -10,6 +10,7 @@ use super::learner::Learner;
 use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
+use crate::model::start::Start;
 use crate::net::bins::{self, BINS};
 use crate::net::course;
 use crate::net::graph::Graph;
@@ -81,7 +82,7 @@ pub struct Course<'a> {
 }
 
 impl<'a> Course<'a> {
-    /// A network that learns from the presses `train`.
+    /// A network that learns from the presses `train`. It starts from random weights, or from those of `start`.
     ///
     /// # Errors
     ///
@@ -93,14 +94,22 @@ impl<'a> Course<'a> {
         }: &'a Parts,
         settings: &Settings,
         seed: u64,
+        start: Option<&Start>,
         device: &'a Device,
     ) -> Result<Self, ModelError> {
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
         let felt = (0..presses.all.len()).map(|place| Felt::of(&presses.course(place)));
         let felt: Vec<Felt> = felt.collect();
-        let rows = train.iter().map(|&place| felt[place].features());
-        let rows: Vec<[f32; FEATURES]> = rows.collect();
+        let (initial, standard) = match start {
+            Some(start) => (start.weights.clone(), start.standard.clone()),
+            None => {
+                let rows = train.iter().map(|&place| felt[place].features());
+                let rows: Vec<[f32; FEATURES]> = rows.collect();
+                let rows = rows.iter().map(<[f32; FEATURES]>::as_slice);
+                (course::initial(seed, device), Standard::of(FEATURES, rows))
+            }
+        };
         let mut counts = vec![0; levels];
         for press in presses.of(train) {
             counts[usize::from(press.level) - 1] += 1;
@@ -110,13 +119,13 @@ impl<'a> Course<'a> {
             felt,
             held_out,
             lots: Lots::of(presses, borders.clone(), train),
-            standard: Standard::of(FEATURES, rows.iter().map(<[f32; FEATURES]>::as_slice)),
+            standard,
             parts: bins::parts(&borders, levels, device),
             outputs: Outputs::Bins {
                 lifts: bins::lifts(&borders, &counts),
                 borders,
             },
-            initial: course::initial(seed, device),
+            initial,
             reports: settings.reports,
             training: settings.training,
             seed,

@@ -6,11 +6,12 @@
 //! whereas force against approach fixes both (`results/method.md`).
 
 use burn::tensor::{Device, Tensor, TensorData, activation};
+use tract_onnx::pb;
 
 use crate::net::bins::BINS;
 use crate::net::graph::{Graph, Inputs, RAW};
 use crate::net::network::{Weights, dense};
-use crate::net::standard::Standard;
+use crate::net::standard::{self, Standard};
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::{PIECE, Piece};
 use hardnessd_simulator::random::Stream;
@@ -71,6 +72,27 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
         weights.add(&bias, &[outputs], vec![0.0; outputs], device);
     }
     weights
+}
+
+/// The weights and the scale of the features in an exported file. `None` if the file has another network.
+pub fn exported(graph: &pb::GraphProto, device: &Device) -> Option<(Weights, Standard)> {
+    let constant = |name: &str, length: usize| {
+        let tensor = graph.initializer.iter().find(|one| one.name == name)?;
+        let (numbers, rest) = tensor.raw_data.as_chunks();
+        let numbers: Vec<f32> = numbers.iter().copied().map(f32::from_le_bytes).collect();
+        (numbers.len() == length && rest.is_empty()).then_some(numbers)
+    };
+    let mut weights = Weights::default();
+    for weight in initial(0, device).entries {
+        let length = weight.dims.iter().product();
+        let values = constant(&weight.name, length)?;
+        weights.add(&weight.name, &weight.dims, values, device);
+    }
+    let standard = Standard {
+        mean: constant(standard::MEANS, FEATURES)?,
+        deviation: constant(standard::DEVIATIONS, FEATURES)?,
+    };
+    Some((weights, standard))
 }
 
 /// Presses of one sensor, with its references.

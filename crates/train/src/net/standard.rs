@@ -7,6 +7,9 @@ use crate::net::graph::Graph;
 const CLIP: f32 = 4.0;
 /// The least standard deviation of a column.
 const LEAST: f64 = 1e-3;
+/// The names of mean and standard deviation in an exported file.
+pub(super) const MEANS: &str = "column means";
+pub(super) const DEVIATIONS: &str = "column deviations";
 
 /// Mean and standard deviation of each column over the training data.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,9 +61,9 @@ impl Standard {
     /// Adds the nodes that bring `columns` to the scale, as `standardised`.
     pub fn add_to(&self, graph: &mut Graph, columns: &str) {
         let dims = [1, self.mean.len()];
-        graph.constant("column means", &dims, &self.mean);
-        graph.constant("column deviations", &dims, &self.deviation);
-        let unit = format!("Div(Sub({columns}, column means), column deviations)");
+        graph.constant(MEANS, &dims, &self.mean);
+        graph.constant(DEVIATIONS, &dims, &self.deviation);
+        let unit = format!("Div(Sub({columns}, {MEANS}), {DEVIATIONS})");
         let formula = format!("standardised = Clip({unit}, -{CLIP}, {CLIP})");
         graph.add(&formula);
     }

@@ -121,6 +121,33 @@ fn a_course_model_takes_the_references_of_each_sensor() {
     let identified = checks.presses.iter().filter(|press| press.identified);
     assert_eq!((checks.references.len(), identified.count()), (4, 4));
 
+    // A training that starts from it and learns nothing judges as it does, and names it among its data.
+    let still = format!("{SETTINGS}    weight_decay = 0.0\n    learning_rate = 1e-9\n");
+    std::fs::write(at.join("still.toml"), still).unwrap();
+    let start = "train --method course --data d.npz --config still.toml --out again --start";
+    succeed_in(at, &format!("{start} run/hrn.onnx"));
+    let again = Model::load(&std::fs::read(at.join("again/hrn.onnx")).unwrap()).unwrap();
+    let judged = |hrn: &Model, press| hrn.judge_course(press).unwrap().probabilities;
+    for press in &checks.presses {
+        let pairs = judged(&hrn, &press.course)
+            .into_iter()
+            .zip(judged(&again, &press.course));
+        assert!(
+            pairs
+                .into_iter()
+                .all(|(one, other)| (one - other).abs() < 1e-4)
+        );
+    }
+    assert!(
+        again.card().data.contains("hrn.onnx"),
+        "{}",
+        again.card().data
+    );
+    std::fs::write(at.join("m.onnx"), BUILT_IN_HRN).unwrap();
+    let refused = hrn_train_in(at, &format!("{start} m.onnx"));
+    let expected = "m.onnx: not a model of the method course";
+    assert!(errors(&refused).contains(expected), "{refused:?}");
+
     // References change a verdict, and come back from a recording's text as they were.
     let press = &checks.presses[0].course;
     let references = hrn.references(&checks.references).unwrap();

@@ -399,6 +399,7 @@ fn bad_input_has_its_exit_code_and_one_line() {
         78 | train hrn100 tiny.npz --config log.toml | log.toml: log_above_n: found 1e-40
         2 | train hrn100 tiny.npz --labels 3 | --labels: found 3, expected at least 4
         2 | train hrn100 tiny.npz --seed 9223372036854775808 | --seed
+        2 | train hrn100 tiny.npz --start model.onnx | --start: only the method course starts from a model
         78 | train hrn100 tiny.npz --resume --out corrupt | corrupt/settings.toml: line 2
         74 | train hrn15 tiny.npz --out /dev/null/no | /dev/null/no
         1 | train ours tiny.npz --labels 160 | no unlabelled training presses are left
