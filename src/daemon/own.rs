@@ -214,6 +214,10 @@ mod tests {
         assert_eq!(loaded(pipeline(|_| {})), 3);
         let scaled = |of: &mut Description| of.sensor.calibration.newtons_per_count *= 2.0;
         assert_eq!(loaded(pipeline(scaled)), 0);
+        for most in [2, 0] {
+            let of_most = |of: &mut Description| of.sensor.own_presses = most;
+            assert_eq!(loaded(pipeline(of_most)), most as usize);
+        }
         let whole = fs::read(&path).unwrap();
         fs::write(&path, &whole[..whole.len() / 2]).unwrap();
         assert_eq!(loaded(pipeline(|_| {})), 0);

@@ -129,9 +129,10 @@ impl Judge {
     }
 
     /// Takes over own presses of the sensor that an earlier judge collected. Those of another model are
-    /// left out.
+    /// left out, and the older ones of too many.
     pub(crate) fn take_own(&mut self, own: OwnPresses) {
-        self.kept.own = own.of_model(&self.hrn);
+        let most = self.sensor.description().sensor.own_presses as usize;
+        self.kept.own = own.of_model(&self.hrn, most);
     }
 
     /// What a judge with `hrn` can take over from this one.

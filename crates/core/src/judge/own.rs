@@ -138,9 +138,13 @@ impl OwnPresses {
         }
         let shore = shore.value;
         self.presses.push(OwnPress { reference, shore });
+        self.keep_last(most);
+        Ok(())
+    }
+
+    fn keep_last(&mut self, most: usize) {
         let many = self.presses.len().saturating_sub(most);
         self.presses.drain(..many);
-        Ok(())
     }
 
     /// The presses as references, if they may be used.
@@ -168,13 +172,17 @@ impl OwnPresses {
         self.presses.len()
     }
 
-    /// The presses, if this model computed them. A recording or a file may hold anything.
-    pub(super) fn of_model(self, hrn: &Model) -> Self {
+    /// The last presses, at most `most`, if this model computed them. A recording or a file may hold anything.
+    pub(super) fn of_model(mut self, hrn: &Model, most: usize) -> Self {
         let mut presses = self.presses.iter();
         let is_usable = self.model == hrn.sha256()
             && presses.len() <= hrn.most_references()
             && presses.all(|press| press.shore.is_finite() && hrn.takes(&press.reference));
-        if is_usable { self } else { Self::default() }
+        if !is_usable {
+            return Self::default();
+        }
+        self.keep_last(most);
+        self
     }
 
     /// The presses without where and when the last one was, which another start cannot compare with.
