@@ -157,9 +157,14 @@ impl Fixed {
         self.framing == Framing::None && self.sync.is_empty() && self.tail.is_empty()
     }
 
-    /// The bytes of the mark of the next frame, which may be needed to know that a frame is whole.
-    pub(super) fn mark_bytes(&self) -> usize {
-        self.mark.len()
+    /// The most bytes that may yet become a frame.
+    pub(super) fn most_pending_bytes(&self) -> usize {
+        match self.framing {
+            // The mark of the next frame may be needed to know that a frame is whole.
+            Framing::None => self.bytes + self.mark.len(),
+            // A frame with some bytes too many is still known by its sync as a damaged one.
+            Framing::Slip | Framing::Cobs => 2 * self.bytes + 2,
+        }
     }
 
     /// The numbers of bytes of the shortest and of the longest frame.
@@ -298,7 +303,7 @@ impl Fixed {
 
     /// Searches frames that are packed.
     fn scan_packed(&self, cells: &Cells, bytes: &[u8], context: Context) -> Scan {
-        let (_, most) = self.least_and_most_bytes();
+        let most = self.most_pending_bytes();
         let end = self.framing.end();
         let found = bytes.iter().position(|&byte| byte == end);
         let Some(packed) = found.map(|at| &bytes[..=at]) else {

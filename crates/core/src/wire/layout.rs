@@ -143,7 +143,7 @@ impl Layout {
     /// The most bytes that may yet become a frame.
     pub fn most_pending_bytes(&self) -> usize {
         match &self.form {
-            Form::Fixed(fixed) => fixed.least_and_most_bytes().1 + fixed.mark_bytes(),
+            Form::Fixed(fixed) => fixed.most_pending_bytes(),
             Form::Text(_) => text::most_bytes(&self.cells) + 1,
         }
     }

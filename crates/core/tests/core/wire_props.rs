@@ -556,13 +556,15 @@ fn packed_frames_are_those_of_rfc_1055_and_of_the_paper_on_cobs() {
         let text = format!("framing = '{framing}'\nfooter_bytes = {footer}");
         let found = |bytes: &[u8]| counts(&text, bytes);
         assert_eq!(found(bytes), (vec![expected.to_vec()], 0), "{framing}");
-        // A frame that lost a byte costs itself alone.
-        let damaged = [&bytes[..], &bytes[..2], &bytes[3..], bytes].concat();
-        assert_eq!(
-            found(&damaged),
-            (vec![expected.to_vec(); 2], 1),
-            "{framing}"
-        );
+        // A frame that lost a byte, or has one too many, costs itself alone.
+        for (more, rest) in [(&[][..], 3), (&[7], 2)] {
+            let damaged = [&bytes[..], &bytes[..2], more, &bytes[rest..], bytes].concat();
+            assert_eq!(
+                found(&damaged),
+                (vec![expected.to_vec(); 2], 1),
+                "{framing}"
+            );
+        }
     }
 }
 
