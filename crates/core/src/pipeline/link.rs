@@ -29,7 +29,7 @@ pub(super) struct Link {
     pub(super) was_lost: bool,
     /// The arrival times of the latest frames.
     recent: VecDeque<Duration>,
-    /// When the last bytes came that are not settled.
+    /// When the last bytes came that are not settled, or when the port was opened.
     pub(super) last_bytes: Option<Duration>,
     pub(super) last_frame: Option<Stamp>,
     /// State and reason of the last published status, and the kind of a touch.
@@ -68,7 +68,8 @@ impl Link {
 
     /// The port is open.
     pub(super) fn opened(&mut self, since: Duration) {
-        self.last_bytes = None;
+        // A silence from now on is a pause before the first frame.
+        self.last_bytes = Some(since);
         if matches!(self.port, Port::Closed { .. }) {
             self.port = Port::Opened { since };
         }
@@ -275,12 +276,12 @@ impl Pipeline {
         })
     }
 
-    /// When a silence settles the pending bytes.
+    /// When a silence settles the pending bytes, or is the pause before a frame.
     pub(super) fn pause_deadline(&self) -> Option<Duration> {
         let last_bytes = self
             .link
             .last_bytes
-            .filter(|_| !self.decoder.pending().is_empty())?;
+            .filter(|_| !self.decoder.pending().is_empty() || self.decoder.awaits_pause())?;
         Some(last_bytes.saturating_add(self.sensor.period().mul_f64(PAUSE_PERIODS)))
     }
 

@@ -117,6 +117,11 @@ impl Decoder {
         self.place.in_sync |= self.layout.is_in_sync_after_pause();
     }
 
+    /// Whether a pause would show where a frame begins.
+    pub(crate) fn awaits_pause(&self) -> bool {
+        !self.place.in_sync && self.layout.is_in_sync_after_pause()
+    }
+
     /// Tells the decoder that the input ended or paused for half a period. A complete frame that
     /// only waited for the next header is then whole.
     pub fn settle(&mut self) {

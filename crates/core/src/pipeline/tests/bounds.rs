@@ -160,28 +160,32 @@ fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
 }
 
 #[test]
-fn the_bare_frames_of_a_file_follow_each_other_also_after_a_damaged_one() {
+fn bare_frames_follow_a_pause_and_those_of_a_file_each_other_also_after_a_damaged_one() {
     let mut described = Description::default();
     described.sensor.frame.preset = Some(Preset::None);
     described.sensor.frame.cell = Some(Cell::F32le);
     described.sensor.frame.rows = Some(4);
     described.sensor.frame.cols = Some(4);
     let sensor = Sensor::new(described).unwrap();
-    let frames = |clock, cells: &[f32]| {
+    let frames = |clock, ms, cells: &[f32]| {
         let mut pipeline = Pipeline::new(sensor.clone(), support::hrn(), clock);
+        if clock == Clock::Arrival {
+            pipeline.opened(at(0));
+        }
         let bytes: Vec<u8> = cells.iter().flat_map(|cell| cell.to_le_bytes()).collect();
-        pipeline.push(&bytes, at(0));
-        let status = pipeline.status(at(0));
+        pipeline.push(&bytes, at(ms));
+        let status = pipeline.status(at(ms));
         (status.frames, status.frames_damaged)
     };
     let mut cells = [7.0; 16 * 9];
-    assert_eq!(frames(Clock::FrameRate, &cells), (9, 0));
+    // On a line, only a pause or a request shows where a frame begins. A silence after the opening is a pause.
+    assert_eq!(frames(Clock::Arrival, 99, &cells), (0, 0));
+    assert_eq!(frames(Clock::Arrival, 100, &cells), (9, 0));
+    assert_eq!(frames(Clock::FrameRate, 0, &cells), (9, 0));
     cells[16 * 3 + 5] = f32::NAN;
-    assert_eq!(frames(Clock::FrameRate, &cells), (8, 1));
+    assert_eq!(frames(Clock::FrameRate, 0, &cells), (8, 1));
     cells[2] = f32::INFINITY;
-    assert_eq!(frames(Clock::FrameRate, &cells), (7, 2));
-    // On a line, only a pause or a request shows where a frame begins.
-    assert_eq!(frames(Clock::Arrival, &cells), (0, 0));
+    assert_eq!(frames(Clock::FrameRate, 0, &cells), (7, 2));
 }
 
 #[test]
