@@ -2,6 +2,7 @@
 
 use super::Setup;
 use hardnessd_core::press;
+use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::wire::Preset;
 
@@ -20,7 +21,9 @@ impl Setup {
                 table.calibration.gains = Some(Gains::File(shown.into()));
             }
         }
-        config.press = self.press_in_force();
+        let press = self.press_in_force();
+        let is_alike = press.is_some();
+        config.press = press.unwrap_or(config.press);
         let unix = &mut config.publish.unix;
         (unix.path, unix.control_path) = (Some(unix.path()), Some(unix.control_path()));
         if let Some(record) = &mut config.record {
@@ -39,21 +42,21 @@ impl Setup {
                 lines += &format!("  # {source}");
             }
             lines.push('\n');
+            if line == "[press]" && !is_alike {
+                lines.extend(self.sensors.iter().map(of_sensor));
+            }
         }
         lines
     }
 
-    /// The `[press]` table. A threshold that depends on the taxels is shown if it is that of all sensors.
-    fn press_in_force(&self) -> press::Settings {
+    /// The `[press]` table, if it is that of all sensors: thresholds depend on the taxels.
+    fn press_in_force(&self) -> Option<press::Settings> {
         let mut sensors = self
             .sensors
             .iter()
             .map(|sensor| sensor.for_recording().press);
         let first = sensors.next().unwrap_or_default();
-        match sensors.all(|press| press == first) {
-            true => first,
-            false => self.config.press.clone(),
-        }
+        sensors.all(|press| press == first).then_some(first)
     }
 
     /// Where the value of a key comes from.
@@ -70,6 +73,18 @@ impl Setup {
         let frame = key.strip_prefix("sensor.frame.");
         frame.and_then(preset).unwrap_or("default".to_owned())
     }
+}
+
+/// The thresholds of a sensor, as a comment.
+fn of_sensor(sensor: &Sensor) -> String {
+    let of = sensor.thresholds();
+    format!(
+        "# {}: contact_threshold_n = {}, begin_area_taxels = {}, end_area_taxels = {}\n",
+        sensor.name(),
+        of.contact_threshold_n,
+        of.begin_area_taxels,
+        of.end_area_taxels
+    )
 }
 
 #[cfg(test)]
@@ -99,6 +114,8 @@ mod tests {
             (first, "preset = \"jq\"  # written"),
             (first, "sync = \"AA 55 03 99\"  # preset jq"),
             (first, "length = \"none\"  # default"),
+            (first, "mask = 255  # default"),
+            (first, "stride_bytes = 1  # default"),
             (first, "rows = 9  # written"),
             (first, "newtons_per_count = 0.04  # default"),
             (own, "preset = \"none\"  # default"),
@@ -114,6 +131,15 @@ mod tests {
             (film, "mode = \"0660\"  # default"),
         ] {
             assert!(part.contains(&format!("{line}\n")), "{line} in {part}");
+        }
+        let unlike = text.replace("[press]", "[sensor.calibration]\npitch_mm = 7.0\n[press]");
+        std::fs::write(&path, unlike).unwrap();
+        let unlike = Setup::load(&path, None).unwrap().in_force();
+        for thresholds in [
+            "own: contact_threshold_n = 0.07, begin_area_taxels = 3, end_area_taxels = 1",
+            "film: contact_threshold_n = 0.28, begin_area_taxels = 3, end_area_taxels = 1",
+        ] {
+            assert!(unlike.contains(&format!("# {thresholds}\n")), "{unlike}");
         }
         // It is a configuration again, and the same one.
         let again: Config = toml::from_str(&lines).unwrap();

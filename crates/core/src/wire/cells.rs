@@ -30,6 +30,13 @@ impl Cell {
         }
     }
 
+    /// The bits that may carry the count, of whole numbers without a sign.
+    pub(super) fn bits(self) -> Option<u32> {
+        self.range()
+            .filter(|&(least, _)| least == 0.0)
+            .map(|(_, most)| most as u32)
+    }
+
     /// The number in the first bytes of `b`.
     pub fn read(self, b: &[u8]) -> f32 {
         match self {

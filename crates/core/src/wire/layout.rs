@@ -3,7 +3,7 @@
 use super::cells::Cells;
 use super::fixed::Fixed;
 use super::scan::{Context, Scan};
-use super::settings::Settings;
+use super::settings::{Cell, Settings};
 use super::text::{self, Lines};
 use crate::frame::{Array, RawFrame};
 use crate::range::{OutOfRange, check, from_to};
@@ -85,22 +85,21 @@ impl Layout {
             let fixed = Box::new(Fixed::new(&keys, array)?);
             (Form::Fixed(fixed), keys.cell.unwrap_or_default().range())
         };
-        // The bits of a cell that may carry the count.
-        let is_text = matches!(form, Form::Text(_));
-        let bits = match range {
-            _ if is_text => Some(u32::MAX),
-            Some((0.0, most)) => Some(most as u32),
-            _ => None,
-        };
+        let all_bits = keys.cell.and_then(Cell::bits);
         if let Some(mask) = keys.mask {
+            // A number of a text has no widest.
+            let bits = match form {
+                Form::Text(_) => Some(u32::MAX),
+                Form::Fixed(_) => all_bits,
+            };
             let bits = bits.ok_or_else(|| {
                 let expected = "none for cells with a sign, of 32 bits or of floats";
                 OutOfRange::new("mask", mask, expected)
             })?;
             from_to((1.0, bits.into()), "for this cell").check("mask", &mask)?;
         }
-        // A text has no widest number, so it can only be inverted by a mask that is written.
-        let mask = keys.mask.or(bits.filter(|_| invert && !is_text));
+        // All bits need no mask, unless the count is the mask minus the cell.
+        let mask = keys.mask.filter(|_| invert || keys.mask != all_bits);
         let full_scale = match (mask, range) {
             (Some(mask), _) => Some(mask as f32),
             (None, Some((least, _))) if invert => Some(0.0 - least),

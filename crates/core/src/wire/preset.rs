@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use toml::Table;
 
-use super::settings::{Preset, Settings};
+use super::settings::{Cell, Preset, Settings};
 use crate::range::OutOfRange;
 
 /// The table of each preset.
@@ -77,6 +77,8 @@ impl Settings {
         let keys: Self = keys.try_into().expect("each key is one of a table");
         Ok(Self {
             preset: Some(preset),
+            stride_bytes: keys.stride_bytes.or(keys.cell.map(Cell::bytes)),
+            mask: keys.mask.or(keys.cell.and_then(Cell::bits)),
             ..keys
         })
     }
