@@ -185,19 +185,23 @@ impl<'a> Cells<'a> {
         jumps * WRAPS > all
     }
 
-    /// Whether numbers are parts of longer ones: of four bytes in a row one is nearly always the same, or of
-    /// two numbers in a row one is nearly always small, and the other is not.
+    /// Whether numbers are parts of longer ones: of four bytes in a row one is nearly always the same and another
+    /// often is not, or of two numbers in a row one is nearly always small, and the other is not.
     fn is_part(&self, cell: Cell) -> bool {
         match cell.bytes() {
-            1 if self.bytes >= FEWEST_PARTS => (0..4).any(|phase| {
-                let bytes = || {
-                    self.pressed()
-                        .flat_map(|bytes| bytes.iter().skip(phase).step_by(4))
+            1 if self.bytes >= FEWEST_PARTS => {
+                let changes = |phase: usize, one_in: usize| {
+                    let bytes = || {
+                        self.pressed()
+                            .flat_map(|bytes| bytes.iter().skip(phase).step_by(4))
+                    };
+                    let usual = bytes().nth(1);
+                    one_in * bytes().filter(|&byte| Some(byte) != usual).count() >= bytes().count()
                 };
-                let usual = bytes().nth(1);
-                let others = bytes().filter(|&byte| Some(byte) != usual).count();
-                NEARLY_ALL * others < bytes().count()
-            }),
+                // Where something small presses a large array, few bytes change, whichever they are.
+                let is_pressed = (0..4).any(|phase| changes(phase, MANY));
+                is_pressed && (0..4).any(|phase| !changes(phase, NEARLY_ALL))
+            }
             2 => {
                 let (mut all, mut large) = (0, [0; 2]);
                 for bytes in self.pressed() {

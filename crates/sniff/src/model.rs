@@ -59,9 +59,14 @@ fn bits(left: f32, width: f32) -> f32 {
     (PI * (width + left * left / width)).log2()
 }
 
+/// The bits of a number of which two predictions are as likely.
+fn either(one: f32, other: f32) -> f32 {
+    1.0 + one.min(other) - (1.0 + (-(one - other).abs()).exp2()).log2()
+}
+
 /// The bits of each press in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
-/// each. A cell is predicted to be like those before it and above it, and to be at rest where little goes on
-/// around. All moments of a press count as one.
+/// each. A cell is predicted to be like those before it and above it, or to be at rest, beside an edge of what
+/// presses: both are as likely. Where little goes on around, it is at rest. All moments of a press count as one.
 pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64> {
     let width = cols * channels;
     let noise = pictures.noise;
@@ -99,7 +104,7 @@ pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64
             return bits(change[at], noise);
         }
         let width = LEFT_OF_AROUND * around + LEFT_OF_OWN * own / 2.0 + noise;
-        bits(change[at] - predicted, width)
+        either(bits(change[at] - predicted, width), bits(change[at], noise))
     };
     let of_picture = |picture: &Picture| -> f64 {
         let cells = pictures.changing();

@@ -143,6 +143,38 @@ fn boards_are_named_by_their_presets() {
 }
 
 #[test]
+fn a_stiff_object_shows_the_array_with_a_few_taxels() {
+    for (settings, seed) in [Preset::Jx255n, Preset::Flexitac]
+        .into_iter()
+        .flat_map(|name| (0..4).map(move |seed| (preset(name), seed)))
+    {
+        let layout = Layout::new(&settings).unwrap();
+        let Array { rows, cols } = layout.array();
+        let stream = &mut Stream::new(seed, "stiff");
+        let mut bytes = Vec::new();
+        for _ in 0..6 {
+            let (top, left) = (
+                rows / 2 - 3 + stream.below(4),
+                cols / 2 - 3 + stream.below(4),
+            );
+            let block: Vec<f64> = (0..12).map(|_| stream.range(4.0, 40.0)).collect();
+            for share in [
+                0.0, 0.0, 0.0, 0.0, 0.3, 0.7, 1.0, 1.0, 1.0, 0.9, 0.4, 0.0, 0.0,
+            ] {
+                let mut frame = RawFrame::zero(layout.array());
+                for (at, most) in block.iter().enumerate() {
+                    let place = (top + at / 3) * cols + left + at % 3;
+                    frame.counts[place] = (share * most).round() as f32;
+                }
+                layout.encode(&frame, &mut bytes);
+            }
+        }
+        let name = format!("preset = \"{}\"\n", settings.preset());
+        assert_eq!(lines(&bytes), name, "seed {seed}");
+    }
+}
+
+#[test]
 fn a_board_of_its_own_gets_keys_and_no_preset() {
     // The mark and the cells of a FlexiTac, but another array.
     let settings = Settings {
@@ -409,9 +441,17 @@ fn each_failure_has_its_own_message() {
         &packets.collect::<Vec<u8>>(),
         "a number from 0 to 7 that begins again",
     );
-    let telnet = pressed
-        .iter()
-        .flat_map(|frame| [vec![0xFF, 0xFF, 0xFE], bytes(frame)].concat());
+    // Taxels that saturate are doubled as the mark is.
+    let telnet = pressed.iter().flat_map(|frame| {
+        let cells = bytes(frame).into_iter().flat_map(|cell| match cell {
+            0..120 => vec![cell],
+            _ => vec![0xFF, 0xFF],
+        });
+        [0xFF, 0xFF, 0xFE]
+            .into_iter()
+            .chain(cells)
+            .collect::<Vec<u8>>()
+    });
     check(&telnet.collect::<Vec<u8>>(), "raw mode");
     let array = Array { rows: 80, cols: 80 };
     let (frames, _) = frames(array, 250, &mut Stream::new(3, "large"));
