@@ -10,7 +10,8 @@ use tokio::time::Instant;
 
 use super::Settings;
 
-/// How long an answer may take, beside its bytes on the line.
+/// How long an answer may take, beside its bytes on the line. It is also at most a third of the shortest stale time, so
+/// that a module that is silent makes no other one stale.
 const MOST_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// After a request without an answer, no module that is silent is asked for this share of the time in which
@@ -48,9 +49,11 @@ pub(super) struct Turns {
 impl Turns {
     pub(super) fn new(sensors: &[Settings], now: Instant) -> Self {
         let mut asks: Vec<Ask> = Vec::new();
+        let stale_after = sensors.iter().map(|sensor| sensor.stale_after).min();
+        let most_timeout = stale_after.map_or(MOST_TIMEOUT, |stale| MOST_TIMEOUT.min(stale / 3));
         let mut of = |sensor: &Settings| {
             let (request, every) = sensor.request.as_ref()?;
-            let timeout = sensor.on_the_line + MOST_TIMEOUT;
+            let timeout = sensor.on_the_line + most_timeout;
             let known = asks.iter().position(|ask| ask.request == *request);
             if let Some(ask) = known.map(|index| &mut asks[index]) {
                 ask.every = ask.every.min(*every);
@@ -139,16 +142,40 @@ mod tests {
     use super::*;
     use hardnessd_core::sensor::{Description, Sensor};
 
+    /// A sensor of 50 frames a second, at a port whose line takes no time.
+    fn settings(request: &[u8]) -> Settings {
+        let mut described = Description::default();
+        described.sensor.port = "tcp://localhost:1".parse().unwrap();
+        Settings {
+            request: Some((request.to_vec(), Duration::from_millis(20))),
+            stale_after: Duration::from_millis(150),
+            ..Settings::of(&Sensor::new(described).unwrap())
+        }
+    }
+
+    #[test]
+    fn a_silent_module_makes_no_other_one_stale() {
+        let begin = Instant::now();
+        let mut turns = Turns::new(&[settings(b"1"), settings(b"2"), settings(b"3")], begin);
+        // The third module never answers, and the others after 30 ms.
+        let (mut now, mut last, mut longest) = (begin, [begin; 2], Duration::ZERO);
+        while now < begin + Duration::from_secs(10) {
+            now = now.max(turns.due().unwrap());
+            let asked = match turns.ask(now) {
+                Some(b"1") => 0,
+                Some(b"2") => 1,
+                _ => continue,
+            };
+            now += Duration::from_millis(30);
+            turns.answered(asked, now);
+            longest = longest.max(now - last[asked]);
+            last[asked] = now;
+        }
+        assert!(longest < Duration::from_millis(150), "{longest:?}");
+    }
+
     #[test]
     fn a_module_that_is_silent_for_good_takes_a_twentieth_of_the_others_time() {
-        let settings = |request: &[u8]| {
-            let mut described = Description::default();
-            described.sensor.port = "tcp://localhost:1".parse().unwrap();
-            Settings {
-                request: Some((request.to_vec(), Duration::from_millis(20))),
-                ..Settings::of(&Sensor::new(described).unwrap())
-            }
-        };
         let begin = Instant::now();
         let mut turns = Turns::new(&[settings(b"1"), settings(b"2")], begin);
         // The first module answers within 2 ms. The second one is silent, and answers once at the end.
