@@ -9,8 +9,8 @@ use super::texture::Patch;
 use crate::random::Stream;
 use hardnessd_core::verdict::Piece;
 
-/// Width of the flat piece, mm.
-pub(super) const FLAT_MM: f64 = 20.0;
+/// Width of the weights, mm.
+const WEIGHT_MM: f64 = 20.0;
 /// Standard deviation of the flat piece's tilt under an arm, degrees.
 const TILT_DEG: f64 = 0.1;
 /// Modulus of steel and of hard plastics alike, beside which every cover is soft, MPa.
@@ -66,7 +66,7 @@ pub(super) struct Weight {
 /// The weights on sensors under one cover.
 pub(super) fn weights(bench: &mut Bench) -> Vec<Weight> {
     // A weight lies by itself, so it does not tilt.
-    let face = Face::flat(0.5 * FLAT_MM, 0.0);
+    let face = Face::flat(0.5 * WEIGHT_MM, 0.0);
     let stream = Stream::new(0, "places of weights");
     let mut weights = Vec::new();
     for place in 0..PLACES {

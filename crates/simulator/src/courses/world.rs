@@ -9,7 +9,7 @@ use super::{ARM_N_PER_MM, LabelledCourse, Plan, Reading};
 use crate::material::Split;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
-use crate::rigid::{self, FLAT_MM};
+use crate::rigid;
 use crate::sensor::{Design, Sensor};
 use crate::settings::{BroadSensors, CourseSettings, SensorDesigns};
 use crate::solved::SolvedPress;
@@ -20,8 +20,9 @@ use hardnessd_core::verdict::Piece;
 const REFERENCES: u32 = 5;
 /// Their forces, N: log-uniform, one in each fifth of this range.
 const REFERENCE_N: [f64; 2] = [3.0, 25.0];
-/// Radius of the rigid ball of a cover, mm.
+/// Radius of the rigid ball of a cover, and width of its rigid flat piece, mm.
 const BALL_MM: [f64; 2] = [5.0, 20.0];
+const FLAT_MM: [f64; 2] = [10.0, 50.0];
 /// The covers: Young's modulus in MPa, and thickness.
 const COVER_MPA: [f64; 2] = [0.1, 20.0];
 const COVER_MM: [f64; 2] = [0.5, 8.0];
@@ -79,6 +80,7 @@ struct Station<'a> {
     bench: Bench,
     arm_n_per_mm: f64,
     ball_mm: f64,
+    flat_mm: f64,
     electronics: Vec<Electronics>,
 }
 
@@ -162,6 +164,7 @@ impl<'a> Station<'a> {
             index,
             arm_n_per_mm,
             ball_mm: log_even(BALL_MM, &mut own),
+            flat_mm: log_even(FLAT_MM, &mut own),
             electronics: (0..sensors.electronics).map(electronics).collect(),
             draws,
             bench,
@@ -174,7 +177,7 @@ impl<'a> Station<'a> {
 
     /// The presses of the rigid pieces. `objects` is the number of the data set's other objects.
     fn references(&mut self, objects: u32) -> Vec<Option<LabelledCourse>> {
-        let (width_mm, radius_mm) = (FLAT_MM as f32, self.ball_mm as f32);
+        let (width_mm, radius_mm) = (self.flat_mm as f32, self.ball_mm as f32);
         let pieces = [Piece::Flat { width_mm }, Piece::Ball { radius_mm }];
         let mut made = Vec::new();
         for (piece, reference) in (0_u32..).zip(pieces) {

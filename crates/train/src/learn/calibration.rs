@@ -18,8 +18,9 @@ pub const ALPHA: f32 = 0.1;
 const LEAST_UNITS: usize = 9;
 /// A quantile is the mean over this many draws of one press from each unit.
 const DRAWS: usize = 50;
-/// The share of the covers, the worst ones, whose confidence is calibrated: a robot's own cover may be one.
-const WORST_COVERS: f64 = 0.1;
+/// The share of the covers, the worst ones, whose confidence is calibrated: a robot's own cover may be one. A tenth of
+/// a few covers may be one or two of which the network knows nothing.
+const WORST_COVERS: f64 = 0.5;
 
 /// The calibration computed from the held-out presses.
 #[derive(Debug, Clone, PartialEq)]
@@ -293,10 +294,10 @@ mod tests {
 
     #[test]
     fn the_temperature_is_that_of_the_worst_covers() {
-        // The larger logit is right in 9 of 10 presses under most covers, and in 6 of 10 under one of ten.
+        // The larger logit is right in 9 of 10 presses under half of the covers, and in 6 of 10 under the others.
         let judged = (0..200).map(|press| {
             let (unit, level) = (press / 10, usize::from(press % 2 == 0));
-            let right = if unit % 10 == 0 { 6 } else { 9 };
+            let right = if unit % 2 == 0 { 6 } else { 9 };
             judged(unit, level, press % 10 < right, 9.0)
         });
         let found = temperature(judged, Unit::Cover);
