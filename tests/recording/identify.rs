@@ -149,7 +149,7 @@ fn a_recording_keeps_the_references_that_presses_of_now_gave() {
 fn references_that_make_verdicts_worse_are_not_used_and_everybody_says_so() {
     let bench = bench();
     let simulate = "simulate --fps 20 --piece flat:40 --seed";
-    bench.succeeds(&format!("{simulate} 6 --presses 8 --to flat.bin"));
+    bench.succeeds(&format!("{simulate} 1 --presses 8 --to flat.bin"));
     bench.succeeds(&format!("{simulate} 5 --presses 20 --to again.bin"));
     let text = bench.succeeds(&format!("{IDENTIFY} --as flat:40 flat.bin"));
     assert!(text.contains("the daemon will not use them"), "{text}");

@@ -306,7 +306,7 @@ fn spoil(proto: &mut pb::ModelProto, output: &str, most: f32, other: &str) {
 fn a_press_that_cannot_be_kept_has_its_verdict() {
     // The model fails on presses of objects of which nothing is known, and judges the press.
     let mut proto = pb::ModelProto::decode(BUILT_IN).unwrap();
-    spoil(&mut proto, "reference", 1.0, "span");
+    spoil(&mut proto, "reference", 99.0, "high");
     let mut pipeline = tared(&[], |_| {});
     let hrn = Model::load(&proto.encode_to_vec()).unwrap();
     judge_by(&mut pipeline, Arc::new(hrn));
