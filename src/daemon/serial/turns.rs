@@ -49,8 +49,8 @@ pub(super) struct Turns {
 impl Turns {
     pub(super) fn new(sensors: &[Settings], now: Instant) -> Self {
         let mut asks: Vec<Ask> = Vec::new();
-        let stale_after = sensors.iter().map(|sensor| sensor.stale_after).min();
-        let most_timeout = stale_after.map_or(MOST_TIMEOUT, |stale| MOST_TIMEOUT.min(stale / 3));
+        let thirds = sensors.iter().map(|sensor| sensor.stale_after / 3);
+        let most_timeout = thirds.fold(MOST_TIMEOUT, Duration::min);
         let mut of = |sensor: &Settings| {
             let (request, every) = sensor.request.as_ref()?;
             let timeout = sensor.on_the_line + most_timeout;
