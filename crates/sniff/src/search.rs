@@ -136,8 +136,11 @@ pub(crate) fn in_frames(
     if places.is_empty() {
         return Err(Failure::NoArray(period));
     }
-    let presses = Presses::of(&columns.activity(frames))
-        .or_else(|| numbers_that_press(frames))
+    let activity = columns.activity(frames);
+    let presses = (contrast(&activity) <= CONTRAST)
+        .then(|| numbers_that_press(frames))
+        .flatten()
+        .or_else(|| Presses::of(&activity))
         .ok_or(Failure::NoPress(period))?;
     let pictures = |index| numbers::numbers(Cell::U8, frames.get(index));
     let pictures = Pictures::of(&presses, pictures).expect("bytes are numbers");
@@ -415,8 +418,9 @@ fn other_cells(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
     })
 }
 
-/// The presses by the numbers of frames, where bytes alone show none: the low bytes of floats and of signed
-/// numbers change as much at rest. Of all types of cells, the one that shows the presses best.
+/// The presses by the numbers of frames, where bytes alone hardly show any: the low bytes of floats and of signed
+/// numbers change as much at rest, and the high bytes of signed ones where they are near 0. Of all types of cells, the
+/// one that shows the presses best.
 fn numbers_that_press(frames: &Frames) -> Option<Presses> {
     let cells = CELLS.into_iter().filter(|cell| cell.bytes() > 1);
     let ways = cells.flat_map(|cell| (0..cell.bytes()).map(move |begin| (cell, begin)));
@@ -424,11 +428,7 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
         let numbers = |frame: &[u8]| numbers::numbers(cell, &frame[begin..]);
         let frames: Vec<Vec<f32>> = frames.iter().map(numbers).collect();
         let activity = activity(&frames)?;
-        let presses = Presses::of(&activity)?;
-        let mut sorted = activity;
-        sorted.sort_unstable();
-        let at = |share: usize| f64::from(sorted[(sorted.len() - 1) * share / 100]);
-        Some(((at(98) - at(25)) / (at(25) - at(0)).max(1.0), presses))
+        Some((contrast(&activity), Presses::of(&activity)?))
     });
     let best = found.max_by(|a, b| a.0.total_cmp(&b.0));
     best.filter(|(contrast, _)| *contrast > CONTRAST)
@@ -437,6 +437,14 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
 
 /// A press stands out by so many times as much as frames at rest differ.
 const CONTRAST: f64 = 4.0;
+
+/// By how many times as much as frames at rest differ, presses stand out.
+fn contrast(activity: &[u32]) -> f64 {
+    let mut sorted = activity.to_vec();
+    sorted.sort_unstable();
+    let at = |share: usize| f64::from(sorted[(sorted.len() - 1) * share / 100]);
+    (at(98) - at(25)) / (at(25) - at(0)).max(1.0)
+}
 
 /// How far the numbers of each frame are from rest, by what they change from frame to frame.
 fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {

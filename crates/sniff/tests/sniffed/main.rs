@@ -317,6 +317,19 @@ fn cells_that_are_below_0_for_moments_have_a_sign() {
 }
 
 #[test]
+fn presses_are_found_where_noise_crosses_0() {
+    // The high byte of a number near 0 changes as much at rest as in a press.
+    let array = Array { rows: 8, cols: 8 };
+    for seed in 0..12 {
+        let found = found_of(seed, array, &[0xE9, 0xD9, 0x45], |count, noise| {
+            let number = 20.0 * count + 25.0 * noise;
+            (number.round() as i16).to_le_bytes().to_vec()
+        });
+        assert_eq!(found, Some((array, Some(Cell::I16le))), "{seed}");
+    }
+}
+
+#[test]
 fn a_mark_is_no_large_float() {
     let array = Array { rows: 12, cols: 32 };
     // As a float, the first four bytes are 733,828.
