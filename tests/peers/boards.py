@@ -157,6 +157,26 @@ def hand(connection):
         connection.sendall(head + struct.pack(">H", 0x8000 | first % 97) * cells)
 
 
+def modules(connection):
+    """Three Paxini modules on one line, of which the third says nothing. An answer takes as long as the line."""
+    stream = connection.makefile("rb")
+    while len(request := stream.read(14)) == 14:
+        module = request[4]
+        if module < 3:
+            time.sleep(732 * 10 / 921_600)
+            head = PAXINI[:4] + bytes([module]) + PAXINI[5:]
+            connection.sendall(with_lrc(head + bytes([0]) + three_axes(239)))
+
+
+def modules_of(board, port):
+    """The tables of three modules at one port, by the table of one."""
+    for module in (1, 2, 3):
+        request = with_lrc(bytes.fromhex(f"55AA0900{module:02X}00FB0E040000CD02")).hex(" ").upper()
+        table = board.replace('"paxini"', f'"module{module}"').replace("D7 02 01", f"D7 02 {module:02X}")
+        table = re.sub(r'(?m)^port = ".*"', f'port = "{port}"', table)
+        yield re.sub(r'(?m)^request = ".*"', f'request = "{request}"', table)
+
+
 def robotiq():
     """A TSF-85 at a pty, whose path this returns. Not every packet has the static tactile field, and lengths vary."""
     ours, theirs = pty.openpty()
@@ -209,8 +229,8 @@ def newtons_are_counts(config):
     return "".join(tables)
 
 
-def check(binary, config, wanted):
-    """The daemon reads `wanted`, the counts by the sensors' names."""
+def check(binary, config, wanted, seconds=0):
+    """The daemon reads `wanted`, the counts by the sensors' names. None of these is stale for so long."""
     with Bench(binary, sensors=()) as bench:
         with open(bench.path("hardnessd.toml"), "w") as out:
             out.write('[publish.unix]\npath = "events.sock"\n' + newtons_are_counts(config))
@@ -220,6 +240,9 @@ def check(binary, config, wanted):
         for name, expected in wanted.items():
             found = wait_for(f"a frame of {name}", lambda name=name: frames(name)[3:])
             assert expected is None or all(frame["newtons"] == expected for frame in found), (name, found[0])
+        time.sleep(seconds)
+        for event in tail.events:
+            assert event["sensor"] not in wanted or event.get("state") != "stale" or not seconds, event
         tail.kill()
         tail.thread.join()
 
@@ -252,6 +275,10 @@ def main(binary):
         wanted[area["name"]] = [int(area["name"][5:]) % 97] * cells
     check(binary, config, wanted)
     print(f"inspire: {len(areas)} areas at one port")
+
+    config = "".join(modules_of(boards["paxini"], listening(modules)))
+    check(binary, config, {"module1": counts(238), "module2": counts(238)}, seconds=10)
+    print("paxini: two modules live at one port, and a silent one")
 
     bridged(binary, programs["bridge.py"], bridge, [row + col / 10 for row in range(4) for col in range(4)])
     print("bridge: UDP")
