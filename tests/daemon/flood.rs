@@ -7,6 +7,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hardnessd_simulator::random::Stream;
+use tempfile::TempDir;
+
 use crate::bench::{Bench, HTTP, frame, free_address, get, sensor};
 
 const PERIOD: Duration = Duration::from_millis(20);
@@ -150,4 +153,37 @@ fn noise_over_udp_is_recorded_at_no_more_than_the_line_carries() {
     assert!((recorded as f64) < most, "{recorded} of {most}");
     assert!(skipped > recorded, "{skipped}");
     assert!(grown < 40 << 20, "{grown}");
+}
+
+#[test]
+fn a_flood_leaves_the_room_that_is_to_stay_free() {
+    const MB: u64 = 1_000_000;
+    let disk = TempDir::new_in("/dev/shm").unwrap();
+    let free = || {
+        let disk = rustix::fs::statvfs(disk.path()).unwrap();
+        disk.f_bavail * disk.f_frsize
+    };
+    let least = free() / MB - 1;
+    let record = format!(
+        "[record]\ndir = {:?}\nkeep_free_mb = {least}\n",
+        disk.path()
+    );
+    let bench = Bench::new();
+    let address = free_address();
+    let large = sensor("large", &format!("udp://{address}"), 100)
+        + "[sensor.frame]\nrows = 64\ncols = 64\ncell = \"u16le\"\n";
+    let mut daemon = bench.daemon_of(&large, &record);
+    // Compression makes it no shorter.
+    let mut stream = Stream::new(1, "noise");
+    let noise: Vec<u8> = (0..60_000).map(|_| stream.next_u64() as u8).collect();
+    let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let begin = Instant::now();
+    let mut lowest = free();
+    while begin.elapsed() < Duration::from_secs(8) {
+        let _ = sender.send_to(&noise, address);
+        lowest = lowest.min(free());
+    }
+    let log = daemon.end();
+    assert!(log.contains("(record.keep_free_mb)"), "{log}");
+    assert!(lowest + MB > least * MB, "{lowest} of {least} MB");
 }

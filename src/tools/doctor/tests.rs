@@ -122,7 +122,11 @@ fn a_slow_latency_timer_is_a_fault() {
 fn who_holds_the_port_is_named_and_the_daemon_is_stopped_as_a_service() {
     let machine = Machine::new();
     machine.put("proc/88/comm", "hardnessd\n");
-    machine.put("proc/88/cmdline", "/usr/bin/hardnessd\0run\0--config\0x\0");
+    // A file that the process names is not opened: this one would never be.
+    let pipe = machine.path("pipe");
+    rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, rustix::fs::Mode::RWXU).unwrap();
+    let line = format!("/usr/bin/hardnessd\0run\0--config\0{}\0", pipe.display());
+    machine.put("proc/88/cmdline", &line);
     fs::create_dir_all(machine.path("proc/88/fd")).unwrap();
     symlink("/dev/ttyUSB0", machine.path("proc/88/fd/3")).unwrap();
     one(

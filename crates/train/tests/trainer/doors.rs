@@ -11,3 +11,22 @@ fn a_data_set_that_the_fuzzer_kept_is_read_or_refused() {
     }
     assert!(tried > 1, "{tried}");
 }
+
+#[test]
+fn a_user_who_may_have_no_more_threads_is_told_so() {
+    use std::os::unix::process::CommandExt;
+
+    let program = std::fs::File::open(env!("CARGO_BIN_EXE_hrn-train")).unwrap();
+    let mut shell = std::process::Command::new("sh");
+    // Another user may execute an open file, wherever it lies.
+    shell.args(["-c", "ulimit -u 3 && exec /proc/self/fd/0 inspect x"]);
+    if rustix::process::getuid().is_root() {
+        // No limit holds for root.
+        shell.uid(65_534).gid(65_534);
+    }
+    let output = shell.current_dir("/").stdin(program).output().unwrap();
+    let said = super::errors(&output);
+    assert_eq!(output.status.code(), Some(74), "{said}");
+    assert!(said.starts_with("hrn-train: threads: "), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+}
