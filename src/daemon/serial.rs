@@ -285,7 +285,7 @@ impl Task {
                 }
                 () = maybe::until(self.turns.due()) => {
                     if let Some(request) = self.turns.ask(Instant::now()) {
-                        line.request(request, self.stale_after);
+                        line.request(request);
                     }
                     continue;
                 }
@@ -394,10 +394,10 @@ impl Line {
         }
     }
 
-    /// Sends a request, but to no sender of datagrams that sends no frames.
-    fn request(&self, request: &[u8], stale_after: Duration) {
+    /// Sends a request, but few to a sender of datagrams that sends no frames.
+    fn request(&mut self, request: &[u8]) {
         match self {
-            Self::Udp(udp) if !udp.may_be_a_sensor(stale_after) => {}
+            Self::Udp(udp) => udp.request(request),
             _ => self.send(request),
         }
     }

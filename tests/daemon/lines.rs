@@ -187,9 +187,9 @@ fn bytes_hold_no_place_and_requests_go_to_a_sender_of_frames() {
         noise.send_to(b"7", address).unwrap();
         requests() > 0
     });
-    // A stranger that sends nothing more is asked for as long as a sensor may need, and no longer.
-    std::thread::sleep(Duration::from_secs(1));
-    requests();
+    // A stranger that sends nothing more is asked as often as a sensor may need, and no more.
+    std::thread::sleep(Duration::from_secs(2));
+    assert!(requests() > 20);
     std::thread::sleep(Duration::from_millis(300));
     assert_eq!(requests(), 0);
     // One byte every 20 ms holds the place for half a second at a time.
@@ -205,4 +205,31 @@ fn bytes_hold_no_place_and_requests_go_to_a_sender_of_frames() {
     // Once it has the place, it keeps it.
     let taken = place.iter().filter(|&&frames| frames > 0).count() as u64;
     assert!(place.last().unwrap() + 5 > taken, "{place:?}");
+}
+
+#[test]
+fn silent_modules_at_a_port_of_datagrams_leave_the_other_one_live() {
+    let bench = Bench::new();
+    let (board, address) = (udp(), free_address());
+    let module = |name: &str, request: &str| {
+        let keys = format!("[sensor.frame]\nrequest = \"{request}\"\n");
+        sensor(name, &format!("udp://{address}"), 50) + &keys
+    };
+    let modules = ["01", "02", "03"].map(|number| module(&format!("m{number}"), number));
+    let _daemon = bench.daemon_of(&modules.concat(), "");
+    let mut subscriber = bench.subscriber();
+    // It says once where it is.
+    board.send_to(b"7", address).unwrap();
+    let mut answers = 0;
+    while answers < 50 {
+        let mut request = [0; 16];
+        board.recv(&mut request).unwrap();
+        if request[0] == 3 {
+            board.send_to(&frame(0.0), address).unwrap();
+            answers += 1;
+        }
+    }
+    wait_for("frames", || {
+        subscriber.status("m03")["frames"].as_u64() > Some(40)
+    });
 }

@@ -23,6 +23,10 @@ const GREETING: Duration = Duration::from_millis(500);
 /// sensor that is only silent answers to the system's probes.
 const GONE: Duration = Duration::from_secs(10);
 
+/// The most requests to a sender of datagrams that has sent no frame. A stranger gets no more, and of the modules of a
+/// board some may be silent.
+const UNPROVEN_REQUESTS: u32 = 32;
+
 /// Connects to `address`, a host and a port.
 pub(super) fn connect(address: &str) -> io::Result<TcpStream> {
     let mut last = None;
@@ -84,6 +88,8 @@ struct Sender {
     /// When its last frame came, or its first bytes.
     last: Instant,
     sends_frames: bool,
+    /// The number of requests to it since then.
+    requests: u32,
     /// Whether another one was reported.
     reported: bool,
 }
@@ -118,6 +124,7 @@ impl Udp {
                 if !sender.sends_frames && !sender.is_new(stale_after) {
                     // Nobody else came since its time was over.
                     sender.last = Instant::now();
+                    sender.requests = 0;
                 }
                 // An empty datagram is no end.
                 match bytes {
@@ -139,6 +146,7 @@ impl Udp {
                     address,
                     last: Instant::now(),
                     sends_frames: false,
+                    requests: 0,
                     reported: false,
                 });
                 Received::OfAnother(bytes)
@@ -154,16 +162,20 @@ impl Udp {
         }
     }
 
-    /// Whether there is a sender that has sent frames, or has had no time for one yet.
-    pub(super) fn may_be_a_sensor(&self, stale_after: Duration) -> bool {
-        let sender = self.sender.as_ref();
-        sender.is_some_and(|sender| sender.sends_frames || sender.is_new(stale_after))
-    }
-
     /// Sends bytes to the sender, if there is one and there is room.
     pub(super) fn send(&self, bytes: &[u8]) {
         if let Some(sender) = &self.sender {
             let _ = self.socket.try_send_to(bytes, sender.address);
+        }
+    }
+
+    /// Sends a request to the sender, unless it has had some and sends no frames.
+    pub(super) fn request(&mut self, bytes: &[u8]) {
+        if let Some(sender) = &mut self.sender
+            && (sender.sends_frames || sender.requests < UNPROVEN_REQUESTS)
+        {
+            sender.requests = sender.requests.saturating_add(1);
+            self.send(bytes);
         }
     }
 }
