@@ -213,8 +213,9 @@ impl<'a> Cells<'a> {
                         }
                     }
                 }
-                let [first, second] = large.map(|large| NEARLY_ALL * large < all);
-                first != second
+                // Of neighbours in an array, one may be large a little more often.
+                let [less, more] = [large[0].min(large[1]), large[0].max(large[1])];
+                NEARLY_ALL * less < all && NEARLY_ALL * more >= all && more > MANY * less
             }
             _ => false,
         }
