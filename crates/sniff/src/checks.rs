@@ -83,13 +83,19 @@ pub(crate) fn find(
                     })
                 })
             };
-            // One of two bytes or more holds by chance nowhere. Others begin with the mark, or the cells.
-            let mut begins = (places.end..=length).filter(|&begin| {
-                checksum.bytes() > 1 || begin == length || beside[begin].constant().is_some()
-            });
-            let begin = begins.find(|&begin| holds(begin, at));
-            if begin.is_some() || holds(length, 0) {
-                return Some(check(begin));
+            if holds(length, 0) {
+                return Some(check(None));
+            }
+            // One of two bytes or more holds by chance nowhere. Others begin with the mark, or behind it.
+            let is_constant =
+                |at: usize| beside.get(at).is_some_and(|kind| kind.constant().is_some());
+            let is_beginning = |begin: usize| {
+                let is_beside_mark = is_constant(begin) || is_constant(begin.saturating_sub(1));
+                checksum.bytes() > 1 || begin == length || is_beside_mark
+            };
+            let mut begins = (places.end..=length).filter(|&begin| is_beginning(begin));
+            if let Some(begin) = begins.find(|&begin| holds(begin, at)) {
+                return Some(check(Some(begin)));
             }
         }
     }

@@ -9,7 +9,7 @@ mod generator;
 
 use generator::{Case, case, frames, hand, unreadable};
 use hardnessd_core::frame::{Array, RawFrame};
-use hardnessd_core::wire::{Cell, Decoder, Layout, Preset, Settings};
+use hardnessd_core::wire::{Cell, Checksum, Decoder, Layout, Preset, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_sniff::{Arrival, Capture, Failure, Found, Known, Scale, sniff};
 
@@ -314,6 +314,37 @@ fn cells_that_are_below_0_for_moments_have_a_sign() {
         }
     }
     assert!(sure >= 4, "{sure}");
+}
+
+#[test]
+fn a_checksum_is_found_whatever_it_covers() {
+    const MARK: [u8; 4] = [0xA5, 0x5A, 0x00, 0x86];
+    let array = Array { rows: 8, cols: 10 };
+    for checksum in [
+        Checksum::Sum8,
+        Checksum::Xor8,
+        Checksum::Crc16Modbus,
+        Checksum::Crc32,
+    ] {
+        // From the cells on, from the counter before them, and from the mark.
+        for (over, begin) in [("\"cells\"", 6), ("\"after-sync\"", 4), ("", 0)] {
+            let mut stream = Stream::new(3, "covered");
+            let mut bytes = Vec::new();
+            for (number, frame) in (0_u16..).zip(frames(array, 250, &mut stream).0) {
+                let mut packet = [&MARK[..], &number.to_le_bytes()].concat();
+                packet.extend(frame.counts.iter().map(|&count| count as u8));
+                let sum = checksum.sent(&packet[begin..]);
+                packet.extend(&sum[..checksum.bytes()]);
+                bytes.extend(packet);
+            }
+            let found = lines(&bytes);
+            let is_found = found.contains(&format!("checksum_over = {over}")) != over.is_empty();
+            assert!(
+                is_found && !found.contains("\"none\"\nrows"),
+                "{begin}: {found}"
+            );
+        }
+    }
 }
 
 #[test]
