@@ -212,14 +212,14 @@ impl Fixed {
         }
     }
 
-    /// The frame at `at`. `None` if more bytes are needed to know.
+    /// The frame at `at`, or nothing of it if a cell is no number. `None` if more bytes are needed to know.
     fn frame_at(
         &self,
         cells: &Cells,
         sums: &mut Sums,
         (bytes, at): (&[u8], usize),
         context: Context,
-    ) -> Option<Result<RawFrame, Damage>> {
+    ) -> Option<Result<Option<RawFrame>, Damage>> {
         let rest = &bytes[at..];
         let (number_at, number) = &self.number;
         rest.get(..self.mark.len().max(number_at + number.len()))?;
@@ -252,7 +252,7 @@ impl Fixed {
             }
         }
         let numbers = self.cells.iter().map(|&at| self.cell.read(&frame[at..]));
-        Some(cells.frame(numbers).ok_or(Damage))
+        Some(Ok(cells.frame(numbers)))
     }
 
     /// Searches a layout that has a sync or a tail. Without a mark at its beginning, only the first
@@ -267,7 +267,8 @@ impl Fixed {
         let (mut at, mut damaged) = (0, 0);
         loop {
             match self.frame_at(cells, &mut sums, (bytes, at), context) {
-                Some(Ok(frame)) if at == 0 => return Scan::found(self.bytes, frame),
+                Some(Ok(Some(frame))) if at == 0 => return Scan::found(self.bytes, frame),
+                Some(Ok(None)) if at == 0 => return Scan::past(1, 1),
                 Some(Ok(_)) | None => return Scan::past(at, damaged),
                 Some(Err(Damage)) => {}
             }
@@ -290,7 +291,7 @@ impl Fixed {
         if context.in_sync && bytes.len() >= self.bytes {
             let mut sums = Sums::new(self.checksum, bytes);
             return match self.frame_at(cells, &mut sums, (bytes, 0), context) {
-                Some(Ok(frame)) => Scan::found(self.bytes, frame),
+                Some(Ok(Some(frame))) => Scan::found(self.bytes, frame),
                 _ if context.settled => Scan::past(bytes.len(), damaged),
                 _ => Scan::past(self.bytes, damaged),
             };
@@ -320,8 +321,12 @@ impl Fixed {
         };
         let mut sums = Sums::new(self.checksum, &unpacked);
         let frame = self.frame_at(cells, &mut sums, (&unpacked, 0), settled);
-        if let (Some(Ok(frame)), true) = (frame, unpacked.len() == self.bytes) {
-            return Scan::found(packed.len(), frame);
+        match frame {
+            Some(Ok(Some(frame))) if unpacked.len() == self.bytes => {
+                return Scan::found(packed.len(), frame);
+            }
+            Some(Ok(None)) if unpacked.len() == self.bytes => return Scan::past(packed.len(), 1),
+            _ => {}
         }
         let is_candidate = context.in_sync && packed.len() > 1 && shares(&unpacked, &self.sync);
         Scan::past(packed.len(), is_candidate.into())

@@ -7,6 +7,7 @@ use super::settings::{Cell, Settings};
 use super::text::{self, Lines};
 use crate::frame::{Array, RawFrame};
 use crate::range::{OutOfRange, check, from_to};
+use crate::wording::is_plain;
 
 /// The way to find counts in bytes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -73,14 +74,14 @@ impl Layout {
         );
         // The range of a cell, if it is known.
         let (form, range) = if settings.preset().is_text() {
-            let heading = keys.heading.clone().unwrap_or_default().into_bytes();
+            let heading = keys.heading.as_deref().unwrap_or_default();
             check(
                 "heading",
-                keys.heading.as_deref().unwrap_or_default(),
-                heading.len() <= MOST_HEADING_BYTES && !heading.contains(&b'\n'),
-                "at most 64 bytes on one line",
+                heading,
+                heading.len() <= MOST_HEADING_BYTES && is_plain(&heading.replace('\t', " ")),
+                "at most 64 bytes without hidden characters",
             )?;
-            (Form::Text(heading), None)
+            (Form::Text(heading.as_bytes().to_vec()), None)
         } else {
             let fixed = Box::new(Fixed::new(&keys, array)?);
             (Form::Fixed(fixed), keys.cell.unwrap_or_default().range())

@@ -540,6 +540,17 @@ fn a_float_that_is_no_number_is_damage() {
         let bytes = [of([1.0; 3]), of([4.0, wrong, 6.0]), of([7.0; 3])].concat();
         let found = counts("sync = 'A5 5A'\ncell = 'f32le'\ntail = '0D 0A'", &bytes);
         assert_eq!(found, (vec![vec![1.0; 3], vec![7.0; 3]], 1), "{wrong}");
+        // Also when none is right, and nothing shows where the first one begins.
+        let cells = [wrong; 3].map(f32::to_le_bytes).concat();
+        let tailed = [&cells[..], &[0x0D, 0x0A]].concat();
+        let mut slip = Vec::new();
+        slip_codec::SlipEncoder::new(false)
+            .encode(&cells, &mut slip)
+            .unwrap();
+        for (keys, frame) in [("tail = '0D 0A'", tailed), ("framing = 'slip'", slip)] {
+            let found = counts(&format!("{keys}\ncell = 'f32le'"), &frame.repeat(4));
+            assert_eq!(found, (Vec::new(), 4), "{keys}: {wrong}");
+        }
     }
 }
 
