@@ -14,6 +14,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
+use tokio::sync::oneshot;
 use tracing::warn;
 
 use super::config::directory_of_service;
@@ -36,6 +37,9 @@ struct Kept {
     presses: OwnPresses,
 }
 
+/// Comes when the thread has written all.
+pub(super) type Written = oneshot::Receiver<()>;
+
 /// The files of own presses. Without a directory, own presses last as long as the daemon.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Store(Option<Directory>);
@@ -49,24 +53,29 @@ struct Directory {
 }
 
 impl Store {
-    /// The store in the directory that systemd or the user's environment names.
-    pub(super) fn of_environment() -> Result<Self, NoThread> {
+    /// The store in the directory that systemd or the user's environment names, and its end: all that was saved is
+    /// written some time after the last store was dropped.
+    pub(super) fn of_environment() -> Result<(Self, Option<Written>), NoThread> {
         let service = directory_of_service("STATE_DIRECTORY").map(|path| (path, false));
         let user = || Some((of_user(|variable| env::var_os(variable))?, true));
         match service.or_else(user) {
-            Some((path, is_of_user)) => Self::in_directory(path, is_of_user),
-            None => Ok(Self::default()),
+            Some((path, is_of_user)) => {
+                let (store, written) = Self::in_directory(path, is_of_user)?;
+                Ok((store, Some(written)))
+            }
+            None => Ok((Self::default(), None)),
         }
     }
 
-    fn in_directory(path: PathBuf, is_of_user: bool) -> Result<Self, NoThread> {
+    fn in_directory(path: PathBuf, is_of_user: bool) -> Result<(Self, Written), NoThread> {
         let (changed, inbox) = channel();
-        spawn_thread("own presses", move || write_all(&inbox))?;
-        Ok(Self(Some(Directory {
+        let written = spawn_thread("own presses", move || write_all(&inbox))?;
+        let directory = Directory {
             path,
             changed,
             is_of_user,
-        })))
+        };
+        Ok((Self(Some(directory)), written))
     }
 
     /// Gives a pipeline the own presses of its sensor, if they are of its calibration and model.
@@ -150,7 +159,6 @@ fn write_all(changed: &Receiver<(PathBuf, Kept)>) {
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
-    use std::time::Duration;
 
     use super::*;
     use hardnessd_core::pipeline::{Clock, Input};
@@ -167,7 +175,7 @@ mod tests {
     }
 
     fn store(directory: &Path) -> Store {
-        Store::in_directory(directory.to_owned(), false).unwrap()
+        Store::in_directory(directory.to_owned(), false).unwrap().0
     }
 
     #[test]
@@ -198,13 +206,11 @@ mod tests {
             first.take(Input::Bytes(bytes), at(0)).unwrap();
         }
         assert_eq!(first.own_presses().count(), 3);
-        let saving = store(directory.path());
+        let (saving, written) = Store::in_directory(directory.path().to_owned(), false).unwrap();
         saving.save(&first);
         drop(saving);
+        written.blocking_recv().unwrap();
         let path = directory.path().join("own-sensor.json");
-        while !path.exists() {
-            std::thread::sleep(Duration::from_millis(1));
-        }
 
         let loaded = |pipeline: Pipeline| {
             let mut pipeline = pipeline;
@@ -218,8 +224,13 @@ mod tests {
             let of_most = |of: &mut Description| of.sensor.own_presses = most;
             assert_eq!(loaded(pipeline(of_most)), most as usize);
         }
-        let whole = fs::read(&path).unwrap();
-        fs::write(&path, &whole[..whole.len() / 2]).unwrap();
-        assert_eq!(loaded(pipeline(|_| {})), 0);
+        let whole = fs::read_to_string(&path).unwrap();
+        // A file that somebody changed says nothing of known objects, and is whole.
+        let labelled = whole.replace(r#""own""#, r#""labelled""#);
+        for changed in [labelled.as_str(), &whole[..whole.len() / 2]] {
+            assert_ne!(changed, whole);
+            fs::write(&path, changed).unwrap();
+            assert_eq!(loaded(pipeline(|_| {})), 0);
+        }
     }
 }

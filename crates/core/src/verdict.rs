@@ -43,6 +43,9 @@ pub use self::settings::{BuiltIn, Settings};
 pub use self::shore::{Borders, Distribution, Level, LevelTable, MOST_LEVELS, Shore, are_levels};
 pub use self::tried::Tried;
 
+/// No number that a model keeps of a press is so large.
+const MOST_FEATURE: f32 = 1e6;
+
 /// The default model, built into the binary; `models/course.md` is its card.
 pub const BUILT_IN: &[u8] = include_bytes!("../../../models/course.onnx");
 
@@ -305,9 +308,15 @@ impl Model {
     }
 
     /// Whether the model may have computed this reference.
-    pub(crate) fn takes(&self, reference: &Reference) -> bool {
+    fn takes(&self, reference: &Reference) -> bool {
         reference.features.len() == self.file.lengths.features
             && reference.knowledge != Knowledge::None
+    }
+
+    /// Whether the model may have computed this reference of a sensor's own press.
+    pub(crate) fn takes_own(&self, reference: &Reference) -> bool {
+        let are_likely = reference.features.iter().all(|x| x.abs() < MOST_FEATURE);
+        self.takes(reference) && reference.knowledge == Knowledge::Own && are_likely
     }
 
     /// The references of the sensor whose presses this model judges.

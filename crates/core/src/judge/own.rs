@@ -177,7 +177,7 @@ impl OwnPresses {
         let mut presses = self.presses.iter();
         let is_usable = self.model == hrn.sha256()
             && presses.len() <= hrn.most_references()
-            && presses.all(|press| press.shore.is_finite() && hrn.takes(&press.reference));
+            && presses.all(|press| press.shore.is_finite() && hrn.takes_own(&press.reference));
         if !is_usable {
             return Self::default();
         }

@@ -102,10 +102,22 @@ impl Pipeline {
     pub fn with_model(&self, sensor: Sensor, hrn: Arc<Model>) -> Option<Self> {
         let state = AtRest {
             judge: self.judge.kept_for(&hrn),
+            context: self.context_for(&hrn),
             ..self.at_rest()?
         };
         let track = self.judge.track.clone();
         Some(Self::new(sensor, hrn, self.clock).after(state, track))
+    }
+
+    /// The context for verdicts of `hrn`. The level in it is a number of a model's levels.
+    fn context_for(&self, hrn: &Model) -> Option<Value> {
+        let mut context = self.judge.context.clone()?;
+        if hrn.card().levels != self.hrn().card().levels
+            && let Some(keys) = context.as_object_mut()
+        {
+            keys.remove("level");
+        }
+        Some(context)
     }
 
     /// The pipeline of a sensor that begins anew with other tables. Its counters, its context and the
@@ -118,6 +130,7 @@ impl Pipeline {
         if judge::owner(&sensor, &hrn) != judge::owner(&self.sensor, self.hrn()) {
             kept.own = OwnPresses::default();
         }
+        let context = self.context_for(&hrn);
         let next = Self::new(sensor, hrn, self.clock);
         let place = Place {
             in_sync: next.decoder.place().in_sync,
@@ -128,6 +141,7 @@ impl Pipeline {
             decoder: place,
             tare: next.tare.at_rest(),
             judge: kept,
+            context,
             ..self.state()
         };
         next.after(state, self.judge.track)

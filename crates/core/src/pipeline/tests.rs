@@ -13,7 +13,7 @@ use crate::frame::Array;
 use crate::motion::Point;
 use crate::sensor::Description;
 use crate::tests::support;
-use crate::verdict::BUILT_IN_HRN;
+use crate::verdict::{BUILT_IN, BUILT_IN_HRN, Level};
 use crate::wire::Preset;
 
 const PERIOD: Duration = Duration::from_millis(200);
@@ -312,6 +312,23 @@ fn a_press_is_judged_by_the_model_that_it_began_with() {
     let verdict = last_verdict(&mut next, 9, &short_press());
     let expected = (2, Some(Rejection::LowForce));
     assert_eq!((verdict.press, verdict.rejected), expected);
+}
+
+#[test]
+fn a_model_of_other_levels_forgets_the_level_that_was_said() {
+    let mut pipeline = ready(|_| {});
+    let said = serde_json::json!({"object": "cup", "level": 4});
+    pipeline.judge.context = Some(said.clone());
+    let (sensor, same) = (pipeline.sensor().clone(), pipeline.hrn().clone());
+    let next = pipeline.with_model(sensor.clone(), same.clone()).unwrap();
+    assert_eq!(next.judge.context, Some(said));
+    let two = vec![Level::new(1, "hard", ">60"), Level::new(2, "soft", "<=60")];
+    let other = Model::load(BUILT_IN).unwrap().with_levels(two);
+    let other = Arc::new(other.unwrap());
+    let kept = Some(serde_json::json!({"object": "cup"}));
+    let next = pipeline.with_model(sensor.clone(), other.clone());
+    assert_eq!(next.unwrap().judge.context, kept);
+    assert_eq!(pipeline.restarted(sensor, other).judge.context, kept);
 }
 
 /// Gives each input at its time in ms, and compares the events in words.

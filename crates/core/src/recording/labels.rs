@@ -68,9 +68,16 @@ pub fn check_label(key: &str, value: &str) -> Result<(), String> {
 pub fn object_of(name: &str) -> u32 {
     let hash = sha256_hex(name.as_bytes());
     let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
-    // The numbers below 2^31 are left to people, who count up from 0.
-    number | 1 << 31
+    number | NAMED
 }
+
+/// Whether the number of an object is that of a name.
+pub fn is_named(object: u32) -> bool {
+    object >= NAMED
+}
+
+/// The numbers below this are left to people, who count up from 0.
+const NAMED: u32 = 1 << 31;
 
 /// The keys of labels that mean something to `hrn-train` and `identify`.
 const KEYS: [&str; 6] = ["level", "object", "shore", "material", "reference", "name"];
