@@ -112,12 +112,27 @@ pub async fn run(
         _ => stderr_line!("press {seen} of {wanted}"),
     };
     let made = live::gather(setup, name, wanted, &args.files, print_next, end, read);
-    all.extend(made.await?);
-    if all.len() > MOST_REFERENCES {
+    let made = made.await?;
+    let is_twice = |press: &ReferencePress| {
+        let mut earlier = all.iter();
+        earlier.any(|earlier| earlier.course.moments == press.course.moments)
+    };
+    if made.iter().any(is_twice) {
+        let twice = "has these presses already: name each recording once";
+        return Err(Failure::new(
+            FAILED,
+            format!("{} {twice}", args.out.display()),
+        ));
+    }
+    all.extend(made);
+    // A model without references may be followed by one that has them.
+    let most = match hrn.most_references() {
+        0 => MOST_REFERENCES,
+        most => most,
+    };
+    if all.len() > most {
         let found = all.len();
-        let many = format!(
-            "found {found} presses, expected at most {MOST_REFERENCES}: leave recordings out"
-        );
+        let many = format!("found {found} presses, expected at most {most}: leave recordings out");
         return Err(Failure::new(FAILED, many));
     }
     let bytes = references::write(&all).of(args.out.display(), IO)?;
@@ -287,8 +302,10 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
     }
     if tried.are_worse() {
         text += "these references make verdicts worse, so the daemon will not use them: check newtons with \
-                 `calibrate force`, press from 5 N on, or leave `references` out\n";
-    } else if flat + ball > 0 && (flat < 2 || ball < 2) {
+                 `calibrate force`, press from 5 N on, add other pieces, or leave `references` out\n";
+        return text;
+    }
+    if flat + ball > 0 && (flat < 2 || ball < 2) {
         text += "a light and a hard press on a rigid flat piece and on a rigid ball tell most\n";
     }
     text + &format!("\n[[sensor]]\nreferences = {out:?}\n")
