@@ -20,6 +20,7 @@ use self::comparison::Comparison;
 pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
 use crate::data::collect::{self, Collection, Settings};
+use crate::data::findings;
 use crate::data::presses::{Layout, Presses};
 use crate::data::source::papers_levels;
 use crate::model::export::{Learnt, validation};
@@ -62,6 +63,7 @@ pub fn fit(
     levels: Option<Vec<Level>>,
 ) -> anyhow::Result<(Report, Option<Written>)> {
     let presses = read(data, sensor, levels)?;
+    let doubtful = findings::doubtful(&presses)?;
     let all: Vec<usize> = presses.labelled(Split::Train).collect();
     let places = whole(&presses, &all);
     check(&presses, &places)?;
@@ -108,6 +110,7 @@ pub fn fit(
         control,
     };
     let (mut report, chosen) = comparison.report();
+    report.remarks.splice(0..0, doubtful);
     let pieces = all.len() - places.len();
     if pieces > 0 {
         let remark = format!(

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::hash::{BuildHasher as _, RandomState};
 
 use anyhow::ensure;
+use hardnessd_core::recording::is_named;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 
@@ -40,6 +41,23 @@ const REPEATED: Kind = (true, "of one frame, repeated");
 ///
 /// Returns all reasons for which no model should be made of such data, as one error.
 pub fn warnings(presses: &Presses, labels: usize) -> anyhow::Result<Vec<String>> {
+    let mut warnings = doubtful(presses)?;
+    warnings.extend(levels(presses));
+    let labelled = presses.labelled(Split::Train).count();
+    if labels < labelled {
+        warnings.push(format!(
+            "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
+        ));
+    }
+    Ok(warnings)
+}
+
+/// Looks through `presses`, however many of them are used. Gives what is doubtful.
+///
+/// # Errors
+///
+/// As [`warnings`].
+pub fn doubtful(presses: &Presses) -> anyhow::Result<Vec<String>> {
     let (mut errors, mut warnings) = (Vec::new(), Vec::new());
     let mut first = BTreeMap::new();
     for source in presses.sources.iter().filter(|one| !one.sha256.is_empty()) {
@@ -79,14 +97,29 @@ pub fn warnings(presses: &Presses, labels: usize) -> anyhow::Result<Vec<String>>
             ));
         }
     }
-    warnings.extend(levels(presses));
-    let labelled = presses.labelled(Split::Train).count();
-    if labels < labelled {
-        warnings.push(format!(
-            "{labels} of {labelled} labelled training presses are used as such: --labels {labelled} uses all"
-        ));
-    }
+    warnings.extend(of_two_levels(presses));
     Ok(warnings)
+}
+
+/// A named object of recordings with two levels. Numbers that people give may begin anew for each level.
+fn of_two_levels(presses: &Presses) -> Option<String> {
+    let mut first = BTreeMap::<u32, usize>::new();
+    let of_recordings = (0..presses.all.len()).filter(|&place| {
+        let press = &presses.all[place];
+        press.level > 0 && press.name.is_some()
+    });
+    let named = of_recordings.filter_map(|place| Some((presses.all[place].object?, place)));
+    let (one, other) = named
+        .filter(|(object, _)| is_named(*object))
+        .map(|(object, place)| (*first.entry(object).or_insert(place), place))
+        .find(|(one, other)| presses.all[*one].level != presses.all[*other].level)?;
+    let [one, other] = [one, other].map(|place| {
+        let level = presses.all[place].level;
+        format!("{} (level {level})", self::named(presses, place))
+    });
+    Some(format!(
+        "one object has two levels, and is taken for two objects: {one} and {other}"
+    ))
 }
 
 /// Levels with few labelled training presses, or none.
@@ -188,6 +221,7 @@ fn units(presses: &Presses) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use hardnessd_core::recording::object_of;
     use hardnessd_core::verdict::ModelFrame;
 
     use super::*;
@@ -260,6 +294,18 @@ mod tests {
         let both = presses(&[(1, 1, train, 1), (2, 1, test, 1)], 0.01);
         let expected = "such as press 1 of d.npz of object 2 and press 0 of d.npz of object 1";
         check(&both, None, expected, "");
+    }
+
+    #[test]
+    fn a_named_object_with_two_levels_is_doubtful() {
+        for (object, warning) in [(7, ""), (object_of("apple"), "one object has two levels")] {
+            let train = Split::Train;
+            let mut presses = presses(&[(object, 1, train, 1), (object, 2, train, 2)], 0.01);
+            for press in &mut presses.all {
+                press.name = Some("a.mcap press 1".to_owned());
+            }
+            check(&presses, None, "", warning);
+        }
     }
 
     #[test]

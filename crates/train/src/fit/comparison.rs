@@ -95,7 +95,7 @@ pub struct Estimate {
     /// The mean over the levels of the share that was judged rightly.
     pub balanced_accuracy: f64,
     /// 95 %, by a bootstrap over objects, or over presses where a level has one object. Null where nothing
-    /// varies.
+    /// varies, unless all are right.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -127,9 +127,13 @@ impl Estimate {
         }
     }
 
-    /// The low end of the interval, or the value where nothing varies.
+    /// The low end of the interval, or the value where nothing varies: a few objects that are all judged rightly are
+    /// worth a model, whose confidence is as low as they are few.
     fn low(&self) -> f64 {
-        self.interval.map_or(self.balanced_accuracy, |[low, _]| low)
+        match self.interval {
+            Some([low, _]) if self.balanced_accuracy < 1.0 => low,
+            _ => self.balanced_accuracy,
+        }
     }
 }
 

@@ -67,7 +67,8 @@ pub fn mean(presses: &[Drawn], mean: Mean) -> f64 {
 
 /// The 95 % interval of the mean. Each draw takes units of each stratum, with replacement.
 /// `None` if a stratum has only one unit, because nothing then says how much its units vary, and if all
-/// values are the same, because every draw is then the same.
+/// values are the same, because every draw is then the same. But if all were judged rightly, the low end is the share
+/// at which that happens to so many units by a chance of 2.5 % (Clopper and Pearson 1934).
 ///
 /// A draw of all n units would vary less than the units do, by (n - 1) / n. So a draw takes n - 1 of them, and
 /// counts each n / (n - 1) times (Rao and Wu 1988, "Resampling inference with complex survey data").
@@ -75,7 +76,12 @@ pub fn of(presses: &[Drawn], mean: Mean) -> Option<[f64; 2]> {
     let strata = strata(presses);
     let is_one = strata.iter().any(|units| units.len() < 2);
     let first = presses.first()?.value;
-    if is_one || presses.iter().all(|press| press.value == first) {
+    let are_same = presses.iter().all(|press| press.value == first);
+    if are_same && first == 1.0 {
+        let units: usize = strata.iter().map(Vec::len).sum();
+        return Some([0.025_f64.powf(1.0 / units as f64), 1.0]);
+    }
+    if is_one || are_same {
         return None;
     }
     let mut stream = Stream::new(0, "bootstrap by object");
@@ -139,8 +145,13 @@ mod tests {
     #[test]
     fn one_unit_of_a_stratum_has_no_interval() {
         assert_eq!(of(&units(&[40]), Mean::OfPresses), None);
-        // Nothing varies where all verdicts are right.
-        assert_eq!(of(&units(&[50, 50, 50]), Mean::OfPresses), None);
+        // Nothing varies where all verdicts are wrong.
+        assert_eq!(of(&units(&[0, 0, 0]), Mean::OfPresses), None);
+        // Where all are right, 19 of 20 is not excluded by 72 units, and is by 73.
+        for (count, is_excluded) in [(72, false), (73, true)] {
+            let [low, high] = of(&units(&vec![50; count]), Mean::OfPresses).unwrap();
+            assert_eq!((low > 0.95, high), (is_excluded, 1.0), "{count}: {low}");
+        }
         let mut presses = units(&[40, 30]);
         assert!(of(&presses, Mean::OfPresses).is_some());
         presses.push(Drawn {

@@ -3,12 +3,12 @@
 //! (split conformal prediction). The unit that counts is what is new on a robot: the cover, or the object
 //! if all presses are of one sensor.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Learning, Outputs};
 use crate::data::presses::{Presses, Unit};
 use crate::net::network::Weights;
-use hardnessd_core::verdict::{Conformal, Knowledge, Limits, TAIL};
+use hardnessd_core::verdict::{Conformal, Knowledge, Limits, TAIL, argmax};
 use hardnessd_simulator::random::Stream;
 
 /// Sets of levels and intervals of Shore hardness miss the truth in at most this share of cases.
@@ -21,6 +21,9 @@ const DRAWS: usize = 50;
 /// The share of the covers, the worst ones, whose confidence is calibrated: a robot's own cover may be one. A tenth of
 /// a few covers may be one or two of which the network knows nothing.
 const WORST_COVERS: f64 = 0.5;
+
+/// The highest temperature. A network that knows its few objects by heart needs far more than one that errs.
+const HOTTEST: f32 = 1000.0;
 
 /// The calibration computed from the held-out presses.
 #[derive(Debug, Clone, PartialEq)]
@@ -127,9 +130,15 @@ impl Calibration {
             let worst = (WORST_COVERS * losses.len() as f64).ceil() as usize;
             losses[..worst].iter().sum::<f64>()
         };
+        let units: BTreeSet<u64> = all().map(|judged| judged.unit).collect();
+        let confidence = |temperature: f32| {
+            let of = |judged: &Judged| argmax(&outputs.probabilities(&judged.row, temperature)).1;
+            let sum: f32 = all().map(of).sum();
+            sum / all().count() as f32
+        };
         let temperature = match all().next() {
             None => 1.0,
-            Some(_) => least(loss),
+            Some(_) => at_most(least(loss), confidence, most_confidence(units.len())),
         };
         let (mut limits, mut units) = (BTreeMap::new(), [0; 2]);
         for (&knowledge, judged) in judged {
@@ -212,6 +221,30 @@ fn least(loss: impl Fn(f64) -> f64) -> f32 {
     (2.0 / (low + high)) as f32
 }
 
+/// The most that a verdict on something new may claim after so many units, all of which were judged rightly (Laplace's
+/// rule of succession).
+fn most_confidence(units: usize) -> f32 {
+    (units + 1) as f32 / (units + 2) as f32
+}
+
+/// The temperature, or the one above it at which the confidence is `most`, if it is more. The confidence falls as the
+/// temperature rises.
+fn at_most(temperature: f32, confidence: impl Fn(f32) -> f32, most: f32) -> f32 {
+    let (mut low, mut high) = (temperature, HOTTEST);
+    if confidence(low) <= most {
+        return low;
+    }
+    for _ in 0..40 {
+        let middle = (low * high).sqrt();
+        if confidence(middle) > most {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    high
+}
+
 /// The values of the presses of each unit.
 fn by_unit(judged: &[Judged], value: impl Fn(&Judged) -> Option<f32>) -> Vec<Vec<f32>> {
     let mut units = BTreeMap::<u64, Vec<f32>>::new();
@@ -290,6 +323,22 @@ mod tests {
         });
         let found = temperature(judged, Unit::Object);
         assert!((found - 4.0).abs() < 1e-2, "{found}");
+    }
+
+    #[test]
+    fn few_objects_that_are_all_judged_rightly_make_no_verdict_certain() {
+        for (objects, expected) in [(4, 5.0 / 6.0), (30, 31.0 / 32.0)] {
+            let judged = (0..10 * objects).map(|press| {
+                let object = press / 10;
+                judged(object, usize::from(object % 2 == 0), true, 1e6)
+            });
+            let found = temperature(judged, Unit::Object);
+            let confidence = 1.0 / (1.0 + 1e-6_f32.powf(1.0 / found));
+            assert!(
+                (confidence - expected).abs() < 1e-3,
+                "{objects}: {confidence}"
+            );
+        }
     }
 
     #[test]

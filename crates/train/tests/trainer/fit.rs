@@ -37,7 +37,9 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
             };
             let moments = (0..10_u8).map(|moment| {
                 let mut frame = ModelFrame::default();
-                let newtons = 0.1 * f32::from(moment + 1) * (1.0 + 0.2 * f32::from(number));
+                // No two presses are the same.
+                let own = 0.001 * object as f32;
+                let newtons = 0.1 * f32::from(moment + 1) * (1.0 + 0.2 * f32::from(number) + own);
                 for row in 12..16 {
                     frame.newtons[row * 28 + 12 + col] = newtons;
                 }
@@ -285,8 +287,8 @@ fn references_that_the_daemon_would_not_use_are_not_written() {
 fn what_cannot_be_fitted_is_said_in_one_line() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);
-    let refused = |expected: &str| {
-        let output = hrn_train_in(directory.path(), "fit d.npz --out m.onnx");
+    let refused_of = |data: &str, expected: &str| {
+        let output = hrn_train_in(directory.path(), &format!("fit {data} --out m.onnx"));
         assert_eq!(output.status.code(), Some(1));
         let errors = errors(&output);
         assert_eq!(
@@ -299,12 +301,19 @@ fn what_cannot_be_fitted_is_said_in_one_line() {
         );
         assert!(!path("m.onnx").exists() && !path("m.npz").exists());
     };
+    let refused = |expected: &str| refused_of("d.npz", expected);
     // The built-in model cannot say levels without ranges, and nothing else is better than guessing.
     let five = ["a", "b", "c", "d", "e"];
     write(&path("d.npz"), &[(1, 0), (1, 2), (5, 0), (5, 2)], &five);
     refused("nothing was written, because no candidate is better than guessing");
     write(&path("d.npz"), &[(1, 0), (2, 2)], &five);
     refused("found 10 labelled presses of 2 objects");
+    refused_of(
+        "d.npz d.npz",
+        "d.npz and d.npz are the same file: name it once",
+    );
+    fs::copy(path("d.npz"), path("copy.npz")).unwrap();
+    refused_of("d.npz copy.npz", "copy.npz and d.npz are the same file");
     write(&path("d.npz"), &[(1, 0), (1, 2), (1, 3)], &five);
     refused("all presses are of one level");
 }

@@ -1,5 +1,6 @@
 //! The presses in one recording, and what its labels say of them.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -25,6 +26,8 @@ const NOT_LOOKED_AT: Stamp = Stamp {
     mono: std::time::Duration::ZERO,
     wall: jiff::Timestamp::UNIX_EPOCH,
 };
+/// A touch is felt at most so long before it is a press.
+const REST_S: f64 = 0.5;
 /// Bytes of a raw recording that are played at once.
 const CHUNK_BYTES: usize = 1 << 16;
 
@@ -50,9 +53,9 @@ pub(super) struct Watched {
     /// Whether the recording has it with two arrays.
     is_changed: bool,
     is_pressed: bool,
-    /// The last frame before the first tare, and the two last ones between presses.
+    /// The last frame before the first tare, and the last ones between presses.
     untared: Vec<f32>,
-    at_rest: [Vec<f32>; 2],
+    at_rest: VecDeque<Vec<f32>>,
 }
 
 impl Recording {
@@ -213,7 +216,7 @@ impl Recording {
                 is_changed: false,
                 is_pressed: false,
                 untared: Vec::new(),
-                at_rest: [Vec::new(), Vec::new()],
+                at_rest: VecDeque::new(),
             }),
         }
     }
@@ -229,10 +232,7 @@ impl Recording {
             let watched = &mut self.sensors[place];
             match event {
                 Event::Frame(frame) if !frame.tared => watched.untared = frame.newtons,
-                Event::Frame(frame) if !watched.is_pressed => {
-                    let [before, newest] = &mut watched.at_rest;
-                    *before = std::mem::replace(newest, frame.newtons);
-                }
+                Event::Frame(frame) if !watched.is_pressed => watched.rest(frame.newtons),
                 // The press's first frame came just before the event of its begin.
                 Event::Press(press) => {
                     watched.is_pressed = press.state == PressState::Begin;
@@ -242,6 +242,9 @@ impl Recording {
                     let ended = ended.iter().find(is_this);
                     if let Some(ended) = ended.filter(|_| press.state == PressState::End) {
                         self.add(place, &press, ended);
+                    }
+                    if press.state != PressState::Begin {
+                        self.sensors[place].at_rest.clear();
                     }
                 }
                 Event::Frame(_) | Event::Hardness(_) | Event::Status(_) => {}
@@ -334,13 +337,22 @@ fn level(label: &str, of: &Settings) -> Option<u8> {
 }
 
 impl Watched {
+    /// Takes a frame between presses.
+    fn rest(&mut self, newtons: Vec<f32>) {
+        let frames = (REST_S * self.sensor.frame_rate_hz()).ceil() as usize;
+        self.at_rest.push_back(newtons);
+        while self.at_rest.len() > frames + 1 {
+            self.at_rest.pop_front();
+        }
+    }
+
     /// The whole array before the touch, with what the tare takes off. The newest frame between presses is the one
-    /// that began the press.
+    /// that began the press, and some before it have a taxel or two of it.
     fn unloaded(&self) -> Vec<f32> {
-        let [at_rest, touched] = &self.at_rest;
+        let at_rest = self.at_rest.front().map_or(&[][..], Vec::as_slice);
         let of = |newtons: &[f32], place: usize| newtons.get(place).copied().unwrap_or(0.0);
         let whole = |place| of(at_rest, place) + of(&self.untared, place);
-        (0..touched.len()).map(whole).collect()
+        (0..at_rest.len()).map(whole).collect()
     }
 }
 
