@@ -56,7 +56,7 @@ use tracing::{debug, error, info, warn};
 use self::clients::Clients;
 use self::config::{Publish, Setup};
 use self::hub::Hub;
-use self::own::Store;
+use self::own::{Store, Written};
 use self::publish::Publishers;
 use self::record::{Progress, Recorder, Target, WithoutSensor};
 use self::reload::Refusal;
@@ -140,6 +140,8 @@ pub struct Daemon {
     /// The thread of the clients.
     clients: Clients,
     store: Store,
+    /// When own presses are written.
+    stored: Option<Written>,
     recorder: Option<Recorder>,
     /// The listeners stop when this is dropped.
     listening: watch::Sender<()>,
@@ -208,7 +210,7 @@ impl Daemon {
         realtime::lock_memory();
         let hub = Hub::new(hello.clone());
         let clients = Clients::start().map_err(NoThread)?;
-        let store = Store::of_environment()?;
+        let (store, stored) = Store::of_environment()?;
         let names = setup.sensors.iter().map(|sensor| sensor.name().to_owned());
         let handles = names.map(|name| {
             let (commands, inbox) = mpsc::channel(QUESTIONS);
@@ -245,6 +247,7 @@ impl Daemon {
             publishers,
             clients,
             store,
+            stored,
             recorder,
             listening,
         };
@@ -391,7 +394,12 @@ impl Daemon {
         if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
             warn!("a subscriber did not fetch its last lines");
         }
-        drop(self.clients);
+        drop((self.clients, self.store));
+        if let Some(stored) = self.stored
+            && tokio::time::timeout(FAREWELL, stored).await.is_err()
+        {
+            warn!("the disk did not take the own presses");
+        }
         match self.recorder {
             // Wait as long as necessary for a recording into one file, because a user asked for it.
             Some(recorder) if self.setup.config.record.is_none() => recorder.finish().await,

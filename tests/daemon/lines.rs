@@ -218,8 +218,13 @@ fn silent_modules_at_a_port_of_datagrams_leave_the_other_one_live() {
     let modules = ["01", "02", "03"].map(|number| module(&format!("m{number}"), number));
     let _daemon = bench.daemon_of(&modules.concat(), "");
     let mut subscriber = bench.subscriber();
-    // It says once where it is.
-    board.send_to(b"7", address).unwrap();
+    // It says where it is, once the port is open.
+    board.set_nonblocking(true).unwrap();
+    wait_for("a first request", || {
+        board.send_to(b"7", address).unwrap();
+        board.peek(&mut [0; 16]).is_ok()
+    });
+    board.set_nonblocking(false).unwrap();
     let mut answers = 0;
     while answers < 50 {
         let mut request = [0; 16];
