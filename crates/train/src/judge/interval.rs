@@ -147,8 +147,8 @@ mod tests {
         assert_eq!(of(&units(&[40]), Mean::OfPresses), None);
         // Nothing varies where all verdicts are wrong.
         assert_eq!(of(&units(&[0, 0, 0]), Mean::OfPresses), None);
-        // Where all are right, 19 of 20 is not excluded by 72 units, and is by 73.
-        for (count, is_excluded) in [(72, false), (73, true)] {
+        // Where all are right, 19 of 20 is not excluded by 71 units, and is by 72.
+        for (count, is_excluded) in [(71, false), (72, true)] {
             let [low, high] = of(&units(&vec![50; count]), Mean::OfPresses).unwrap();
             assert_eq!((low > 0.95, high), (is_excluded, 1.0), "{count}: {low}");
         }

@@ -37,9 +37,9 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
             };
             let moments = (0..10_u8).map(|moment| {
                 let mut frame = ModelFrame::default();
-                // No two presses are the same.
-                let own = 0.001 * object as f32;
-                let newtons = 0.1 * f32::from(moment + 1) * (1.0 + 0.2 * f32::from(number) + own);
+                // No two presses are the same, and this tells no level.
+                let own = 0.001 * f32::from((7 * object as u8 + 3 * number) % 11);
+                let newtons = 0.1 * f32::from(moment + 1) * (1.0 + 0.2 * f32::from(number)) + own;
                 for row in 12..16 {
                     frame.newtons[row * 28 + 12 + col] = newtons;
                 }
