@@ -7,6 +7,7 @@
 use std::fs::File;
 use std::future::Future;
 use std::io::{ErrorKind, Read as _};
+use std::os::unix::fs::FileTypeExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -215,6 +216,11 @@ fn of_file(
     sensor: &Sensor,
     hrn: &Arc<Model>,
 ) -> Result<Vec<ReferencePress>, Failure> {
+    let found = file.metadata().of(path.display(), IO)?;
+    if found.file_type().is_char_device() {
+        let device = format!("{}: found a device, expected a recording", path.display());
+        return Err(Failure::new(FAILED, device));
+    }
     let mut played = Played::open(path, file, sensor, hrn, args.motion.as_deref())?;
     played.playback.keep_courses();
     let grid_mm = hrn.card().pitch_mm.into();

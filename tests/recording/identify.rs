@@ -81,6 +81,8 @@ fn what_cannot_be_a_reference_is_refused_in_one_line() {
     bench.fails_each(
         "
         identify --config plain.toml --out r.npz --as ball:10 wood.bin | 74 | r.npz exists already
+        identify --config plain.toml --out r.npz --append --as flat:20 wood.bin | 1 | r.npz has these presses already
+        identify --config plain.toml --out n.npz --as flat:20 /dev/zero | 1 | /dev/zero: found a device
         identify --config plain.toml --out text.npz --append --as ball:10 wood.bin | 1 | text.npz: found no .npz file
         identify --config plain.toml --out n.npz wood.bin | 1 | wood.bin: found no label `reference`, `shore` or `level`
         identify --config plain.toml --out n.npz --as level:5 wood.bin | 2 | level:N with 1 to 4
