@@ -88,9 +88,9 @@ impl Layout {
         };
         let all_bits = keys.cell.and_then(Cell::bits);
         if let Some(mask) = keys.mask {
-            // A number of a text has no widest.
+            // Of a larger number of a text, the last bits are rounded.
             let bits = match form {
-                Form::Text(_) => Some(u32::MAX),
+                Form::Text(_) => Some(0xFF_FFFF),
                 Form::Fixed(_) => all_bits,
             };
             let bits = bits.ok_or_else(|| {

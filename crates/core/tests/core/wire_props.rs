@@ -298,6 +298,7 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
         rows = 65 | rows: found 65, expected 1 to 64
         length = 'u8' | length: found 784 payload bytes, expected at most 255
         mask = 0x1FF | mask: found 511, expected 1 to 255
+        preset = 'csv', mask = 0x1000000 | mask: found 16777216, expected 1 to 16777215
         preset = 'csv', tail = 'FF' | tail: found a value, expected none: frames of preset csv have no such part
         header_bytes = 8193 | header_bytes: found 8193, expected 0 to 8192
         preset = 'jq-glove', sync = '', tail = 'AA' | packets: found no sync, or framing, expected sync
