@@ -86,7 +86,7 @@ pub(crate) fn find(
             if holds(length, 0) {
                 return Some(check(None));
             }
-            // One of two bytes or more holds by chance nowhere. Others begin with the mark, or behind it.
+            // One of two bytes or more holds by chance nowhere. Others begin with the mark, behind it, or with the cells.
             let is_constant =
                 |at: usize| beside.get(at).is_some_and(|kind| kind.constant().is_some());
             let is_beginning = |begin: usize| {
