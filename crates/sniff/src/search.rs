@@ -46,6 +46,8 @@ const INTERLEAVED_BITS: f64 = 60.0;
 /// Where it is a little more like it, nothing is sure. Of 120 arrays of three axes with weak shear, 12 were taken
 /// for arrays three times as wide when only [`INTERLEAVED`] counted.
 const MAYBE_INTERLEAVED: f64 = 0.9;
+/// One in so many frames may be damaged.
+const DAMAGED: usize = 10;
 /// The number of frames that a checksum is tried on.
 const CHECKED: usize = 40;
 /// The share of the packets whose number follows the one before.
@@ -124,7 +126,11 @@ pub(crate) fn in_frames(
     let begin = frames.beginning(&capture.pauses());
     let frames = &frames.inner();
     let columns = &Columns::new(frames);
-    let frames = &frames.retained(|frame| columns.is_whole(frame));
+    let whole = frames.retained(|frame| columns.is_whole(frame));
+    // At the edge of what presses, bytes change in so few frames that they look constant. Where many frames have such
+    // ones, these are its presses, and no damage.
+    let is_damage = DAMAGED * (frames.len() - whole.len()) <= frames.len();
+    let frames = if is_damage { &whole } else { frames };
     if !columns.kinds.contains(&Kind::Active) {
         return Err(Failure::NoPress(period));
     }
