@@ -213,9 +213,11 @@ impl Score {
         self.once + self.presses.iter().sum::<f64>()
     }
 
-    /// Whether this one is surely likelier than `other`. However much a press is in favour, it is one.
+    /// Whether this one is surely likelier than `other`. However much a press is in favour, it is one. All bits say so
+    /// too: of noise that passes for presses, some are in favour of anything.
     pub(crate) fn is_surely_less(&self, other: &Self) -> bool {
-        other.once - self.once + self.lead_of_presses(other) >= SURE_BITS
+        let is_less = other.bits() - self.bits() >= SURE_BITS;
+        is_less && other.once - self.once + self.lead_of_presses(other) >= SURE_BITS
     }
 
     /// Whether this one is surely likelier than `other`, whose cells are the same but for a few at the ends.
