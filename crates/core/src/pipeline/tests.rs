@@ -320,7 +320,7 @@ fn a_model_of_other_levels_forgets_the_level_that_was_said() {
     let said = serde_json::json!({"object": "cup", "level": 4});
     pipeline.judge.context = Some(said.clone());
     let (sensor, same) = (pipeline.sensor().clone(), pipeline.hrn().clone());
-    let next = pipeline.with_model(sensor.clone(), same.clone()).unwrap();
+    let next = pipeline.with_model(sensor.clone(), same).unwrap();
     assert_eq!(next.judge.context, Some(said));
     let two = vec![Level::new(1, "hard", ">60"), Level::new(2, "soft", "<=60")];
     let other = Model::load(BUILT_IN).unwrap().with_levels(two);
