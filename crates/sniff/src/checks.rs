@@ -87,13 +87,11 @@ pub(crate) fn find(
                 return Some(check(None));
             }
             // One of two bytes or more holds by chance nowhere. Others begin with the mark, behind it, or with the cells.
-            let is_constant =
-                |at: usize| beside.get(at).is_some_and(|kind| kind.constant().is_some());
-            let is_beginning = |begin: usize| {
-                let is_beside_mark = is_constant(begin) || is_constant(begin.saturating_sub(1));
-                checksum.bytes() > 1 || begin == length || is_beside_mark
-            };
-            let mut begins = (places.end..=length).filter(|&begin| is_beginning(begin));
+            let is_constant = |kind: &Kind| kind.constant().is_some();
+            let mut begins = (places.end..=length).filter(|&begin| {
+                let around = &beside[begin - 1..length.min(begin + 1)];
+                checksum.bytes() > 1 || begin == length || around.iter().any(is_constant)
+            });
             if let Some(begin) = begins.find(|&begin| holds(begin, at)) {
                 return Some(check(Some(begin)));
             }

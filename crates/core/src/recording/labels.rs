@@ -64,6 +64,9 @@ pub fn check_label(key: &str, value: &str) -> Result<(), String> {
     }
 }
 
+/// The numbers below this are left to people, who count up from 0.
+const NAMED: u32 = 1 << 31;
+
 /// The number of an object that only has a name, for the label `object`: the same in every recording.
 pub fn object_of(name: &str) -> u32 {
     let hash = sha256_hex(name.as_bytes());
@@ -75,9 +78,6 @@ pub fn object_of(name: &str) -> u32 {
 pub fn is_named(object: u32) -> bool {
     object >= NAMED
 }
-
-/// The numbers below this are left to people, who count up from 0.
-const NAMED: u32 = 1 << 31;
 
 /// The keys of labels that mean something to `hrn-train` and `identify`.
 const KEYS: [&str; 6] = ["level", "object", "shore", "material", "reference", "name"];

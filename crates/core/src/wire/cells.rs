@@ -8,7 +8,7 @@ use crate::frame::{Array, RawFrame};
 const MOST_COUNT: f32 = 4_294_967_296.0;
 
 /// The largest number of which every bit is there. Above it, a mask would take bits that were rounded.
-const MOST_EXACT: f32 = 16_777_215.0;
+pub(super) const MOST_EXACT: u32 = 0xFF_FFFF;
 
 impl Cell {
     /// The number of bytes that the cell takes on the wire.
@@ -115,7 +115,7 @@ impl Cells {
             let is_count = cell.abs() <= MOST_COUNT;
             return is_count.then_some(if self.invert { 0.0 - cell } else { cell });
         };
-        let is_whole = cell.fract() == 0.0 && (0.0..=MOST_EXACT).contains(&cell);
+        let is_whole = cell.fract() == 0.0 && (0.0..=MOST_EXACT as f32).contains(&cell);
         let masked = is_whole.then_some(cell as u32 & mask)?;
         Some(if self.invert { mask - masked } else { masked } as f32)
     }

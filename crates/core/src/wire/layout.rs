@@ -1,6 +1,6 @@
 //! A checked layout: where the parts of a frame are.
 
-use super::cells::Cells;
+use super::cells::{Cells, MOST_EXACT};
 use super::fixed::Fixed;
 use super::scan::{Context, Scan};
 use super::settings::{Cell, Settings};
@@ -90,7 +90,7 @@ impl Layout {
         if let Some(mask) = keys.mask {
             // Of a larger number of a text, the last bits are rounded.
             let bits = match form {
-                Form::Text(_) => Some(0xFF_FFFF),
+                Form::Text(_) => Some(MOST_EXACT),
                 Form::Fixed(_) => all_bits,
             };
             let bits = bits.ok_or_else(|| {

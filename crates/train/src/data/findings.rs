@@ -104,18 +104,18 @@ pub fn doubtful(presses: &Presses) -> anyhow::Result<Vec<String>> {
 /// A named object of recordings with two levels. Numbers that people give may begin anew for each level.
 fn of_two_levels(presses: &Presses) -> Option<String> {
     let mut first = BTreeMap::<u32, usize>::new();
-    let of_recordings = (0..presses.all.len()).filter(|&place| {
+    let two = (0..presses.all.len()).find_map(|place| {
         let press = &presses.all[place];
-        press.level > 0 && press.name.is_some()
+        let object = press.object.filter(|&object| is_named(object))?;
+        if press.level == 0 || press.name.is_none() {
+            return None;
+        }
+        let before = *first.entry(object).or_insert(place);
+        (presses.all[before].level != press.level).then_some([before, place])
     });
-    let named = of_recordings.filter_map(|place| Some((presses.all[place].object?, place)));
-    let (one, other) = named
-        .filter(|(object, _)| is_named(*object))
-        .map(|(object, place)| (*first.entry(object).or_insert(place), place))
-        .find(|(one, other)| presses.all[*one].level != presses.all[*other].level)?;
-    let [one, other] = [one, other].map(|place| {
+    let [one, other] = two?.map(|place| {
         let level = presses.all[place].level;
-        format!("{} (level {level})", self::named(presses, place))
+        format!("{} (level {level})", named(presses, place))
     });
     Some(format!(
         "one object has two levels, and is taken for two objects: {one} and {other}"
