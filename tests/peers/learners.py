@@ -7,12 +7,14 @@ It needs the client with its extra `adopt`, numpy, onnxruntime, scikit-learn and
 two. Claims: `python3 -m hardnessd.adopt` takes each file as skl2onnx writes it by default, and `hrn-train check-model`
 takes the result; its probabilities differ from onnxruntime's by less than 1e-5 on 288 frames; the same holds with classes
 that are texts, and for graphs as PyTorch and Keras write them with any batch. What cannot be adopted is
-refused in one line that says what to change.
+refused in one line that says what to change, and so is a file that is no model or no data set. A model that cannot be
+written whole is removed.
 """
 
 import csv
 import os
 import pathlib
+import resource
 import sys
 import tempfile
 import warnings
@@ -62,11 +64,11 @@ def kinds():
     }
 
 
-def adopt(path, data, out, code=0):
+def adopt(path, data, out, code=0, **more):
     """Adopts a file anew. Gives what was said."""
     pathlib.Path(out).unlink(missing_ok=True)
     command = [sys.executable, "-m", "hardnessd.adopt", path, "--data", data, "--out", out]
-    return run(*command, code=code).stderr
+    return run(*command, code=code, **more).stderr
 
 
 def adopted(path, data):
@@ -110,8 +112,8 @@ def compare(name, path, data, order=None):
     assert difference < TOLERANCE, (name, difference)
 
 
-def refuse(path, data, wanted, code=1):
-    said = adopt(path, data, "refused.onnx", code)
+def refuse(path, data, wanted, code=1, **more):
+    said = adopt(path, data, "refused.onnx", code, **more)
     assert wanted in said and said.count("\n") == 1 and not os.path.exists("refused.onnx"), (wanted, said)
     print(f"refused: {said.strip()}")
 
@@ -150,6 +152,41 @@ def classifiers(data):
     adopt(export(KNeighborsClassifier(), inputs, level), data, "adopted.onnx")
     said = run("hrn-train", "check-model", "adopted.onnx", code=78)
     assert "integers that depend on an input" in said.stdout + said.stderr, said
+
+
+def bad_files(data):
+    """What is no model, what is no data set, and no place for the model."""
+    arrays = dict(np.load(data))
+    inputs = arrays["frames"].reshape(-1, 784)
+    model = export(logistic(), inputs, arrays["level"].astype(np.int64))
+    whole = pathlib.Path(model).read_bytes()
+    for content in (b"no model\n", whole[: len(whole) // 2]):
+        pathlib.Path("bad.onnx").write_bytes(content)
+        refuse("bad.onnx", data, "bad.onnx: not an ONNX file: ")
+    refuse(model, model, f"{model}: not a data set (.npz): no zip archive")
+    with_nan = arrays["frames"].copy()
+    with_nan[3, 4, 5] = np.nan
+    for name, array, wanted in [
+        ("meta", np.frombuffer(b"{", np.uint8), "meta: not JSON"),
+        ("meta", np.frombuffer(b'{"levels":[1,2,3,4]}', np.uint8), "a number `level` and a text `label` of each: found 1"),
+        ("level", None, "it has no 'level'"),
+        ("level", arrays["level"][1:], "frames: found float32 [288, 28, 28], expected numbers [287, 28, 28]"),
+        ("frames", inputs, "frames: found float32 [288, 784], expected numbers [288, 28, 28]"),
+        ("frames", with_nan, "frames: found nan, expected -1000000 to 1000000"),
+        ("split", None, ""),
+    ]:
+        given = {key: value for key, value in {**arrays, name: array}.items() if value is not None}
+        np.savez("bad.npz", **given)
+        if wanted:
+            refuse(model, "bad.npz", wanted)
+        else:
+            # Without a split all presses are for training.
+            adopt(model, "bad.npz", "adopted.onnx")
+
+    def small_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    refuse(model, data, "refused.onnx: File too large", preexec_fn=small_files)
 
 
 def networks(data):
@@ -219,6 +256,7 @@ def main(binaries):
         run("hrn-train", "simulate", "--out", "data.npz", *few)
         classifiers("data.npz")
         networks("data.npz")
+        bad_files("data.npz")
         os.chdir("/")
 
 

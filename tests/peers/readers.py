@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """The Python client's readers, on data sets and recordings that our programs write.
 
-    python3 -m venv venv && venv/bin/pip install './clients/python[dataset,recording]' mypy
+    python3 -m venv venv && venv/bin/pip install './clients/python[dataset,plot,recording]' mypy
     venv/bin/python tests/peers/readers.py target/debug
 
 Claims: a data set reads as numpy reads it, and what is none is refused with the array's name; a recording
 gives the very events that a subscriber read, the frames and the bytes; a damaged one is refused in one
-line. The type hints are strict, and a program that installs the package is checked by them.
+line. `python3 -m hardnessd.plot` replaces no picture unless --out names it, and says in one line what it cannot draw or
+write. The type hints are strict, and a program that installs the package is checked by them.
 """
 
 import json
@@ -70,6 +71,38 @@ def data_sets(binaries, directory):
     np.save(directory / "one.npy", arrays["level"])
     refused(dataset.load, directory / "one.npy", "not a data set")
     return len(presses)
+
+
+def pictures(directory):
+    def plot(*arguments, code=0):
+        done = run(sys.executable, "-m", "hardnessd.plot", *arguments, code=code, cwd=directory)
+        assert done.stderr.count("\n") == code, done.stderr
+        return done.stdout + done.stderr
+
+    picture = directory / "data.png"
+    assert plot("data.npz") == "data.png\n"
+    picture.write_text("of somebody")
+    assert plot("data.npz", code=1) == "data.png: it exists already: name another file with --out\n"
+    assert picture.read_text() == "of somebody"
+    plot("data.npz", "--out", "data.png")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    data = (directory / "data.npz").read_bytes()
+    (directory / "cut.npz").write_bytes(data[:-200])
+    (directory / "damaged.npz").write_bytes(data[:2000] + bytes(100) + data[2100:])
+    (directory / "empty.json").write_text("")
+    (directory / "results.json").write_text("[{}]")
+    (directory / "two.json").write_text('{"models":[],"difference":{}}')
+    for name, said in [
+        ("cut.npz", "not a data set"),
+        ("damaged.npz", "not a data set"),
+        ("empty.json", "not JSON"),
+        ("results.json", "found a list, expected `hrn-train fit --json`"),
+        ("two.json", "found the keys difference, models, expected"),
+    ]:
+        found = plot(name, code=1)
+        assert found.startswith(f"{name}: ") and said in found, found
+    assert plot("data.npz", "--out", "/dev/full", code=1) == "/dev/full: No space left on device\n"
+    assert "not supported" in plot("data.npz", "--out", "data.pictures", code=1)
 
 
 def a_recording(binary, directory, built_in):
@@ -150,6 +183,7 @@ def main(binaries):
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
         print("a data set of", data_sets(binaries, directory), "presses")
+        pictures(directory)
         for built_in in ["course", "hrn"]:
             found = a_recording(binaries / "hardnessd", directory, built_in)
             print("a recording of %d verdicts and %d frames" % found)

@@ -13,13 +13,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import onnx
 from onnx import AttributeProto, TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
+
+from hardnessd.dataset import best_frames
+from hardnessd.files import BadFile, ending, reading, save
 
 OPSET = 17
 LEARNERS = "ai.onnx.ml"
@@ -271,17 +273,16 @@ def data_of(path: Optional[str]) -> Dict[str, Any]:
         frames = np.array([4 * np.exp(-one) for one in away], np.float32)
         open_range = {"force_n": [0, 1e6], "contact_area_taxels": [0, 784]}
         return {"levels": LEVELS, "frames": frames, "pitch_mm": 3.5, "range": open_range, "data": "not stated"}
-    arrays = np.load(path)
-    if "frames_mn" in arrays:
-        frames, level, split = arrays["frames_mn"][arrays["best"]] / np.float32(1000), arrays["level"], arrays["split"]
-    else:
-        frames, level = arrays["frames"], arrays["level"]
-        split = arrays["split"] if "split" in arrays else np.zeros(len(level), np.uint8)
-    meta = json.loads(arrays["meta"].tobytes()) if "meta" in arrays else {}
+    arrays, meta = best_frames(path)
+    frames, level, split = arrays["frames"], arrays["level"], arrays["split"]
     levels = meta.get("levels") or LEVELS
+    with reading(path, "meta: levels: expected a number `level` and a text `label` of each"):
+        for one in levels:
+            if not (isinstance(one, dict) and isinstance(one.get("level"), int) and isinstance(one.get("label"), str)):
+                raise ValueError(f"found {one}")
     train = frames[(split == 0) & (level > 0)].astype(np.float32)
     if len(train) == 0:
-        raise Refused(f"{path}: no press of the train split has a level")
+        raise BadFile(f"{path}: no press of the train split has a level")
     force, area = train.sum(axis=(1, 2)), (train >= CONTACT_N).sum(axis=(1, 2))
     spread = np.linspace(0, len(train) - 1, 8).astype(int)
     return {
@@ -362,12 +363,13 @@ def main() -> None:
     parser.add_argument("--validation", metavar="TEXT", default="not validated", help="what it was tried on")
     given = parser.parse_args()
     stated = {"method": given.method or f"adopted from {os.path.basename(given.model)}", "validation": given.validation}
-    try:
-        model, done = adopt(onnx.load(given.model), data_of(given.data), stated)
-        with open(given.out, "xb") as file:
-            file.write(model.SerializeToString())
-    except (Refused, OSError) as error:
-        sys.exit(f"{given.model}: {error}" if isinstance(error, Refused) else str(error))
+    with ending(given.out):
+        with reading(given.model, "not an ONNX file"):
+            original = onnx.load(given.model)
+        data = data_of(given.data)
+        with reading(given.model, "not adopted"):
+            model, done = adopt(original, data, stated)
+        save(given.out, model.SerializeToString())
     for change in done:
         print(f"changed  {change}")
     print(f"{given.out}: check it with `hrn-train check-model {given.out}`")

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Dict, Literal, Optional, Tuple, Union
+from typing import Any, Dict, Literal, Optional, Tuple
 
 import numpy as np
 import numpy.typing as npt
+
+from hardnessd.files import Path, reading
 
 Array = npt.NDArray[Any]
 
@@ -32,6 +33,9 @@ _ARRAYS: Tuple[Tuple[str, str, Tuple[int, ...]], ...] = (
     ("split", "uint8", ()),
     ("shore", "float32", ()),
 )
+
+# Newtons on a taxel that the trainer takes (docs/formats.md).
+MOST_N = 1_000_000
 
 # What a file that begins with these bytes is.
 _KINDS: Dict[bytes, str] = {
@@ -87,19 +91,9 @@ class DataSet:
         return replace(self, **picked, others=others)
 
 
-def load(path: Union[str, "os.PathLike[str]"]) -> DataSet:
+def load(path: Path) -> DataSet:
     """Reads a data set. Raises ValueError if the file is none, OSError if it cannot be read."""
-    try:
-        with open(path, "rb") as content:
-            # numpy takes what it does not know for pickled objects, and proposes to load them unsafely.
-            begin = content.read(4)
-            if not begin.startswith(b"PK"):
-                raise ValueError(_KINDS.get(begin, "no zip archive"))
-            content.seek(0)
-            with np.load(content, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-    except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{os.fspath(path)}: not a data set (.npz): {error}") from error
+    arrays, meta = _content(path)
     if "frames_mn" in arrays:
         raise ValueError(
             f"{os.fspath(path)}: it has whole presses (--sequences), and this module reads single frames: "
@@ -120,8 +114,41 @@ def load(path: Union[str, "os.PathLike[str]"]) -> DataSet:
                 f"expected {dtype} {[count, *shape]}"
             )
         known[name] = array
-    try:
-        meta = json.loads(arrays.pop("meta", np.frombuffer(b"{}", np.uint8)).tobytes())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{os.fspath(path)}: meta: not JSON: {error}") from error
     return DataSet(**known, meta=meta, others=arrays)
+
+
+def best_frames(path: Path) -> Tuple[Dict[str, Array], Dict[str, Any]]:
+    """The arrays and `meta` of single frames or of whole presses, as the trainer reads them: either has `frames`,
+    newtons of one frame of each press, `level` and `split`. Raises what `load` raises."""
+    arrays, meta = _content(path)
+    with reading(path, "not a data set (.npz)"):
+        if "frames_mn" in arrays:
+            arrays["frames"] = arrays["frames_mn"][arrays["best"]] / np.float32(1000)
+        count = len(arrays["level"])
+        arrays.setdefault("split", np.zeros(count, np.uint8))
+        for name, shape in (("frames", (count, 28, 28)), ("level", (count,)), ("split", (count,))):
+            array = arrays[name]
+            if array.shape != shape or array.dtype.kind not in "biuf":
+                raise ValueError(f"{name}: found {array.dtype} {list(array.shape)}, expected numbers {list(shape)}")
+        wrong = arrays["frames"][~(np.abs(arrays["frames"]) <= MOST_N)]
+        if wrong.size:
+            raise ValueError(f"frames: found {wrong[0]}, expected -{MOST_N} to {MOST_N}")
+    return arrays, meta
+
+
+def _content(path: Path) -> Tuple[Dict[str, Array], Dict[str, Any]]:
+    """The arrays of a file, and its `meta`."""
+    with reading(path, "not a data set (.npz)"), open(path, "rb") as content:
+        # numpy takes what it does not know for pickled objects, and proposes to load them unsafely.
+        begin = content.read(4)
+        if not begin.startswith(b"PK"):
+            raise ValueError(_KINDS.get(begin, "no zip archive"))
+        content.seek(0)
+        with np.load(content, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    with reading(path, "meta: not JSON"):
+        meta = json.loads(arrays.pop("meta", np.frombuffer(b"{}", np.uint8)).tobytes())
+    with reading(path, "meta"):
+        if not isinstance(meta, dict):
+            raise ValueError(f"found {type(meta).__name__}, expected an object")
+    return arrays, meta

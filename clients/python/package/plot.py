@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import json
 import pathlib
-import sys
 from typing import Any, Dict, List, Tuple
 
 import matplotlib
@@ -21,6 +21,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+
+from hardnessd.dataset import best_frames  # noqa: E402
+from hardnessd.files import ending, reading, save  # noqa: E402
 
 # Pictures of a level.
 SHOWN = 8
@@ -121,16 +124,25 @@ def of_fit(report: Dict[str, Any]) -> Any:
     return figure
 
 
+def json_of(path: pathlib.Path) -> Any:
+    with reading(path, "not JSON"):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
 def of_json(path: pathlib.Path) -> Any:
-    found = json.loads(path.read_text())
-    return of_fit(found) if "candidates" in found else of_figures(found)[0]
+    report = json_of(path)
+    keys = set(report) if isinstance(report, dict) else set()
+    if not keys & {"candidates", "confusion"}:
+        found = f"the keys {', '.join(sorted(keys)[:4])}" if keys else f"a {type(report).__name__}"
+        raise ValueError(f"found {found}, expected `hrn-train fit --json`, `evaluate --json` of one model, or a run directory")
+    return of_fit(report) if "candidates" in keys else of_figures(report)[0]
 
 
 def of_run(path: pathlib.Path) -> Any:
     """Learning curves, and the figures of the evaluation if the run has ended."""
     evaluation = path / "evaluation.json"
     if evaluation.exists():
-        figure, axes = of_figures(json.loads(evaluation.read_text()), 1)
+        figure, axes = of_figures(json_of(evaluation), 1)
         curves(axes[0], path / "metrics.csv")
         return figure
     figure, one = plt.subplots(figsize=(7, 4.5), layout="constrained")
@@ -138,28 +150,20 @@ def of_run(path: pathlib.Path) -> Any:
     return figure
 
 
-def frames_of(data: Any) -> Tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """One frame of each press in newtons, and the levels."""
-    if "frames_mn" in data:
-        return data["frames_mn"][data["best"]] / 1000, data["level"]
-    return data["frames"], data["level"]
-
-
 def of_data(path: pathlib.Path) -> Any:
     """Presses of each level. Of presses over time, one press of each level from its beginning to its end, too."""
-    with np.load(path) as data:
-        frames, level = frames_of(data)
-        levels = np.unique(level)
-        rows: List[Tuple[str, Any]] = []
-        for one in levels:
-            places = np.flatnonzero(level == one)
-            chosen = places[np.linspace(0, len(places) - 1, min(SHOWN, len(places))).astype(int)]
-            name = f"level {one}" if one else "no level"
-            rows.append((f"{name}\n{len(places)} presses", frames[chosen]))
-            if "frames_mn" in data:
-                of_press = np.flatnonzero((data["press"] == chosen[0]) & (data["time_s"] >= 0))
-                moments = of_press[np.linspace(0, len(of_press) - 1, min(MOMENTS, len(of_press))).astype(int)]
-                rows.append((f"{name}\none press", data["frames_mn"][moments] / 1000))
+    data, _ = best_frames(path)
+    frames, level = data["frames"], data["level"]
+    rows: List[Tuple[str, Any]] = []
+    for one in np.unique(level):
+        places = np.flatnonzero(level == one)
+        chosen = places[np.linspace(0, len(places) - 1, min(SHOWN, len(places))).astype(int)]
+        name = f"level {one}" if one else "no level"
+        rows.append((f"{name}\n{len(places)} presses", frames[chosen]))
+        if "frames_mn" in data:
+            of_press = np.flatnonzero((data["press"] == chosen[0]) & (data["time_s"] >= 0))
+            moments = of_press[np.linspace(0, len(of_press) - 1, min(MOMENTS, len(of_press))).astype(int)]
+            rows.append((f"{name}\none press", data["frames_mn"][moments] / 1000))
     figure, axes = plt.subplots(
         len(rows), SHOWN, figsize=(1.3 * SHOWN + 1, 1.5 * len(rows)), layout="constrained", squeeze=False
     )
@@ -180,20 +184,22 @@ def of_data(path: pathlib.Path) -> Any:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python3 -m hardnessd.plot", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("path", type=pathlib.Path, help="a run directory, a file of `evaluate --json` or `fit --json`, or a data set")
-    parser.add_argument("--out", type=pathlib.Path, metavar="P.png", help="the picture [default: beside the input]")
+    parser.add_argument(
+        "--out", type=pathlib.Path, metavar="P.png",
+        help="the picture; an old one is replaced [default: beside the input, where none may be]",
+    )
     given = parser.parse_args()
     path = given.path
-    try:
-        if path.is_dir():
-            figure, out = of_run(path), path / "run.png"
-        elif path.suffix == ".npz":
-            figure, out = of_data(path), path.with_suffix(".png")
-        else:
-            figure, out = of_json(path), path.with_suffix(".png")
-    except (OSError, ValueError, KeyError) as error:
-        sys.exit(f"{path}: {error}")
-    figure.savefig(given.out or out, dpi=110)
-    print(given.out or out)
+    draw = of_run if path.is_dir() else of_data if path.suffix == ".npz" else of_json
+    out = given.out or (path / "run.png" if path.is_dir() else path.with_suffix(".png"))
+    picture = io.BytesIO()
+    with ending(out):
+        with reading(path, "cannot be drawn"):
+            figure = draw(path)
+        with reading(out, "cannot be drawn"):
+            figure.savefig(picture, dpi=110, format=out.suffix[1:] or "png")
+        save(out, picture.getvalue(), "wb" if given.out else "xb")
+    print(out)
 
 
 if __name__ == "__main__":
