@@ -28,6 +28,8 @@ mod own;
 mod relay;
 mod reload;
 mod request;
+#[cfg(feature = "zenoh")]
+pub mod rmw_zenoh;
 #[cfg(feature = "ros2")]
 pub mod ros2;
 mod sensor;

@@ -22,7 +22,9 @@ use serde_json::Value;
 
 use self::error::Problem;
 pub use self::error::{Error, Text};
-pub use self::publish::{Foxglove, Http, Mode, Publish, Ros2, Tcp, Unix, Zenoh};
+pub use self::publish::{
+    Foxglove, Http, Mode, Publish, RmwZenoh, Ros2, Tcp, Unix, Zenoh, domain_id,
+};
 use super::log;
 use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};

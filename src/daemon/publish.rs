@@ -16,6 +16,8 @@ use super::config::{Config, Unix};
 use super::foxglove;
 use super::http::Http;
 use super::hub::Hub;
+#[cfg(feature = "zenoh")]
+use super::rmw_zenoh;
 #[cfg(feature = "ros2")]
 use super::ros2;
 use super::sensor::Sensors;
@@ -126,6 +128,11 @@ impl Publishers {
         #[cfg(feature = "zenoh")]
         if let Some(settings) = &publish.zenoh {
             let worker = zenoh::open(settings, config, hub)?;
+            serving.push((clients, Box::pin(worker.serve(hub.clone()))));
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(settings) = &publish.rmw_zenoh {
+            let worker = rmw_zenoh::open(settings, sensors)?;
             serving.push((clients, Box::pin(worker.serve(hub.clone()))));
         }
         for (way, path) in paths {

@@ -30,16 +30,7 @@ use hardnessd_core::event::{self, Event, Kind, Reply};
 /// Fails if the daemon cannot listen on an address, or the library fails. A peer that cannot be
 /// reached is not an error, because the library tries again.
 pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Result<Worker, Error> {
-    // Try the addresses here first, because the library's error is a page long and names paths of
-    // its sources.
-    for endpoint in &settings.listen {
-        TcpListener::bind(config::Zenoh::address(endpoint).unwrap_or_default()).map_err(
-            |error| {
-                let key = "publish.zenoh.listen";
-                Error::Io(format!("{key}: cannot listen on {endpoint:?}: {error}"))
-            },
-        )?;
-    }
+    check_listen("publish.zenoh.listen", &settings.listen)?;
     let site = settings.site(&config.robot).to_owned();
     let (listen, connect) = (&settings.listen, &settings.connect);
     info!(way = "zenoh", site, ?listen, ?connect, "publishing");
@@ -65,7 +56,11 @@ struct Zenoh {
 
 impl Zenoh {
     fn open(settings: &config::Zenoh, site: String, hub: Hub) -> Result<Self, zenoh::Error> {
-        let session = zenoh::open(configuration(settings)?).wait()?;
+        let mut config = configuration(&settings.listen, &settings.connect)?;
+        // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to
+        // peers that the configuration does not name.
+        config.insert_json5("scouting/gossip/autoconnect", "[]")?;
+        let session = zenoh::open(config).wait()?;
         let queries = session
             .declare_queryable(format!("tactile/{site}/**"))
             .callback({
@@ -153,23 +148,33 @@ fn text(line: &Line) -> &str {
     line.json().trim_end()
 }
 
-/// The daemon's session. An address in use is an error. If a router is not there yet, the library tries
+/// Tries to listen on the endpoints, because the library's error is a page long and names paths of its sources.
+pub(super) fn check_listen(key: &str, endpoints: &[String]) -> Result<(), Error> {
+    for endpoint in endpoints {
+        let tried = TcpListener::bind(config::Zenoh::address(endpoint).unwrap_or_default());
+        tried
+            .map_err(|error| Error::Io(format!("{key}: cannot listen on {endpoint:?}: {error}")))?;
+    }
+    Ok(())
+}
+
+/// A session of the daemon. An address in use is an error. If a router is not there yet, the library tries
 /// again. By default zenoh listens on every interface and looks for peers by multicast. This configuration
 /// does neither.
-fn configuration(settings: &config::Zenoh) -> Result<zenoh::Config, zenoh::Error> {
+pub(super) fn configuration(
+    listen: &[String],
+    connect: &[String],
+) -> Result<zenoh::Config, zenoh::Error> {
     let json =
         |endpoints: &[String]| serde_json::to_string(endpoints).expect("a list of strings is JSON");
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"peer\"".to_owned()),
-        ("listen/endpoints", json(&settings.listen)),
+        ("listen/endpoints", json(listen)),
         ("listen/exit_on_failure", "true".to_owned()),
-        ("connect/endpoints", json(&settings.connect)),
+        ("connect/endpoints", json(connect)),
         ("connect/exit_on_failure", "false".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        // Without gossip, a peer behind a router gets events twice. Autoconnect would connect to
-        // peers that the configuration does not name.
-        ("scouting/gossip/autoconnect", "[]".to_owned()),
     ] {
         config.insert_json5(key, &value)?;
     }

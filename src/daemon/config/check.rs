@@ -1,7 +1,7 @@
 //! Checks that every value can be used, and that all of them can be used together.
 
 use super::error::Problem;
-use super::{Config, Publish, Ros2, Unix, Zenoh};
+use super::{Config, Publish, Unix, Zenoh, domain_id};
 use crate::daemon::port;
 use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::{range, verdict, wording};
@@ -22,25 +22,39 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
         check_zenoh(zenoh, &config.robot)?;
     }
     if let Some(ros2) = &publish.ros2 {
-        check_ros2(ros2, &config.sensors)?;
+        let (domain, namespace) = (ros2.domain_id, &ros2.namespace);
+        check_ros("publish.ros2", domain, namespace, &config.sensors)?;
+    }
+    if let Some(ros) = &publish.rmw_zenoh {
+        check_endpoints("publish.rmw_zenoh.listen", &ros.listen)?;
+        check_endpoints("publish.rmw_zenoh.connect", &ros.connect)?;
+        let (domain, namespace) = (ros.domain_id, &ros.namespace);
+        check_ros("publish.rmw_zenoh", domain, namespace, &config.sensors)?;
     }
     Ok(sensors)
 }
 
 /// Checks that this program was built with the features that the tables need.
 fn check_built(publish: &Publish) -> Result<(), Problem> {
-    let (foxglove, zenoh, ros2) = (&publish.foxglove, &publish.zenoh, &publish.ros2);
-    for (feature, is_built, is_given) in [
-        ("foxglove", cfg!(feature = "foxglove"), foxglove.is_some()),
-        ("zenoh", cfg!(feature = "zenoh"), zenoh.is_some()),
-        ("ros2", cfg!(feature = "ros2"), ros2.is_some()),
+    let (has_zenoh, has_ros2) = (cfg!(feature = "zenoh"), cfg!(feature = "ros2"));
+    let has_foxglove = cfg!(feature = "foxglove");
+    for (table, feature, is_built, is_given) in [
+        (
+            "foxglove",
+            "foxglove",
+            has_foxglove,
+            publish.foxglove.is_some(),
+        ),
+        ("zenoh", "zenoh", has_zenoh, publish.zenoh.is_some()),
+        ("rmw_zenoh", "zenoh", has_zenoh, publish.rmw_zenoh.is_some()),
+        ("ros2", "ros2", has_ros2, publish.ros2.is_some()),
     ] {
         if is_given && !is_built {
             let problem = format_args!(
                 "this hardnessd was built without {feature}: build it with --features {feature}, or \
                  remove the table"
             );
-            return Err(Problem::because(&format!("publish.{feature}"), problem));
+            return Err(Problem::because(&format!("publish.{table}"), problem));
         }
     }
     Ok(())
@@ -97,14 +111,8 @@ fn check_unix(unix: &Unix) -> Result<(), Problem> {
 }
 
 fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
-    for (key, endpoints) in [("listen", &zenoh.listen), ("connect", &zenoh.connect)] {
-        for endpoint in endpoints {
-            let key = format!("publish.zenoh.{key}");
-            let expected = "an endpoint such as \"tcp/127.0.0.1:7447\"";
-            let fits = Zenoh::address(endpoint).is_some();
-            range::check(&key, endpoint, fits, expected)?;
-        }
-    }
+    check_endpoints("publish.zenoh.listen", &zenoh.listen)?;
+    check_endpoints("publish.zenoh.connect", &zenoh.connect)?;
     let site = zenoh.site(robot);
     // These characters have a meaning in zenoh's key expressions. The log shows a site.
     let is_key = !site.split('/').any(str::is_empty)
@@ -115,29 +123,43 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
     Ok(range::check("publish.zenoh.site", site, is_key, expected)?)
 }
 
-fn check_ros2(ros2: &Ros2, sensors: &[sensor::Settings]) -> Result<(), Problem> {
-    let key = "publish.ros2.domain_id";
+fn check_endpoints(key: &str, endpoints: &[String]) -> Result<(), Problem> {
+    for endpoint in endpoints {
+        let expected = "an endpoint such as \"tcp/127.0.0.1:7447\"";
+        let fits = Zenoh::address(endpoint).is_some();
+        range::check(key, endpoint, fits, expected)?;
+    }
+    Ok(())
+}
+
+/// Checks what both tables of ROS 2 have.
+fn check_ros(
+    table: &str,
+    domain: Option<u16>,
+    namespace: &str,
+    sensors: &[sensor::Settings],
+) -> Result<(), Problem> {
+    let key = format!("{table}.domain_id");
     let expected = "0 to 232 (by default $ROS_DOMAIN_ID)";
-    match ros2.domain_id() {
-        Ok(id) => range::check(key, id, id <= LAST_DOMAIN_ID, expected)?,
-        Err(found) => return Err(Problem::found(key, found, expected)),
+    match domain_id(domain) {
+        Ok(id) => range::check(&key, id, id <= LAST_DOMAIN_ID, expected)?,
+        Err(found) => return Err(Problem::found(&key, found, expected)),
     }
     let token = |token: &str| {
         token.starts_with(|first: char| first.is_ascii_alphabetic())
             && token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
             && !token.contains("__")
     };
-    let namespace = &ros2.namespace;
     let tokens = namespace.strip_prefix('/');
     let fits = tokens.is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(token));
     let expected = "a namespace of ROS such as \"/arm_7\"";
-    range::check("publish.ros2.namespace", namespace, fits, expected)?;
+    range::check(&format!("{table}.namespace"), namespace, fits, expected)?;
     let fits = |sensor: &&sensor::Settings| token(&sensor.name);
     match sensors.iter().find(|sensor| !fits(sensor)) {
         Some(sensor) => Err(Problem::found(
             "sensor.name",
             &sensor.name,
-            "a name without two _ in a row, for publish.ros2",
+            format_args!("a name without two _ in a row, for {table}"),
         )),
         None => Ok(()),
     }

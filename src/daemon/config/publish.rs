@@ -24,6 +24,8 @@ settings! {
         pub zenoh: Option<Zenoh>;
         /// The topics of a ROS 2 node. Without the table, it is off. It needs the feature `ros2`.
         pub ros2: Option<Ros2>;
+        /// The same topics for nodes of `rmw_zenoh`. Without the table, it is off. It needs the feature `zenoh`.
+        pub rmw_zenoh: Option<RmwZenoh>;
     }
 }
 
@@ -88,8 +90,8 @@ impl Zenoh {
 settings! {
     /// The `[publish.ros2]` table.
     pub struct Ros2 {
-        /// The domain ID. The default is `$ROS_DOMAIN_ID`, else 0.
-        domain_id: Option<u16>;
+        /// The domain ID. [`domain_id`] has the default.
+        pub domain_id: Option<u16>;
         /// Namespace of the node and its topics.
         pub namespace: String = "/".to_owned();
         /// Addresses of the interfaces to use. An empty list means every interface, as in ROS 2.
@@ -97,20 +99,34 @@ settings! {
     }
 }
 
-impl Ros2 {
-    /// The domain ID: the configured one, else that of the environment, else 0.
-    ///
-    /// # Errors
-    ///
-    /// Returns what `$ROS_DOMAIN_ID` is, if it is not a number.
-    pub fn domain_id(&self) -> Result<u16, String> {
-        match (self.domain_id, env::var("ROS_DOMAIN_ID")) {
-            (Some(id), _) => Ok(id),
-            (None, Ok(text)) if !text.is_empty() => {
-                text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
-            }
-            (None, _) => Ok(0),
+settings! {
+    /// The `[publish.rmw_zenoh]` table. The session looks for nodes at its routers only.
+    pub struct RmwZenoh {
+        /// Endpoints of ROS's routers (`rmw_zenohd`). The session retries until they answer.
+        pub connect: Vec<String> = vec!["tcp/127.0.0.1:7447".to_owned()];
+        /// Endpoints to listen on. A port of 0 is any free port.
+        pub listen: Vec<String> = vec!["tcp/127.0.0.1:0".to_owned()];
+        /// The domain ID. [`domain_id`] has the default.
+        pub domain_id: Option<u16>;
+        /// Namespace of the node and its topics.
+        pub namespace: String = "/".to_owned();
+        /// Whether the topics' keys have the hash of the message type. They have none in ROS 2 Humble.
+        pub type_hashes: bool = true;
+    }
+}
+
+/// The domain ID of ROS: the configured one, else that of the environment, else 0.
+///
+/// # Errors
+///
+/// Returns what `$ROS_DOMAIN_ID` is, if it is not a number.
+pub fn domain_id(configured: Option<u16>) -> Result<u16, String> {
+    match (configured, env::var("ROS_DOMAIN_ID")) {
+        (Some(id), _) => Ok(id),
+        (None, Ok(text)) if !text.is_empty() => {
+            text.parse().map_err(|_| format!("$ROS_DOMAIN_ID {text:?}"))
         }
+        (None, _) => Ok(0),
     }
 }
 

@@ -222,6 +222,8 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
         ),
         ("ros2]\ndomain_id = 233", "found 233, expected 0 to 232"),
         ("ros2]\nnetworks = [\"eth0\"]", "IP address"),
+        ("rmw_zenoh]\nconnect = [\"router\"]", "zenoh.connect"),
+        ("rmw_zenoh]\nnamespace = \"arm_7\"", "zenoh.namespace"),
     ] {
         let error = load(&format!("{LEAST}[publish.{table}\n")).unwrap_err();
         assert!(error.contains(expected), "{table:?}: {error:?}");
@@ -233,8 +235,10 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
         "{error}"
     );
     let named = LEAST.replace("port", "name = \"a__b\"\nport");
-    let error = load(&format!("{named}[publish.ros2]\n")).unwrap_err();
-    assert!(error.contains("a__b"), "{error}");
+    for table in ["publish.ros2", "publish.rmw_zenoh"] {
+        let error = load(&format!("{named}[{table}]\n")).unwrap_err();
+        assert!(error.contains("a__b") && error.contains(table), "{error}");
+    }
     let good = format!("{robot}{LEAST}[publish.zenoh]\nsite = \"hall/3\"\n[publish.ros2]\n");
     let publish = load(&good).unwrap().publish;
     assert_eq!(publish.zenoh.unwrap().site("arm #7"), "hall/3");
@@ -243,18 +247,19 @@ fn zenoh_and_ros2_take_what_their_networks_do() {
 
 #[test]
 fn a_table_of_a_part_that_was_not_built_in_is_refused_by_name() {
-    for (feature, built) in [
-        ("foxglove", cfg!(feature = "foxglove")),
-        ("zenoh", cfg!(feature = "zenoh")),
-        ("ros2", cfg!(feature = "ros2")),
+    for (table, feature, built) in [
+        ("foxglove", "foxglove", cfg!(feature = "foxglove")),
+        ("zenoh", "zenoh", cfg!(feature = "zenoh")),
+        ("rmw_zenoh", "zenoh", cfg!(feature = "zenoh")),
+        ("ros2", "ros2", cfg!(feature = "ros2")),
     ] {
-        let loaded = load(&format!("{LEAST}[publish.{feature}]\n"));
+        let loaded = load(&format!("{LEAST}[publish.{table}]\n"));
         if built {
             assert!(loaded.is_ok(), "{loaded:?}");
         } else {
             let error = loaded.unwrap_err();
             let expected = format!(
-                "publish.{feature}: this hardnessd was built without {feature}: build it with \
+                "publish.{table}: this hardnessd was built without {feature}: build it with \
                  --features {feature}, or remove the table"
             );
             assert!(error.contains(&expected), "{error}");

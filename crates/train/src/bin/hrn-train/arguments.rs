@@ -34,7 +34,7 @@ const FITTED: &str = "\
     1,500 presses on the paper's network, each on objects that it has not met. Where nothing is better than the \
     built-in model by more than chance, it writes references for it, in the place of M.onnx with the ending .npz. The \
     levels are those of the label `level`, a number or a name, or of the label `shore`. Exit code 1: nothing is better \
-    than guessing.";
+    than guessing, and the daemon would not use these references.";
 
 /// What `check-model --help` says below the options.
 const CHECKED: &str = "\
