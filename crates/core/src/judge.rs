@@ -256,7 +256,7 @@ impl Judge {
                 let judged = hrn.judge_beside(&course, &references);
                 // The press is remembered even if its verdict is missing, and its verdict stays if the
                 // press cannot be kept.
-                if phase == Phase::Final && is_felt && !peak.saturated {
+                if phase == Phase::Final && is_felt {
                     let most = described.sensor.own_presses as usize;
                     if let Err(error) = self.kept.own.add(pressed, &hrn, &course, most) {
                         self.failed(press, phase, error);

@@ -3,4 +3,3 @@
 pub mod file;
 pub mod verdicts;
 pub mod export;
-pub mod start;

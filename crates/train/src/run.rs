@@ -1,11 +1,12 @@
 //! A run's directory: settings, revision, metrics, checkpoints, the model and its evaluation.
 //!
 //! Every file is complete at all times ([`disk`]), also after SIGKILL or a full disk. Only the last
-//! row of `metrics.csv` may be broken; a resumed run drops it.
+//! row of `metrics.csv` may be broken; a resumed run drops it. A run may [`start`] from a model.
 
 pub mod checkpoint;
 pub mod disk;
 pub mod history;
+pub mod start;
 
 use std::fs::{self, File};
 use std::io::ErrorKind;
