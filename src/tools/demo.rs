@@ -9,7 +9,7 @@
 mod account;
 mod place;
 
-use std::future::{self, Future};
+use std::future::Future;
 use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
 use std::path::Path;
@@ -149,8 +149,9 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     let daemon = daemon.run(stopped.map(drop), None);
     let play = async {
         player.play(frames, start).await.of("pty", IO)?;
-        // The loss of the port ends what is printed.
-        future::pending::<Result<_, Failure>>().await
+        // The loss of the port ends what is printed, unless a busy machine's daemon has never had the port.
+        tokio::time::sleep(LOSS).await;
+        Ok::<_, Failure>(None)
     };
     let playing = async {
         let _stop = stop;
@@ -172,6 +173,8 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
     Ok(served?)
 }
 
+/// How long the daemon may take to say that the port is gone.
+const LOSS: Duration = Duration::from_secs(5);
 /// How long a terminal may take for the last line.
 const LAST_LINE: Duration = Duration::from_millis(500);
 
