@@ -23,6 +23,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use crate::data::presses::Presses;
+use crate::data::source::Source;
 use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
@@ -119,6 +120,23 @@ impl Plan {
         Planned { name, words }
     }
 
+    /// Refuses a run of the directory that learnt from other data, or for another time.
+    fn check_before(&self, name: &str, presses: &Presses) -> anyhow::Result<()> {
+        let directory = self.directory(name);
+        let Some(before) = Run::description_at(&directory)? else {
+            return Ok(());
+        };
+        let hashes = |sources: &[Source]| -> Vec<String> {
+            sources.iter().map(|one| one.sha256.clone()).collect()
+        };
+        ensure!(
+            before.profile == self.profile && hashes(&before.data) == hashes(&presses.sources),
+            "{}: this run has another --data or --profile: give the same ones, or choose another --out",
+            directory.display()
+        );
+        Ok(())
+    }
+
     fn directory(&self, name: &str) -> PathBuf {
         self.out.join("runs").join(name)
     }
@@ -139,6 +157,9 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
     let presses = Presses::read(&plan.data)?;
     let mut open = plan.runs(presses.are_over_time());
+    for run in &open {
+        plan.check_before(&run.name, &presses)?;
+    }
     open.retain(|run| !plan.directory(&run.name).join("hrn.onnx").exists());
     if plan.plan {
         let line = |run: &Planned| {

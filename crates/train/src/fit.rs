@@ -2,7 +2,7 @@
 //!
 //! In: recordings of known objects, or data sets. Out: the candidates with what each reaches on objects that it
 //! has not met and on later presses, and a model or references, whichever judges these presses best. Nothing is
-//! written unless it is better than guessing.
+//! written if no candidate is better than guessing and the daemon would not use the references.
 
 pub mod candidate;
 pub mod comparison;
@@ -21,8 +21,8 @@ pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
 use crate::data::collect::{self, Collection, Settings};
 use crate::data::findings;
-use crate::data::presses::{Layout, Presses};
-use crate::data::source::papers_levels;
+use crate::data::presses::{Layout, Presses, read_one};
+use crate::data::source::{Source, papers_levels};
 use crate::model::export::{Learnt, validation};
 use crate::progress;
 use hardnessd_core::references;
@@ -62,10 +62,21 @@ pub fn fit(
     sensor: &Sensor,
     levels: Option<Vec<Level>>,
 ) -> anyhow::Result<(Report, Option<Written>)> {
-    let presses = read(data, sensor, levels)?;
-    let doubtful = findings::doubtful(&presses)?;
+    let (presses, mut doubtful) = read(data, sensor, levels)?;
+    doubtful.extend(findings::doubtful(&presses)?);
+    let tested = presses.labelled(Split::Test).count();
+    if tested > 0 {
+        doubtful.push(format!("{tested} presses of the split test are not used"));
+    }
     let all: Vec<usize> = presses.labelled(Split::Train).collect();
-    let places = whole(&presses, &all);
+    let once = findings::without_copies(&presses, &all);
+    if once.len() < all.len() {
+        let copies = all.len() - once.len();
+        doubtful.push(format!(
+            "{copies} presses are copies of others, and are not used"
+        ));
+    }
+    let places = whole(&presses, &once);
     check(&presses, &places)?;
     let candidates = candidate::all(&presses, &places)?;
     let control = candidate::unloaded(&presses, &places);
@@ -111,12 +122,12 @@ pub fn fit(
     };
     let (mut report, chosen) = comparison.report();
     report.remarks.splice(0..0, doubtful);
-    let pieces = all.len() - places.len();
+    let pieces = once.len() - places.len();
     if pieces > 0 {
         let remark = format!(
             "{pieces} of {} presses are left out, because each took less than a third of the median time of its object's: a \
              light contact that is lost for a moment makes several presses of one",
-            all.len()
+            once.len()
         );
         report.remarks.insert(0, remark);
     }
@@ -160,27 +171,43 @@ pub fn fit(
     Ok((report, Some(Written::Model(bytes))))
 }
 
-/// Reads the labelled presses.
-fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow::Result<Presses> {
+/// Reads the labelled presses, in the order in which they were made, and says what is doubtful about their objects. An
+/// object of recordings and of data sets that were collected is the same where its number and level are.
+fn read(
+    data: &[PathBuf],
+    sensor: &Sensor,
+    levels: Option<Vec<Level>>,
+) -> anyhow::Result<(Presses, Vec<String>)> {
     let paths = collect::captures(data)?;
     let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths
         .into_iter()
         .partition(|path| collect::is_data_set(path));
-    let mut sets = Presses::read(&sets)?;
-    let layout = Layout::of(sets.all.is_empty() || sets.are_over_time());
+    let sets = sets.iter().map(|path| read_one(path));
+    let sets: Vec<Presses> = sets.collect::<anyhow::Result<_>>()?;
+    let layout = Layout::of(sets.is_empty() || sets.iter().any(Presses::are_over_time));
     let mut played = Vec::new();
     collect::recordings(&recordings, sensor, layout, false, |recording| {
         played.push(recording);
         Ok(())
     })?;
-    let stated = sets.sources.iter().find_map(|source| source.levels.clone());
+    played.sort_by_key(|recording| recording.began);
+    let mut doubtful = Vec::new();
+    let unnumbered = played
+        .iter()
+        .filter(|recording| recording.is_unnumbered())
+        .count();
+    if unnumbered > 0 {
+        doubtful.push(format!(
+            "{unnumbered} recordings have no label `object`, and each counts as an object of its own: if two are of one \
+             object, the figures on new objects are too good"
+        ));
+    }
+    let mut sources = sets.iter().flat_map(|set| &set.sources);
+    let stated = sources.find_map(|source| source.levels.clone());
     let levels = match levels.or(stated) {
         Some(levels) => levels,
         None => levels::of_labels(played.iter().map(|recording| &recording.labels))?,
     };
-    for source in &mut sets.sources {
-        source.levels = Some(levels.clone());
-    }
     let settings = Settings {
         levels,
         level: None,
@@ -192,9 +219,29 @@ fn read(data: &[PathBuf], sensor: &Sensor, levels: Option<Vec<Level>>) -> anyhow
     for recording in played {
         collection.add(recording, &settings)?;
     }
+    let is_collected = |set: &Presses| set.sources.iter().all(Source::is_collected);
+    let (collected, others): (Vec<Presses>, Vec<Presses>) =
+        sets.into_iter().partition(is_collected);
+    for set in collected {
+        collection.add_set(set)?;
+    }
     let mut all = collection.into_presses(&settings.levels);
-    all.join(sets)?;
-    Ok(all)
+    // One object may be of two materials where one recording does not name its own.
+    all.all.iter_mut().for_each(|press| press.material = None);
+    if others.len() > 1 {
+        doubtful.push(
+            "objects of different data sets count as different ones: if they are not, the figures on new objects are too \
+             good"
+                .to_owned(),
+        );
+    }
+    for set in others {
+        all.join(set)?;
+    }
+    for source in &mut all.sources {
+        source.levels = Some(settings.levels.clone());
+    }
+    Ok((all, doubtful))
 }
 
 /// The presses that are no pieces of one. Where the contact is light, it is lost and felt again.
@@ -234,7 +281,9 @@ fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
     let count = presses.levels().len();
     let found: BTreeSet<u8> = presses.of(places).map(|press| press.level).collect();
     if let Some(level) = found.iter().find(|&&level| usize::from(level) > count) {
-        anyhow::bail!("found a press of level {level}, and {count} levels: name all levels");
+        anyhow::bail!(
+            "found a press of level {level}, and {count} levels: name all of them in [[level]] tables of --config"
+        );
     }
     ensure!(
         found.len() > 1,

@@ -12,7 +12,7 @@ use std::pin::Pin;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{counted_in_words, create, record, shown, unavailable};
+use super::{counted_in_words, create, record, unavailable};
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
@@ -173,7 +173,9 @@ pub(super) async fn run(
         print(&format!("{}\n", score.in_words()));
     }
     if count > 0 {
-        let directory = shown(directory);
+        let directory = directory.to_string_lossy();
+        // No path has the byte 0, which alone cannot be quoted.
+        let directory = shlex::try_quote(&directory).unwrap_or_default();
         print(&format!(
             "to make a model of them: hrn-train fit {directory} --out own.onnx\n"
         ));

@@ -67,9 +67,11 @@ pub fn check_label(key: &str, value: &str) -> Result<(), String> {
 /// The numbers below this are left to people, who count up from 0.
 const NAMED: u32 = 1 << 31;
 
-/// The number of an object that only has a name, for the label `object`: the same in every recording.
+/// The number of an object that only has a name, for the label `object`: the same in every recording, whatever its
+/// letters' case and the spaces are.
 pub fn object_of(name: &str) -> u32 {
-    let hash = sha256_hex(name.as_bytes());
+    let words: Vec<&str> = name.split_whitespace().collect();
+    let hash = sha256_hex(words.join(" ").to_lowercase().as_bytes());
     let number = u32::from_str_radix(&hash[..8], 16).expect("a hash is hexadecimal");
     number | NAMED
 }
@@ -103,6 +105,12 @@ mod tests {
         ] {
             assert_eq!(misspelt(key), known, "{key}");
         }
+    }
+
+    #[test]
+    fn an_object_has_one_number_however_its_name_is_typed() {
+        assert_eq!(object_of("Yoga  mat "), object_of("yoga mat"));
+        assert_ne!(object_of("yoga mat"), object_of("yoga mats"));
     }
 
     #[test]

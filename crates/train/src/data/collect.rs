@@ -19,7 +19,7 @@ use walkdir::WalkDir;
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::COLLECTOR;
+use crate::data::source::{COLLECTOR, Source};
 use crate::exit::unreadable;
 use crate::progress;
 use hardnessd_core::npz::Writer;
@@ -62,12 +62,21 @@ pub fn captures(paths: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
             all.push(path.clone());
             continue;
         }
-        let before = all.len();
+        let (before, mut sets) = (all.len(), 0);
         for entry in WalkDir::new(path).sort_by_file_name() {
             let entry = entry.map_err(|error| unreadable(path, &error.into()))?;
             if entry.path().is_file() && begins(entry.path(), MAGIC) {
                 all.push(entry.into_path());
+            } else if is_data_set(entry.path()) {
+                sets += 1;
             }
+        }
+        if sets > 0 {
+            hardnessd_core::stderr_line!(
+                "warning: {}: only recordings are taken of a directory, and {sets} .npz files are not: name the data sets \
+                 among them",
+                path.display()
+            );
         }
         ensure!(
             all.len() > before,
@@ -266,6 +275,24 @@ impl Collection {
         Ok(())
     }
 
+    /// Adds the presses of a data set that was collected. Its objects have the numbers of their labels.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if it was added before, its taxels have another pitch, or all presses are too many.
+    pub fn add_set(&mut self, set: Presses) -> anyhow::Result<()> {
+        for Source { name, sha256, .. } in &set.sources {
+            let is_same = self
+                .captures
+                .iter()
+                .any(|before| before["sha256"] == *sha256);
+            ensure!(!is_same, "{name}: is named twice");
+            self.captures
+                .push(json!({ "name": name, "sha256": sha256 }));
+        }
+        self.presses.append(set)
+    }
+
     /// The presses, as those of one file with these levels.
     pub fn into_presses(self, levels: &[Level]) -> Presses {
         let hashes = self.captures.iter().filter_map(|of| of["sha256"].as_str());
@@ -274,7 +301,7 @@ impl Collection {
         let grid = presses.grid();
         presses.sources.truncate(1);
         for source in &mut presses.sources {
-            source.name = format!("{} recordings", self.captures.len());
+            source.name = format!("{} files", self.captures.len());
             source.sha256 = sha256_hex(hashes.clone().collect::<String>().as_bytes());
             source.generator = Some(collector());
             source.levels = Some(levels.to_owned());

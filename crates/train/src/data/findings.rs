@@ -4,10 +4,11 @@
 //! reader thinks. Presses are compared by their frames and not by their numbers: a recording that was collected twice
 //! has two numbers.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::hash::{BuildHasher as _, RandomState};
 
 use anyhow::ensure;
+use hardnessd_core::frame::{Array, Frame, Pitch};
 use hardnessd_core::recording::is_named;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
@@ -98,7 +99,32 @@ pub fn doubtful(presses: &Presses) -> anyhow::Result<Vec<String>> {
         }
     }
     warnings.extend(of_two_levels(presses));
+    warnings.extend(beyond_contacts(presses));
     Ok(warnings)
+}
+
+/// Frames of other programs that a model would get otherwise from the daemon.
+pub fn beyond_contacts(presses: &Presses) -> Option<String> {
+    let differs = |&place: &usize| {
+        let source = presses.sources.get(presses.all[place].source);
+        let source = source.filter(|source| !source.is_ours());
+        source.is_some_and(|source| {
+            let frame = Frame {
+                array: Array::JX255N,
+                newtons: presses.frame(place).newtons.into(),
+            };
+            let threshold_n = Pitch::square(source.pitch()).contact_threshold_n();
+            frame.felt(threshold_n) != frame
+        })
+    };
+    let count = (0..presses.all.len()).filter(differs).count();
+    (count > 0).then(|| {
+        format!(
+            "{count} of {} frames have newtons more than two taxels from the contact: the daemon gives a model 0 there, so \
+             its verdicts may be worse than these frames show",
+            presses.all.len()
+        )
+    })
 }
 
 /// A named object of recordings with two levels. Numbers that people give may begin anew for each level.
@@ -181,6 +207,17 @@ fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
         count(kind, place, Some(other));
     }
     counts
+}
+
+/// The presses of `places` but for later copies of one.
+pub fn without_copies(presses: &Presses, places: &[usize]) -> Vec<usize> {
+    let (state, mut seen) = (RandomState::new(), HashSet::new());
+    let is_first = |&&place: &&usize| {
+        let frames: Vec<Vec<(u16, u32)>> = presses.contents(place).collect();
+        let taxels: usize = frames.iter().map(Vec::len).sum();
+        taxels < LEAST_TAXELS || seen.insert(state.hash_one(&frames))
+    };
+    places.iter().filter(is_first).copied().collect()
 }
 
 /// The press as its reader would find it.

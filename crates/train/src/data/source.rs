@@ -83,6 +83,18 @@ pub struct Source {
 }
 
 impl Source {
+    /// Whether our own programs made its frames.
+    pub fn is_ours(&self) -> bool {
+        let generator = self.generator.as_deref().unwrap_or_default();
+        self.is_collected() || generator.starts_with(SIMULATOR)
+    }
+
+    /// Whether the numbers of its objects are labels of recordings.
+    pub fn is_collected(&self) -> bool {
+        let generator = self.generator.as_deref();
+        generator.is_some_and(|generator| generator.starts_with(COLLECTOR))
+    }
+
     /// Distance between the sensor's taxels, in mm.
     pub fn pitch(&self) -> f64 {
         self.pitch_mm.unwrap_or(PITCH_MM)

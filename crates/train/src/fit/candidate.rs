@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use super::folds::Fold;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
+use crate::exit::remove_at_signal;
 use crate::learn::regression::{Regression, Seen};
 use crate::learn::{self, Learning, Question};
 use crate::methods::{Stages, last_stage};
@@ -191,6 +192,7 @@ fn with_hrn<T>(
     let mut settings = recipe.settings(Profile::Quick, train.len(), &toml::Table::new())?;
     settings.held_out = 0.0;
     let directory = tempfile::tempdir()?;
+    remove_at_signal(directory.path());
     let run = Run::open(
         directory.path(),
         &Description {

@@ -94,14 +94,17 @@ pub struct OfLevel {
 pub struct Estimate {
     /// The mean over the levels of the share that was judged rightly.
     pub balanced_accuracy: f64,
-    /// 95 %, by a bootstrap over objects, or over presses where a level has one object. Null where nothing
-    /// varies, unless all are right.
+    /// 95 %, over objects, or over the later presses of known objects where a level has one object.
     pub interval: Option<[f64; 2]>,
+    /// What it is worth at least, by the bootstrap alone: a few objects that are all judged rightly are worth a model,
+    /// whose confidence is as low as they are few.
+    #[serde(skip)]
+    worth: f64,
 }
 
 impl Estimate {
     /// The mean over the levels of values of presses, with its interval.
-    fn of(presses: &Presses, values: Vec<(usize, f64)>) -> Self {
+    fn of(presses: &Presses, values: Vec<(usize, f64)>, division: Division) -> Self {
         let places: Vec<usize> = values.iter().map(|(press, _)| *press).collect();
         let objects = presses.by_object(&places);
         let mut counts = BTreeMap::<u8, usize>::new();
@@ -109,30 +112,28 @@ impl Estimate {
             *counts.entry(*level).or_default() += 1;
         }
         let has_several = counts.values().all(|&count| count > 1);
+        let are_objects = has_several || division == Division::NewObjects;
         let units = objects.values().zip(0_u32..);
         let units = units.flat_map(|(own, unit)| own.iter().map(move |&press| (press, unit)));
         let units: BTreeMap<usize, u32> = units.collect();
         let drawn = values.into_iter().map(|(press, value)| Drawn {
             stratum: presses.all[press].level,
-            unit: match has_several {
+            unit: match are_objects {
                 true => units[&press],
                 false => press as u32,
             },
             value,
         });
         let drawn: Vec<Drawn> = drawn.collect();
+        let balanced_accuracy = interval::mean(&drawn, Mean::OfStrata);
+        let worth = match interval::of(&drawn, Mean::OfStrata) {
+            Some([low, _]) if balanced_accuracy < 1.0 => low,
+            _ => balanced_accuracy,
+        };
         Self {
-            balanced_accuracy: interval::mean(&drawn, Mean::OfStrata),
-            interval: interval::of(&drawn, Mean::OfStrata),
-        }
-    }
-
-    /// The low end of the interval, or the value where nothing varies: a few objects that are all judged rightly are
-    /// worth a model, whose confidence is as low as they are few.
-    fn low(&self) -> f64 {
-        match self.interval {
-            Some([low, _]) if self.balanced_accuracy < 1.0 => low,
-            _ => self.balanced_accuracy,
+            balanced_accuracy,
+            interval: interval::of_balanced(&drawn),
+            worth,
         }
     }
 }
@@ -154,11 +155,13 @@ impl Row {
         left_out: Option<String>,
         presses: &Presses,
     ) -> Self {
-        let estimate = |judged: &Option<Judged>| {
+        let estimate = |division| {
+            let judged: &Option<Judged> = &judged[division as usize];
             let right = right(presses, judged.as_ref()?);
-            Some(Estimate::of(presses, right))
+            Some(Estimate::of(presses, right, division))
         };
-        let [new_objects, later_presses] = judged.each_ref().map(estimate);
+        let [new_objects, later_presses] =
+            [Division::NewObjects, Division::LaterPresses].map(estimate);
         Self {
             name: name.to_owned(),
             new_objects,
@@ -185,7 +188,7 @@ impl Row {
         let other: BTreeMap<usize, f64> = other.into_iter().collect();
         let own = right(presses, self.judged(division)?).into_iter();
         let of_both = own.filter_map(|(press, right)| Some((press, right - other.get(&press)?)));
-        Some(Estimate::of(presses, of_both.collect()))
+        Some(Estimate::of(presses, of_both.collect(), division))
     }
 }
 
@@ -284,7 +287,7 @@ impl Comparison<'_> {
             let best = self.best(division)?;
             let found = self.candidates[best].estimate(division)?;
             let least = self.guessing(division) + LEAST_GAIN;
-            (found.low() >= least).then_some((division, best))
+            (found.worth >= least).then_some((division, best))
         });
         let (division, best, place) = match useful {
             Some((division, best)) => {
@@ -312,6 +315,7 @@ impl Comparison<'_> {
             self.best(division).map(|_| Estimate {
                 balanced_accuracy: self.guessing(division),
                 interval: None,
+                worth: self.guessing(division),
             })
         };
         let guessing = Row {
@@ -346,9 +350,9 @@ impl Comparison<'_> {
         let (row, built_in) = (&self.candidates[best], &self.candidates[0]);
         let name = &row.name;
         let lead = |other: &Row| row.lead(other, division, self.presses);
-        let is_no_better = |other: &Row| lead(other).is_some_and(|lead| lead.low() <= 0.0);
+        let is_no_better = |other: &Row| lead(other).is_some_and(|lead| lead.worth <= 0.0);
         let control = self.control.estimate(division);
-        let tells = |control: Estimate| control.low() > self.guessing(division);
+        let tells = |control: Estimate| control.worth > self.guessing(division);
         if control.is_some_and(tells) && is_no_better(&self.control) {
             remarks.push(format!(
                 "the unloaded sensor alone tells the levels as well as {name}: the sessions tell them apart, and not the \

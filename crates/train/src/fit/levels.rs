@@ -9,13 +9,14 @@ use hardnessd_core::recording::Labels;
 use hardnessd_core::verdict::{Level, MOST_LEVELS};
 
 /// The levels that the labels of recordings name. Numbers alone are those of the paper's levels, or of as
-/// many as there are. Names are put in the order of the Shore hardness that was measured, the hardest first, or
+/// many as there are. Names are the same in any case, and are put in the order of the Shore hardness that was measured, the hardest first, or
 /// else of the alphabet.
 ///
 /// # Errors
 ///
 /// Fails if the labels name more levels than a model may have.
 pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Vec<Level>> {
+    let mut spelt = BTreeMap::<String, &str>::new();
     let mut named = BTreeMap::<&str, Vec<Option<f32>>>::new();
     let mut most = 0;
     for labels in all {
@@ -26,7 +27,8 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
             Ok(number) => most = most.max(number),
             Err(_) => {
                 let shore = labels.get("shore").and_then(|shore| shore.parse().ok());
-                named.entry(label).or_default().push(shore);
+                let first = spelt.entry(label.to_ascii_lowercase()).or_insert(label);
+                named.entry(*first).or_default().push(shore);
             }
         }
     }
@@ -104,7 +106,7 @@ mod tests {
                 "hard >70, firm 61-70, soft 51-60, very-soft <=50",
             ),
             ("1, 5", "1 -, 2 -, 3 -, 4 -, 5 -"),
-            ("ripe, green", "green -, ripe -"),
+            ("ripe, green, Ripe", "green -, ripe -"),
             (
                 "ripe 20, green 80, ripe 30, half 50",
                 "green >65, half 40-65, ripe <=40",

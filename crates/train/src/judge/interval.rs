@@ -7,6 +7,8 @@ use std::collections::BTreeMap;
 
 use hardnessd_simulator::random::Stream;
 
+/// So few units of a stratum do not show how much units vary.
+const FEW: usize = 4;
 /// The number of draws.
 const DRAWS: usize = 2_000;
 
@@ -97,6 +99,83 @@ pub fn of(presses: &[Drawn], mean: Mean) -> Option<[f64; 2]> {
     Some([quantile(&draws, 0.025), quantile(&draws, 0.975)])
 }
 
+/// The 95 % interval of the mean over the strata. To the bootstrap it adds what that cannot see: the units of a stratum
+/// may be alike because they are few. A stratum of fewer than [`FEW`] units, or of units that are all alike, counts with the interval of Clopper and Pearson (1934), as if
+/// each unit had one press, and the distances of all limits from the mean are added as independent ones are (Zou and
+/// Donner 2008, "Construction of confidence limits about effect measures").
+pub fn of_balanced(presses: &[Drawn]) -> Option<[f64; 2]> {
+    let mut each = BTreeMap::<u8, Vec<Drawn>>::new();
+    for press in presses {
+        each.entry(press.stratum).or_default().push(*press);
+    }
+    let count = each.len() as f64;
+    let mut squares = [0.0; 2];
+    let mut add = |limits: [f64; 2], share: f64, strata: usize| {
+        for (square, limit) in squares.iter_mut().zip(limits) {
+            *square += ((limit - share) * strata as f64 / count).powi(2);
+        }
+    };
+    let mut varied = Vec::new();
+    for own in each.into_values() {
+        let units = strata(&own).concat();
+        let share = |[sum, n]: Sum| sum / n;
+        let are_alike = units
+            .windows(2)
+            .all(|pair| share(pair[0]) == share(pair[1]));
+        if are_alike || units.len() < FEW {
+            let share = share(total(units.iter().copied()));
+            add(of_share(share, units.len()), share, 1);
+        } else {
+            varied.push(own);
+        }
+    }
+    let strata = varied.len();
+    let varied = varied.concat();
+    if let Some(limits) = of(&varied, Mean::OfStrata) {
+        add(limits, mean(&varied, Mean::OfStrata), strata);
+    }
+    let [below, above] = squares.map(f64::sqrt);
+    let centre = mean(presses, Mean::OfStrata);
+    (count > 0.0).then(|| [(centre - below).max(0.0), (centre + above).min(1.0)])
+}
+
+/// The shares of which so many right units, or fewer and more, are found by a chance of 2.5 % each.
+fn of_share(right: f64, units: usize) -> [f64; 2] {
+    // The chance of at most `most` right ones.
+    let at_most = |most: usize, share: f64| {
+        let mut chance = (1.0 - share).powi(units as i32);
+        let mut sum = 0.0;
+        for count in 0..=most {
+            sum += chance;
+            chance *= (units - count) as f64 / (count + 1) as f64 * share / (1.0 - share);
+        }
+        sum
+    };
+    let right = right * units as f64;
+    let (low, high) = (right.floor() as usize, right.ceil() as usize);
+    let where_it_is = |is_above: &dyn Fn(f64) -> bool| {
+        let (mut below, mut above) = (0.0, 1.0);
+        for _ in 0..50 {
+            let middle = 0.5 * (below + above);
+            match is_above(middle) {
+                true => above = middle,
+                false => below = middle,
+            }
+        }
+        0.5 * (below + above)
+    };
+    [
+        match low {
+            0 => 0.0,
+            _ => where_it_is(&|share| 1.0 - at_most(low - 1, share) > 0.025),
+        },
+        match high == units {
+            true => 1.0,
+            false => where_it_is(&|share| at_most(high, share) < 0.025),
+        },
+    ]
+}
+
 fn total(sums: impl Iterator<Item = Sum>) -> Sum {
     sums.fold([0.0; 2], |[sum, n], [more, of]| [sum + more, n + of])
 }
@@ -140,6 +219,32 @@ mod tests {
                 "{count}: {found}, expected {expected}"
             );
         }
+    }
+
+    #[test]
+    fn a_level_of_few_units_that_are_alike_widens_the_interval() {
+        let of = |levels: &[&[usize]]| {
+            let presses = (0..).zip(levels).flat_map(|(stratum, right)| {
+                let own = units(right).into_iter();
+                own.map(move |press| Drawn { stratum, ..press })
+            });
+            of_balanced(&presses.collect::<Vec<_>>()).unwrap()
+        };
+        let all = [50; 60];
+        // Two units say no more than that a fifth is right (0.025^(1/2) = 0.158).
+        let [low, high] = of(&[&all[..2], &all]);
+        assert!((low - (1.0 - 0.5 * (1.0 - 0.158))).abs() < 0.01, "{low}");
+        assert_eq!(high, 1.0);
+        // One press less does not make it surer.
+        let [lower, _] = of(&[&all[..2], &[[49].as_slice(), &all[..59]].concat()]);
+        assert!((low - lower).abs() < 0.02, "{low} {lower}");
+        // One unit says nothing, and units of which each has half right are a fair coin's.
+        assert!(of(&[&all[..1]])[0] < 0.03);
+        let [low, high] = of(&[&[25; 10]]);
+        assert!(
+            (low - 0.187).abs() < 1e-3 && (high - 0.813).abs() < 1e-3,
+            "{low} {high}"
+        );
     }
 
     #[test]

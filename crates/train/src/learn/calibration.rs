@@ -130,7 +130,16 @@ impl Calibration {
             let worst = (WORST_COVERS * losses.len() as f64).ceil() as usize;
             losses[..worst].iter().sum::<f64>()
         };
+        let mut of_levels = BTreeMap::<usize, BTreeSet<u64>>::new();
+        for judged in all() {
+            of_levels
+                .entry(judged.level)
+                .or_default()
+                .insert(judged.unit);
+        }
+        let fewest = of_levels.values().map(BTreeSet::len).min();
         let units: BTreeSet<u64> = all().map(|judged| judged.unit).collect();
+        let units = units.len().min(fewest.unwrap_or(0) * of_levels.len());
         let confidence = |temperature: f32| {
             let of = |judged: &Judged| argmax(&outputs.probabilities(&judged.row, temperature)).1;
             let sum: f32 = all().map(of).sum();
@@ -138,7 +147,7 @@ impl Calibration {
         };
         let temperature = match all().next() {
             None => 1.0,
-            Some(_) => at_most(least(loss), confidence, most_confidence(units.len())),
+            Some(_) => at_most(least(loss), confidence, most_confidence(units)),
         };
         let (mut limits, mut units) = (BTreeMap::new(), [0; 2]);
         for (&knowledge, judged) in judged {
@@ -222,7 +231,7 @@ fn least(loss: impl Fn(f64) -> f64) -> f32 {
 }
 
 /// The most that a verdict on something new may claim after so many units, all of which were judged rightly (Laplace's
-/// rule of succession).
+/// rule of succession). A level with few of them counts for all.
 fn most_confidence(units: usize) -> f32 {
     (units + 1) as f32 / (units + 2) as f32
 }

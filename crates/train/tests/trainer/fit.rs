@@ -24,6 +24,11 @@ use crate::{errors, hrn_train_in, json_in, succeed_in};
 /// Five presses of each object on an array of 4x4 taxels. Each object is its level and the column of the array
 /// that feels it, 0 to 3.
 fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
+    write_by("another program", path, objects, levels);
+}
+
+/// The same, as this generator would say it.
+fn write_by(generator: &str, path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
     let mut presses = Presses::default();
     for (object, &(level, col)) in (0..).zip(objects) {
         for number in 0..5_u8 {
@@ -56,7 +61,9 @@ fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
         }})
     };
     let levels: Vec<Value> = levels.iter().enumerate().map(level).collect();
-    let meta = json!({"grid": [4, 4], "pitch_mm": 3.5, "levels": levels});
+    let meta = json!({
+        "grid": [4, 4], "pitch_mm": 3.5, "levels": levels, "generator": generator
+    });
     presses::write(
         Writer::new(File::create(path).unwrap()),
         &presses,
@@ -236,6 +243,41 @@ fn presses_scattered_on_a_large_array_are_no_model_of_its_taxels() {
     let text = String::from_utf8_lossy(&output.stdout);
     let expected = "left out: presses fall on different places of a large array";
     assert!(text.contains(expected), "{text}");
+}
+
+#[test]
+fn an_object_of_two_collected_files_is_one_and_a_copied_press_counts_once() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    let monday = [(1, 0), (1, 1), (2, 2), (2, 3)];
+    let tuesday = [(1, 1), (1, 0), (2, 3), (2, 2)];
+    let of = |first: &str, second: &str, objects: &[(u8, usize)]| {
+        write_by(first, &path("mon.npz"), &monday, &PAPERS);
+        write_by(second, &path("tue.npz"), objects, &PAPERS);
+        let words = "fit mon.npz tue.npz --out m.onnx --json";
+        let report = json_in(directory.path(), words);
+        for file in ["m.onnx", "m.npz", "mon.npz", "tue.npz"] {
+            let _ = fs::remove_file(path(file));
+        }
+        let remarks = report["remarks"].to_string();
+        (
+            report["levels"][0]["objects"].as_u64(),
+            report["presses"].as_u64(),
+            remarks,
+        )
+    };
+    let (first, second) = ("hrn-train collect 1", "hrn-train collect 2");
+    let (objects, presses, remarks) = of(first, second, &tuesday);
+    assert_eq!((objects, presses), (Some(2), Some(40)), "{remarks}");
+    let (objects, presses, remarks) = of(first, second, &monday);
+    assert_eq!((objects, presses), (Some(2), Some(20)), "{remarks}");
+    assert!(remarks.contains("20 presses are copies"), "{remarks}");
+    let (objects, _, remarks) = of("another", "another", &tuesday);
+    assert_eq!(objects, Some(4));
+    assert!(
+        remarks.contains("objects of different data sets"),
+        "{remarks}"
+    );
 }
 
 #[test]

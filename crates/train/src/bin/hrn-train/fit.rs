@@ -38,42 +38,47 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
         true => serde_json::to_string(&report)? + "\n",
         false => of_report(&report),
     };
-    let lines = match written {
-        None => {
+    match save(written, &arguments.out, &references, sensor.frame_rate_hz()) {
+        Ok(lines) if arguments.json || lines.is_empty() => Ok(text),
+        Ok(lines) => Ok(format!(
+            "{text}\nThe daemon loads it. Its lines in the configuration:\n\n{lines}"
+        )),
+        // The table took minutes.
+        Err(error) => {
             super::print(&text)?;
-            bail!("nothing was written, because no candidate is better than guessing");
+            Err(error)
         }
+    }
+}
+
+/// Writes the model or the references, and gives their lines in the configuration.
+fn save(
+    written: Option<Written>,
+    model: &Path,
+    references: &Path,
+    rate_hz: f64,
+) -> anyhow::Result<String> {
+    Ok(match written {
+        None => bail!("nothing was written, because no candidate is better than guessing"),
         Some(Written::Model(bytes)) => {
-            let rate_hz = sensor.frame_rate_hz();
             trial::load(&bytes, Some(trial::verdict_most(rate_hz)))
                 .context("the daemon refuses the model")?;
-            write(&arguments.out, &bytes)?;
-            let path = shown(&arguments.out);
-            format!("[model]\npath = {path}\n")
+            write(model, &bytes)?;
+            format!("[model]\npath = {}\n", shown(model))
         }
         Some(Written::References(bytes, levels)) => {
-            let own = levels
-                .as_deref()
-                .map(of_levels)
-                .transpose()?
-                .unwrap_or_default();
+            let own = levels.as_deref().map(of_levels).transpose()?;
             let line = match bytes {
                 Some(bytes) => {
-                    write(&references, &bytes)?;
-                    let path = shown(&references);
+                    write(references, &bytes)?;
+                    let path = shown(references);
                     format!("references = {path}   # in the table of the [[sensor]]\n")
                 }
                 None => String::new(),
             };
-            line + &own
+            line + &own.unwrap_or_default()
         }
-    };
-    if arguments.json || lines.is_empty() {
-        return Ok(text);
-    }
-    Ok(format!(
-        "{text}\nThe daemon loads it. Its lines in the configuration:\n\n{lines}"
-    ))
+    })
 }
 
 /// A path as TOML has it.

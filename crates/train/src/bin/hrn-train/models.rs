@@ -5,6 +5,7 @@ use std::path::Path;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
 use hardnessd_core::{exit, wording};
+use hrn_train::data::findings;
 use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
@@ -27,6 +28,9 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         check_new(path)?;
     }
     let presses = read_one(&arguments.data)?;
+    if let Some(text) = findings::beyond_contacts(&presses) {
+        hardnessd_core::stderr_line!("warning: {}: {text}", arguments.data.display());
+    }
     let judged = models.iter().map(|hrn| judge(arguments, &presses, hrn));
     let judged: Vec<Vec<Case>> = judged.collect::<anyhow::Result<_>>()?;
     let of_models = models.iter().zip(&judged);

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, bail, ensure};
+use jiff::Timestamp;
 use serde_json::Value;
 
 use super::{ARCHIVE, Settings};
@@ -28,6 +29,8 @@ const NOT_LOOKED_AT: Stamp = Stamp {
 };
 /// A touch is felt at most so long before it is a press.
 const REST_S: f64 = 0.5;
+/// A durometer's reading may be so many OO beyond the border of the level that people say.
+const NEAR_OO: f32 = 2.0;
 /// Bytes of a raw recording that are played at once.
 const CHUNK_BYTES: usize = 1 << 16;
 
@@ -38,6 +41,8 @@ pub struct Recording {
     /// What its labels say. Raw bytes have none.
     pub labels: Labels,
     pub(super) sha256: String,
+    /// When it began. Raw bytes do not say it.
+    pub began: Option<Timestamp>,
     layout: Layout,
     kind: Kind,
     /// Its sensors, by number.
@@ -75,6 +80,7 @@ impl Recording {
             path: path.to_owned(),
             labels: Labels::new(),
             sha256: sha256_hex(bytes),
+            began: None,
             layout,
             kind: Kind::Unknown,
             sensors: Vec::new(),
@@ -101,6 +107,12 @@ impl Recording {
         read.map(Some)
     }
 
+    /// Whether it has a press of which neither a label nor a word during the press says which object it was.
+    pub fn is_unnumbered(&self) -> bool {
+        let are_named = |press: &Press| press.object.is_some();
+        !self.labels.contains_key("object") && !self.presses.all.iter().all(are_named)
+    }
+
     /// Gives its presses what options and labels say of them. What was said of a press while it was made counts more
     /// than the labels. An object without a number is `new`.
     pub(super) fn label_presses(
@@ -117,16 +129,23 @@ impl Recording {
         );
         let shore = |text: &str| text.parse().ok().filter(|shore| SHORE.contains(shore));
         let shore = self.label("shore", "a number from 0 to 100", shore)?;
-        let expected =
-            "the name of a level, or a number from 0 (unlabelled) to 16: --level gives another one";
+        let expected = "the name of a level, or a number from 0 (unlabelled) to 16: `collect --level` gives \
+                        another one";
         let level = match of.level {
             None => self.label("level", expected, |text| level(text, of))?,
             given => given,
         };
-        let of_shore = || {
-            let borders = Borders::of(&of.levels).ok()?;
-            Some(of.levels[borders.place_of(shore?)].level)
-        };
+        let borders = Borders::of(&of.levels).ok();
+        if let (Some(level @ 1..), Some(shore), Some(borders)) = (level, shore, &borders)
+            && usize::from(level) <= of.levels.len()
+        {
+            let [low, high] = borders.part(usize::from(level) - 1);
+            ensure!(
+                (low - NEAR_OO..=high + NEAR_OO).contains(&shore),
+                "label shore: found {shore} OO, expected {low} to {high}, those of its label level"
+            );
+        }
+        let of_shore = || Some(of.levels[borders?.place_of(shore?)].level);
         let level = level.or_else(of_shore);
         let object = match of.object {
             None => self.label("object", "a number: --object gives another one", |text| {
@@ -175,6 +194,9 @@ impl Recording {
         playback.keep_courses();
         for found in entries {
             let found = found?;
+            if found.at.wall != NOT_LOOKED_AT.wall {
+                self.began.get_or_insert(found.at.wall);
+            }
             // A wrong description is an error of the playback.
             if let Entry::State(state) = &found.entry
                 && let Ok(sensor) = state.sensor.check()
