@@ -88,6 +88,8 @@ fn the_control_socket_has_its_mode_and_group_tares_and_gives_presses_their_conte
 fn tail(bench: &Bench, arguments: &str) -> Command {
     let mut command = bench.command(&format!("tail {arguments}"));
     command.env("RUNTIME_DIRECTORY", bench.path(""));
+    // Where a demonstration of another test has its socket.
+    command.env("TMPDIR", bench.path(""));
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }
