@@ -194,9 +194,11 @@ fn newtons(scale: &Scale) -> String {
     text += "\n[sensor.calibration]\n# pitch_mm = 3.5  # from the centre of a taxel to the next: measure it\n\
              # The bytes say neither the pitch nor the newtons of a count. A wrong one gives wrong verdicts.\n";
     text += &match scale.newtons_per_count {
+        // Of counts of 24 bits, one has fewer than a millionth.
         Some(newtons) => format!(
-            "newtons_per_count = {newtons:.6}  # a guess from counts up to {}: measure it with weights\n",
-            scale.most_counts
+            "newtons_per_count = {newtons:.digits$}  # a guess from counts up to {}: measure it with weights\n",
+            scale.most_counts,
+            digits = (3.0 - newtons.log10().floor()).max(6.0) as usize
         ),
         None => format!("# newtons_per_count = {NEWTONS_PER_COUNT}  # measure it with weights\n"),
     };

@@ -7,9 +7,9 @@ use std::collections::BTreeSet;
 
 use hardnessd_core::wire::Cell;
 
-use crate::numbers::{self, is_signed};
+use crate::numbers::{self, is_signed, signed};
 use crate::period::Frames;
-use crate::pictures::Presses;
+use crate::pictures::{Presses, some};
 
 /// One in so many numbers is below 0 at least, and so many times as many are by little as are by much.
 const MANY: usize = 10;
@@ -19,6 +19,8 @@ const CROSSING_CELLS: usize = 2;
 const CROSSING_MOMENTS: usize = 3;
 /// So many bytes of a frame are looked at for it.
 const CROSSING_BYTES: usize = 4096;
+/// So many pairs of frames are looked at for numbers that pass through half of their range.
+const PASSING_MOMENTS: usize = 300;
 /// The largest of floats of 16 bits is at least 0.03 and finite: as a count it is between these.
 const LEAST_HALF: f32 = 10_240.0;
 const MOST_HALF: f32 = 31_743.0;
@@ -34,8 +36,9 @@ const NOISIER: f32 = 2.0;
 const WRAPS: usize = 1000;
 /// The fewest bytes that show whether bytes are parts of longer numbers.
 const FEWEST_PARTS: usize = 64;
-/// The high half of a number of 24 bits is smaller.
+/// The high half of a number of 24 bits is smaller, and the high byte of one of 12 bits.
 const HIGH_HALF: f32 = 256.0;
+const HIGH_BYTE: f32 = 16.0;
 /// All but one of so many are nearly all. At the ends of a place may be other parts of the frame.
 const NEARLY_ALL: usize = 50;
 
@@ -52,8 +55,8 @@ impl<'a> Cells<'a> {
     pub(crate) fn may_be(&self, cell: Cell, channels: usize) -> bool {
         let wraps = self.wraps(cell, channels) || self.crosses_zero(cell);
         let is_sign_right = match is_signed(cell) {
-            true => wraps || self.has_negative(cell),
-            false => !wraps,
+            true => (wraps || self.has_negative(cell)) && !self.passes_half(cell),
+            false => !wraps || self.passes_half(cell),
         };
         is_sign_right && !self.is_part(cell)
     }
@@ -85,11 +88,8 @@ impl<'a> Cells<'a> {
     /// Whether numbers are below 0 for a moment, or above it, by little. One that is may be a broken taxel, and all of
     /// one moment are taxels that saturate: without a sign, the number before 0 is the largest.
     fn crosses_zero(&self, cell: Cell) -> bool {
-        let cell = match cell {
-            Cell::U8 | Cell::I8 => Cell::I8,
-            Cell::U16le | Cell::I16le => Cell::I16le,
-            Cell::U16be | Cell::I16be => Cell::I16be,
-            _ => return false,
+        let Some(cell) = signed(cell) else {
+            return false;
         };
         let quarter = 2.0_f32.powi(8 * cell.bytes() as i32 - 2);
         let numbers = |index| {
@@ -114,6 +114,26 @@ impl<'a> Cells<'a> {
             }
         }
         cells.len() >= CROSSING_CELLS && moments.len() >= CROSSING_MOMENTS
+    }
+
+    /// Whether numbers without a sign pass through half of their range. With a sign they would jump from the largest to
+    /// the least: they have none, and those that look like -1 are at their maximum.
+    fn passes_half(&self, cell: Cell) -> bool {
+        let Some(cell) = signed(cell) else {
+            return false;
+        };
+        let half = 2.0_f32.powi(8 * cell.bytes() as i32 - 1);
+        let passes = |&moment: &usize| {
+            let [before, now] = [moment - 1, moment].map(|index| {
+                let bytes = self.of_frame(index);
+                numbers::numbers(cell, &bytes[..bytes.len().min(CROSSING_BYTES)])
+            });
+            let mut both = before.iter().zip(&now);
+            both.any(|(before, now)| (before - now).abs() > half)
+        };
+        let moments: Vec<usize> = (1..self.frames.len()).collect();
+        let moments = some(&moments, PASSING_MOMENTS);
+        moments.iter().filter(|moment| passes(moment)).count() > CROSSING_MOMENTS
     }
 
     /// Whether numbers of 16 bits look like floats, which the daemon does not read: between 0 and the larger ones
@@ -201,23 +221,28 @@ impl<'a> Cells<'a> {
                 // Where something small presses a large array, few bytes change, whichever they are.
                 let is_pressed = (0..4).any(|phase| changes(phase, MANY));
                 is_pressed && (0..4).any(|phase| !changes(phase, NEARLY_ALL))
+                    || self.has_high_halves(Cell::I8, HIGH_BYTE)
             }
-            2 => {
-                let (mut all, mut large) = (0, [0; 2]);
-                for bytes in self.pressed() {
-                    for pair in numbers::numbers(cell, bytes).chunks_exact(2) {
-                        all += 1;
-                        for (large, &number) in large.iter_mut().zip(pair) {
-                            let wrapped = if number >= 32_768.0 { 65_536.0 } else { 0.0 };
-                            *large += usize::from((number - wrapped).abs() >= HIGH_HALF);
-                        }
-                    }
-                }
-                // Of neighbours in an array, one may be large a little more often.
-                let [less, more] = [large[0].min(large[1]), large[0].max(large[1])];
-                NEARLY_ALL * less < all && NEARLY_ALL * more >= all && more > MANY * less
-            }
+            2 => self.has_high_halves(cell, HIGH_HALF),
             _ => false,
         }
+    }
+
+    /// Whether of two numbers in a row one is nearly always less than `small`, and the other is not.
+    fn has_high_halves(&self, cell: Cell, small: f32) -> bool {
+        let range = 2.0_f32.powi(8 * cell.bytes() as i32);
+        let (mut all, mut large) = (0, [0; 2]);
+        for bytes in self.pressed() {
+            for pair in numbers::numbers(cell, bytes).chunks_exact(2) {
+                all += 1;
+                for (large, &number) in large.iter_mut().zip(pair) {
+                    let wrapped = if number >= range / 2.0 { range } else { 0.0 };
+                    *large += usize::from((number - wrapped).abs() >= small);
+                }
+            }
+        }
+        // Of neighbours in an array, one may be large a little more often.
+        let [less, more] = [large[0].min(large[1]), large[0].max(large[1])];
+        NEARLY_ALL * less < all && NEARLY_ALL * more >= all && more > MANY * less
     }
 }

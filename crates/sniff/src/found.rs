@@ -5,7 +5,8 @@ use hardnessd_core::wire::Cell;
 use hardnessd_core::wording::name;
 
 use crate::layout::Proposal;
-use crate::model::Score;
+use crate::model::{self, Score};
+use crate::pictures::Pictures;
 
 /// What the user knows of the array.
 #[derive(Debug, Clone, Copy, Default)]
@@ -142,6 +143,7 @@ impl Found {
             proposal,
             score: Score {
                 presses: Vec::new(),
+                weights: Vec::new(),
                 once: 0.0,
             },
             own_doubt: None,
@@ -220,6 +222,22 @@ pub(crate) fn doubt_of_cells(cells: usize, score: &Score, alone: &Score) -> Opti
              or this is no array"
         )
     })
+}
+
+/// The doubt that these are the rows of the array: others, that make another array or none, may be as likely.
+pub(crate) fn doubt_of_rows(pictures: &Pictures, array: Array, channels: usize) -> Option<String> {
+    let say = "press with one finger at more places and at the edges, or say --rows and --cols";
+    if let Some(count) = model::stack(pictures, array, channels) {
+        let rows = array.rows / count;
+        return Some(format!(
+            "{count} arrays of {rows} rows, one behind the other, are as likely as {array} taxels: {say}"
+        ));
+    }
+    let other = model::other_row(pictures, array.cols, channels)?;
+    Some(format!(
+        "rows of {other} taxels are about as likely as rows of {}: {say}",
+        array.cols
+    ))
 }
 
 /// The bits that say which array it is: a long and narrow one is rarer.

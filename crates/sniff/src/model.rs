@@ -1,8 +1,8 @@
 //! The model: how many bits a lossless coder needs for the captured bytes under a layout.
 //!
 //! The layout that needs the fewest bits is the likeliest, and one that needs n bits more is 2^n times
-//! less likely. Pictures of one press are much alike, so all of them count as one. The bits of a layout
-//! are the sum of these terms:
+//! less likely. Pictures of one press are much alike, so all of them count as one. So do presses at one
+//! place, and a press that covers the array says nothing. The bits of a layout are the sum of these terms:
 //!
 //! | term | what is coded | how |
 //! |---|---|---|
@@ -18,12 +18,14 @@
 //! distribution whose mean is that of all changes with as much going on around them. This is how
 //! pictures are compressed without loss (LOCO-I, ISO 14495-1).
 
+use hardnessd_core::frame::Array;
+
 use super::pictures::{Picture, Pictures};
 
 /// So many bits are odds of a thousand to one.
 pub(crate) const SURE_BITS: f64 = 10.0;
-/// The most bits in favour of a layout that one press may have.
-const PRESS_BITS: f64 = 10.0;
+/// The most bits in favour of a layout that the presses at one place may have. One place is never enough.
+const PRESS_BITS: f64 = 8.0;
 /// The most bits against it.
 const AGAINST_BITS: f64 = 6.0;
 /// A constant byte that nothing predicts.
@@ -44,6 +46,12 @@ pub(crate) const UNUSED_DIGIT_BITS: f64 = 2.0;
 
 /// The most numbers of one taxel.
 pub(crate) const MOST_CHANNELS: usize = 4;
+/// The most arrays in a stack.
+const MOST_STACKED: usize = 4;
+/// By so many bits, numbers at an end of the cells are likelier alone than a taxel.
+const ALONE_BITS: f64 = 2.0;
+/// The longest row that is tried.
+const LONGEST_ROW: usize = 128;
 /// What is left of a prediction is about this share of what goes on around, ...
 const LEFT_OF_AROUND: f32 = 0.1;
 /// ... and of how far the cells are from rest, for taxels differ.
@@ -65,15 +73,27 @@ fn either(one: f32, other: f32) -> f32 {
 }
 
 /// The bits of each press in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
-/// each. A cell is predicted to be like those before it and above it, or to be at rest, beside an edge of what
-/// presses: both are as likely. Where little goes on around, it is at rest. All moments of a press count as one.
+/// each.
 pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64> {
+    sums(&stacked(pictures, cols, channels, usize::MAX))
+}
+
+/// The bits of all cells of each press.
+pub(crate) fn sums(presses: &[Vec<f64>]) -> Vec<f64> {
+    presses.iter().map(|press| press.iter().sum()).collect()
+}
+
+/// The bits of each press and cell in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
+/// each, in an array or in a stack of arrays of `rows` rows. A cell is predicted to be like those before it and above
+/// it, or to be at rest, beside an edge of what presses: both are as likely. Where little goes on around, it is at
+/// rest. All moments of a press count as one.
+fn stacked(pictures: &Pictures, cols: usize, channels: usize, rows: usize) -> Vec<Vec<f64>> {
     let width = cols * channels;
     let noise = pictures.noise;
     let of_cell = |change: &[f32], at: usize| {
         let place = at % width;
         let back = |by: usize| change[at - by];
-        let (has_west, has_north) = (place >= channels, at >= width);
+        let (has_west, has_north) = (place >= channels, !(at / width).is_multiple_of(rows));
         let west = if has_west { back(channels) } else { 0.0 };
         let north = if has_north { back(width) } else { 0.0 };
         let east = if has_north && place + channels < width {
@@ -106,14 +126,14 @@ pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64
         let width = LEFT_OF_AROUND * around + LEFT_OF_OWN * own / 2.0 + noise;
         either(bits(change[at] - predicted, width), bits(change[at], noise))
     };
-    let of_picture = |picture: &Picture| -> f64 {
-        let cells = pictures.changing();
+    let of_press = |press: &Vec<Picture>| -> Vec<f64> {
+        let mut cells = vec![0.0; pictures.changes.len()];
+        for at in pictures.changing() {
+            let bits = press.iter().map(|picture| of_cell(&picture.change, at));
+            cells[at] = f64::from(bits.sum::<f32>()) / press.len() as f64;
+        }
         cells
-            .map(|at| f64::from(of_cell(&picture.change, at)))
-            .sum()
     };
-    let of_press =
-        |press: &Vec<Picture>| press.iter().map(of_picture).sum::<f64>() / press.len() as f64;
     pictures.presses.iter().map(of_press).collect()
 }
 
@@ -204,6 +224,8 @@ pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
 pub(crate) struct Score {
     /// The bits of each press.
     pub(crate) presses: Vec<f64>,
+    /// How much each press counts, by its pictures.
+    pub(crate) weights: Vec<f64>,
     /// The bits of all that is coded once.
     pub(crate) once: f64,
 }
@@ -221,17 +243,60 @@ impl Score {
     }
 
     /// Whether this one is surely likelier than `other`, whose cells are the same but for a few at the ends.
-    /// Then presses say less.
     pub(crate) fn is_surely_before(&self, other: &Self) -> bool {
-        other.once - self.once + self.lead_of_presses(other) / 2.0 >= SURE_BITS
+        other.once - self.once + self.lead_of_presses(other) >= SURE_BITS
     }
 
     fn lead_of_presses(&self, other: &Self) -> f64 {
-        let presses = other.presses.iter().zip(&self.presses);
-        presses
-            .map(|(other, own)| (other - own).clamp(-AGAINST_BITS, PRESS_BITS))
-            .sum()
+        lead(&self.presses, &other.presses, &self.weights)
     }
+}
+
+/// By how many bits presses are in favour of what has the bits `own` rather than `other`.
+fn lead(own: &[f64], other: &[f64], weights: &[f64]) -> f64 {
+    let presses = own.iter().zip(other).zip(weights);
+    presses
+        .map(|((own, other), weight)| weight * (other - own).clamp(-AGAINST_BITS, PRESS_BITS))
+        .sum()
+}
+
+/// The number of taxels in a row that explains the presses about as well as `cols`. Rows that make no array must be
+/// likelier: in packets, or where other numbers are behind an array, the right ones make none.
+pub(crate) fn other_row(pictures: &Pictures, cols: usize, channels: usize) -> Option<usize> {
+    let own = rows(pictures, cols, channels);
+    let taxels = pictures.changes.len() / channels;
+    let is_likely = |&other: &usize| {
+        let is_array = taxels.is_multiple_of(other);
+        lead(&own, &rows(pictures, other, channels), &pictures.weights)
+            < if is_array { SURE_BITS } else { 0.0 }
+    };
+    (2..=(taxels / 2).min(LONGEST_ROW)).find(|other| *other != cols && is_likely(other))
+}
+
+/// The number of arrays, such as one for each axis of a force, whose stack surely explains the presses better than one
+/// array: where one ends, the next does not go on.
+pub(crate) fn stack(
+    pictures: &Pictures,
+    Array { rows, cols }: Array,
+    channels: usize,
+) -> Option<usize> {
+    let own = self::rows(pictures, cols, channels);
+    let is_stack = |count: &usize| {
+        let bits = sums(&stacked(pictures, cols, channels, rows / count));
+        // The three axes of a force are the likeliest stack.
+        let most = if *count == 3 { 0.0 } else { -SURE_BITS };
+        lead(&own, &bits, &pictures.weights) < most
+    };
+    (2..=MOST_STACKED).find(|count| rows.is_multiple_of(*count) && rows > *count && is_stack(count))
+}
+
+/// Whether the number `at` an end of the cells never changes, or acts as one alone does rather than as its neighbours
+/// in rows: then it may be none of a taxel.
+pub(crate) fn is_alone(pictures: &Pictures, cols: usize, channels: usize, at: usize) -> bool {
+    let of = |cells: &[Vec<f64>]| -> Vec<f64> { cells.iter().map(|press| press[at]).collect() };
+    let own = of(&stacked(pictures, cols, channels, usize::MAX));
+    let lead = lead(&own, &of(&alone(pictures)), &pictures.weights);
+    !pictures.changes[at] || lead < -ALONE_BITS
 }
 
 /// A cell near another one.

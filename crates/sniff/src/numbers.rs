@@ -46,6 +46,16 @@ pub(crate) fn is_signed(cell: Cell) -> bool {
     matches!(cell, Cell::I8 | Cell::I16le | Cell::I16be)
 }
 
+/// The type of as many bytes with a sign.
+pub(crate) fn signed(cell: Cell) -> Option<Cell> {
+    match cell {
+        Cell::U8 | Cell::I8 => Some(Cell::I8),
+        Cell::U16le | Cell::I16le => Some(Cell::I16le),
+        Cell::U16be | Cell::I16be => Some(Cell::I16be),
+        _ => None,
+    }
+}
+
 /// How many bits it takes to say that a board has it: the rarer, the more.
 pub(crate) fn name_bits(cell: Cell) -> f64 {
     match cell {

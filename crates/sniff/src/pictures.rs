@@ -19,8 +19,11 @@ const PICTURES: usize = 4;
 const RESTS: usize = 15;
 /// The most frames with hardly a press.
 const IDLE: usize = 60;
-/// The correlation from which numbers are alike.
+/// The correlation from which numbers are alike, and from which presses are at the same place. The square of that
+/// with a picture whose cells all change alike from which a press covers the array.
 const ALIKE: f64 = 0.9;
+const SAME_PLACE: f64 = 0.9;
+const COVERING: f64 = 0.8;
 
 impl Presses {
     /// Finds the presses by how much each frame differs from rest. `None` if nothing presses in any.
@@ -114,6 +117,9 @@ pub(crate) fn some<T: Clone>(of: &[T], most: usize) -> Vec<T> {
 #[derive(Debug, Clone)]
 pub(crate) struct Pictures {
     pub(crate) presses: Vec<Vec<Picture>>,
+    /// How much each press says of the shape of the array: nothing if it covers the array, and as much as all others
+    /// at the same place together.
+    pub(crate) weights: Vec<f64>,
     /// Whether each cell changes in any of them.
     pub(crate) changes: Vec<bool>,
     /// How far a cell is from rest on average where nothing presses, in steps.
@@ -209,6 +215,7 @@ impl Pictures {
         let changing = (rests.len() * changes.iter().filter(|changes| **changes).count()).max(1);
         let noise = rests.iter().map(far).sum::<f32>() / changing as f32;
         Some(Self {
+            weights: weights(&presses, &changes),
             presses,
             changes,
             noise,
@@ -282,6 +289,28 @@ impl Pictures {
             }
         })
     }
+}
+
+/// How much each press says of the shape of the array.
+fn weights(presses: &[Vec<Picture>], changes: &[bool]) -> Vec<f64> {
+    let all = changes.iter().map(|&is| f32::from(u8::from(is)));
+    let all: Vec<f32> = all.collect();
+    let pictures = || presses.iter().map(|press| &press[press.len() / 2].change);
+    let of_press = |picture: &Vec<f32>| {
+        let here = pictures().filter(|other| alike(picture, other) > SAME_PLACE);
+        let is_covering = alike(picture, &all).powi(2) > COVERING;
+        f64::from(u8::from(!is_covering)) / here.count().max(1) as f64
+    };
+    pictures().map(of_press).collect()
+}
+
+/// The correlation of two pictures.
+fn alike(a: &[f32], b: &[f32]) -> f64 {
+    let sum = |a: &[f32], b: &[f32]| -> f64 {
+        let products = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b));
+        products.sum()
+    };
+    sum(a, b) / (sum(a, a) * sum(b, b)).sqrt().max(f64::MIN_POSITIVE)
 }
 
 /// How much the cells of a picture change.

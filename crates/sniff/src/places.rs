@@ -164,6 +164,14 @@ impl Place {
         resting.count()
     }
 
+    /// The most constant bytes in a row that are equal. Those of a number are not among them.
+    pub(crate) fn longest_run(&self) -> usize {
+        let constant = |beside: &Beside| beside.constant().filter(|_| !beside.is_high);
+        let runs = self.beside.chunk_by(|a, b| constant(a) == constant(b));
+        let constant = runs.filter(|run| constant(&run[0]).is_some());
+        constant.map(<[Beside]>::len).max().unwrap_or(0)
+    }
+
     /// The value of a byte beside the cells, if it may belong to a mark.
     pub(crate) fn constant(&self, at: usize) -> Option<u8> {
         let (after, before) = self.skipped();

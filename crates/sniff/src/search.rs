@@ -11,7 +11,8 @@ use crate::cells::Cells;
 use crate::checks::{self, Tried};
 use crate::columns::{Columns, Kind};
 use crate::found::{
-    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, is_too_large, name_bits,
+    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, doubt_of_rows, is_too_large,
+    name_bits,
 };
 use crate::layout::{Parts, Proposal};
 use crate::model::{
@@ -20,7 +21,7 @@ use crate::model::{
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
 use crate::pictures::{Pictures, Presses, energy, middle, some};
-use crate::places::{Place, places};
+use crate::places::{Beside, Place, places};
 
 /// The longest side that is tried, so that an array that is too large is found.
 const LONGEST_SIDE: usize = 128;
@@ -46,6 +47,8 @@ const INTERLEAVED_BITS: f64 = 60.0;
 /// Where it is a little more like it, nothing is sure. Of 120 arrays of three axes with weak shear, 12 were taken
 /// for arrays three times as wide when only [`INTERLEAVED`] counted.
 const MAYBE_INTERLEAVED: f64 = 0.9;
+/// Four columns are the numbers of a taxel where cells of a row differ by so many times as much as those of a column.
+const UNLIKE: f64 = 1.1;
 /// One in so many frames may be damaged.
 const DAMAGED: usize = 10;
 /// The number of frames that a checksum is tried on.
@@ -72,27 +75,43 @@ impl Format {
 
 /// The number of cells after which a cell is more like the one before it than like its neighbour, if their
 /// difference is less than such a `share`.
-fn interleaved(pictures: &Pictures, array: Array, share: f64) -> Option<usize> {
+fn interleaved(pictures: &Pictures, array: Array, most: usize, share: f64) -> Option<usize> {
     let differs = |by: usize| model::difference(pictures, array.cols, by);
-    let mut numbers = (2..=MOST_CHANNELS)
-        .filter(|by| array.cols.is_multiple_of(*by) && array.cols >= 3 * by)
+    let mut numbers = (2..=most)
+        .filter(|by| *by <= MOST_CHANNELS || by.is_multiple_of(4) && array.cols >= 4 * by)
+        .filter(|by| array.cols.is_multiple_of(*by) && array.cols >= 2 * by)
         .peekable();
     numbers.peek()?;
     let neighbours = differs(1);
     numbers.find(|&by| differs(by) < share * neighbours)
 }
 
-/// The doubt that what looks like several columns is several numbers of a taxel.
+/// The doubt that what looks like several columns is several numbers of a taxel, or several numbers one.
 fn several_numbers(pictures: &Pictures, array: Array, format: Format) -> Option<String> {
+    let say = "say --rows, --cols and --cell if it has one";
+    // Numbers of 24 bits are rarer than the three axes of a force.
+    if matches!(format.channels, 2 | 4) && format.cell.bytes() == 1 {
+        let bytes = format.channels;
+        return Some(format!(
+            "the {bytes} bytes of each taxel may be one number or several: {say}"
+        ));
+    }
     // A few columns of many rows may be the axes of as many taxels.
-    let of_taxel = (array.cols < MOST_CHANNELS && array.rows > array.cols).then_some(array.cols);
-    let numbers = of_taxel.or_else(|| interleaved(pictures, array, MAYBE_INTERLEAVED))?;
-    (format.channels == 1).then(|| {
-        format!(
-            "each taxel may have {numbers} numbers, such as the axes of a force: say --rows, --cols and --cell if it \
-             has one"
-        )
-    })
+    let is_unlike = |[beside, below]: [f64; 2]| beside > UNLIKE * below;
+    let differ = [(array.cols, 1), (array.taxels(), array.cols)];
+    let is_few = array.cols <= MOST_CHANNELS && array.rows > array.cols;
+    let are_axes = is_few
+        && (array.cols < MOST_CHANNELS
+            || is_unlike(differ.map(|(cols, by)| model::difference(pictures, cols, by))));
+    // Of long numbers, each has several cells.
+    let most = MOST_CHANNELS * 4 / format.cell.bytes();
+    let numbers = are_axes
+        .then_some(array.cols)
+        .or_else(|| interleaved(pictures, array, most, MAYBE_INTERLEAVED))?;
+    Some(format!(
+        "each taxel may have {} numbers, such as the axes of a force: {say}",
+        numbers * format.channels
+    ))
 }
 
 /// An array at a place.
@@ -212,6 +231,7 @@ impl Search<'_> {
                 .zip(&self.alone)
                 .map(|(bits, alone)| bits + beside(alone))
                 .collect(),
+            weights: pictures.weights.clone(),
             once: place.bits(self.columns)
                 + name_bits(array)
                 + format.name_bits()
@@ -285,7 +305,8 @@ impl Search<'_> {
                     }
                     let bits = added(model::rows(&pictures, array.cols, format.channels), &later);
                     let mut score = self.score(&place, format, array, &pictures, &bits);
-                    if format.channels == 1 && interleaved(&pictures, array, INTERLEAVED).is_some()
+                    if format.channels == 1
+                        && interleaved(&pictures, array, MOST_CHANNELS, INTERLEAVED).is_some()
                     {
                         score.once += INTERLEAVED_BITS;
                     }
@@ -359,7 +380,7 @@ impl Search<'_> {
             let Some(proposal) = Proposal::of(&parts, bytes) else {
                 continue;
             };
-            let alone = added(sums(&model::alone(&pictures)), &later(&pictures));
+            let alone = added(model::sums(&model::alone(&pictures)), &later(&pictures));
             let alone = self.score(&candidate.place, format, array, &pictures, &alone);
             let mut score = candidate.score.clone();
             if proposal.is_board {
@@ -367,8 +388,12 @@ impl Search<'_> {
                 let mark = candidate.place.mark().map_or(0, |mark| mark.len());
                 score.once -= CONSTANT_BITS * mark as f64 - EXPECTED_BITS;
             }
+            // Only the doubt of the likeliest counts.
+            let is_best = ranked
+                .iter()
+                .all(|ranked| score.bits() < ranked.score.bits());
             let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
-            if !proposal.is_board && !known.is_complete() {
+            if is_best && !proposal.is_board && !known.is_complete() {
                 let half = "they look like floats of 16 bits, which the daemon does not read: say --cell if they are \
                             not, or let a bridge send them as text";
                 let cells = self.cells(&candidate.place);
@@ -380,8 +405,14 @@ impl Search<'_> {
                             .then(|| long.to_owned())
                     })
                     .or_else(|| are_halves.then(|| half.to_owned()))
-                    .or_else(|| several_numbers(&pictures, array, format))
-                    .or_else(|| other_cells(candidate, candidates));
+                    .or_else(|| {
+                        let is_given = known.rows.is_some() && known.cols.is_some();
+                        let doubt = || doubt_of_rows(&pictures, array, format.channels);
+                        (!is_given).then(doubt).flatten()
+                    })
+                    .or_else(|| several_numbers(&channels[channel], array, format))
+                    .or_else(|| other_cells(candidate, candidates))
+                    .or_else(|| shifted(candidate, &pictures));
             }
             tried.push((array, format));
             ranked.push(Ranked {
@@ -418,9 +449,38 @@ fn other_cells(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
              {other_before} and {other_after}; press the first taxels and the last"
         ));
     }
+    let row = best.array.cols * best.format.bytes();
+    if best.place.longest_run() >= row {
+        return Some(format!(
+            "{row} equal bytes beside the cells may be a row of dead taxels: say --rows, --cols and --cell"
+        ));
+    }
     let resting = best.place.resting();
     (resting > MOST_RESTING).then(|| {
         format!("{resting} bytes beside the cells look like cells at rest: press the edges too")
+    })
+}
+
+/// The doubt that the first cell is none, where there may be one more behind the last, and the other way around.
+fn shifted(best: &Candidate, pictures: &Pictures) -> Option<String> {
+    let Candidate {
+        array,
+        format,
+        place,
+        ..
+    } = best;
+    let bytes = format.cell.bytes();
+    let is_alone = |at| model::is_alone(pictures, array.cols, format.channels, at);
+    let length = place.beside.len();
+    let may_be_cell = |end: &[Beside]| {
+        let mut unknown = place.unknown();
+        unknown.any(|unknown| unknown.kind == Kind::Active && end.contains(unknown))
+    };
+    let is_shifted = may_be_cell(&place.beside[..bytes.min(length)]) && is_alone(0)
+        || may_be_cell(&place.beside[length.saturating_sub(bytes)..])
+            && is_alone(pictures.changes.len() - 1);
+    is_shifted.then(|| {
+        format!("all cells may be {bytes} bytes further: press the first taxels and the last")
     })
 }
 
@@ -482,11 +542,6 @@ fn activity(frames: &[Vec<f32>]) -> Option<Vec<u32>> {
 /// The bits of each press that no shape changes.
 fn later(pictures: &Pictures) -> Vec<f64> {
     added(model::later(pictures), &pictures.below_step_bits)
-}
-
-/// The bits of all cells of each press.
-fn sums(presses: &[Vec<f64>]) -> Vec<f64> {
-    presses.iter().map(|press| press.iter().sum()).collect()
 }
 
 fn added(mut a: Vec<f64>, b: &[f64]) -> Vec<f64> {

@@ -8,7 +8,8 @@ use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::{Preset, Settings, is_separator};
 
 use crate::found::{
-    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, is_too_large, name_bits,
+    Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, doubt_of_rows, is_too_large,
+    name_bits,
 };
 use crate::layout::Proposal;
 use crate::model::{self, Score};
@@ -201,6 +202,7 @@ fn in_order(
         Pictures::of(&presses, |index| frames[index].clone()).expect("words were numbers");
     let score = |array: Array, presses| Score {
         presses,
+        weights: pictures.weights.clone(),
         once: name_bits(array),
     };
     let alone = model::alone(&pictures);
@@ -215,7 +217,8 @@ fn in_order(
             cell: None,
             picture: pictures.strongest().to_vec(),
             proposal,
-            own_doubt: doubt_of_cells(cells, &own, &score(array, alone.clone())),
+            own_doubt: doubt_of_cells(cells, &own, &score(array, alone.clone()))
+                .or_else(|| doubt_of_rows(&pictures, array, 1)),
             score: own,
         })
     });
