@@ -263,7 +263,7 @@ mod tests {
 
     use super::*;
     use crate::data::presses::Press;
-    use crate::data::source::Source;
+    use crate::data::source::{SIMULATOR, Source};
 
     /// Presses of `frames` frames each, on object, level and split, with a content of its own for each number.
     fn presses(all: &[(u32, u8, Split, u32)], scale: f32) -> Presses {
@@ -287,6 +287,7 @@ mod tests {
         }
         presses.sources = vec![Source {
             name: "d.npz".to_owned(),
+            generator: Some(SIMULATOR.to_owned()),
             ..Source::default()
         }];
         presses
@@ -353,6 +354,14 @@ mod tests {
         check(&presses(&all, 0.0), None, "3 presses in which no taxel", "");
         check(&presses(&all, 0.01), Some(3), "", "");
         check(&presses(&all, 0.01), Some(2), "", "2 of 3 labelled");
+        let mut theirs = presses(&all, 0.01);
+        theirs.sources[0].generator = None;
+        check(
+            &theirs,
+            None,
+            "",
+            "1 of 3 frames have newtons more than two",
+        );
         let mut twice = presses(&all, 0.01);
         let source = Source {
             sha256: "5e".to_owned(),
