@@ -100,9 +100,9 @@ pub fn of(presses: &[Drawn], mean: Mean) -> Option<[f64; 2]> {
 }
 
 /// The 95 % interval of the mean over the strata. To the bootstrap it adds what that cannot see: the units of a stratum
-/// may be alike because they are few. A stratum of fewer than [`FEW`] units, or of units that are all alike, counts with the interval of Clopper and Pearson (1934), as if
-/// each unit had one press, and the distances of all limits from the mean are added as independent ones are (Zou and
-/// Donner 2008, "Construction of confidence limits about effect measures").
+/// may be alike because they are few. A stratum of fewer than four units, or of units that are all alike, counts with
+/// the interval of Clopper and Pearson (1934), as if each unit had one press. The distances of all limits from the mean
+/// are added as independent ones are (Zou and Donner 2008, "Construction of confidence limits about effect measures").
 pub fn of_balanced(presses: &[Drawn]) -> Option<[f64; 2]> {
     let mut each = BTreeMap::<u8, Vec<Drawn>>::new();
     for press in presses {
