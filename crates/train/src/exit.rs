@@ -22,7 +22,7 @@ pub fn coded(code: u8, text: impl Display) -> anyhow::Error {
     Coded { code, text }.into()
 }
 
-/// Directories that an interrupted program removes.
+/// The directories that are removed when a signal ends the program.
 static PASSING: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
 /// Has this directory removed if a signal ends the program.
@@ -33,8 +33,8 @@ pub fn remove_at_signal(directory: &Path) {
         .push(directory.to_owned());
 }
 
-/// Removes the directories of which that was said. Call it when a signal came.
-pub fn remove_all() {
+/// Removes the directories that [`remove_at_signal`] has. Call it at a signal.
+pub fn remove_at_once() {
     for directory in PASSING
         .lock()
         .unwrap_or_else(PoisonError::into_inner)

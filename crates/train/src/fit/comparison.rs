@@ -96,15 +96,15 @@ pub struct Estimate {
     pub balanced_accuracy: f64,
     /// 95 %, over objects, or over the later presses of known objects where a level has one object.
     pub interval: Option<[f64; 2]>,
-    /// What it is worth at least, by the bootstrap alone: a few objects that are all judged rightly are worth a model,
-    /// whose confidence is as low as they are few.
+    /// The low end of the bootstrap's interval alone, by which a candidate is chosen. If nothing varies, it is the value: a
+    /// few objects that are all judged rightly are worth a model, whose confidence is as low as they are few.
     #[serde(skip)]
     worth: f64,
 }
 
 impl Estimate {
     /// The mean over the levels of values of presses, with its interval.
-    fn of(presses: &Presses, values: Vec<(usize, f64)>, division: Division) -> Self {
+    fn of(presses: &Presses, values: &[(usize, f64)], division: Division) -> Self {
         let places: Vec<usize> = values.iter().map(|(press, _)| *press).collect();
         let objects = presses.by_object(&places);
         let mut counts = BTreeMap::<u8, usize>::new();
@@ -112,27 +112,30 @@ impl Estimate {
             *counts.entry(*level).or_default() += 1;
         }
         let has_several = counts.values().all(|&count| count > 1);
-        let are_objects = has_several || division == Division::NewObjects;
         let units = objects.values().zip(0_u32..);
         let units = units.flat_map(|(own, unit)| own.iter().map(move |&press| (press, unit)));
         let units: BTreeMap<usize, u32> = units.collect();
-        let drawn = values.into_iter().map(|(press, value)| Drawn {
-            stratum: presses.all[press].level,
-            unit: match are_objects {
-                true => units[&press],
-                false => press as u32,
-            },
-            value,
-        });
-        let drawn: Vec<Drawn> = drawn.collect();
-        let balanced_accuracy = interval::mean(&drawn, Mean::OfStrata);
-        let worth = match interval::of(&drawn, Mean::OfStrata) {
+        let drawn = |by_object: bool| -> Vec<Drawn> {
+            let one = |&(press, value): &(usize, f64)| Drawn {
+                stratum: presses.all[press].level,
+                unit: match by_object {
+                    true => units[&press],
+                    false => press as u32,
+                },
+                value,
+            };
+            values.iter().map(one).collect()
+        };
+        let chosen_by = drawn(has_several);
+        let balanced_accuracy = interval::mean(&chosen_by, Mean::OfStrata);
+        let worth = match interval::of(&chosen_by, Mean::OfStrata) {
             Some([low, _]) if balanced_accuracy < 1.0 => low,
             _ => balanced_accuracy,
         };
+        let shown = drawn(has_several || division == Division::NewObjects);
         Self {
             balanced_accuracy,
-            interval: interval::of_balanced(&drawn),
+            interval: interval::of_balanced(&shown),
             worth,
         }
     }
@@ -158,7 +161,7 @@ impl Row {
         let estimate = |division| {
             let judged: &Option<Judged> = &judged[division as usize];
             let right = right(presses, judged.as_ref()?);
-            Some(Estimate::of(presses, right, division))
+            Some(Estimate::of(presses, &right, division))
         };
         let [new_objects, later_presses] =
             [Division::NewObjects, Division::LaterPresses].map(estimate);
@@ -188,7 +191,8 @@ impl Row {
         let other: BTreeMap<usize, f64> = other.into_iter().collect();
         let own = right(presses, self.judged(division)?).into_iter();
         let of_both = own.filter_map(|(press, right)| Some((press, right - other.get(&press)?)));
-        Some(Estimate::of(presses, of_both.collect(), division))
+        let of_both: Vec<(usize, f64)> = of_both.collect();
+        Some(Estimate::of(presses, &of_both, division))
     }
 }
 

@@ -9,8 +9,8 @@ use hardnessd_core::recording::Labels;
 use hardnessd_core::verdict::{Level, MOST_LEVELS};
 
 /// The levels that the labels of recordings name. Numbers alone are those of the paper's levels, or of as
-/// many as there are. Names are the same in any case, and are put in the order of the Shore hardness that was measured, the hardest first, or
-/// else of the alphabet.
+/// many as there are. Two names that differ in case alone are one. Names are put in the order of the Shore hardness that
+/// was measured, the hardest first, or else of the alphabet.
 ///
 /// # Errors
 ///
