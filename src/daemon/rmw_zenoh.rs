@@ -38,11 +38,9 @@ struct Known {
     type_hash: &'static str,
     /// The quality of service as a token has it. What is not written is ROS's default: reliable, volatile.
     qos: &'static str,
-    /// Whether a reader that comes later gets the last message.
-    is_latched: bool,
 }
 
-/// Reliable, transient local, the last one.
+/// Reliable, transient local, the last one: a reader that comes later gets the last message.
 const LATCHED: &str = ":1:,1:,:,:,,";
 
 const TOPICS: [Known; 5] = [
@@ -50,32 +48,27 @@ const TOPICS: [Known; 5] = [
         topic: ros::HARDNESS,
         type_hash: "RIHS01_72e975257ef6bcbfbe618446e8b9d908c23cc46db9b62e1e4dd77ae8d96d6a22",
         qos: LATCHED,
-        is_latched: true,
     },
     Known {
         topic: ros::STATUS,
         type_hash: "RIHS01_a5fa9b67b10c152daa6f31e32c5330631e776e0a82d00082f9b53e1aca5f807c",
         qos: LATCHED,
-        is_latched: true,
     },
     Known {
         topic: ros::PRESS,
         type_hash: "RIHS01_00bdf2951d5eb85caa54cd53efa0fd1088e85dc0da00ff265ebf13e99d13f7b7",
         qos: "::,16:,:,:,,",
-        is_latched: false,
     },
     Known {
         topic: ros::FRAME,
         type_hash: "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
         // Best effort.
         qos: "2::,5:,:,:,,",
-        is_latched: false,
     },
     Known {
         topic: ros::CONTACT,
         type_hash: "RIHS01_e2296428fc6fe1d9c84e8942b44d846a7e8ec3f535b65b38441b0005c93f625c",
         qos: "::,5:,:,:,,",
-        is_latched: false,
     },
 ];
 
@@ -213,7 +206,7 @@ fn publisher(
             false => CongestionControl::Block,
         });
     let publisher = plain.advanced();
-    if !known.is_latched {
+    if known.qos != LATCHED {
         return publisher.wait();
     }
     publisher

@@ -72,8 +72,7 @@ fn either(one: f32, other: f32) -> f32 {
     1.0 + one.min(other) - (1.0 + (-(one - other).abs()).exp2()).log2()
 }
 
-/// The bits of each press in its first frame, if the cells are rows of `cols` taxels of `channels` numbers
-/// each.
+/// The bits of each press, if the cells are rows of `cols` taxels of `channels` numbers each: the sums of [`stacked`].
 pub(crate) fn rows(pictures: &Pictures, cols: usize, channels: usize) -> Vec<f64> {
     sums(&stacked(pictures, cols, channels, usize::MAX))
 }
