@@ -30,7 +30,7 @@ use hardnessd_core::recording::{Entry, FileKind, Reader};
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::stderr_line;
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
-use hardnessd_core::wire::Cell;
+use hardnessd_core::wire::{Cell, Order};
 use hardnessd_core::wording::{escaped, name, named, positive};
 
 /// What `--help` says below the options.
@@ -38,8 +38,8 @@ const MORE: &str = "\
     Press the sensor meanwhile, with one finger at several places and at the edges: only presses \
     show the shape of the array. It finds frames of one length with a constant mark, \
     lines of numbers, SLIP and COBS, and jq-glove, of up to 64x64 taxels. If two arrays are likely, it \
-    shows a picture of each with the options that choose it. `order`, `mask` and `invert` leave \
-    no trace in the bytes, and without a checksum a header and a tail look the same. Exit code 1: \
+    shows a picture of each with the options that choose it. A column-major `order`, `mask` and \
+    `invert` leave no trace in the bytes, and without a checksum a header and a tail look the same. Exit code 1: \
     no layout was found, it is not sure, or the daemon cannot read what it found.";
 
 /// Arguments of `sniff`.
@@ -361,14 +361,21 @@ fn toml(path: &Path, bytes: usize, found: &Found, proposal: &Proposal) -> String
     for words in &proposal.remarks {
         remark(words);
     }
-    remark("bytes do not show order, mask and invert, nor which side of the sensor is up");
+    remark(
+        "bytes do not show mask, invert and column-major order, nor which side of the sensor is up",
+    );
     toml + "[sensor.frame]\n" + &proposal.toml()
 }
 
 fn array_in_words(ranked: &Ranked) -> String {
+    let array = ranked.array;
+    let order = match ranked.order {
+        Order::RowMajor => String::new(),
+        other => format!(" {}", name(&other)),
+    };
     match ranked.cell {
-        Some(cell) => format!("{} {}", ranked.array, name(&cell)),
-        None => format!("{} decimals", ranked.array),
+        Some(cell) => format!("{array}{order} {}", name(&cell)),
+        None => format!("{array} decimals"),
     }
 }
 

@@ -12,6 +12,8 @@ struct Escaped {
     /// What may follow an escape.
     escaped: [u8; 2],
     what: Coding,
+    /// What it may be where hardly anything is escaped.
+    maybe: Coding,
 }
 
 /// What was done to the bytes.
@@ -19,10 +21,11 @@ struct Escaped {
 pub(crate) enum Coding {
     /// They are packed in frames that the daemon reads.
     Packed(Framing),
-    /// They are packed in another way, or read at a wrong speed.
+    /// They are surely packed in another way.
     Unreadable(&'static str),
-    /// The same, unless frames of one length explain them: negative numbers have many bytes of FF.
-    Doubled(&'static str),
+    /// They look packed in another way, or read at a wrong speed. If frames of one length explain them, this is chance:
+    /// negative numbers have many bytes of FF, and so has a mark.
+    Maybe(&'static str),
 }
 
 const ESCAPED: [Escaped; 2] = [
@@ -31,17 +34,18 @@ const ESCAPED: [Escaped; 2] = [
         escape: 0xDB,
         escaped: [0xDC, 0xDD],
         what: Coding::Packed(Framing::Slip),
+        maybe: Coding::Packed(Framing::Slip),
     },
     Escaped {
         end: 0x7E,
         escape: 0x7D,
         escaped: [0x5E, 0x5D],
-        what: Coding::Unreadable(
-            "it looks like HDLC (7E ends a frame, and 7D escapes within it), which the daemon does not read",
-        ),
+        what: Coding::Unreadable(HDLC),
+        maybe: Coding::Maybe(HDLC),
     },
 ];
 
+const HDLC: &str = "it looks like HDLC (7E ends a frame, and 7D escapes within it), which the daemon does not read";
 const TOO_FAST: &str =
     "the port is read faster than the sensor sends, for its bits come in runs: try a lower --baud";
 const TOO_SLOW: &str = "the port is read slower than the sensor sends, for stop bits are among the bits: try a \
@@ -62,19 +66,19 @@ pub(crate) fn of(bytes: &[u8]) -> Option<Coding> {
     if is_telnet(bytes) && is_telnet(&bytes[3..]) {
         return Some(Coding::Unreadable(TELNET));
     }
-    if let Some(escaped) = ESCAPED.iter().find(|escaped| escaped.is_in(bytes)) {
-        return Some(escaped.what);
+    if let Some(found) = ESCAPED.iter().find_map(|escaped| escaped.found(bytes)) {
+        return Some(found);
     }
     if is_cobs(bytes) {
         return Some(Coding::Packed(Framing::Cobs));
     }
     if doubles_ff(bytes) {
-        return Some(Coding::Doubled(TELNET));
+        return Some(Coding::Maybe(TELNET));
     }
     if is_too_slow(bytes) {
-        return Some(Coding::Unreadable(TOO_SLOW));
+        return Some(Coding::Maybe(TOO_SLOW));
     }
-    is_too_fast(bytes).then_some(Coding::Unreadable(TOO_FAST))
+    is_too_fast(bytes).then_some(Coding::Maybe(TOO_FAST))
 }
 
 /// The share of `of` that `is` so. None of a few.
@@ -96,7 +100,7 @@ fn mostly<T>(of: impl Iterator<Item = T>, is: impl Fn(T) -> bool) -> bool {
 }
 
 impl Escaped {
-    fn is_in(&self, bytes: &[u8]) -> bool {
+    fn found(&self, bytes: &[u8]) -> Option<Coding> {
         let frames = || {
             bytes
                 .split(|&byte| byte == self.end)
@@ -115,10 +119,11 @@ impl Escaped {
         // Where hardly anything is escaped, frames are as long as each other.
         let are_alike = || share(lengths(frames()), |(length, usual)| length == usual) >= ALIKE;
         let spread = bytes.iter().filter(|&&byte| byte == self.end).count() * 4 < bytes.len();
-        spread
-            && are_valid
-            && frames().count() >= FEWEST
-            && (escapes.len() >= FEWEST || are_alike())
+        let is_found = spread && are_valid && frames().count() >= FEWEST;
+        match escapes.len() >= FEWEST {
+            true => is_found.then_some(self.what),
+            false => (is_found && are_alike()).then_some(self.maybe),
+        }
     }
 }
 

@@ -1,7 +1,7 @@
 //! What a search ends with: ranked layouts, or the reason why there is none.
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
-use hardnessd_core::wire::Cell;
+use hardnessd_core::wire::{Cell, Order};
 use hardnessd_core::wording::name;
 
 use crate::layout::Proposal;
@@ -35,6 +35,8 @@ pub struct Found {
 pub struct Ranked {
     /// The array.
     pub array: Array,
+    /// Whether each second row runs the other way.
+    pub order: Order,
     /// `None` for text.
     pub cell: Option<Cell>,
     /// The strongest press, as the array would have it.
@@ -96,6 +98,9 @@ impl Failure {
 /// The fewest taxels that show an array.
 const FEWEST: usize = 12;
 
+/// That the order of an array is open.
+const TO_AND_FRO: &str = "each second row may run the other way, which is `order = \"serpentine\"`";
+
 /// The number of frames that are needed.
 pub(crate) const LEAST_FRAMES: usize = 8;
 
@@ -129,7 +134,17 @@ impl Found {
     pub(crate) fn among(mut ranked: Vec<Ranked>, is_given: bool) -> Option<Self> {
         ranked.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
         let mut ranked = ranked.into_iter();
-        let (best, next) = (ranked.next()?, ranked.next());
+        let (mut best, mut next) = (ranked.next()?, ranked.next());
+        // Where the array is given, the next one differs in its order alone. The usual one is proposed.
+        if is_given
+            && let Some(next) = &mut next
+            && best.may_be(next)
+        {
+            if best.order == Order::Serpentine {
+                std::mem::swap(&mut best, next);
+            }
+            best.proposal.remarks.push(TO_AND_FRO.to_owned());
+        }
         let doubt = best.doubt(next.as_ref(), is_given);
         Some(Self { best, next, doubt })
     }
@@ -138,6 +153,7 @@ impl Found {
     pub(crate) fn stated(array: Array, cell: Option<Cell>, proposal: Proposal) -> Self {
         let best = Ranked {
             array,
+            order: Order::RowMajor,
             cell,
             picture: Vec::new(),
             proposal,
@@ -179,6 +195,11 @@ impl Ranked {
             && known.cell.is_none_or(|cell| Some(cell) == self.cell)
     }
 
+    /// Whether it may be `other` as well.
+    fn may_be(&self, other: &Self) -> bool {
+        !self.score.is_surely_less(&other.score)
+    }
+
     fn doubt(&self, next: Option<&Self>, is_given: bool) -> Option<String> {
         let Proposal {
             frames,
@@ -196,10 +217,16 @@ impl Ranked {
         if is_given {
             return None;
         }
+        let is_open = next.is_some_and(|next| self.may_be(next));
+        if is_open && next.is_some_and(|next| next.array == self.array && next.cell == self.cell) {
+            return Some(format!(
+                "{TO_AND_FRO}: press with one finger at several places and at the edges"
+            ));
+        }
         let (taxels, options) = (self.array.taxels(), self.options());
         // A row of an array looks like an array of one row.
         let is_strip = self.array.rows == 1;
-        if is_strip || next.is_some_and(|next| !self.score.is_surely_less(&next.score)) {
+        if is_strip || is_open {
             return Some(format!(
                 "choose with `{options}` or as the pictures say, or press with one finger at several places and at \
                  the edges"

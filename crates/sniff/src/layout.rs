@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::{
-    Cell, Checksum, ChecksumOver, Decoder, HexBytes, Layout, LengthField, Preset, Settings,
+    Cell, Checksum, ChecksumOver, Decoder, HexBytes, Layout, LengthField, Order, Preset, Settings,
 };
 
 use crate::checks::Check;
@@ -156,6 +156,7 @@ pub(crate) struct Parts<'a> {
     pub(crate) columns: &'a Columns,
     pub(crate) place: &'a Place,
     pub(crate) array: Array,
+    pub(crate) order: Order,
     pub(crate) cell: Cell,
     /// How many numbers a taxel has, and which of them is read.
     pub(crate) channels: usize,
@@ -265,6 +266,7 @@ impl Parts<'_> {
             }),
             rows: Some(self.array.rows),
             cols: Some(self.array.cols),
+            order: (self.order != Order::RowMajor).then_some(self.order),
             ..Settings::default()
         }
     }

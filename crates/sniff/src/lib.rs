@@ -88,12 +88,12 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
     match coding::of(bytes) {
         Some(Coding::Packed(framing)) => return packed::find(framing, bytes, known),
         Some(Coding::Unreadable(words)) => return Err(Failure::sure(words)),
-        Some(Coding::Doubled(words)) => {
-            let found = in_periods(capture, known);
-            return found
-                .ok()
-                .filter(|found| found.doubt.is_none())
-                .ok_or(Failure::sure(words));
+        Some(Coding::Maybe(words)) => {
+            let mut found = in_periods(capture, known).or(Err(Failure::sure(words)))?;
+            if let Some(doubt) = &mut found.doubt {
+                *doubt += &format!("; or {words}");
+            }
+            return Ok(found);
         }
         None => {}
     }

@@ -9,9 +9,9 @@
 //! | name | which layout it is | a rare type of cells, a long and narrow array and unknown bytes take more |
 //! | beside | what is beside the cells: constant bytes | 8 bits each, once; what is known beforehand takes none: a length, the high bytes of a number, the mark of a known board |
 //! | | numbers that grow, and checksums | none |
-//! | | other bytes | as cells on their own |
+//! | | other bytes | by what they do in other presses ([`unknown`]) |
 //! | rest | a cell that never changes | by the cells near it: their values at rest, and whether they are as still |
-//! | presses | the change of each cell | by its neighbours in the array ([`rows`]) |
+//! | presses | the change of each cell | by its neighbours in the array ([`rows`]), whose each second row may run the other way |
 //! | | of cells on their own | by what they do in other presses ([`alone`]) |
 //!
 //! Changes are whole numbers of steps. They are coded as what is left of a prediction, by a geometric
@@ -41,6 +41,8 @@ pub(crate) const UNKNOWN_TAXEL_BITS: f64 = 12.0;
 pub(crate) const RESTLESS_TAXEL_BITS: f64 = 12.0;
 /// That a taxel has several numbers, each more.
 pub(crate) const CHANNEL_BITS: f64 = 8.0;
+/// That each second row runs the other way.
+pub(crate) const SERPENTINE_BITS: f64 = 4.0;
 /// That the last binary digit of all numbers is not used.
 pub(crate) const UNUSED_DIGIT_BITS: f64 = 2.0;
 
@@ -206,16 +208,41 @@ pub(crate) fn alone(pictures: &Pictures) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// The bits of each press and byte beside the cells, of which nothing is known.
+/// The bits of each press and byte beside the cells, of which nothing is known: it is about as far from rest, and moves
+/// as much, as in the other presses. Bytes near it have nothing to do with it.
 pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
-    let mut bits = alone(pictures);
-    for (bits, press) in bits.iter_mut().zip(&pictures.presses) {
-        for at in pictures.changing() {
-            let later = |picture| later_bits(pictures, picture, at);
-            bits[at] += press.iter().map(later).sum::<f64>();
+    let mut bits = vec![vec![0.0; pictures.changes.len()]; pictures.presses.len()];
+    for at in pictures.changing() {
+        let far = as_in_others(pictures, |picture| picture.change[at]);
+        let moved = as_in_others(pictures, |picture| picture.change[at] - picture.before[at]);
+        for ((bits, press), (far, moved)) in
+            bits.iter_mut().zip(&pictures.presses).zip(far.zip(moved))
+        {
+            // The first frame counts once, whichever it is.
+            bits[at] = f64::from(far / press.len() as f32 + moved);
         }
     }
     bits
+}
+
+/// The bits of a value in all pictures of each press, if it is about as large as in the other presses and, as if that
+/// were one more, as a step.
+fn as_in_others(pictures: &Pictures, of: impl Fn(&Picture) -> f32) -> impl Iterator<Item = f32> {
+    let presses = &pictures.presses;
+    let mean = |press: &Vec<Picture>| {
+        let sum: f32 = press.iter().map(|picture| of(picture).abs()).sum();
+        sum / press.len() as f32
+    };
+    let all: f32 = presses.iter().map(mean).sum();
+    let of_press = |press: &Vec<Picture>| -> f32 {
+        let width = (all - mean(press) + 1.0) / presses.len() as f32;
+        press.iter().map(|picture| bits(of(picture), width)).sum()
+    };
+    presses
+        .iter()
+        .map(of_press)
+        .collect::<Vec<f32>>()
+        .into_iter()
 }
 
 /// The bits by which one is more than the other, press by press.

@@ -255,6 +255,17 @@ impl Pictures {
         both > ALIKE * (first * second).sqrt()
     }
 
+    /// The pictures as an array has them whose each second row of `cols` taxels runs the other way.
+    pub(crate) fn turned(&self, cols: usize, channels: usize) -> Self {
+        let mut turned = self.clone();
+        turn(&mut turned.changes, cols, channels);
+        for Picture { change, before } in turned.presses.iter_mut().flatten() {
+            turn(change, cols, channels);
+            turn(before, cols, channels);
+        }
+        turned
+    }
+
     /// The pictures of each of so many interleaved numbers.
     pub(crate) fn split(&self, channels: usize) -> impl Iterator<Item = Self> + '_ {
         (0..channels).map(move |channel| {
@@ -288,6 +299,14 @@ impl Pictures {
                 ..self.clone()
             }
         })
+    }
+}
+
+/// Turns each second row of `cols` taxels with so many numbers each.
+fn turn<T>(cells: &mut [T], cols: usize, channels: usize) {
+    for row in cells.chunks_exact_mut(cols * channels).skip(1).step_by(2) {
+        row.reverse();
+        row.chunks_exact_mut(channels).for_each(<[T]>::reverse);
     }
 }
 

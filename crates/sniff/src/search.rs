@@ -4,7 +4,7 @@
 //! none.
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
-use hardnessd_core::wire::Cell;
+use hardnessd_core::wire::{Cell, Order};
 
 use crate::Capture;
 use crate::cells::Cells;
@@ -16,7 +16,8 @@ use crate::found::{
 };
 use crate::layout::{Parts, Proposal};
 use crate::model::{
-    self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, Score, UNUSED_DIGIT_BITS,
+    self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, SERPENTINE_BITS, Score,
+    UNUSED_DIGIT_BITS,
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
@@ -118,6 +119,7 @@ fn several_numbers(pictures: &Pictures, array: Array, format: Format) -> Option<
 #[derive(Debug, Clone)]
 struct Candidate {
     array: Array,
+    order: Order,
     format: Format,
     place: Place,
     score: Score,
@@ -128,8 +130,8 @@ struct Search<'a> {
     frames: &'a Frames<'a>,
     columns: &'a Columns,
     presses: Presses,
-    /// By press, the bits of each byte on its own.
-    alone: Vec<Vec<f64>>,
+    /// By press, the bits of each byte of which nothing is known.
+    unknown: Vec<Vec<f64>>,
 }
 
 pub(crate) fn in_frames(
@@ -169,12 +171,12 @@ pub(crate) fn in_frames(
         .ok_or(Failure::NoPress(period))?;
     let pictures = |index| numbers::numbers(Cell::U8, frames.get(index));
     let pictures = Pictures::of(&presses, pictures).expect("bytes are numbers");
-    let alone = model::unknown(&pictures);
+    let unknown = model::unknown(&pictures);
     let search = Search {
         frames,
         columns,
         presses,
-        alone,
+        unknown,
     };
     let mut tried = Tried::new();
     let mut places: Vec<Place> = places
@@ -219,7 +221,7 @@ impl Search<'_> {
         presses: &[f64],
     ) -> Score {
         let unknown: Vec<usize> = place.unknown().map(|beside| beside.at).collect();
-        let beside = |alone: &Vec<f64>| unknown.iter().map(|&at| alone[at]).sum::<f64>();
+        let beside = |of_press: &Vec<f64>| unknown.iter().map(|&at| of_press[at]).sum::<f64>();
         let unused = if is_float(format.cell) {
             0
         } else {
@@ -228,8 +230,8 @@ impl Search<'_> {
         Score {
             presses: presses
                 .iter()
-                .zip(&self.alone)
-                .map(|(bits, alone)| bits + beside(alone))
+                .zip(&self.unknown)
+                .map(|(bits, of_press)| bits + beside(of_press))
                 .collect(),
             weights: pictures.weights.clone(),
             once: place.bits(self.columns)
@@ -312,6 +314,7 @@ impl Search<'_> {
                     }
                     found.push(Candidate {
                         array,
+                        order: Order::RowMajor,
                         format,
                         place: place.clone(),
                         score,
@@ -319,9 +322,52 @@ impl Search<'_> {
                 }
             }
         }
-        found.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
-        found.truncate(MOST_CANDIDATES);
+        let likeliest = |found: &mut Vec<Candidate>| {
+            found.sort_by(|a, b| a.score.bits().total_cmp(&b.score.bits()));
+            found.truncate(MOST_CANDIDATES);
+        };
+        likeliest(&mut found);
+        let serpentine = found
+            .iter()
+            .flat_map(|candidate| self.serpentine(candidate, known));
+        let serpentine: Vec<Candidate> = serpentine.collect();
+        found.extend(serpentine);
+        likeliest(&mut found);
         found
+    }
+
+    /// The arrays of which each second row runs the other way, if `candidate` is one without. Two such rows, one behind
+    /// the other, look like a row of twice as many taxels.
+    fn serpentine(&self, candidate: &Candidate, known: Known) -> Vec<Candidate> {
+        let Candidate {
+            array,
+            format,
+            place,
+            ..
+        } = candidate;
+        let Some(pictures) = self.pictures(&self.presses, place, *format) else {
+            return Vec::new();
+        };
+        let later = later(&pictures);
+        let of = |array: Array| {
+            let (cols, channels) = (array.cols, format.channels);
+            let turned = pictures.turned(cols, channels);
+            let bits = added(model::rows(&turned, cols, channels), &later);
+            let mut score = self.score(place, *format, array, &turned, &bits);
+            score.once += SERPENTINE_BITS;
+            Candidate {
+                array,
+                order: Order::Serpentine,
+                score,
+                ..candidate.clone()
+            }
+        };
+        known
+            .arrays(array.taxels(), LONGEST_SIDE)
+            .filter(|other| other.cols == array.cols || 2 * other.cols == array.cols)
+            .filter(|other| other.rows > 1 && other.cols > 1)
+            .map(of)
+            .collect()
     }
 
     /// Finds the checksum among the bytes beside the cells.
@@ -347,10 +393,15 @@ impl Search<'_> {
         known: Known,
     ) -> Result<Found, Failure> {
         let mut ranked: Vec<Ranked> = Vec::new();
-        let mut tried: Vec<(Array, Format)> = Vec::new();
+        let mut tried: Vec<(Array, Order, Format)> = Vec::new();
         for candidate in candidates {
-            let Candidate { array, format, .. } = *candidate;
-            if ranked.len() == RANKED || tried.contains(&(array, format)) {
+            let Candidate {
+                array,
+                order,
+                format,
+                ..
+            } = *candidate;
+            if ranked.len() == RANKED || tried.contains(&(array, order, format)) {
                 continue;
             }
             if is_too_large(array) {
@@ -359,9 +410,12 @@ impl Search<'_> {
                 }
                 continue;
             }
-            let Some(pictures) = self.pictures(&self.presses, &candidate.place, format) else {
+            let Some(mut pictures) = self.pictures(&self.presses, &candidate.place, format) else {
                 continue;
             };
+            if order == Order::Serpentine {
+                pictures = pictures.turned(array.cols, format.channels);
+            }
             let channels: Vec<Pictures> = pictures.split(format.channels).collect();
             let of_channel = channels.iter().enumerate();
             let (channel, strongest) = of_channel
@@ -372,12 +426,13 @@ impl Search<'_> {
                 columns: self.columns,
                 place: &candidate.place,
                 array,
+                order,
                 cell: format.cell,
                 channels: format.channels,
                 channel,
                 begin,
             };
-            let Some(proposal) = Proposal::of(&parts, bytes) else {
+            let Some(mut proposal) = Proposal::of(&parts, bytes) else {
                 continue;
             };
             let alone = added(model::sums(&model::alone(&pictures)), &later(&pictures));
@@ -393,7 +448,12 @@ impl Search<'_> {
                 .iter()
                 .all(|ranked| score.bits() < ranked.score.bits());
             let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
-            if is_best && !proposal.is_board && !known.is_complete() {
+            let of_place =
+                || other_cells(candidate, candidates).or_else(|| shifted(candidate, &pictures));
+            if is_best && !proposal.is_board && known.is_complete() {
+                // No more can be said of the array, and the cells may still begin elsewhere.
+                proposal.remarks.extend(of_place());
+            } else if is_best && !proposal.is_board {
                 let half = "they look like floats of 16 bits, which the daemon does not read: say --cell if they are \
                             not, or let a bridge send them as text";
                 let cells = self.cells(&candidate.place);
@@ -411,12 +471,12 @@ impl Search<'_> {
                         (!is_given).then(doubt).flatten()
                     })
                     .or_else(|| several_numbers(&channels[channel], array, format))
-                    .or_else(|| other_cells(candidate, candidates))
-                    .or_else(|| shifted(candidate, &pictures));
+                    .or_else(of_place);
             }
-            tried.push((array, format));
+            tried.push((array, order, format));
             ranked.push(Ranked {
                 array,
+                order,
                 cell: Some(format.cell),
                 picture: strongest.to_vec(),
                 proposal,
@@ -444,6 +504,12 @@ fn other_cells(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
         && let Some(((before, after), (other_before, other_after))) =
             around(&best.place).zip(around(&other.place))
     {
+        if (before, after) == (other_before, other_after) {
+            return Some(
+                "which bytes are the mark: other ones that never change may be it, and not taxels; press all taxels"
+                    .to_owned(),
+            );
+        }
         return Some(format!(
             "which bytes are cells: {before} bytes are between the mark and them and {after} behind them, or \
              {other_before} and {other_after}; press the first taxels and the last"
@@ -476,9 +542,9 @@ fn shifted(best: &Candidate, pictures: &Pictures) -> Option<String> {
         let mut unknown = place.unknown();
         unknown.any(|unknown| unknown.kind == Kind::Active && end.contains(unknown))
     };
+    let last = pictures.changes.len() - 1;
     let is_shifted = may_be_cell(&place.beside[..bytes.min(length)]) && is_alone(0)
-        || may_be_cell(&place.beside[length.saturating_sub(bytes)..])
-            && is_alone(pictures.changes.len() - 1);
+        || may_be_cell(&place.beside[length.saturating_sub(bytes)..]) && is_alone(last);
     is_shifted.then(|| {
         format!("all cells may be {bytes} bytes further: press the first taxels and the last")
     })

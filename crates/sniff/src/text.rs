@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
-use hardnessd_core::wire::{Preset, Settings, is_separator};
+use hardnessd_core::wire::{Order, Preset, Settings, is_separator};
 
 use crate::found::{
     Failure, Found, Known, LEAST_FRAMES, Ranked, doubt_of_cells, doubt_of_rows, is_too_large,
@@ -214,6 +214,7 @@ fn in_order(
         let own = score(array, model::rows(&pictures, array.cols, 1));
         Some(Ranked {
             array,
+            order: Order::RowMajor,
             cell: None,
             picture: pictures.strongest().to_vec(),
             proposal,

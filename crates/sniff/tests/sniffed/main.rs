@@ -9,7 +9,7 @@ mod generator;
 
 use generator::{Case, case, frames, hand, unreadable};
 use hardnessd_core::frame::{Array, RawFrame};
-use hardnessd_core::wire::{Cell, Checksum, Decoder, Layout, Preset, Settings};
+use hardnessd_core::wire::{Cell, Checksum, Decoder, Layout, Order, Preset, Settings};
 use hardnessd_simulator::random::Stream;
 use hardnessd_sniff::{Arrival, Capture, Failure, Found, Known, Scale, sniff};
 
@@ -334,13 +334,106 @@ fn taxels_at_their_maximum_have_no_sign() {
     }
 }
 
-/// Whether a layout is sure in frames that `packet` writes.
-fn is_sure(seed: u64, array: Array, packet: impl Fn(&RawFrame, &mut Stream) -> Vec<u8>) -> bool {
+/// The layout that is sure in frames that `packet` writes.
+fn sure(
+    seed: u64,
+    array: Array,
+    packet: impl Fn(&RawFrame, &mut Stream) -> Vec<u8>,
+) -> Option<Settings> {
     let mut stream = Stream::new(seed, "packets");
     let (pressed, _) = frames(array, 250, &mut stream);
     let packets = pressed.iter().flat_map(|frame| packet(frame, &mut stream));
     let bytes: Vec<u8> = packets.collect();
-    of(&bytes, Known::default()).is_ok_and(|found| found.doubt.is_none())
+    let found = of(&bytes, Known::default()).ok()?;
+    found
+        .doubt
+        .is_none()
+        .then_some(found.best.proposal.settings)
+}
+
+fn is_sure(seed: u64, array: Array, packet: impl Fn(&RawFrame, &mut Stream) -> Vec<u8>) -> bool {
+    sure(seed, array, packet).is_some()
+}
+
+#[test]
+fn rows_that_run_to_and_fro_are_no_rows_of_twice_as_many() {
+    for (rows, cols) in [(12, 16), (16, 10), (8, 8)] {
+        let array = Array { rows, cols };
+        let serpentine = |frame: &RawFrame, _: &mut Stream| {
+            let mut packet = vec![0xE9, 0xD9, 0x45];
+            for (row, counts) in frame.counts.chunks(cols).enumerate() {
+                let mut counts: Vec<u8> = counts.iter().map(|&count| count as u8).collect();
+                if row % 2 == 1 {
+                    counts.reverse();
+                }
+                packet.extend(counts);
+            }
+            packet
+        };
+        let found: Vec<Settings> = (0..8)
+            .filter_map(|seed| sure(seed, array, serpentine))
+            .collect();
+        let is_right = |found: &Settings| {
+            let sides = (found.rows, found.cols);
+            sides == (Some(rows), Some(cols)) && found.order == Some(Order::Serpentine)
+        };
+        assert!(found.len() >= 5 && found.iter().all(is_right), "{found:?}");
+    }
+}
+
+#[test]
+fn a_number_that_changes_slowly_is_no_taxel() {
+    let array = Array { rows: 8, cols: 9 };
+    let is_right = |seed: u64| {
+        let volts = std::cell::Cell::new(180.0);
+        let found = sure(seed, array, |frame, stream| {
+            volts.set(volts.get() + 0.02 * stream.normal());
+            let mut packet = vec![0xE9, 0xD9, 0x45, 0x0B, volts.get().round() as u8];
+            packet.extend(frame.counts.iter().map(|&count| count as u8));
+            // It changes in each frame, and is no taxel either.
+            packet.push(stream.below(256) as u8);
+            packet
+        })?;
+        let header = found.sync.map_or(0, |sync| sync.0.len()) + found.header_bytes.unwrap_or(0);
+        Some(header == 5 && found.footer_bytes == Some(1))
+    };
+    let found: Vec<bool> = (0..24).filter_map(is_right).collect();
+    assert!(found.len() >= 8 && found.iter().all(|is| *is), "{found:?}");
+}
+
+#[test]
+fn a_mark_of_ff_ff_is_no_telnet_server() {
+    let (pressed, _) = frames(Array { rows: 3, cols: 3 }, 250, &mut Stream::new(1, "mark"));
+    let packets = pressed.iter().flat_map(|frame| {
+        let cells = frame.counts.iter().map(|&count| count as u8 / 2);
+        [0xFF, 0xFF, 0x45].into_iter().chain(cells)
+    });
+    let found = of(&packets.collect::<Vec<u8>>(), Known::default()).unwrap();
+    // Nine taxels are too few to be sure, and not unreadable.
+    assert!(found.doubt.is_some() && found.best.array.taxels() == 9);
+}
+
+#[test]
+fn a_status_is_no_part_of_the_mark() {
+    let array = Array { rows: 8, cols: 9 };
+    let found = |seed| {
+        let sent = std::cell::Cell::new(0);
+        let found = sure(seed, array, |frame, _| {
+            sent.set(sent.get() + 1);
+            let status = if sent.get() % 22 == 0 { 0x91 } else { 0x90 };
+            let cells = frame.counts.iter().map(|&count| count as u8);
+            [0xE9, 0xD9, 0x45, status]
+                .into_iter()
+                .chain(cells)
+                .collect()
+        })?;
+        Some((found.sync.map(|sync| sync.0), found.header_bytes))
+    };
+    let found: Vec<_> = (0..12).filter_map(found).collect();
+    let expected = (Some(vec![0xE9, 0xD9, 0x45]), Some(1));
+    // In a short stream it has another value too seldom.
+    let right = found.iter().filter(|found| **found == expected);
+    assert!(right.count() >= 5, "{found:?}");
 }
 
 #[test]
