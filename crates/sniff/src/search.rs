@@ -370,6 +370,32 @@ impl Search<'_> {
             .collect()
     }
 
+    /// The doubt that the mark is a taxel at full scale, where other bytes may be the mark.
+    fn stuck_mark(&self, best: &Candidate, candidates: &[Candidate]) -> Option<String> {
+        let Candidate { format, place, .. } = best;
+        let mark: Option<Vec<u8>> = place.mark()?.map(|at| place.constant(at)).collect();
+        let mark = numbers::numbers(format.cell, &mark?);
+        let of_frame = |index| {
+            numbers::numbers(
+                format.cell,
+                self.frames.from(index, place.start, place.bytes),
+            )
+        };
+        let all = self.presses.frames().flat_map(of_frame);
+        let most = all.fold(f32::MIN, f32::max);
+        // Full scale of a converter has all its bits set.
+        let is_full = |&number: &f32| {
+            number == most || number > most && (number as u32 + 1).is_power_of_two()
+        };
+        let is_full_scale = !mark.is_empty() && mark.iter().all(is_full);
+        let mut others = candidates
+            .iter()
+            .filter(|other| other.format == *format && other.place.bytes == place.bytes);
+        (is_full_scale && others.any(|other| other.place.start != place.start)).then(|| {
+            "the mark may be a taxel that is stuck at full scale, and other bytes the mark: look it up in the data sheet".to_owned()
+        })
+    }
+
     /// Finds the checksum among the bytes beside the cells.
     fn checked(&self, place: Place, tried: &mut Tried) -> Place {
         if place.unknown().next().is_none() {
@@ -448,8 +474,11 @@ impl Search<'_> {
                 .iter()
                 .all(|ranked| score.bits() < ranked.score.bits());
             let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
-            let of_place =
-                || other_cells(candidate, candidates).or_else(|| shifted(candidate, &pictures));
+            let of_place = || {
+                self.stuck_mark(candidate, candidates)
+                    .or_else(|| other_cells(candidate, candidates))
+                    .or_else(|| shifted(candidate, &pictures))
+            };
             if is_best && !proposal.is_board && known.is_complete() {
                 // No more can be said of the array, and the cells may still begin elsewhere.
                 proposal.remarks.extend(of_place());

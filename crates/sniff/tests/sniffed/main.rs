@@ -414,6 +414,22 @@ fn a_mark_of_ff_ff_is_no_telnet_server() {
 }
 
 #[test]
+fn a_taxel_that_is_stuck_at_full_scale_is_no_mark() {
+    for (seed, stuck) in (0..24).flat_map(|seed| [40, 77].map(|stuck| (seed, stuck))) {
+        let found = sure(seed, Array { rows: 12, cols: 13 }, |frame, _| {
+            let counts = frame.counts.iter().enumerate();
+            let cells = counts.map(|(at, &count)| match at {
+                _ if at == stuck => 0xFF,
+                _ => (count * 1.5).min(255.0) as u8,
+            });
+            [0xA7].into_iter().chain(cells).collect()
+        });
+        let mark = found.and_then(|found| found.sync);
+        assert_ne!(mark.map(|mark| mark.0), Some(vec![0xFF]), "{seed} {stuck}");
+    }
+}
+
+#[test]
 fn a_status_is_no_part_of_the_mark() {
     let array = Array { rows: 8, cols: 9 };
     let found = |seed| {
