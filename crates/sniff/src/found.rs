@@ -35,7 +35,7 @@ pub struct Found {
 pub struct Ranked {
     /// The array.
     pub array: Array,
-    /// Whether each second row runs the other way.
+    /// The order of its cells: row by row, or with each second row the other way.
     pub order: Order,
     /// `None` for text.
     pub cell: Option<Cell>,

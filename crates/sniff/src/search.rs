@@ -392,7 +392,9 @@ impl Search<'_> {
             .iter()
             .filter(|other| other.format == *format && other.place.bytes == place.bytes);
         (is_full_scale && others.any(|other| other.place.start != place.start)).then(|| {
-            "the mark may be a taxel that is stuck at full scale, and other bytes the mark: look it up in the data sheet".to_owned()
+            "the mark may be a taxel that is stuck at full scale, and other bytes the mark: look it up in the data \
+             sheet"
+                .to_owned()
         })
     }
 
