@@ -12,8 +12,6 @@ struct Escaped {
     /// What may follow an escape.
     escaped: [u8; 2],
     what: Coding,
-    /// What it may be where hardly anything is escaped.
-    maybe: Coding,
 }
 
 /// What was done to the bytes.
@@ -34,18 +32,17 @@ const ESCAPED: [Escaped; 2] = [
         escape: 0xDB,
         escaped: [0xDC, 0xDD],
         what: Coding::Packed(Framing::Slip),
-        maybe: Coding::Packed(Framing::Slip),
     },
     Escaped {
         end: 0x7E,
         escape: 0x7D,
         escaped: [0x5E, 0x5D],
-        what: Coding::Unreadable(HDLC),
-        maybe: Coding::Maybe(HDLC),
+        what: Coding::Unreadable(
+            "it looks like HDLC (7E ends a frame, and 7D escapes within it), which the daemon does not read",
+        ),
     },
 ];
 
-const HDLC: &str = "it looks like HDLC (7E ends a frame, and 7D escapes within it), which the daemon does not read";
 const TOO_FAST: &str =
     "the port is read faster than the sensor sends, for its bits come in runs: try a lower --baud";
 const TOO_SLOW: &str = "the port is read slower than the sensor sends, for stop bits are among the bits: try a \
@@ -119,11 +116,12 @@ impl Escaped {
         // Where hardly anything is escaped, frames are as long as each other.
         let are_alike = || share(lengths(frames()), |(length, usual)| length == usual) >= ALIKE;
         let spread = bytes.iter().filter(|&&byte| byte == self.end).count() * 4 < bytes.len();
+        let are_escaped = escapes.len() >= FEWEST;
         let is_found = spread && are_valid && frames().count() >= FEWEST;
-        match escapes.len() >= FEWEST {
-            true => is_found.then_some(self.what),
-            false => (is_found && are_alike()).then_some(self.maybe),
-        }
+        (is_found && (are_escaped || are_alike())).then_some(match self.what {
+            Coding::Unreadable(words) if !are_escaped => Coding::Maybe(words),
+            what => what,
+        })
     }
 }
 

@@ -54,8 +54,8 @@ type Pair<'a> = (&'a [u8], &'a [u8]);
 
 /// The share of frames in which damage may change a constant byte.
 const DAMAGED_SHARE: f64 = 0.05;
-/// A constant byte has the same other value in fewer frames by damage.
-const FLAG_FRAMES: usize = 4;
+/// The fewest frames in which a status has the same other value. Damage gives it to fewer.
+const STATUS_FRAMES: usize = 4;
 /// The most bytes that count as restless. If there are more, they are noisy taxels.
 const MOST_RESTLESS: usize = 10;
 /// The mean difference of two random bytes is 64, counted the shorter way around.
@@ -124,15 +124,15 @@ impl Columns {
         columns.find_numbers(&pairs);
         columns.find_restless(&pairs);
         columns.cell_bits = columns.cell_bits(frames);
-        columns.find_flags(frames);
+        columns.find_statuses(frames);
         columns.all_cell_bits = columns.cell_bits.iter().sum();
         columns
     }
 
-    /// Finds the bytes that look like a part of a mark, but have another value again and again in frames that are whole
-    /// else, such as a status. Damage leaves the same value hardly twice, or changes other bytes too. With such a byte
-    /// in the mark, all these frames would be lost.
-    fn find_flags(&mut self, frames: &Frames) {
+    /// Finds the bytes of a status. They look like a part of a mark, but have the same other value again and again, in
+    /// frames that are otherwise whole. Damage seldom leaves one value twice, or it changes other bytes too. If the mark
+    /// had such a byte, all these frames would be lost.
+    fn find_statuses(&mut self, frames: &Frames) {
         let mut alone: BTreeMap<(usize, u8), usize> = BTreeMap::new();
         for frame in frames.iter() {
             let kinds = self.kinds.iter().zip(frame).enumerate();
@@ -145,7 +145,7 @@ impl Columns {
             }
         }
         for (&(at, _), &times) in &alone {
-            if times >= FLAG_FRAMES && self.cell_bits[at] > model::CONSTANT_BITS {
+            if times >= STATUS_FRAMES && self.cell_bits[at] > model::CONSTANT_BITS {
                 self.kinds[at] = Kind::Restless;
                 self.cell_bits[at] = model::RESTLESS_TAXEL_BITS;
             }

@@ -217,8 +217,8 @@ impl Ranked {
         if is_given {
             return None;
         }
-        let is_open = next.is_some_and(|next| self.may_be(next));
-        if is_open && next.is_some_and(|next| next.array == self.array && next.cell == self.cell) {
+        let other = next.filter(|next| self.may_be(next));
+        if other.is_some_and(|other| other.array == self.array && other.cell == self.cell) {
             return Some(format!(
                 "{TO_AND_FRO}: press with one finger at several places and at the edges"
             ));
@@ -226,7 +226,7 @@ impl Ranked {
         let (taxels, options) = (self.array.taxels(), self.options());
         // A row of an array looks like an array of one row.
         let is_strip = self.array.rows == 1;
-        if is_strip || is_open {
+        if is_strip || other.is_some() {
             return Some(format!(
                 "choose with `{options}` or as the pictures say, or press with one finger at several places and at \
                  the edges"

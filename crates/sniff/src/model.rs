@@ -58,6 +58,8 @@ const LONGEST_ROW: usize = 128;
 const LEFT_OF_AROUND: f32 = 0.1;
 /// ... and of how far the cells are from rest, for taxels differ.
 const LEFT_OF_OWN: f32 = 0.1;
+/// How far from rest a byte beside the cells usually is, and by how much it moves, in steps.
+const STEP: f32 = 1.0;
 /// What goes on around is noise up to so many times the noise at rest.
 const NOISE: f32 = 4.0;
 
@@ -171,78 +173,72 @@ fn later_bits(pictures: &Pictures, Picture { change, before }: &Picture, at: usi
 /// The bits of each press and cell in its first frame, if cells have nothing to do with those around them. A
 /// cell is about as far from rest as in the other presses, and, as if that were one more, as all cells are.
 pub(crate) fn alone(pictures: &Pictures) -> Vec<Vec<f64>> {
-    let far = |press: &Vec<Picture>| -> Vec<f32> {
-        let of_cell = |at: usize| {
-            press
-                .iter()
-                .map(|picture| picture.change[at].abs())
-                .sum::<f32>()
-                / press.len() as f32
-        };
-        (0..pictures.changes.len()).map(of_cell).collect()
-    };
-    let presses: Vec<Vec<f32>> = pictures.presses.iter().map(far).collect();
-    let count = presses.len() as f32;
-    let mean =
-        presses.iter().flatten().sum::<f32>() / (count * pictures.changing().count().max(1) as f32);
-    let of_press = |(press, far): (&Vec<Picture>, &Vec<f32>)| -> Vec<f64> {
-        let of_cell = |at: usize| {
-            if !pictures.changes[at] {
-                return 0.0;
-            }
-            let all = presses.iter().map(|press| press[at]).sum::<f32>();
-            let width = (all - far[at] + mean) / count + pictures.noise;
-            let sum: f32 = press
-                .iter()
-                .map(|picture| bits(picture.change[at], width))
-                .sum();
-            f64::from(sum / press.len() as f32)
-        };
-        (0..far.len()).map(of_cell).collect()
-    };
-    pictures
+    let cells = pictures.changing().count().max(1) as f32;
+    let all: f32 = pictures
         .presses
         .iter()
-        .zip(&presses)
-        .map(of_press)
-        .collect()
+        .map(|press| {
+            let far = pictures.changing();
+            far.map(|at| mean(press, &|picture| picture.change[at]))
+                .sum::<f32>()
+        })
+        .sum();
+    let usual = all / (pictures.presses.len() as f32 * cells);
+    of_changing(pictures, |at| {
+        as_in_others(pictures, usual, pictures.noise, &|picture| {
+            picture.change[at]
+        })
+    })
 }
 
-/// The bits of each press and byte beside the cells, of which nothing is known: it is about as far from rest, and moves
-/// as much, as in the other presses. Bytes near it have nothing to do with it.
+/// The bits of each press and byte beside the cells, of which nothing is known. It is about as far from rest as in the
+/// other presses, and moves as much in each frame. Bytes near it have nothing to do with it.
 pub(crate) fn unknown(pictures: &Pictures) -> Vec<Vec<f64>> {
+    of_changing(pictures, |at| {
+        let far = as_in_others(pictures, STEP, 0.0, &|picture| picture.change[at]);
+        let moved = as_in_others(pictures, STEP, 0.0, &|picture| {
+            picture.change[at] - picture.before[at]
+        });
+        let of_press =
+            |(press, (far, moved)): (&Vec<Picture>, (f32, f32))| far + moved * press.len() as f32;
+        let moves = far.into_iter().zip(moved);
+        pictures.presses.iter().zip(moves).map(of_press).collect()
+    })
+}
+
+/// By press, the bits of each cell: what `of` says of one that changes, a number a press, and 0 for the others.
+fn of_changing(pictures: &Pictures, of: impl Fn(usize) -> Vec<f32>) -> Vec<Vec<f64>> {
     let mut bits = vec![vec![0.0; pictures.changes.len()]; pictures.presses.len()];
     for at in pictures.changing() {
-        let far = as_in_others(pictures, |picture| picture.change[at]);
-        let moved = as_in_others(pictures, |picture| picture.change[at] - picture.before[at]);
-        for ((bits, press), (far, moved)) in
-            bits.iter_mut().zip(&pictures.presses).zip(far.zip(moved))
-        {
-            // The first frame counts once, whichever it is.
-            bits[at] = f64::from(far / press.len() as f32 + moved);
+        for (bits, of_press) in bits.iter_mut().zip(of(at)) {
+            bits[at] = of_press.into();
         }
     }
     bits
 }
 
-/// The bits of a value in all pictures of each press, if it is about as large as in the other presses and, as if that
-/// were one more, as a step.
-fn as_in_others(pictures: &Pictures, of: impl Fn(&Picture) -> f32) -> impl Iterator<Item = f32> {
+/// The mean size of a value in the pictures of a press.
+fn mean(press: &[Picture], of: &impl Fn(&Picture) -> f32) -> f32 {
+    press.iter().map(|picture| of(picture).abs()).sum::<f32>() / press.len() as f32
+}
+
+/// The bits of a value in a picture of each press, if it is about as large as in the other presses and, as if that were
+/// one more, as is `usual`.
+fn as_in_others(
+    pictures: &Pictures,
+    usual: f32,
+    noise: f32,
+    of: &impl Fn(&Picture) -> f32,
+) -> Vec<f32> {
     let presses = &pictures.presses;
-    let mean = |press: &Vec<Picture>| {
-        let sum: f32 = press.iter().map(|picture| of(picture).abs()).sum();
+    let means: Vec<f32> = presses.iter().map(|press| mean(press, of)).collect();
+    let all: f32 = means.iter().sum();
+    let of_press = |(press, mean): (&Vec<Picture>, f32)| {
+        let width = (all - mean + usual) / presses.len() as f32 + noise;
+        let sum: f32 = press.iter().map(|picture| bits(of(picture), width)).sum();
         sum / press.len() as f32
     };
-    let all: f32 = presses.iter().map(mean).sum();
-    let of_press = |press: &Vec<Picture>| -> f32 {
-        let width = (all - mean(press) + 1.0) / presses.len() as f32;
-        press.iter().map(|picture| bits(of(picture), width)).sum()
-    };
-    presses
-        .iter()
-        .map(of_press)
-        .collect::<Vec<f32>>()
-        .into_iter()
+    presses.iter().zip(means).map(of_press).collect()
 }
 
 /// The bits by which one is more than the other, press by press.
