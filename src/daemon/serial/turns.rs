@@ -1,9 +1,11 @@
 //! Who is asked next at a port: sensors that send a frame only when they are asked take turns.
 //!
 //! Bytes after a request go to the sensors that asked, because the answers of equal modules are alike. The
-//! next one is asked when a frame came or the time for it is over. A sensor that is alone is asked at its own
-//! pace, whether it answers or not. This has no clock.
+//! next one is asked when a frame came or the time for it is over. After a request without an answer, all others have
+//! their turn, those first that are far from it: modules beside each other go silent together. A sensor that is alone
+//! is asked at its own pace, whether it answers or not. This has no clock.
 
+use std::cmp::Reverse;
 use std::time::Duration;
 
 use tokio::time::Instant;
@@ -28,6 +30,10 @@ struct Ask {
     every: Duration,
     due: Instant,
     timeout: Duration,
+    /// When it was asked last.
+    asked: Option<Instant>,
+    /// Whether a frame came since the port was opened.
+    is_heard: bool,
     /// The last rest, if the last request had no answer.
     rest: Option<Duration>,
 }
@@ -42,6 +48,8 @@ pub(super) struct Turns {
     asking: Option<(usize, Instant)>,
     /// The last one that was asked, for bytes that come late.
     last: Option<usize>,
+    /// The last request without an answer, and when the time for it was over.
+    failed: Option<(usize, Instant)>,
     /// From then on a silent module may be asked.
     may_try: Instant,
 }
@@ -64,6 +72,8 @@ impl Turns {
                     every: *every,
                     due: now,
                     timeout,
+                    asked: None,
+                    is_heard: false,
                     rest: None,
                 });
             }
@@ -74,6 +84,7 @@ impl Turns {
             asks,
             asking: None,
             last: None,
+            failed: None,
             may_try: now,
         }
     }
@@ -81,7 +92,9 @@ impl Turns {
     /// The port was opened: all are asked anew.
     pub(super) fn begin(&mut self, now: Instant) {
         (self.asking, self.last) = (None, None);
-        self.asks.iter_mut().for_each(|ask| ask.due = now);
+        for ask in &mut self.asks {
+            (ask.due, ask.is_heard) = (now, false);
+        }
     }
 
     /// Whether bytes are for this sensor: it was asked last, or it sends by itself.
@@ -107,6 +120,7 @@ impl Turns {
         let Some(index) = self.of_sensors[sensor] else {
             return;
         };
+        self.asks[index].is_heard = true;
         // Whoever sends is not silent, even if it is late.
         if self.asks[index].rest.take().is_some() {
             self.asks[index].due = now;
@@ -124,12 +138,25 @@ impl Turns {
             ask.rest = Some(rest);
             ask.due = now + rest;
             self.may_try = now + least;
+            self.failed = Some((silent, now));
         }
         let (may_try, is_alone) = (self.may_try <= now, self.asks.len() == 1);
+        let (failed, failed_at) = self.failed.unzip();
+        let most = self.asks.len();
+        let apart = |index: usize| {
+            let apart = index.abs_diff(failed.unwrap_or(index));
+            apart.min(most - apart)
+        };
         let asks = self.asks.iter_mut().enumerate();
         let (index, ask) = asks
             .filter(|(_, ask)| ask.due <= now && (may_try || ask.rest.is_none()))
-            .min_by_key(|(_, ask)| ask.due)?;
+            .min_by_key(|(index, ask)| match ask.asked < failed_at {
+                true if ask.rest.is_none() => {
+                    (false, !ask.is_heard, Reverse(apart(*index)), ask.due)
+                }
+                _ => (true, false, Reverse(0), ask.due),
+            })?;
+        ask.asked = Some(now);
         ask.due = (ask.due + ask.every).max(now);
         self.last = Some(index);
         self.asking = (!is_alone).then_some((index, now + ask.timeout));
@@ -153,25 +180,52 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_silent_module_makes_no_other_one_stale() {
+    /// The longest time between two answers of one of the first `speaking` of `modules`, which take so long for an
+    /// answer. The others never answer, or not after `silent_after`.
+    fn longest_gap(
+        modules: usize,
+        speaking: usize,
+        answer: Duration,
+        silent_after: Duration,
+    ) -> Duration {
+        let all: Vec<Settings> = (0..modules)
+            .map(|module| settings(&[module as u8]))
+            .collect();
         let begin = Instant::now();
-        let mut turns = Turns::new(&[settings(b"1"), settings(b"2"), settings(b"3")], begin);
-        // The third module never answers, and the others after 30 ms.
-        let (mut now, mut last, mut longest) = (begin, [begin; 2], Duration::ZERO);
+        let mut turns = Turns::new(&all, begin);
+        let (mut now, mut last, mut longest) = (begin, vec![begin; speaking], Duration::ZERO);
         while now < begin + Duration::from_secs(10) {
             now = now.max(turns.due().unwrap());
-            let asked = match turns.ask(now) {
-                Some(b"1") => 0,
-                Some(b"2") => 1,
-                _ => continue,
+            let Some(asked) = turns.ask(now).map(|request| usize::from(request[0])) else {
+                continue;
             };
-            now += Duration::from_millis(30);
-            turns.answered(asked, now);
-            longest = longest.max(now - last[asked]);
-            last[asked] = now;
+            if asked < speaking || now < begin + silent_after {
+                now += answer;
+                turns.answered(asked, now);
+            }
+            if let Some(last) = last.get_mut(asked) {
+                longest = longest.max(now - *last);
+                *last = now;
+            }
         }
-        assert!(longest < Duration::from_millis(150), "{longest:?}");
+        longest
+    }
+
+    #[test]
+    fn silent_modules_make_no_other_one_stale() {
+        let ms = Duration::from_millis;
+        for (modules, speaking, answer, silent_after) in [
+            (3, 2, ms(30), ms(0)),
+            (4, 1, ms(1), ms(0)),
+            (6, 2, ms(1), ms(0)),
+            (17, 14, ms(1), ms(3000)),
+            (17, 14, ms(1), ms(3010)),
+            (17, 12, ms(3), ms(0)),
+            (17, 1, ms(1), ms(0)),
+        ] {
+            let longest = longest_gap(modules, speaking, answer, silent_after);
+            assert!(longest < ms(150), "{speaking} of {modules}: {longest:?}");
+        }
     }
 
     #[test]
