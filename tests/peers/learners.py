@@ -32,7 +32,8 @@ except ImportError as missing:
     sys.exit(print(f"skipped: {missing} (pip install scikit-learn skl2onnx)"))
 
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.ensemble import AdaBoostClassifier, GradientBoostingClassifier, RandomForestClassifier, StackingClassifier
+from sklearn.ensemble import (AdaBoostClassifier, ExtraTreesClassifier, GradientBoostingClassifier,
+                              RandomForestClassifier, StackingClassifier)
 from sklearn.linear_model import LogisticRegression, SGDClassifier
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.neural_network import MLPClassifier
@@ -56,7 +57,8 @@ def kinds():
         "Normalizer": make_pipeline(Normalizer(), logistic()),
         "SGD": SGDClassifier(loss="log_loss"),
         "LDA": LinearDiscriminantAnalysis(),
-        "forest": RandomForestClassifier(30, max_depth=8),
+        "forest": RandomForestClassifier(),
+        "extra trees": ExtraTreesClassifier(),
         "gradient boosting": GradientBoostingClassifier(n_estimators=10, max_features=50),
         "AdaBoost": AdaBoostClassifier(n_estimators=10),
         "MLP": make_pipeline(StandardScaler(), MLPClassifier((32,), max_iter=60)),
@@ -74,7 +76,7 @@ def adopt(path, data, out, code=0, **more):
 def adopted(path, data):
     """What `adopt` makes of the file: for each frame of the data set its probabilities."""
     adopt(path, data, "adopted.onnx")
-    run("hrn-train", "check-model", "adopted.onnx")
+    run("hrn-train", "check-model", "adopted.onnx", "--fps", "100")
     found = []
     for split in ("train", "test"):
         pathlib.Path("verdicts.csv").unlink(missing_ok=True)

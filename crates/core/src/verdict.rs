@@ -11,6 +11,7 @@ mod course;
 mod error;
 pub mod features;
 mod file;
+mod forest;
 mod grid;
 mod guard;
 mod inputs;
@@ -156,6 +157,7 @@ impl Model {
         let mut optimized = typed.map_err(ModelError::of(RUNNING))?;
         guard::check_values(&optimized)?;
         optimized.optimize().map_err(ModelError::of(RUNNING))?;
+        forest::quicken(&mut optimized).map_err(ModelError::of(RUNNING))?;
         for (place, output) in file.outputs.iter().enumerate() {
             let Some(lengths) = file.lengths_of(output) else {
                 continue;

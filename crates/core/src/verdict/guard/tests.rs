@@ -2,6 +2,7 @@ use tract_onnx::pb::attribute_proto::AttributeType;
 use tract_onnx::pb::tensor_proto::DataType;
 use tract_onnx::pb::{AttributeProto, GraphProto, NodeProto};
 
+use super::super::forest;
 use super::*;
 use crate::tests::graph::{indices, int, ints, node, value};
 
@@ -48,6 +49,11 @@ fn graph(nodes: &[NodeProto]) -> GraphProto {
 /// Checks a graph as [`super::super::Model::read`] does.
 fn check(graph: GraphProto) -> Result<(), ModelError> {
     check_operators(&graph)?;
+    check_values(&typed(graph))
+}
+
+/// A graph as the inference library reads it.
+fn typed(graph: GraphProto) -> TypedModel {
     let proto = pb::ModelProto {
         ir_version: 8,
         opset_import: vec![pb::OperatorSetIdProto {
@@ -59,7 +65,7 @@ fn check(graph: GraphProto) -> Result<(), ModelError> {
     };
     let onnx = tract_onnx::onnx().with_ignore_value_info(true);
     let model = onnx.model_for_proto_model(&proto).unwrap();
-    check_values(&model.into_typed().unwrap().into_decluttered().unwrap())
+    model.into_typed().unwrap().into_decluttered().unwrap()
 }
 
 #[test]
@@ -147,6 +153,32 @@ fn forest() -> NodeProto {
             &["label", "y"],
             &attributes,
         )
+    }
+}
+
+#[test]
+fn a_quick_forest_votes_as_that_of_the_library() {
+    let library = typed(graph(&[forest()]));
+    let mut quick = library.clone();
+    forest::quicken(&mut quick).unwrap();
+    let names = quick.nodes().iter().map(|node| node.op.name());
+    assert!(names.into_iter().any(|name| name == "Forest"));
+    let plans = [library, quick].map(|model| model.into_runnable().unwrap());
+    let values = [-1.0, 0.5, 0.75, f32::NAN];
+    for (first, third) in values
+        .iter()
+        .flat_map(|a| values.iter().map(move |b| (*a, *b)))
+    {
+        let [expected, found] = plans.each_ref().map(|plan| {
+            let x = Tensor::from_shape(&[1, 4], &[first, 9.0, third, 9.0]).unwrap();
+            let y = plan.run(tvec!(x.into())).unwrap().remove(0);
+            y.to_plain_array_view::<f32>()
+                .unwrap()
+                .as_slice()
+                .unwrap()
+                .to_vec()
+        });
+        assert_eq!(found, expected, "{first} {third}");
     }
 }
 
