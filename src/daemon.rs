@@ -280,9 +280,10 @@ impl Daemon {
             validation = self.setup.hrn.card().validation.as_str(),
             "started"
         );
-        for index in 0..self.setup.config.sensors.len() {
-            announce_sensor(&self.setup, index);
+        for sensor in &self.setup.config.sensors {
+            info!(sensor = sensor.name.as_str(), port = %sensor.port, "sensor");
         }
+        warn_of(&self.setup);
     }
 
     /// The address of the live page, if there is one.
@@ -359,12 +360,14 @@ impl Daemon {
                 continue;
             };
             info!(sensor = sensor.name(), "stopped");
-            announce_sensor(&self.setup, index);
+            let port = &self.setup.config.sensors[index].port;
+            info!(sensor = sensor.name(), %port, "sensor");
             core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
             core.recorder.begin_anew(&core.pipeline, now());
             anew.push(core);
         }
         self.start_sensors(anew);
+        warn_of(&self.setup);
         info!(model = short(&self.setup), "reloaded");
     }
 
@@ -426,18 +429,9 @@ fn raise_descriptors() {
     }
 }
 
-fn announce_sensor(setup: &Setup, index: usize) {
-    let sensor = &setup.config.sensors[index];
-    let name = sensor.name.as_str();
-    info!(sensor = name, port = %sensor.port, "sensor");
-    if let Some(warning) = setup.guess_warning(index) {
-        warn!(sensor = name, "{warning}");
-    }
-    if setup.ignores_references_of(name) {
-        warn!(
-            sensor = name,
-            "references are not used: they make verdicts on each other worse"
-        );
+fn warn_of(setup: &Setup) {
+    for warning in setup.warnings() {
+        warn!("{warning}");
     }
 }
 

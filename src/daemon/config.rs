@@ -11,6 +11,7 @@ mod publish;
 mod check;
 mod parse;
 mod in_force;
+mod warnings;
 
 use std::collections::BTreeMap;
 use std::env;
@@ -30,8 +31,7 @@ use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
 use hardnessd_core::verdict::{self, BuiltIn, Format, LevelTable, Model};
-use hardnessd_core::wire::Preset;
-use hardnessd_core::{motion, press, trial};
+use hardnessd_core::{press, trial};
 
 settings! {
     /// The whole configuration file.
@@ -235,35 +235,6 @@ impl Setup {
         }
     }
 
-    /// The keys that are written in the configuration and change no verdict of this model.
-    pub fn without_effect(&self) -> Vec<String> {
-        let Config {
-            press,
-            model,
-            sensors,
-            ..
-        } = &self.config;
-        let of = |key: &str, sensor: &sensor::Settings| format!("{key} of {:?}", sensor.name);
-        let mut idle = Vec::new();
-        if matches!(self.hrn.format(), Format::Course { .. }) {
-            if press.early_settle_s != press::Settings::default().early_settle_s {
-                idle.push("press.early_settle_s".to_owned());
-            }
-        } else {
-            let given = |sensor: &&sensor::Settings| sensor.arm != motion::Settings::default();
-            let arms = sensors.iter().filter(given);
-            idle.extend(arms.map(|sensor| of("sensor.arm", sensor)));
-            if model.early_confidence != verdict::Settings::default().early_confidence {
-                idle.push("model.early_confidence".to_owned());
-            }
-        }
-        if self.hrn.most_references() == 0 {
-            let given = sensors.iter().filter(|sensor| sensor.references.is_some());
-            idle.extend(given.map(|sensor| of("sensor.references", sensor)));
-        }
-        idle
-    }
-
     /// Reads a configuration and its model. `model` replaces the configuration's own.
     ///
     /// # Errors
@@ -343,25 +314,6 @@ impl Setup {
         is_same
             && self.config.press == other.config.press
             && at_its_port(self) == at_its_port(other)
-    }
-
-    /// A warning if the configuration leaves out the pitch or the scale of the sensor at `index`, unless its preset
-    /// is one of an array whose pitch and scale are the defaults.
-    pub fn guess_warning(&self, index: usize) -> Option<String> {
-        let preset = self.config.sensors[index].frame.preset();
-        let is_of_array = matches!(preset, Preset::Jx255n | Preset::Jx255nU16);
-        let keys = ["pitch_mm", "newtons_per_count"].into_iter();
-        let is_guess = |key: &&str| {
-            let key = format!("sensor.calibration.{key}");
-            !is_of_array && !self.text.is_written(index, &key)
-        };
-        let guesses: Vec<&str> = keys.filter(is_guess).collect();
-        let guesses = guesses.join(" and ");
-        (!guesses.is_empty()).then(|| {
-            format!(
-                "{guesses} not written: the default is a guess, and a wrong one gives wrong verdicts: measure it"
-            )
-        })
     }
 
     /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.
