@@ -15,7 +15,8 @@ std::string value(const std::string &event, const std::string &key) {
     return event.substr(begin, event.find_first_of(",}", begin) - begin);
 }
 
-int main(int, char **arguments) {
+int main(int count, char **arguments) {
+    if (count != 2) return std::cerr << "found " << count - 1 << " arguments, expected the path of a socket" << std::endl, 2;
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
     std::strncpy(address.sun_path, arguments[1], sizeof(address.sun_path) - 1);

@@ -126,8 +126,8 @@ fn refuse_living(key: &str, path: &Path) -> Result<(), Error> {
             Err(failed(key, path, "try it", &error.into()))
         }
         _ => Err(Error::Io(format!(
-            "{key}: a daemon serves {} already: stop it (the package's with `sudo systemctl stop hardnessd`), \
-             or set another path in [publish.unix], or another XDG_RUNTIME_DIR",
+            "the daemon runs and serves {}: stop it (the package's with `sudo systemctl stop hardnessd`), or \
+             give a second one another {key} or another XDG_RUNTIME_DIR",
             path.display()
         ))),
     }
