@@ -164,8 +164,7 @@ impl<'a> Played<'a> {
     fn end(&mut self) -> (Vec<Event>, Option<Failure>) {
         let is_raw = self.is_raw();
         let (path, playback) = (self.path.display(), &mut self.playback);
-        let left_out = playback.left_out();
-        for note in &left_out {
+        for note in playback.left_out() {
             stderr_line!("warning: {path}: {note}");
         }
         let events = playback.end();
@@ -184,13 +183,10 @@ impl<'a> Played<'a> {
                 "no whole frame in {bytes_skipped} bytes ({frames_damaged} damaged): the layout is not that of \
                  [sensor.frame]: `hardnessd sniff {path}` looks for another"
             ),
-            _ if playback.sensors() > 0 => return (events, None),
-            _ if left_out.is_empty() => {
-                "found no state of a sensor, expected a recording of hardnessd".to_owned()
-            }
-            // A clip of a recording may lie inside one press.
-            _ => "found no sensor at rest, expected a recording with a moment between presses"
-                .to_owned(),
+            _ => match playback.nothing_played() {
+                Some(problem) => problem.to_owned(),
+                None => return (events, None),
+            },
         };
         let failure = Failure::new(FAILED, format!("{path}: {problem}"));
         (events, Some(failure))

@@ -232,17 +232,22 @@ impl Playback {
             Some(to) => {
                 let seconds = to.mono.saturating_sub(from.mono).as_secs_f64();
                 format!(
-                    "sensor {sensor:?}: the first {seconds:.1} s begin inside a press: left out"
+                    "sensor {sensor:?}: left out: the first {seconds:.1} s, which come before a state at rest"
                 )
             }
-            None => format!("sensor {sensor:?}: no moment at rest: left out"),
+            None => format!("sensor {sensor:?}: left out: it has no state at rest"),
         };
         self.left_out.iter().map(note).collect()
     }
 
-    /// The number of sensors so far.
-    pub fn sensors(&self) -> usize {
-        self.players.len()
+    /// Why nothing was played, in words. `None` if something was.
+    pub fn nothing_played(&self) -> Option<&'static str> {
+        let problem = match self.left_out.is_empty() {
+            true => "found no state of a sensor, expected a recording of hardnessd",
+            // A clip of a recording may lie inside one press.
+            false => "found no sensor at rest, expected a recording with a moment between presses",
+        };
+        self.players.is_empty().then_some(problem)
     }
 
     /// The labels of the recording, from the part played so far.

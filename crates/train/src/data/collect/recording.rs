@@ -217,10 +217,9 @@ impl Recording {
         for note in playback.left_out() {
             hardnessd_core::stderr_line!("warning: {note}");
         }
-        ensure!(
-            !self.sensors.is_empty(),
-            "found no state of a sensor, expected a recording of hardnessd"
-        );
+        if let Some(problem) = playback.nothing_played() {
+            bail!(problem);
+        }
         self.labels = playback.labels();
         Ok(())
     }
