@@ -172,7 +172,10 @@ fn print_next(args: &Args, seen: u64) {
 fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<String, Failure> {
     let (found, expected) = (presses.len(), newtons.len());
     if found != expected {
-        let count = format!("found {found} presses, expected {expected}: put each weight on once");
+        let count = format!(
+            "found {found} presses, expected {expected}: put each weight on once; with a scale that is far off, weights \
+             are no presses or noise is one: set newtons_per_count to a guess from your data sheet, and record anew"
+        );
         return Err(Failure::new(FAILED, count));
     }
     let weights: Vec<(f64, &Press)> = newtons.iter().copied().zip(presses).collect();

@@ -86,7 +86,7 @@ pub(super) fn presses(
 #[derive(Default)]
 struct Gathered {
     presses: Vec<Press>,
-    /// The memory of their frames.
+    /// The memory of their frames, and of those of the press under way.
     bytes: usize,
     /// The frames of the press under way, and the newest frame.
     frames: Vec<(FrameEvent, Duration)>,
@@ -100,9 +100,10 @@ impl Gathered {
             match event {
                 Event::Frame(frame) if frame.force_n.is_some() => {
                     if self.began.is_none() {
-                        self.frames.clear();
+                        self.forget();
                     }
                     let moment = at.mono_of(frame.time);
+                    self.bytes += size_of_val(&frame.newtons[..]);
                     self.frames.push((frame, moment));
                 }
                 Event::Press(press) => match press.state {
@@ -141,11 +142,17 @@ impl Gathered {
             if own.contains(&frame.frame) {
                 press.moments.push(moment);
                 press.forces_n.push(frame.force_n.unwrap_or_default());
-                self.bytes += size_of_val(&frame.newtons[..]);
                 press.frames.push(frame.newtons);
             }
         }
         self.presses.push(press);
+    }
+
+    /// Forgets frames that are of no press.
+    fn forget(&mut self) {
+        for (frame, _) in self.frames.drain(..) {
+            self.bytes -= size_of_val(&frame.newtons[..]);
+        }
     }
 
     /// Refuses presses that fill the memory.
@@ -177,17 +184,40 @@ mod tests {
     }
 
     #[test]
-    fn presses_that_fill_the_memory_are_refused() {
+    fn presses_that_fill_the_memory_are_refused_while_they_last() {
+        let path = Path::new("x");
         let of = |bytes| Gathered {
             bytes,
             ..Gathered::default()
         };
-        let path = Path::new("x");
-        assert!(of(MOST_BYTES).check_size(path).is_ok());
         let error = of(MOST_BYTES + 1).check_size(path).unwrap_err().line();
         assert!(
             error.contains("x: its presses take more than 1 GB"),
             "{error}"
         );
+        // All frames count as soon as they come: in the end, those that are kept are as large.
+        let (recording, sensor) = of_a_press(|_| {}, None, true);
+        let hrn = hrn();
+        let mut gathered = Gathered::default();
+        let mut most = 0;
+        Played::open(path, recording.as_slice(), &sensor, &hrn, None)
+            .unwrap()
+            .play(|played, events, at| {
+                let pipeline = played.playback.pipeline(sensor.name());
+                if let Some(pipeline) = pipeline {
+                    gathered.take(events, at, pipeline);
+                }
+                let under_way = gathered.frames.iter().map(|(frame, _)| &frame.newtons);
+                let ended = gathered.presses.iter().flat_map(|press| &press.frames);
+                let kept: usize = under_way
+                    .chain(ended)
+                    .map(|frame| size_of_val(&frame[..]))
+                    .sum();
+                assert!(gathered.bytes >= kept, "{} for {kept}", gathered.bytes);
+                most = most.max(gathered.frames.len());
+                Ok(true)
+            })
+            .unwrap();
+        assert!(most > 3 && !gathered.presses.is_empty(), "{most}");
     }
 }
