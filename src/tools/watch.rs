@@ -61,6 +61,9 @@ const PICTURE: Duration = Duration::from_millis(100);
 const QUESTION: &str = r#"{"get":"status"}"#;
 const QUESTIONS: Duration = Duration::from_secs(1);
 
+/// Time between two pictures that are written as a whole: another program may write to the same terminal.
+const WHOLE_PICTURES: Duration = Duration::from_secs(5);
+
 /// Time between two tries to connect.
 const PAUSE: Duration = Duration::from_millis(500);
 
@@ -122,7 +125,14 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
     start("daemon", move || follow(&source, &news))?;
     // The address of the last daemon.
     let mut daemon_at = None;
+    let mut whole_at = Instant::now() + WHOLE_PICTURES;
     while !is_over.load(Ordering::Relaxed) {
+        if Instant::now() >= whole_at {
+            whole_at = Instant::now() + WHOLE_PICTURES;
+            if screen.forget().is_err() {
+                break;
+            }
+        }
         let drawn = screen.draw(|frame| draw(frame, &view, now().mono));
         if drawn.is_err() {
             // The terminal has gone.

@@ -83,6 +83,11 @@ fn it_shows_presses_loss_and_a_daemon_that_goes_and_comes_back() {
     let bench = Bench::new();
     let mut watch = Watch::new(&bench);
     watch.shows("NO DAEMON");
+    // Another program writes to the same terminal.
+    watch.screen.process(b"\x1b[20;30Ha line of the log");
+    watch.until("a whole picture", |screen| {
+        !screen.contents().contains("a line of the log")
+    });
     let mut daemon = bench.daemon();
     watch.shows("arm-7");
     let mut sensor = bench.sensor("");
