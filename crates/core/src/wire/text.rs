@@ -261,8 +261,17 @@ fn after_heading(
     lines: &Lines,
 ) -> Result<Found, Refused> {
     let Range { start, end } = line;
-    let mut windows = bytes[line].windows(heading.len());
-    let skipped = match windows.rposition(|window| window == heading) {
+    let line = &bytes[line];
+    let mut windows = line.windows(heading.len()).enumerate();
+    // "Sensor 1" is no heading of a line with "Sensor 11".
+    let goes_on = |at: usize| {
+        let next = line
+            .get(at + heading.len())
+            .filter(|next| next.is_ascii_digit());
+        next.and(heading.last()).is_some_and(u8::is_ascii_digit)
+    };
+    let found = windows.rfind(|(at, window)| *window == heading && !goes_on(*at));
+    let skipped = match found.map(|(at, _)| at) {
         Some(at) if start + at > 0 => return Ok(Found::Nothing(start + at)),
         Some(_) => heading.len(),
         None if !lines.held.is_empty() => 0,
