@@ -15,7 +15,7 @@ use anyhow::ensure;
 use crate::net::graph::Graph;
 pub use crate::net::graph::Inputs;
 use crate::net::network::Weights;
-use crate::progress::{ensure_finite, progress_bar, report};
+use crate::progress::{ensure_learning, progress_bar, report};
 use crate::run::Run;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::history::Metrics;
@@ -199,7 +199,7 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
         }
         done.epoch += 1;
         for loss in [Some(mean.loss), mean.generator_loss].into_iter().flatten() {
-            ensure_finite(stage, done.epoch, "loss", loss)?;
+            ensure_learning(stage, done.epoch, "loss", loss)?;
         }
         let is_last = done.epoch == epochs;
         let is_validated = is_last || done.epoch.is_multiple_of(VALIDATED_EVERY_EPOCHS);
@@ -208,7 +208,7 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
             validated(learning, &weights, &plan.held_out)
         });
         if let Some((loss, _)) = validation {
-            ensure_finite(stage, done.epoch, "validation loss", loss)?;
+            ensure_learning(stage, done.epoch, "validation loss", loss)?;
         }
         done.seconds = seconds_before + begun.elapsed().as_secs_f64();
         metrics.add(&done, rate, &mean, validation)?;
@@ -218,7 +218,7 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
             done.numbers = sides.iter().flat_map(Learner::numbers).collect();
             // The loss does not show the last step yet, because a step's loss is that of the weights before it.
             for &number in &done.numbers {
-                ensure_finite(stage, done.epoch, "weights", number.into())?;
+                ensure_learning(stage, done.epoch, "weights", number.into())?;
             }
             done.write(&run.checkpoint(stage))?;
         }

@@ -14,7 +14,7 @@ use crate::learn;
 use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
-use crate::progress::ensure_finite;
+use crate::progress::ensure_learning;
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::start::Start;
 use crate::run::{Description, Run, disk};
@@ -159,7 +159,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     // Finite weights can still give a logit that is not. One press is enough for this check.
     let first = learn::Question::alone(&parts.train[..1]);
     for logit in learning.judge(&weights, &[first], None).concat() {
-        ensure_finite(
+        ensure_learning(
             learning.stage(),
             settings.training.epochs,
             "logit",

@@ -184,13 +184,13 @@ fn a_training_that_diverges_ends_where_it_does() {
             1e300,
             "hrn: epoch 1: weights: found ",
         ),
-        // They are finite after it, but too large.
+        // Nothing is infinite, but no network learns with a loss of millions.
         (
             "hrn15",
             "training",
-            one_step,
-            1e30,
-            "hrn: epoch 1: logit: found NaN",
+            "epochs = 30\n",
+            100.0,
+            "expected at most 1e6",
         ),
     ] {
         let settings = format!("[{table}]\n{more}learning_rate = {rate:e}\n");
@@ -201,8 +201,7 @@ fn a_training_that_diverges_ends_where_it_does() {
         let last = error.lines().last().unwrap();
         assert!(last.contains(expected), "{method}: {error}");
         assert!(last.ends_with(": the training has diverged"), "{error}");
-        let is_kept = trial.checkpoints().contains(&"hrn".to_owned());
-        assert_eq!(is_kept, method == "hrn15", "{method}");
+        assert!(!trial.checkpoints().contains(&"hrn".to_owned()), "{method}");
     }
 }
 
