@@ -9,14 +9,16 @@ use std::hash::{BuildHasher as _, RandomState};
 
 use anyhow::ensure;
 use hardnessd_core::frame::{Array, Frame, Pitch};
-use hardnessd_core::recording::is_named;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 
 use super::presses::Presses;
 
-/// Presses with fewer taxels that are not 0, over all frames, may be alike by chance.
-const LEAST_TAXELS: usize = 32;
+/// Presses with fewer taxels that are not 0, over all frames, are never compared: two of few counts are often alike.
+const LEAST_TAXELS: usize = 4;
+/// Of presses with fewer taxels than these, some may be alike by chance: less than one in so many.
+const SURE_TAXELS: usize = 32;
+const CHANCE: usize = 50;
 /// No hand or gripper presses a finger's array so hard.
 const MOST_N: f64 = 500.0;
 /// Less than noise.
@@ -127,15 +129,12 @@ pub fn beyond_contacts(presses: &Presses) -> Option<String> {
     })
 }
 
-/// A named object of recordings with two levels. Numbers that people give may begin anew for each level.
+/// An object with two levels. Numbers that people give may begin anew for each level.
 fn of_two_levels(presses: &Presses) -> Option<String> {
     let mut first = BTreeMap::<u32, usize>::new();
     let two = (0..presses.all.len()).find_map(|place| {
         let press = &presses.all[place];
-        let object = press.object.filter(|&object| is_named(object))?;
-        if press.level == 0 || press.name.is_none() {
-            return None;
-        }
+        let object = press.object.filter(|_| press.level > 0)?;
         let before = *first.entry(object).or_insert(place);
         (presses.all[before].level != press.level).then_some([before, place])
     });
@@ -144,7 +143,7 @@ fn of_two_levels(presses: &Presses) -> Option<String> {
         format!("{} (level {level})", named(presses, place))
     });
     Some(format!(
-        "one object has two levels, and is taken for two objects: {one} and {other}"
+        "one object has two levels, and is taken for two: {one} and {other}"
     ))
 }
 
@@ -169,7 +168,6 @@ fn levels(presses: &Presses) -> Vec<String> {
 /// What the frames say: copies of presses, and presses without a contact. Of each kind the number of presses, and the
 /// first of them.
 fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
-    let (state, mut first) = (RandomState::new(), HashMap::<u64, usize>::new());
     let mut counts = BTreeMap::<Kind, (usize, String)>::new();
     let mut count = |kind: Kind, place: usize, other: Option<usize>| {
         let (count, _) = counts.entry(kind).or_insert_with(|| {
@@ -178,23 +176,18 @@ fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
         });
         *count += 1;
     };
-    for (place, press) in presses.all.iter().enumerate() {
+    for place in 0..presses.all.len() {
         let frames: Vec<Vec<(u16, u32)>> = presses.contents(place).collect();
-        let taxels: usize = frames.iter().map(Vec::len).sum();
         let is_one_frame = frames.windows(2).all(|pair| pair[0] == pair[1]);
-        if taxels == 0 {
+        if frames.iter().all(Vec::is_empty) {
             count(DEAD, place, None);
         } else if is_one_frame && frames.len() >= LEAST_REPEATED {
             count(REPEATED, place, None);
         }
-        if taxels < LEAST_TAXELS {
-            continue;
-        }
-        let other = *first.entry(state.hash_one(&frames)).or_insert(place);
-        if other == place {
-            continue;
-        }
-        let before = &presses.all[other];
+    }
+    let all: Vec<usize> = (0..presses.all.len()).collect();
+    for (place, other) in copies(presses, &all) {
+        let (press, before) = (&presses.all[place], &presses.all[other]);
         let kind = if press.split != before.split {
             IN_BOTH_SPLITS
         } else if press.level != before.level && press.level > 0 && before.level > 0 {
@@ -209,15 +202,37 @@ fn contents(presses: &Presses) -> BTreeMap<Kind, (usize, String)> {
     counts
 }
 
-/// The presses of `places` but for later copies of one.
-pub fn without_copies(presses: &Presses, places: &[usize]) -> Vec<usize> {
-    let (state, mut seen) = (RandomState::new(), HashSet::new());
-    let is_first = |&&place: &&usize| {
+/// The presses of `places` whose frames are those of an earlier one, each with the first such one.
+fn copies(presses: &Presses, places: &[usize]) -> Vec<(usize, usize)> {
+    let state = RandomState::new();
+    let mut first = HashMap::<u64, usize>::new();
+    let (mut sure, mut maybe, mut small) = (Vec::new(), Vec::new(), 0);
+    for &place in places {
         let frames: Vec<Vec<(u16, u32)>> = presses.contents(place).collect();
         let taxels: usize = frames.iter().map(Vec::len).sum();
-        taxels < LEAST_TAXELS || seen.insert(state.hash_one(&frames))
-    };
-    places.iter().filter(is_first).copied().collect()
+        if taxels < LEAST_TAXELS {
+            continue;
+        }
+        let is_small = taxels < SURE_TAXELS;
+        small += usize::from(is_small);
+        let other = *first.entry(state.hash_one(&frames)).or_insert(place);
+        if other != place {
+            let found = if is_small { &mut maybe } else { &mut sure };
+            found.push((place, other));
+        }
+    }
+    if maybe.len() * CHANCE >= small {
+        sure.extend(maybe);
+    }
+    sure
+}
+
+/// The presses of `places` but for later copies of one.
+pub fn without_copies(presses: &Presses, places: &[usize]) -> Vec<usize> {
+    let copies = copies(presses, places).into_iter();
+    let later: HashSet<usize> = copies.map(|(place, _)| place).collect();
+    let is_first = |place: &usize| !later.contains(place);
+    places.iter().copied().filter(is_first).collect()
 }
 
 /// The press as its reader would find it.
@@ -258,7 +273,6 @@ fn units(presses: &Presses) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use hardnessd_core::recording::object_of;
     use hardnessd_core::verdict::ModelFrame;
 
     use super::*;
@@ -320,7 +334,7 @@ mod tests {
             ((1, 1, test, 2), "", "object 1 is in both splits"),
             // An unlabelled press agrees with every level.
             ((1, 0, test, 2), "", "object 1 is in both splits"),
-            ((1, 2, test, 2), "", ""),
+            ((1, 2, test, 2), "", "one object has two levels"),
         ] {
             check(
                 &presses(&[(1, 1, train, 1), second], 0.01),
@@ -335,14 +349,49 @@ mod tests {
     }
 
     #[test]
-    fn a_named_object_with_two_levels_is_doubtful() {
-        for (object, warning) in [(7, ""), (object_of("apple"), "one object has two levels")] {
-            let train = Split::Train;
-            let mut presses = presses(&[(object, 1, train, 1), (object, 2, train, 2)], 0.01);
-            for press in &mut presses.all {
-                press.name = Some("a.mcap press 1".to_owned());
+    fn an_object_with_two_levels_is_doubtful() {
+        let train = Split::Train;
+        let two = presses(&[(7, 1, train, 1), (7, 2, train, 2)], 0.01);
+        check(&two, None, "", "one object has two levels");
+    }
+
+    #[test]
+    fn copies_of_small_single_frames_are_found_unless_they_are_few() {
+        let of = |contents: &mut dyn Iterator<Item = u32>| {
+            let mut all = presses(&[], 1.0);
+            for (object, content) in (0..).zip(contents) {
+                let mut frame = ModelFrame::default();
+                for taxel in 0..6 {
+                    frame.newtons[300 + taxel] =
+                        0.01 * (content * 31 + taxel as u32 * 7 + 1) as f32;
+                }
+                let press = Press {
+                    object: Some(object),
+                    split: if object % 2 == 0 {
+                        Split::Train
+                    } else {
+                        Split::Test
+                    },
+                    ..Press::default()
+                };
+                all.push(press, [(0.0, None, frame.newtons)]);
             }
-            check(&presses, None, "", warning);
+            all
+        };
+        for (contents, error) in [
+            (&mut (0..200_u32) as &mut dyn Iterator<Item = u32>, ""),
+            (
+                &mut (0..200).map(|content| content / 2),
+                "100 presses in training and in test",
+            ),
+            (&mut (0..200).map(|content| content.max(1)), ""),
+        ] {
+            let found = doubtful(&of(contents)).err().map(|error| error.to_string());
+            assert!(
+                found.as_deref().unwrap_or_default().contains(error),
+                "{found:?}"
+            );
+            assert_eq!(found.is_none(), error.is_empty(), "{found:?}");
         }
     }
 

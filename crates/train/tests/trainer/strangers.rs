@@ -5,8 +5,10 @@ use std::fs;
 use std::path::Path;
 
 use hardnessd_core::verdict::BUILT_IN_HRN;
+use hardnessd_simulator::Split;
+use hrn_train::data::presses::{Press, Presses, meta, read_one};
 
-use crate::{few, hrn_train_in};
+use crate::{few, hrn_train_in, json_in, write_data};
 
 /// The last line of stderr says `expected`, and the exit code is `code`.
 fn refused(at: &Path, arguments: &str, code: i32, expected: &str) {
@@ -87,4 +89,58 @@ fn a_directory_of_something_else_stays_as_it_is() {
         assert_eq!(fs::read(other.join(name)).unwrap(), b"somebody's");
         fs::remove_dir_all(&other).unwrap();
     }
+}
+
+#[test]
+fn data_are_looked_through_before_anything_is_learnt() {
+    let directory = bench();
+    let at = directory.path();
+    let data = at.join("d.npz");
+    let presses = read_one(&data).unwrap();
+    // Some presses of the training are also in the test.
+    let mut leaked = Presses::default();
+    leaked.sources.clone_from(&presses.sources);
+    for (place, press) in presses.all.iter().enumerate() {
+        let is_first = place < 3;
+        for split in [press.split, Split::Test]
+            .into_iter()
+            .take(1 + usize::from(is_first))
+        {
+            let press = Press {
+                split,
+                ..press.clone()
+            };
+            leaked.push(press, [(0.0, None, presses.frame(place).newtons)]);
+        }
+    }
+    write_data(&at.join("leaked.npz"), &leaked, &meta(&data).unwrap());
+    fs::copy(&data, at.join("d\u{202e}.npz")).unwrap();
+    let train = "train --method features --profile smoke --out run --data";
+    for (data, code, expected) in [
+        ("leaked.npz", 1, "3 presses in training and in test"),
+        (
+            "d\u{202e}.npz",
+            78,
+            "the model could not name the files of --data",
+        ),
+    ] {
+        refused(at, &format!("{train} {data}"), code, expected);
+        assert!(!at.join("run").exists(), "{data}");
+    }
+    let output = hrn_train_in(at, &format!("{train} d.npz --labels 30"));
+    assert!(output.status.success(), "{output:?}");
+    let findings = fs::read_to_string(at.join("run/findings.txt")).unwrap();
+    assert!(
+        findings.contains("30 of 48 labelled training presses"),
+        "{findings}"
+    );
+    assert!(String::from_utf8_lossy(&output.stderr).contains(findings.trim_end()));
+    // A model is as good as itself.
+    let two = json_in(
+        at,
+        "evaluate --model m.onnx --model m.onnx --data d.npz --json",
+    );
+    assert_eq!(two["models"][0], two["models"][1]);
+    let difference = serde_json::to_string(&two["difference"]).unwrap();
+    assert!(difference.contains("\"accuracy\""), "{difference}");
 }

@@ -154,6 +154,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
     };
     let frames: Vec<f32> = file.read(array, &[ROWS, COLS], of_each)?;
     within(array, &frames, &FORCES)?;
+    let taxels = frames.iter().filter(|&&newtons| newtons != 0.0);
+    presses.frames.reserve(taxels.count());
     let moments = frames.len() / TAXELS;
     // A single frame is a press of one moment.
     let each: Vec<u32> = (0..moments as u32).collect();

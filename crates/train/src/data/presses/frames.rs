@@ -18,6 +18,12 @@ impl Frames {
         self.ends.len()
     }
 
+    /// Makes room for so many taxels that are not 0. What grows takes up to twice its room.
+    pub(super) fn reserve(&mut self, taxels: usize) {
+        self.places.reserve_exact(taxels);
+        self.newtons.reserve_exact(taxels);
+    }
+
     /// Adds a frame of all taxels.
     pub(super) fn push(&mut self, newtons: impl Iterator<Item = f32>) {
         for (place, newtons) in (0..).zip(newtons) {
