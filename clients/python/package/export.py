@@ -4,7 +4,8 @@
     python3 -m hardnessd.export takes/*.mcap --to parquet --partition --append --skip-damaged --out tables
     python3 -m hardnessd.export takes/*.mcap --to lerobot --episodes presses --out presses
 
-It reads one recording after another, and holds a bounded part of one in memory.
+It reads one recording after another, with `--partition` several at once on the processors, and holds a bounded part of
+each in memory.
 
 It needs mcap, mcap-ros2-support, numpy and pyarrow: pip install './clients/python[export]'
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import concurrent.futures
 import datetime
 import json
 import os
@@ -150,7 +152,7 @@ class Output:
 
     def __init__(self, folder: pathlib.Path, append: bool = False) -> None:
         self.folder = folder
-        self._made: List[pathlib.Path] = []
+        self.made: List[pathlib.Path] = []
         if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not append)):
             raise Problem(f"{folder}: it exists and is not an empty folder: name a new one", 74)
         self._make(folder)
@@ -159,17 +161,23 @@ class Output:
         """The path of a new file."""
         path = self.folder / name
         self._make(path.parent)
-        self._made.append(path)
+        self.made.append(path)
         return path
 
     def _make(self, folder: pathlib.Path) -> None:
         if not folder.exists():
             self._make(folder.parent)
-            folder.mkdir()
-            self._made.append(folder)
+            # Another process may make it for its own recording.
+            folder.mkdir(exist_ok=True)
+            self.made.append(folder)
+
+    def take(self, made: List[pathlib.Path]) -> None:
+        """Takes over what another process made in the folder."""
+        self.made += made
 
     def remove(self) -> None:
-        for path in reversed(self._made):
+        # A folder may hold files that were made before it was taken over, or after: the deepest goes first.
+        for path in sorted(self.made, key=lambda path: len(path.parts), reverse=True):
             try:
                 path.rmdir() if path.is_dir() else path.unlink()
             except OSError:
@@ -184,7 +192,7 @@ class Tables:
         self._output = output
         self._is_parted: bool = options.partition
         self._rows: Dict[str, List[Dict[str, Any]]] = {name: [] for name in TABLES}
-        self._counts = dict.fromkeys(TABLES, 0)
+        self.counts: Dict[str, int] = dict.fromkeys(TABLES, 0)
         self._writers: Dict[str, pq.ParquetWriter] = {}
         # The folder of a partition says the robot.
         self._schemas = dict(TABLES)
@@ -248,7 +256,7 @@ class Tables:
 
     def _write(self, name: str) -> None:
         self._writers[name].write_table(pa.Table.from_pylist(self._rows[name], schema=self._schemas[name]))
-        self._counts[name] += len(self._rows[name])
+        self.counts[name] += len(self._rows[name])
         self._rows[name].clear()
 
     def close(self) -> None:
@@ -259,7 +267,7 @@ class Tables:
         self._writers.clear()
 
     def summary(self) -> str:
-        return "rows: " + ", ".join(f"{name} {count}" for name, count in self._counts.items())
+        return "rows: " + ", ".join(f"{name} {count}" for name, count in self.counts.items())
 
 
 class Row(NamedTuple):
@@ -617,6 +625,40 @@ def _column(values: Array) -> pa.Array:
     return pa.ListArray.from_arrays(np.arange(0, count * rows + 1, rows, dtype=np.int32), inner)
 
 
+def _part(path: str, name: str, options: argparse.Namespace) -> Tuple[List[pathlib.Path], Dict[str, int]]:
+    """Writes the files of one recording, in a process of its own. Returns what was made, and the rows of each table."""
+    output = Output(pathlib.Path(options.out), append=True)
+    try:
+        tables = Tables(output, options)
+        with recording.open(path) as take:
+            tables.add(name, take)
+        return output.made, tables.counts
+    except BaseException:
+        output.remove()
+        raise
+
+
+def _parts(taken: Sequence[Tuple[str, str]], output: Output, options: argparse.Namespace) -> Tables:
+    """Writes the files of all recordings, on all processors. Returns the tables, which count the rows."""
+    tables = Tables(output, options)
+    with concurrent.futures.ProcessPoolExecutor() as pool:
+        parts = [pool.submit(_part, path, name, options) for path, name in taken]
+        try:
+            concurrent.futures.wait(parts, return_when=concurrent.futures.FIRST_EXCEPTION)
+        finally:
+            # Without an error, nothing is left to cancel.
+            pool.shutdown(cancel_futures=True)
+            for part in parts:
+                if not part.cancelled() and part.exception() is None:
+                    made, counts = part.result()
+                    output.take(made)
+                    tables.counts = {name: count + counts[name] for name, count in tables.counts.items()}
+    for part in parts:
+        if not part.cancelled():
+            part.result()
+    return tables
+
+
 LEFT_OUT = "left-out.tsv"
 """The file that names the recordings that `--skip-damaged` left out, and why."""
 
@@ -643,10 +685,14 @@ def export(paths: Sequence[str], options: argparse.Namespace) -> str:
             left_out.append((path, str(error)))
     output = Output(pathlib.Path(options.out), options.append)
     try:
-        writer = LeRobot(output, options) if options.to == "lerobot" else Tables(output, options)
-        for path, name in taken:
-            with recording.open(path) as take:
-                writer.add(name, take)
+        writer: Any
+        if options.partition and len(taken) > 1:
+            writer = _parts(taken, output, options)
+        else:
+            writer = LeRobot(output, options) if options.to == "lerobot" else Tables(output, options)
+            for path, name in taken:
+                with recording.open(path) as take:
+                    writer.add(name, take)
         writer.close()
         if left_out:
             lines = "".join(f"{path}\t{why}\n" for path, why in left_out)
