@@ -152,6 +152,8 @@ impl Header {
         let size = size(&self.descr);
         let size = size.ok_or_else(|| unusable(format!("dtype '{}'", short(&self.descr))))?;
         let mut values = Vec::new();
+        // What grows takes up to twice its room. A header may promise more than there is.
+        let _ = values.try_reserve_exact(count);
         let mut block = Vec::with_capacity(BLOCK_BYTES);
         while values.len() < count {
             let wanted = (count - values.len()).min(BLOCK_BYTES / size) * size;

@@ -16,8 +16,8 @@ use crate::found::{
 };
 use crate::layout::{Parts, Proposal};
 use crate::model::{
-    self, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, SERPENTINE_BITS, Score,
-    UNUSED_DIGIT_BITS,
+    self, ALONE_BITS, CHANNEL_BITS, CONSTANT_BITS, EXPECTED_BITS, MOST_CHANNELS, SERPENTINE_BITS,
+    SURE_BITS, Score, UNUSED_DIGIT_BITS,
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
@@ -398,6 +398,48 @@ impl Search<'_> {
         })
     }
 
+    /// The doubt that the first cell is none, where there may be one more behind the last, and the other way around.
+    fn shifted(&self, best: &Candidate, pictures: &Pictures) -> Option<String> {
+        let Candidate {
+            array,
+            format,
+            place,
+            ..
+        } = best;
+        let (bytes, length) = (format.cell.bytes(), place.beside.len());
+        let (last, period) = (pictures.changes.len() - 1, self.frames.period);
+        let may_be_cell = |end: &[Beside]| {
+            let mut unknown = place.unknown();
+            unknown.any(|unknown| unknown.kind == Kind::Active && end.contains(unknown))
+        };
+        let as_neighbour = |pictures: &Pictures, at| {
+            model::as_neighbour(pictures, array.cols, format.channels, at)
+        };
+        // The cell at an end may be none, and the one at the other end of cells that begin elsewhere acts no less as a
+        // neighbour.
+        let may_begin_at = |start: usize, own: usize, other: usize| {
+            let bits = as_neighbour(pictures, own);
+            let place = Place {
+                start: start % period,
+                ..place.clone()
+            };
+            let moved = self.pictures(&self.presses, &place, *format);
+            let moved = moved.map(|moved| match best.order {
+                Order::Serpentine => moved.turned(array.cols, format.channels),
+                _ => moved,
+            });
+            let of_other = moved.map_or(0.0, |moved| as_neighbour(&moved, other));
+            (!pictures.changes[own] || bits < -ALONE_BITS) && bits < of_other + SURE_BITS
+        };
+        let is_shifted = may_be_cell(&place.beside[..bytes.min(length)])
+            && may_begin_at(place.start + bytes, 0, last)
+            || may_be_cell(&place.beside[length.saturating_sub(bytes)..])
+                && may_begin_at(place.start + period - bytes, last, 0);
+        is_shifted.then(|| {
+            format!("all cells may be {bytes} bytes further: press the first taxels and the last")
+        })
+    }
+
     /// Finds the checksum among the bytes beside the cells.
     fn checked(&self, place: Place, tried: &mut Tried) -> Place {
         if place.unknown().next().is_none() {
@@ -479,7 +521,7 @@ impl Search<'_> {
             let of_place = || {
                 self.stuck_mark(candidate, candidates)
                     .or_else(|| other_cells(candidate, candidates))
-                    .or_else(|| shifted(candidate, &pictures))
+                    .or_else(|| self.shifted(candidate, &pictures))
             };
             if is_best && !proposal.is_board && known.is_complete() {
                 // No more can be said of the array, and the cells may still begin elsewhere.
@@ -555,29 +597,6 @@ fn other_cells(best: &Candidate, candidates: &[Candidate]) -> Option<String> {
     let resting = best.place.resting();
     (resting > MOST_RESTING).then(|| {
         format!("{resting} bytes beside the cells look like cells at rest: press the edges too")
-    })
-}
-
-/// The doubt that the first cell is none, where there may be one more behind the last, and the other way around.
-fn shifted(best: &Candidate, pictures: &Pictures) -> Option<String> {
-    let Candidate {
-        array,
-        format,
-        place,
-        ..
-    } = best;
-    let bytes = format.cell.bytes();
-    let is_alone = |at| model::is_alone(pictures, array.cols, format.channels, at);
-    let length = place.beside.len();
-    let may_be_cell = |end: &[Beside]| {
-        let mut unknown = place.unknown();
-        unknown.any(|unknown| unknown.kind == Kind::Active && end.contains(unknown))
-    };
-    let last = pictures.changes.len() - 1;
-    let is_shifted = may_be_cell(&place.beside[..bytes.min(length)]) && is_alone(0)
-        || may_be_cell(&place.beside[length.saturating_sub(bytes)..]) && is_alone(last);
-    is_shifted.then(|| {
-        format!("all cells may be {bytes} bytes further: press the first taxels and the last")
     })
 }
 
