@@ -50,10 +50,6 @@ pub(crate) const UNUSED_DIGIT_BITS: f64 = 2.0;
 pub(crate) const MOST_CHANNELS: usize = 4;
 /// The most arrays in a stack.
 const MOST_STACKED: usize = 4;
-/// So many presses that surely go on from row to row show that there is no stack.
-const GOING_ON: f64 = 2.0;
-/// A cell is pressed from such a share of the strongest one on.
-const PRESSED: f32 = 1.0 / 16.0;
 /// By so many bits, numbers at an end of the cells are likelier alone than a taxel.
 pub(crate) const ALONE_BITS: f64 = 2.0;
 /// The longest row that is tried.
@@ -300,55 +296,20 @@ pub(crate) fn other_row(pictures: &Pictures, cols: usize, channels: usize) -> Op
 }
 
 /// The number of arrays, such as one for each axis of a force, whose stack surely explains the presses better than one
-/// array: where one ends, the next does not go on. All cells say so, and those that are pressed alone too, for noise
-/// goes on nowhere.
+/// array: where one ends, the next does not go on.
 pub(crate) fn stack(
     pictures: &Pictures,
     Array { rows, cols }: Array,
     channels: usize,
 ) -> Option<usize> {
-    let pressed = pressed(pictures, cols * channels);
-    let bits = |rows: usize| {
-        let cells = stacked(pictures, cols, channels, rows);
-        let of_press = |(cells, pressed): (&Vec<f64>, &Vec<bool>)| -> f64 {
-            let cells = cells.iter().zip(pressed);
-            cells.filter_map(|(bits, &is)| is.then_some(bits)).sum()
-        };
-        let pressed: Vec<f64> = cells.iter().zip(&pressed).map(of_press).collect();
-        (sums(&cells), pressed)
-    };
-    let (all, own) = bits(usize::MAX);
+    let own = self::rows(pictures, cols, channels);
     let is_stack = |count: &usize| {
-        let (other_all, other) = bits(rows / count);
-        // A press may end where an array does, but it goes on where there is only one.
-        let goes_on = own.iter().zip(&other).zip(&pictures.weights);
-        let goes_on = goes_on.filter(|((own, other), _)| *other - *own >= PRESS_BITS);
+        let bits = sums(&stacked(pictures, cols, channels, rows / count));
         // The three axes of a force are the likeliest stack.
         let most = if *count == 3 { 0.0 } else { -SURE_BITS };
-        goes_on.map(|(_, weight)| weight).sum::<f64>() < GOING_ON
-            && lead(&own, &other, &pictures.weights) < most
-            && lead(&all, &other_all, &pictures.weights) < most
+        lead(&own, &bits, &pictures.weights) < most
     };
     (2..=MOST_STACKED).find(|count| rows.is_multiple_of(*count) && rows > *count && is_stack(count))
-}
-
-/// By press, the cells that are pressed, and those `below` so many places behind one.
-fn pressed(pictures: &Pictures, below: usize) -> Vec<Vec<bool>> {
-    let of_press = |press: &Vec<Picture>| -> Vec<bool> {
-        let far = |at: usize| {
-            let changes = press.iter().map(|picture| picture.change[at].abs());
-            changes.fold(0.0, f32::max)
-        };
-        let far: Vec<f32> = (0..pictures.changes.len()).map(far).collect();
-        let most = far.iter().copied().fold(0.0, f32::max);
-        let least = (PRESSED * most).max(NOISE * pictures.noise);
-        let is_pressed = |at: usize| far[at] >= least;
-        let cells = 0..far.len();
-        cells
-            .map(|at| is_pressed(at) || at >= below && is_pressed(at - below))
-            .collect()
-    };
-    pictures.presses.iter().map(of_press).collect()
 }
 
 /// By how many bits the number `at` an end of the cells acts as its neighbours in rows do, rather than as one alone.

@@ -50,6 +50,8 @@ const INTERLEAVED_BITS: f64 = 60.0;
 const MAYBE_INTERLEAVED: f64 = 0.9;
 /// Four columns are the numbers of a taxel where cells of a row differ by so many times as much as those of a column.
 const UNLIKE: f64 = 1.1;
+/// The full scale of a converter of 10 bits. Those of fewer are one byte.
+const LEAST_FULL_SCALE: f32 = 1023.0;
 /// One in so many frames may be damaged.
 const DAMAGED: usize = 10;
 /// The number of frames that a checksum is tried on.
@@ -373,8 +375,9 @@ impl Search<'_> {
     /// The doubt that the mark is a taxel at full scale, where other bytes may be the mark.
     fn stuck_mark(&self, best: &Candidate, candidates: &[Candidate]) -> Option<String> {
         let Candidate { format, place, .. } = best;
-        let mark: Option<Vec<u8>> = place.mark()?.map(|at| place.constant(at)).collect();
-        let mark = numbers::numbers(format.cell, &mark?);
+        let bytes: Option<Vec<u8>> = place.mark()?.map(|at| place.constant(at)).collect();
+        let bytes = bytes?;
+        let mark = numbers::numbers(format.cell, &bytes);
         let of_frame = |index| {
             numbers::numbers(
                 format.cell,
@@ -383,15 +386,20 @@ impl Search<'_> {
         };
         let all = self.presses.frames().flat_map(of_frame);
         let most = all.fold(f32::MIN, f32::max);
-        // Full scale of a converter has all its bits set.
+        // Full scale of a converter has all its bits set. The mark may be among the cells, and larger.
         let is_full = |&number: &f32| {
-            number == most || number > most && (number as u32 + 1).is_power_of_two()
+            let may_be = number > most || number >= LEAST_FULL_SCALE;
+            number == most || may_be && (number as u32 + 1).is_power_of_two()
         };
         let is_full_scale = !mark.is_empty() && mark.iter().all(is_full);
         let mut others = candidates
             .iter()
             .filter(|other| other.format == *format && other.place.bytes == place.bytes);
-        (is_full_scale && others.any(|other| other.place.start != place.start)).then(|| {
+        // FF FF is a usual mark, and 0F FF is none.
+        let is_long = mark.iter().all(|&number| number >= LEAST_FULL_SCALE);
+        let is_converters = is_long && bytes.iter().any(|&byte| byte != u8::MAX);
+        let may_be = is_converters || others.any(|other| other.place.start != place.start);
+        (is_full_scale && may_be).then(|| {
             "the mark may be a taxel that is stuck at full scale, and other bytes the mark: look it up in the data \
              sheet"
                 .to_owned()
