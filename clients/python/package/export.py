@@ -22,7 +22,7 @@ import pathlib
 import signal
 import sys
 import urllib.parse
-from typing import Any, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Sequence, Tuple
+from typing import Any, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Sequence, Tuple, Union
 
 import numpy as np
 import pyarrow as pa
@@ -685,7 +685,7 @@ def export(paths: Sequence[str], options: argparse.Namespace) -> str:
             left_out.append((path, str(error)))
     output = Output(pathlib.Path(options.out), options.append)
     try:
-        writer: Any
+        writer: Union[LeRobot, Tables]
         if options.partition and len(taken) > 1:
             writer = _parts(taken, output, options)
         else:
