@@ -171,12 +171,8 @@ class Output:
             folder.mkdir(exist_ok=True)
             self.made.append(folder)
 
-    def take(self, made: List[pathlib.Path]) -> None:
-        """Takes over what another process made in the folder."""
-        self.made += made
-
     def remove(self) -> None:
-        # A folder may hold files that were made before it was taken over, or after: the deepest goes first.
+        # Several processes may have made something in one folder, so the deepest goes first.
         for path in sorted(self.made, key=lambda path: len(path.parts), reverse=True):
             try:
                 path.rmdir() if path.is_dir() else path.unlink()
@@ -644,18 +640,16 @@ def _parts(taken: Sequence[Tuple[str, str]], output: Output, options: argparse.N
     with concurrent.futures.ProcessPoolExecutor() as pool:
         parts = [pool.submit(_part, path, name, options) for path, name in taken]
         try:
-            concurrent.futures.wait(parts, return_when=concurrent.futures.FIRST_EXCEPTION)
+            for part in parts:
+                part.result()
         finally:
-            # Without an error, nothing is left to cancel.
+            # What was made counts also after an error, because it is removed then.
             pool.shutdown(cancel_futures=True)
             for part in parts:
                 if not part.cancelled() and part.exception() is None:
                     made, counts = part.result()
-                    output.take(made)
+                    output.made += made
                     tables.counts = {name: count + counts[name] for name, count in tables.counts.items()}
-    for part in parts:
-        if not part.cancelled():
-            part.result()
     return tables
 
 

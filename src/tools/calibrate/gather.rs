@@ -143,6 +143,8 @@ impl Gathered {
                 press.moments.push(moment);
                 press.forces_n.push(frame.force_n.unwrap_or_default());
                 press.frames.push(frame.newtons);
+            } else {
+                self.bytes -= size_of_val(&frame.newtons[..]);
             }
         }
         self.presses.push(press);
@@ -190,12 +192,13 @@ mod tests {
             bytes,
             ..Gathered::default()
         };
+        assert!(of(MOST_BYTES).check_size(path).is_ok());
         let error = of(MOST_BYTES + 1).check_size(path).unwrap_err().line();
         assert!(
             error.contains("x: its presses take more than 1 GB"),
             "{error}"
         );
-        // All frames count as soon as they come: in the end, those that are kept are as large.
+        // Frames count as soon as they come, and for as long as they are kept.
         let (recording, sensor) = of_a_press(|_| {}, None, true);
         let hrn = hrn();
         let mut gathered = Gathered::default();
@@ -203,8 +206,7 @@ mod tests {
         Played::open(path, recording.as_slice(), &sensor, &hrn, None)
             .unwrap()
             .play(|played, events, at| {
-                let pipeline = played.playback.pipeline(sensor.name());
-                if let Some(pipeline) = pipeline {
+                if let Some(pipeline) = played.playback.pipeline(sensor.name()) {
                     gathered.take(events, at, pipeline);
                 }
                 let under_way = gathered.frames.iter().map(|(frame, _)| &frame.newtons);
@@ -213,7 +215,7 @@ mod tests {
                     .chain(ended)
                     .map(|frame| size_of_val(&frame[..]))
                     .sum();
-                assert!(gathered.bytes >= kept, "{} for {kept}", gathered.bytes);
+                assert_eq!(gathered.bytes, kept);
                 most = most.max(gathered.frames.len());
                 Ok(true)
             })

@@ -1,8 +1,8 @@
 //! Forests as a plan that is quick to follow.
 //!
 //! In: the graph as the inference library has read it. Out: the same graph, whose forests find the votes of a leaf at
-//! once. The library walks through the votes of all leaves before it (tract-onnx-opl 0.23, `eval_unchecked`): scikit-learn's
-//! default forests took 20 to 40 ms. The votes are added in the same order, so the numbers are the same.
+//! once. The library walks through the votes of all leaves before it (tract-onnx-opl 0.23, `eval_unchecked`), so a
+//! default forest of scikit-learn took 20 to 40 ms. The votes are added in the same order: the numbers are the same.
 
 use tract_onnx::tract_core::internal::*;
 use tract_onnx_opl::ml::tree_ensemble_classifier::{TreeEnsembleClassifier, TreeEnsembleData};
