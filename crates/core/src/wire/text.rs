@@ -286,11 +286,13 @@ fn after_heading(
     if all < cells.count() {
         return Ok(Found::Held(numbers));
     }
-    if all > cells.count() {
+    // The first held line begins with the heading. It may have a number of its own, as in "Frame 17".
+    let in_title = lines.held.front().map_or(0, |line| line.numbers);
+    let is_numbered = in_title < cells.array.cols && all == cells.count() + in_title;
+    if all > cells.count() && !is_numbered {
         return Err(wrong_numbers(all, cells));
     }
-    // The first held line begins with the heading.
-    let (_, values) = cells_at_end(&bytes[heading.len()..end], cells, all)?;
+    let (_, values) = cells_at_end(&bytes[heading.len()..end], cells, cells.count())?;
     let frame = of_values(cells, values)?;
     Ok(Found::Frame { start: 0, frame })
 }
@@ -330,6 +332,7 @@ fn cells_at_end(text: &[u8], cells: &Cells, count: usize) -> Result<(usize, Vec<
         let found = match number(word) {
             Some(value) => Some((word.len(), value)),
             None if is_first && (!is_word(word) || ends_with_number(word)) => number_at_end(word),
+            None if word == b"|" => continue,
             None if values.len().is_multiple_of(cells.array.cols) && is_word(word) => continue,
             None => None,
         };

@@ -617,6 +617,7 @@ fn text_has_any_separators_signs_decimals_and_words_beside_the_rows() {
         "{\n  \"row0\": [1.5, -2, 3e2],\n  \"row1\": [0.25, 5, 6]\n}\n",
         "0: 1.5 -2 300 mV\n1: 0.25 5 6 mV\n--\n",
         "| 1.5 | -2 300 |\n| 1.5 -2 300 |\n| 0.25 5 6 |\n+----+\n",
+        "1.5 | -2 | 300\n0.25 | 5 | 6\n\n",
     ];
     let all = texts.join(banners);
     for chunk in [1, 7, all.len()] {
@@ -629,8 +630,14 @@ fn text_has_any_separators_signs_decimals_and_words_beside_the_rows() {
     }
     // One array of two.
     let dual =
-        "Sensor 1\n1 2 3\n4 5 6\nSensor 2\n7 8 9\n1 1 1\nSensor 11\n2 3 4\n5 6 7\nEND\n".repeat(3);
-    for (heading, first) in [("Sensor 1", 1.0), ("Sensor 2", 7.0), ("Sensor 11", 2.0)] {
+        "Sensor 1\n1 2 3\n4 5 6\nSensor 2\n7 8 9\n1 1 1\nSensor 11\n2 3 4\n5 6 7\nPad 12\n8 1 2\n3 4 5\nEND\n"
+            .repeat(3);
+    for (heading, first) in [
+        ("Sensor 1", 1.0),
+        ("Sensor 2", 7.0),
+        ("Sensor 11", 2.0),
+        ("Pad", 8.0),
+    ] {
         let layout = layout(&format!("heading = '{heading}'"));
         for chunk in [1, dual.len()] {
             let (found, damaged) = decode(&layout, dual.as_bytes().chunks(chunk));
