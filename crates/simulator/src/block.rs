@@ -187,6 +187,7 @@ mod tests {
     use super::super::substance::{Creep, Law, Substance};
     use super::super::texture::Patch;
     use crate::random::Stream;
+    use crate::tests::near;
 
     const SIDE_MM: f64 = 24.0 * CELL_MM;
     const SQUARE: FlatFace = FlatFace::Rectangle {
@@ -237,11 +238,6 @@ mod tests {
         (contact.approach_mm, [at(56, 56), at(56, 44)])
     }
 
-    fn near(found: f64, expected: f64, tolerance: f64) {
-        let off = found / expected - 1.0;
-        assert!(off.abs() < tolerance, "{found}, expected {expected}");
-    }
-
     #[test]
     fn a_soft_block_is_a_column_and_carries_an_even_load() {
         let mut bench = Bench::under(cover(1e4, 1.0));
@@ -250,11 +246,8 @@ mod tests {
             let (approach_mm, [middle, rim]) = pressed(&mut bench, &specimen, 8.0);
             let shape = SIDE_MM / (8.0 * height_mm);
             let modulus = young_mpa * (1.0 + 2.0 * shape * shape);
-            near(
-                approach_mm,
-                8.0 * height_mm / (SIDE_MM * SIDE_MM * modulus),
-                0.03,
-            );
+            let expected = 8.0 * height_mm / (SIDE_MM * SIDE_MM * modulus);
+            near(approach_mm, expected, 0.03, "a column");
             assert!(
                 (0.9..1.1).contains(&middle) && (0.8..1.2).contains(&rim),
                 "{middle} {rim}"
@@ -283,18 +276,13 @@ mod tests {
         let share =
             pressure[(56 - corner.0) * width + 56 - corner.1] / pressure.iter().sum::<f32>();
         let mean = 10.0 * f64::from(share) / (CELL_MM * CELL_MM);
-        near(
-            thin.approach_mm,
-            mean * 0.5 * confined_compliance(0.45) / plane_strain(2.0),
-            0.015,
-        );
+        let expected = mean * 0.5 * confined_compliance(0.45) / plane_strain(2.0);
+        near(thin.approach_mm, expected, 0.015, "a thin cover");
         let round = FlatFace::Round { radius_mm: 14.0 };
         let punch = body(round, 20.0, 2e5, 0.3, 0.0);
-        let contact = Bench::under(cover(1.0, 1e4))
-            .press(&punch, 10.0, 0.0, 0.0)
-            .2;
+        let (_, _, contact) = Bench::under(cover(1.0, 1e4)).press(&punch, 10.0, 0.0, 0.0);
         let expected = 10.0 / (2.0 * plane_strain(1.0) * contact.radius_mm);
-        near(contact.approach_mm, expected, 0.015);
+        near(contact.approach_mm, expected, 0.015, "a thick cover");
     }
 
     #[test]
@@ -303,7 +291,7 @@ mod tests {
         let specimen = body(SQUARE, 2.0, 0.5, 0.3, 0.0);
         let (approach_mm, _) = pressed(&mut bench, &specimen, 8.0);
         let even = 8.0 / (SIDE_MM * SIDE_MM) * 2.0 * confined_compliance(0.3) * (1.0 - 0.09) / 0.5;
-        near(approach_mm, even, 0.06);
+        near(approach_mm, even, 0.06, "a sheet");
     }
 
     #[test]
@@ -317,6 +305,6 @@ mod tests {
         let mean = 10.0 / (SIDE_MM * SIDE_MM);
         let expected = 1.0 + young_mpa / height_mm * tilt * 11.5 * CELL_MM / mean;
         assert!((middle - 1.0).abs() < 0.1, "{middle}");
-        near(rim, expected, 0.1);
+        near(rim, expected, 0.1, "the rim");
     }
 }

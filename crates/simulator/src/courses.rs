@@ -256,8 +256,7 @@ impl Plan {
             .map(|number| first_s + f64::from(number) * period_s)
             .take_while(|&time_s| time_s < last_s)
             .map(|time_s| {
-                let (_, forces) = felt.at(time_s);
-                let film_n = film.advance(&sensor.design, &forces, period_s);
+                let film_n = film.advance(&sensor.design, &felt.at(time_s), period_s);
                 (time_s, sensor.felt(&sensor.read(&film_n, gain, noise)))
             })
             .unzip();

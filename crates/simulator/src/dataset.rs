@@ -154,17 +154,12 @@ mod tests {
                 let count = |kind| numbers.iter().filter(|&&n| of(n) == kind).count();
                 (0..kinds).map(count).collect()
             };
-            let (postures, forces) = (
-                times(POSTURES, |n| n % POSTURES),
-                times(FORCES, |n| n / POSTURES),
-            );
-            for (times, name) in [(postures, "postures"), (forces, "forces")] {
+            let postures = times(POSTURES, |n| n % POSTURES);
+            let forces = times(FORCES, |n| n / POSTURES);
+            for times in [postures, forces] {
                 assert_eq!(times.iter().sum::<usize>(), count);
                 let (least, most) = (times.iter().min(), times.iter().max());
-                assert!(
-                    most.unwrap() - least.unwrap() <= 1,
-                    "{count}: {name} {times:?}"
-                );
+                assert!(most.unwrap() - least.unwrap() <= 1, "{count}: {times:?}");
             }
             assert!(numbers.is_sorted_by(|a, b| a < b), "{numbers:?}");
         }

@@ -141,8 +141,9 @@ impl Durometer {
 #[cfg(test)]
 mod tests {
     use super::super::material::Material;
-    use super::super::substance::Law;
+    use super::super::substance::{Creep, Law};
     use super::*;
+    use crate::tests::near;
 
     #[test]
     fn the_tables_moduli_are_what_the_durometer_gives() {
@@ -162,10 +163,8 @@ mod tests {
             ] {
                 let held = properties.young_mpa(shore);
                 let found = Durometer::new(&properties.substance).young_mpa(shore);
-                assert!(
-                    (held / found - 1.0).abs() < tolerance,
-                    "{material:?} at Shore OO {shore}: table {held}, durometer {found}"
-                );
+                let what = format!("{material:?} at Shore OO {shore}");
+                near(held, found, tolerance, &what);
             }
         }
     }
@@ -186,10 +185,9 @@ mod tests {
             others.is_sorted_by(|thick, thin| thick < thin),
             "{forces:?}"
         );
-        let thick = forces[0] / force_n(solid);
-        assert!((thick - 1.0).abs() < 0.01, "{thick}");
-        let thin = thin / (core * force_n(Substance { nu: 0.3, ..solid }));
-        assert!((thin - 1.0).abs() < 0.05, "{thin}");
+        near(forces[0], force_n(solid), 0.01, "thick");
+        let core_n = core * force_n(Substance { nu: 0.3, ..solid });
+        near(*thin, core_n, 0.05, "thin");
     }
 
     #[test]
@@ -204,7 +202,7 @@ mod tests {
         // 94.5 and below, the indenter sinks in by a tenth of its radius or more.
         let wood = Material::Wood.properties().substance;
         let elastic = Substance {
-            creep: [super::super::substance::Creep::NONE; 2],
+            creep: [Creep::NONE; 2],
             ..wood
         };
         let shore = 95.0;
@@ -213,6 +211,6 @@ mod tests {
             (9.0 * force_n.powi(2) / (16.0 * RADIUS_MM * depth_mm(shore).powi(3))).sqrt();
         let expected = plane_strain * (1.0 - elastic.nu.powi(2));
         let found = Durometer::new(&elastic).young_mpa(shore);
-        assert!((found / expected - 1.0).abs() < 0.06, "{found}, {expected}");
+        near(found, expected, 0.06, "the modulus");
     }
 }

@@ -34,6 +34,8 @@ mod solved;
 mod dataset;
 mod courses;
 mod sequence;
+#[cfg(test)]
+mod tests;
 
 pub use courses::{LabelledCourse, Sample, courses};
 pub use dataset::{LabelledSample, dataset};

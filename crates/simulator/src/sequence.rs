@@ -241,7 +241,7 @@ impl Sequence {
         let times = (self.frames..).map(|number| number as f64 * period_s - touch_s);
         self.ready.clear();
         for time_s in times.take_while(|&time_s| time_s < solved.duration_s()) {
-            let (_, forces) = felt.at(time_s);
+            let forces = felt.at(time_s);
             let crept = self.film.advance(&self.sensor.design, &forces, period_s);
             self.ready.push_back(SequenceFrame {
                 raw: self.sensor.read(&crept, gain, noise),

@@ -36,8 +36,8 @@ struct SolvedStep {
 
 /// A press as the taxels of a grid feel it.
 pub(super) struct FeltPress {
-    /// Times, the force and those of the taxels in newtons. Forces are linear between them.
-    moments: Vec<(f64, f64, Vec<f32>)>,
+    /// Times, and the forces of the taxels in newtons. Forces are linear between them.
+    moments: Vec<(f64, Vec<f32>)>,
 }
 
 /// The number of forces solved while loading, and while unloading. With twice as many, less of the
@@ -101,7 +101,7 @@ impl SolvedPress {
     pub(super) fn felt(&self, grid: &Grid) -> FeltPress {
         let moment = |step: &SolvedStep| {
             let taxels_n = grid.taxel_forces(&step.pressure, self.window);
-            (step.time_s, step.force_n, taxels_n)
+            (step.time_s, taxels_n)
         };
         FeltPress {
             moments: self.moments.iter().map(moment).collect(),
@@ -110,17 +110,16 @@ impl SolvedPress {
 }
 
 impl FeltPress {
-    /// The force of the press and those of the taxels in newtons, `time_s` after the touch; zero before and
-    /// after the press.
-    pub(super) fn at(&self, time_s: f64) -> (f64, Vec<f32>) {
-        let after = self.moments.partition_point(|&(at_s, ..)| at_s <= time_s);
+    /// The forces of the taxels in newtons, `time_s` after the touch; zero before and after the press.
+    pub(super) fn at(&self, time_s: f64) -> Vec<f32> {
+        let after = self.moments.partition_point(|&(at_s, _)| at_s <= time_s);
         if after == 0 || after == self.moments.len() {
-            return (0.0, vec![0.0; self.moments[0].2.len()]);
+            return vec![0.0; self.moments[0].1.len()];
         }
-        let ((a_s, a_n, a), (b_s, b_n, b)) = (&self.moments[after - 1], &self.moments[after]);
+        let ((a_s, a), (b_s, b)) = (&self.moments[after - 1], &self.moments[after]);
         let part = (time_s - a_s) / (b_s - a_s);
         let taxels = a.iter().zip(b).map(|(a, b)| a + part as f32 * (b - a));
-        (a_n + part * (b_n - a_n), taxels.collect())
+        taxels.collect()
     }
 }
 
@@ -367,25 +366,8 @@ fn left(time_s: f64, tau_s: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::super::material::Material;
-    use super::super::object::{Face, Pose};
-    use super::super::press::Specimen;
-    use super::super::texture::Patch;
+    use super::super::press::tests::ball;
     use super::*;
-    use crate::random::Stream;
-
-    fn specimen(material: Material, face: &Face) -> Specimen {
-        let properties = material.properties();
-        let mut stream = Stream::new(4, "course");
-        let pose = Pose::draw(face, &mut stream.child(0));
-        let patch = Patch::new(&properties.substance.texture, 1.0, 0.875, &mut stream);
-        Specimen::new(
-            properties.substance,
-            properties.young_mpa(properties.shore.mean),
-            face,
-            &pose,
-            &patch,
-        )
-    }
 
     #[test]
     fn an_element_keeps_to_its_closed_form_at_50_hz() {
@@ -414,25 +396,15 @@ mod tests {
     #[test]
     fn force_relaxes_in_the_hold_as_creep_and_arm_say() {
         // Soft candy's compliance grows by up to 60 %, which the arm and the growing contact share.
-        let specimen = specimen(Material::SoftCandy, &Face::ball(27.0));
-        let course = SolvedPress::new(&mut Bench::default(), &specimen, Arm::default(), 12.0, 1.5);
-        let top = course
-            .moments
-            .iter()
-            .map(|moment| moment.force_n)
-            .fold(0.0, f64::max);
-        let hold: Vec<&SolvedStep> = course
-            .moments
-            .iter()
-            .skip_while(|moment| moment.force_n < top)
-            .take(10)
-            .collect();
+        let ball = ball(Material::SoftCandy, 1.0);
+        let course = SolvedPress::new(&mut Bench::default(), &ball, Arm::default(), 12.0, 1.5);
+        let forces_n = course.moments.iter().map(|moment| moment.force_n);
+        let top = forces_n.clone().fold(0.0, f64::max);
+        let hold = forces_n.skip_while(|&force_n| force_n < top);
+        let hold: Vec<f64> = hold.take(10).collect();
         assert!((top - 12.0).abs() < 1e-9);
-        assert!(
-            hold.windows(2)
-                .all(|pair| pair[1].force_n < pair[0].force_n)
-        );
-        let kept = hold[9].force_n / top;
+        assert!(hold.is_sorted_by(|before, after| before > after));
+        let kept = hold[9] / top;
         assert!((0.75..0.97).contains(&kept), "{kept} of the force is left");
     }
 }

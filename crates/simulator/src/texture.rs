@@ -111,6 +111,7 @@ impl Patch {
 mod tests {
     use super::super::material::Material;
     use super::*;
+    use crate::tests::near;
 
     #[test]
     fn rms_height_and_grain_are_those_of_the_table() {
@@ -128,16 +129,10 @@ mod tests {
                 }
             }
             let rms_um = 1e3 * (square / (4000.0 * seeds as f64)).sqrt();
-            assert!(
-                (rms_um / texture.rms_um - 1.0).abs() < 0.1,
-                "{material:?}: {rms_um} um"
-            );
+            near(rms_um, texture.rms_um, 0.1, material.name());
             // Slopes across the grain are steeper by the anisotropy.
             let grain = (across / along).sqrt();
-            assert!(
-                (grain / texture.anisotropy - 1.0).abs() < 0.2,
-                "{material:?}: grain {grain}"
-            );
+            near(grain, texture.anisotropy, 0.2, material.name());
         }
     }
 }

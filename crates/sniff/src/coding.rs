@@ -137,22 +137,16 @@ fn lengths<'a>(frames: impl Iterator<Item = &'a [u8]>) -> impl Iterator<Item = (
         .map(move |length| (length, usual))
 }
 
-/// Whether each frame is a chain of distances to the next zero.
+/// Whether nearly all frames that end with 0 can be unpacked.
 fn is_cobs(bytes: &[u8]) -> bool {
-    let is_chain = |frame: &[u8]| {
-        let mut at = 0;
-        while at < frame.len() {
-            at += usize::from(frame[at]);
-        }
-        at == frame.len()
-    };
     let frames = bytes
-        .split(|&byte| byte == 0)
-        .filter(|frame| !frame.is_empty())
+        .split_inclusive(|&byte| byte == 0)
+        .filter(|frame| frame.len() > 1)
         .take(MOST_FRAMES);
     let frames: Vec<&[u8]> = frames.collect();
-    let long = frames.iter().filter(|frame| frame.len() > 4).count();
-    10 * long >= 9 * frames.len() && mostly(frames.into_iter(), is_chain)
+    let long = frames.iter().filter(|frame| frame.len() > 5).count();
+    let is_packed = |frame: &[u8]| Framing::Cobs.unpacked(frame).is_some();
+    10 * long >= 9 * frames.len() && mostly(frames.into_iter(), is_packed)
 }
 
 const ALL_ONES: u8 = 0xFF;

@@ -66,9 +66,8 @@ pub enum Failure {
     )]
     NoPress(usize),
     /// The array is larger than any that the daemon reads.
-    #[error("found an array of about {rows}x{cols} taxels, expected at most 64x64")]
-    #[allow(missing_docs, reason = "the names say all")]
-    TooLarge { rows: usize, cols: usize },
+    #[error("found an array of about {0} taxels, expected at most 64x64")]
+    TooLarge(Array),
     /// No other failure is looked for beside this one.
     #[error("{0}")]
     Sure(String),
@@ -81,17 +80,13 @@ impl Failure {
             Self::NotPeriodic(_) => 0,
             Self::NoArray(_) => 1,
             Self::NoPress(_) => 2,
-            Self::TooLarge { .. } => 3,
+            Self::TooLarge(_) => 3,
             Self::Sure(_) => 4,
         }
     }
 
     pub(crate) fn sure(words: impl Into<String>) -> Self {
         Self::Sure(words.into())
-    }
-
-    pub(crate) fn too_large(Array { rows, cols }: Array) -> Self {
-        Self::TooLarge { rows, cols }
     }
 }
 
@@ -157,11 +152,7 @@ impl Found {
             cell,
             picture: Vec::new(),
             proposal,
-            score: Score {
-                presses: Vec::new(),
-                weights: Vec::new(),
-                once: 0.0,
-            },
+            score: Score::default(),
             own_doubt: None,
         };
         let doubt = best.doubt(None, true);

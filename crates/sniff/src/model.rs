@@ -242,7 +242,7 @@ fn as_in_others(
 }
 
 /// The bits by which one is more than the other, press by press.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Score {
     /// The bits of each press.
     pub(crate) presses: Vec<f64>,

@@ -3,12 +3,11 @@
 //! In: packed bytes. Out: the layout of what is in them. A mark is put before each unpacked frame, so that
 //! the search for frames of one length finds them, and is taken out of the proposal again.
 
-use std::collections::BTreeMap;
-
 use hardnessd_core::wire::{Framing, HexBytes, Settings};
 
 use crate::found::{Failure, Found, Known, Ranked};
 use crate::layout::Proposal;
+use crate::text::most_frequent;
 use crate::{Capture, in_periods};
 
 /// What no sensor sends.
@@ -21,11 +20,7 @@ pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found
         .filter_map(|packed| framing.unpacked(packed))
         .filter(|frame| !frame.is_empty())
         .collect();
-    let mut lengths: BTreeMap<usize, usize> = BTreeMap::new();
-    for frame in &frames {
-        *lengths.entry(frame.len()).or_default() += 1;
-    }
-    let usual = lengths.into_iter().max_by_key(|&(_, count)| count);
+    let usual = most_frequent(frames.iter().map(Vec::len));
     let (usual, _) = usual.ok_or(Failure::NotPeriodic(bytes.len()))?;
     let mut capture = Capture::default();
     let usual_frames = frames.iter().filter(|frame| frame.len() == usual);

@@ -28,14 +28,7 @@ const COVERING: f64 = 0.8;
 impl Presses {
     /// Finds the presses by how much each frame differs from rest. `None` if nothing presses in any.
     pub(crate) fn of(activity: &[u32]) -> Option<Self> {
-        let mut sorted = activity.to_vec();
-        sorted.sort_unstable();
-        let at = |share: usize| {
-            Some(f64::from(
-                *sorted.get(sorted.len().checked_sub(1)? * share / 100)?,
-            ))
-        };
-        let (least, quarter, most) = (at(0)?, at(25)?, at(98)?);
+        let [least, quarter, most] = quantiles(activity)?;
         let mean =
             activity.iter().map(|&value| f64::from(value)).sum::<f64>() / activity.len() as f64;
         let spread: f64 = activity
@@ -103,6 +96,14 @@ impl Presses {
     pub(crate) fn idle(&self) -> impl Iterator<Item = usize> + '_ {
         self.idle.iter().copied()
     }
+}
+
+/// The least of these, and that above a quarter and above 98 % of them. `None` without any.
+pub(crate) fn quantiles(activity: &[u32]) -> Option<[f64; 3]> {
+    let mut sorted = activity.to_vec();
+    sorted.sort_unstable();
+    let last = sorted.len().checked_sub(1)?;
+    Some([0, 25, 98].map(|share| f64::from(sorted[last * share / 100])))
 }
 
 /// About `most` of `of`, from all over it.
@@ -269,37 +270,28 @@ impl Pictures {
     /// The pictures of each of so many interleaved numbers.
     pub(crate) fn split(&self, channels: usize) -> impl Iterator<Item = Self> + '_ {
         (0..channels).map(move |channel| {
-            let part = |cells: &Vec<f32>| {
-                cells
-                    .iter()
-                    .skip(channel)
-                    .step_by(channels)
-                    .copied()
-                    .collect()
-            };
             let of = |picture: &Picture| Picture {
-                change: part(&picture.change),
-                before: part(&picture.before),
+                change: part(&picture.change, channels, channel),
+                before: part(&picture.before, channels, channel),
             };
             let presses = self
                 .presses
                 .iter()
                 .map(|press| press.iter().map(of).collect())
                 .collect();
-            let changes = self
-                .changes
-                .iter()
-                .skip(channel)
-                .step_by(channels)
-                .copied()
-                .collect();
             Self {
                 presses,
-                changes,
+                changes: part(&self.changes, channels, channel),
                 ..self.clone()
             }
         })
     }
+}
+
+/// The cells of one of so many interleaved numbers.
+fn part<T: Copy>(cells: &[T], channels: usize, channel: usize) -> Vec<T> {
+    let own = cells.iter().skip(channel).step_by(channels);
+    own.copied().collect()
 }
 
 /// Turns each second row of `cols` taxels with so many numbers each.
@@ -335,6 +327,14 @@ fn alike(a: &[f32], b: &[f32]) -> f64 {
 /// How much the cells of a picture change.
 pub(crate) fn energy(picture: &[f32]) -> f64 {
     picture.iter().map(|change| f64::from(change.abs())).sum()
+}
+
+/// How far the cells of a frame are from rest, all together.
+pub(crate) fn distance(frame: &[f32], rest: &[f32]) -> f64 {
+    let cells = frame.iter().zip(rest);
+    cells
+        .map(|(cell, rest)| f64::from((cell - rest).abs()))
+        .sum()
 }
 
 /// The middle value of each cell.

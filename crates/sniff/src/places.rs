@@ -213,17 +213,11 @@ impl Place {
     /// The numbers of bytes after the last cell and before the first one that are no part of a mark,
     /// a check or a field: they look like cells at rest.
     pub(crate) fn skipped(&self) -> (usize, usize) {
-        let after = self
-            .beside
-            .iter()
-            .take_while(|beside| beside.is_resting())
-            .count();
-        let before = self
-            .beside
-            .iter()
-            .rev()
-            .take_while(|beside| beside.is_resting())
-            .count();
+        let resting = |beside: &mut dyn Iterator<Item = &Beside>| {
+            beside.take_while(|beside| beside.is_resting()).count()
+        };
+        let after = resting(&mut self.beside.iter());
+        let before = resting(&mut self.beside.iter().rev());
         let length = self.beside.len();
         let checked = self.check.map_or(length, |check| check.at);
         let field_end = self.length_field().unwrap_or(0);

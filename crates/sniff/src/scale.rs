@@ -7,7 +7,7 @@ use hardnessd_core::tare::{self, NEWTONS_PER_COUNT};
 use hardnessd_core::wire::Settings;
 
 use crate::layout::decode;
-use crate::pictures::middle;
+use crate::pictures::{distance, middle};
 
 /// What to write beside the layout. What is `None` may be left out.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -56,13 +56,7 @@ impl Scale {
         }
         // Most frames may be pressed, but hardly at the same taxel.
         let rest = middle(&frames);
-        let change = |frame: &Vec<f32>| -> f64 {
-            let taxels = frame.iter().zip(&rest);
-            taxels
-                .map(|(count, rest)| f64::from((count - rest).abs()))
-                .sum()
-        };
-        let changes: Vec<f64> = frames.iter().map(change).collect();
+        let changes: Vec<f64> = frames.iter().map(|frame| distance(frame, &rest)).collect();
         let mut sorted = changes.clone();
         sorted.sort_by(f64::total_cmp);
         let most = sorted[sorted.len() / QUIET];

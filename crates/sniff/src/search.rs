@@ -21,7 +21,7 @@ use crate::model::{
 };
 use crate::numbers::{self, CELLS, is_float};
 use crate::period::Frames;
-use crate::pictures::{Pictures, Presses, energy, middle, some};
+use crate::pictures::{Pictures, Presses, energy, middle, quantiles, some};
 use crate::places::{Beside, Place, places};
 
 /// The longest side that is tried, so that an array that is too large is found.
@@ -166,7 +166,7 @@ pub(crate) fn in_frames(
         return Err(Failure::NoArray(period));
     }
     let activity = columns.activity(frames);
-    let presses = (contrast(&activity) <= CONTRAST)
+    let presses = (contrast(&activity) <= Some(CONTRAST))
         .then(|| numbers_that_press(frames))
         .flatten()
         .or_else(|| Presses::of(&activity))
@@ -484,7 +484,7 @@ impl Search<'_> {
             }
             if is_too_large(array) {
                 if ranked.is_empty() {
-                    return Err(Failure::too_large(array));
+                    return Err(Failure::TooLarge(array));
                 }
                 continue;
             }
@@ -618,7 +618,7 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
         let numbers = |frame: &[u8]| numbers::numbers(cell, &frame[begin..]);
         let frames: Vec<Vec<f32>> = frames.iter().map(numbers).collect();
         let activity = activity(&frames)?;
-        Some((contrast(&activity), Presses::of(&activity)?))
+        Some((contrast(&activity)?, Presses::of(&activity)?))
     });
     let best = found.max_by(|a, b| a.0.total_cmp(&b.0));
     best.filter(|(contrast, _)| *contrast > CONTRAST)
@@ -629,11 +629,9 @@ fn numbers_that_press(frames: &Frames) -> Option<Presses> {
 const CONTRAST: f64 = 4.0;
 
 /// By how many times as much as frames at rest differ, presses stand out.
-fn contrast(activity: &[u32]) -> f64 {
-    let mut sorted = activity.to_vec();
-    sorted.sort_unstable();
-    let at = |share: usize| f64::from(sorted[(sorted.len() - 1) * share / 100]);
-    (at(98) - at(25)) / (at(25) - at(0)).max(1.0)
+fn contrast(activity: &[u32]) -> Option<f64> {
+    let [least, quarter, most] = quantiles(activity)?;
+    Some((most - quarter) / (quarter - least).max(1.0))
 }
 
 /// How far the numbers of each frame are from rest, by what they change from frame to frame.

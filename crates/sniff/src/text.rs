@@ -13,7 +13,7 @@ use crate::found::{
 };
 use crate::layout::Proposal;
 use crate::model::{self, Score};
-use crate::pictures::{Pictures, Presses, middle};
+use crate::pictures::{Pictures, Presses, distance, middle};
 
 /// The share of the lines that must have the same number of cells.
 const SAME_SHARE: f64 = 0.6;
@@ -114,7 +114,8 @@ pub(crate) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
     Ok(found)
 }
 
-fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize)> {
+/// The most frequent of these, and how often it is there.
+pub(crate) fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize)> {
     let mut counts: BTreeMap<T, usize> = BTreeMap::new();
     for one in of {
         *counts.entry(one).or_default() += 1;
@@ -125,7 +126,7 @@ fn most_frequent<T: Ord + Copy>(of: impl Iterator<Item = T>) -> Option<(T, usize
 /// The text says the array itself.
 fn in_rows(array: Array, bytes: &[u8], known: Known) -> Result<Found, Failure> {
     if is_too_large(array) {
-        return Err(Failure::too_large(array));
+        return Err(Failure::TooLarge(array));
     }
     let is_allowed = known
         .arrays(array.taxels(), MOST_SIDE)
@@ -186,13 +187,7 @@ fn in_order(
     known: Known,
 ) -> Result<Found, Failure> {
     let rest = middle(frames);
-    let change = |frame: &Vec<f32>| -> f64 {
-        let cells = frame.iter().zip(&rest);
-        cells
-            .map(|(value, rest)| f64::from((value - rest).abs()))
-            .sum()
-    };
-    let changes: Vec<f64> = frames.iter().map(change).collect();
+    let changes: Vec<f64> = frames.iter().map(|frame| distance(frame, &rest)).collect();
     // In whole steps, also of volts. Most cells of a quiet board seldom change, so their usual step says nothing.
     let most = changes.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
     let activity = changes.iter().map(|change| (change / most * 1e6) as u32);
@@ -226,7 +221,7 @@ fn in_order(
     let is_given = known.rows.is_some() && known.cols.is_some();
     Found::among(ranked.collect(), is_given).ok_or_else(|| {
         match arrays.into_iter().find(|&array| is_too_large(array)) {
-            Some(array) => Failure::too_large(array),
+            Some(array) => Failure::TooLarge(array),
             None => Failure::sure(format!(
                 "text, but no array: {cells} numbers on each line make no array"
             )),

@@ -148,12 +148,15 @@ pub fn fit(
     let judged = judged.context("the best candidate was judged")?;
     let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
         let mut stream = Stream::new(SEED, "calibration");
-        let calibration =
+        let mut calibration =
             comparison::calibration(judged, &presses, &learning.outputs(), &mut stream);
-        let (calibration, by) = match division {
-            Division::NewObjects => (calibration, "new objects"),
-            // Presses of known objects promise nothing of others.
-            Division::LaterPresses => (calibration.without_sets(), "later presses"),
+        let by = match division {
+            Division::NewObjects => "new objects",
+            Division::LaterPresses => {
+                // Presses of known objects promise nothing of others.
+                calibration.limits.clear();
+                "later presses"
+            }
         };
         let learnt = Learnt {
             learning,

@@ -1,8 +1,9 @@
 use std::f64::consts::PI;
 
 use super::*;
-use crate::kernel::{self, Base, Layer};
+use crate::kernel;
 use crate::press::CELL_MM;
+use crate::tests::near;
 
 const ELASTIC: Local = Local {
     law: Law::Solid,
@@ -13,7 +14,7 @@ const ELASTIC: Local = Local {
     time_s: 1.0,
 };
 
-/// Solves gaps that are given by radius, on a half-space of modulus E* or on a layer.
+/// Solves gaps that are given by radius, on a half-space.
 struct Bed {
     width: usize,
     spectrum: Vec<f32>,
@@ -21,21 +22,17 @@ struct Bed {
 }
 
 impl Bed {
-    /// A bed with this influence of E* = 1, lengths in cells.
-    fn new(width: usize, plane_strain_mpa: f64, influence: impl Fn(f64, f64) -> f64) -> Self {
+    /// A half-space of modulus E*.
+    fn half_space(width: usize, plane_strain_mpa: f64) -> Self {
         let mut solver = Solver::new(width);
         let unit = CELL_MM / plane_strain_mpa;
-        let influence = |i, j| unit * influence(i as f64, j as f64);
+        let influence = |i, j| unit * kernel::half_space(i as f64, j as f64);
         let spectrum = solver.convolver.spectrum(influence);
         Self {
             width,
             spectrum,
             solver,
         }
-    }
-
-    fn half_space(width: usize, plane_strain_mpa: f64) -> Self {
-        Self::new(width, plane_strain_mpa, kernel::half_space)
     }
 
     fn gap(&self, shape: impl Fn(f64) -> f64) -> Vec<f32> {
@@ -75,17 +72,6 @@ impl Bed {
     }
 }
 
-fn peak(pressure: &[f32]) -> f64 {
-    f64::from(pressure.iter().copied().fold(0.0, f32::max))
-}
-
-fn near(seen: f64, expected: f64, tolerance: f64, what: &str) {
-    assert!(
-        (seen / expected - 1.0).abs() < tolerance,
-        "{what}: {seen}, {expected}"
-    );
-}
-
 #[test]
 fn sphere_on_half_space_is_hertz() {
     // The gap is Hertz's paraboloid.
@@ -97,45 +83,18 @@ fn sphere_on_half_space_is_hertz() {
         let a = (0.75 * force * radius / modulus).cbrt();
         // The radius from counted cells errs by the cells on the rim. The second moment, 2 a^2 / 5,
         // does not.
-        near(
-            (2.5 * bed.second_moment(&pressure)).sqrt(),
-            a,
-            0.01,
-            "contact radius",
-        );
+        let second_moment = bed.second_moment(&pressure);
+        near((2.5 * second_moment).sqrt(), a, 0.01, "contact radius");
         near(contact.radius_mm, a, 0.03, "counted radius");
         near(contact.approach_mm, a * a / radius, 0.01, "approach");
-        near(
-            peak(&pressure),
-            1.5 * force / (PI * a * a),
-            0.02,
-            "peak pressure",
-        );
+        let peak = f64::from(pressure.iter().copied().fold(0.0, f32::max));
+        near(peak, 1.5 * force / (PI * a * a), 0.02, "peak pressure");
         let sum: f64 = pressure
             .iter()
             .map(|&p| f64::from(p) * CELL_MM * CELL_MM)
             .sum();
         near(sum, force, 1e-5, "force");
     }
-}
-
-#[test]
-fn thin_layer_is_a_mattress() {
-    // Above a ratio of 20 of contact radius to thickness, the layer is a Winkler foundation with
-    // the confined modulus.
-    let (nu, modulus, height, radius, force) = (0.3, 3.0, 0.5, 4000.0, 40.0);
-    let layer = Layer::new(nu, Base::RIGID);
-    let mut bed = Bed::new(96, modulus, |x, y| layer.influence(x, y, height / CELL_MM));
-    let gap = bed.gap(|r| 0.5 * r * r / radius);
-    let (pressure, contact) = bed.press(&gap, force, ELASTIC);
-    let stiffness = modulus / (kernel::confined_compliance(nu) * height);
-    assert!(contact.radius_mm > 20.0 * height, "{contact:?}");
-    near(
-        peak(&pressure),
-        (force * stiffness / (PI * radius)).sqrt(),
-        0.01,
-        "peak pressure",
-    );
 }
 
 #[test]

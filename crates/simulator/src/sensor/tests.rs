@@ -18,12 +18,18 @@ fn smooth_load() -> (Vec<f32>, f64) {
     (pressure, force)
 }
 
+fn jx255n(profile: SensorProfile, seed: u64) -> Sensor {
+    Sensor::draw(Design::jx255n(profile), &Stream::new(seed, "sensor"))
+}
+
+/// The number of taxels that feel something.
+fn felt(raw: &RawFrame) -> usize {
+    raw.counts.iter().filter(|&&counts| counts > 0.0).count()
+}
+
 /// A raw sensor without activation thresholds.
 fn without_thresholds(seed: u64) -> Sensor {
-    let mut sensor = Sensor::draw(
-        Design::jx255n(SensorProfile::Raw),
-        &Stream::new(seed, "sensor"),
-    );
+    let mut sensor = jx255n(SensorProfile::Raw, seed);
     sensor.threshold_n.fill(0.0);
     sensor
 }
@@ -103,11 +109,7 @@ fn a_point_load_draws_no_cross() {
     forces[ARRAY.place(14, 14)] = 25.0;
     let sensor = without_thresholds(6);
     let raw = sensor.read(&forces, 1.0, &mut Stream::new(6, "noise"));
-    assert_eq!(
-        raw.counts.iter().filter(|&&counts| counts > 0.0).count(),
-        5,
-        "itself and four"
-    );
+    assert_eq!(felt(&raw), 5, "itself and four");
 }
 
 #[test]
@@ -121,11 +123,8 @@ fn an_unloaded_sensor_reads_zero_even_after_long_load() {
     let crept = film.advance(&sensor.design, &forces, 0.1)[0] / 3.0;
     assert!((1.05..1.07).contains(&crept), "film creep {crept}");
     forces = [0.0; TAXELS];
-    let raw = sensor.read(
-        &film.advance(&sensor.design, &forces, 0.01),
-        1.0,
-        &mut Stream::new(2, "noise"),
-    );
+    let crept = film.advance(&sensor.design, &forces, 0.01);
+    let raw = sensor.read(&crept, 1.0, &mut Stream::new(2, "noise"));
     assert_eq!(raw, RawFrame::zero(ARRAY));
 }
 
@@ -136,20 +135,12 @@ fn a_restless_array_has_noise_on_every_taxel_and_is_tared_to_a_mean_of_zero() {
     assert!(restless.len() > 70 && quiet.len() > 70, "{}", quiet.len());
     let unloaded = |design: &Design| {
         let sensor = Sensor::draw(design.clone(), &Stream::new(4, "sensor"));
-        let raw = sensor.read(
-            &vec![0.0; design.array.taxels()],
-            1.0,
-            &mut Stream::new(5, "noise"),
-        );
+        let none = vec![0.0; design.array.taxels()];
+        let raw = sensor.read(&none, 1.0, &mut Stream::new(5, "noise"));
         (sensor.tared(&raw), raw, sensor)
     };
-    assert!(
-        unloaded(&quiet[0])
-            .1
-            .counts
-            .iter()
-            .all(|&counts| counts == 0.0)
-    );
+    let (_, raw, _) = unloaded(&quiet[0]);
+    assert_eq!(raw, RawFrame::zero(quiet[0].array));
     for design in restless.iter().take(20) {
         let (frame, _, sensor) = unloaded(design);
         let count = frame.newtons.len() as f32;
@@ -172,30 +163,18 @@ fn a_restless_array_has_noise_on_every_taxel_and_is_tared_to_a_mean_of_zero() {
         .find(|design| design.noise_n > f64::from(2.0 * design.count_n));
     let (frame, ..) = unloaded(noisy.unwrap());
     let below = frame.newtons.iter().filter(|&&n| n < 0.0).count();
-    assert!(
-        (0.35..0.65).contains(&(below as f64 / frame.newtons.len() as f64)),
-        "{below}"
-    );
+    let share = below as f64 / frame.newtons.len() as f64;
+    assert!((0.35..0.65).contains(&share), "{share}");
 }
 
 #[test]
 fn every_taxel_feels_the_guaranteed_load_and_full_scale_is_8_bits() {
-    let sensor = Sensor::draw(
-        Design::jx255n(SensorProfile::Clean),
-        &Stream::new(9, "sensor"),
-    );
+    let sensor = jx255n(SensorProfile::Clean, 9);
     let mut noise = Stream::new(9, "noise");
     let dead = sensor.gain.iter().filter(|&&gain| gain == 0.0).count();
-    let felt = |raw: RawFrame| raw.counts.iter().filter(|&&c| c > 0.0).count();
-    assert_eq!(
-        felt(sensor.read(&[0.21; TAXELS], 1.0, &mut noise)),
-        TAXELS - dead
-    );
-    assert!(felt(sensor.read(&[0.03; TAXELS], 1.0, &mut noise)) < TAXELS / 2);
-    let most = sensor
-        .read(&[100.0; TAXELS], 1.0, &mut noise)
-        .counts
-        .into_iter()
-        .fold(0.0, f32::max);
+    let mut read = |force_n: f32| sensor.read(&[force_n; TAXELS], 1.0, &mut noise);
+    assert_eq!(felt(&read(0.21)), TAXELS - dead);
+    assert!(felt(&read(0.03)) < TAXELS / 2);
+    let most = read(100.0).counts.into_iter().fold(0.0, f32::max);
     assert_eq!(most, 255.0);
 }

@@ -265,7 +265,7 @@ fn text(array: Array, stream: &mut Stream) -> Case {
 
 /// How hands and skins write a number.
 #[derive(Debug, Clone, Copy)]
-enum Hand {
+pub(crate) enum Hand {
     F32le,
     F32be,
     I16le,
@@ -278,7 +278,7 @@ enum Hand {
 
 impl Hand {
     /// A number as it is sent, and what a reader finds.
-    fn sent(self, number: f64) -> (Vec<u8>, f32) {
+    pub(crate) fn sent(self, number: f64) -> (Vec<u8>, f32) {
         let float = number as f32;
         let whole = number.round() as i16;
         match self {
@@ -609,18 +609,12 @@ fn contacts(array: Array, stream: &mut Stream) -> Vec<Contact> {
         3 => vec![round(stream, 0.25), round(stream, 0.25)],
         _ => {
             let edge = [0.0, 1.0][stream.below(2)];
-            let contact = round(stream, 0.4);
-            vec![if stream.below(2) == 0 {
-                Contact {
-                    row: edge * (sides.0 - 1.0),
-                    ..contact
-                }
-            } else {
-                Contact {
-                    col: edge * (sides.1 - 1.0),
-                    ..contact
-                }
-            }]
+            let mut contact = round(stream, 0.4);
+            match stream.below(2) {
+                0 => contact.row = edge * (sides.0 - 1.0),
+                _ => contact.col = edge * (sides.1 - 1.0),
+            }
+            vec![contact]
         }
     }
 }

@@ -19,7 +19,7 @@ use walkdir::WalkDir;
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::{COLLECTOR, Source};
+use crate::data::source::{COLLECTOR, Source, name_of};
 use crate::exit::unreadable;
 use crate::progress;
 use hardnessd_core::npz::Writer;
@@ -266,9 +266,9 @@ impl Collection {
         self.presses.append(presses)?;
         (self.materials, self.sensors) = (materials, sensors);
         self.captures.push(json!({
-            "name": recording::name_of(&recording.path),
+            "name": name_of(&recording.path),
             "sha256": sha256,
-            "split": settings.split.name(),
+            "split": settings.split,
             "labels": labels,
         }));
         self.unnumbered = Some(new);

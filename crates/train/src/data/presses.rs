@@ -17,6 +17,7 @@ use hardnessd_core::verdict::{
     COLS, COURSE_FRAMES, Card, Level, ModelFrame, Moment, Piece, ROWS, Resampling, TAXELS,
     TimeSeries, parts,
 };
+use hardnessd_core::wording;
 use hardnessd_simulator::{LabelledCourse, LabelledSample, Labels, Split};
 
 pub use self::file::{Layout, meta, write};
@@ -324,7 +325,7 @@ impl Presses {
     /// Returns an error if the split has no labelled press.
     pub fn some_labelled(&self, split: Split) -> anyhow::Result<Vec<usize>> {
         let found: Vec<usize> = self.labelled(split).collect();
-        let name = split.name();
+        let name = wording::name(&split);
         ensure!(
             !found.is_empty(),
             "{}: no press of the {name} split has a level: add some with `collect --append --split {name} --level L`",
@@ -525,8 +526,7 @@ impl Presses {
 }
 
 /// What is drawn as a whole for an interval.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// An object with all its presses.
     Object,

@@ -1,11 +1,11 @@
 //! The files that presses are from: what they say of themselves, and whose levels a model states.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use hardnessd_core::frame::{Array, Pitch};
-use hardnessd_core::verdict::{COLS, Level, ROWS};
+use hardnessd_core::verdict::{COLS, Level, ROWS, sha256_hex};
 use hardnessd_simulator::{LEVELS, LevelRange};
 
 /// The distance between taxels, unless a file names another one.
@@ -82,7 +82,23 @@ pub struct Source {
     pub levels: Option<Vec<Level>>,
 }
 
+/// The name of a file without its directory.
+pub(super) fn name_of(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
+}
+
 impl Source {
+    /// A file of this content.
+    pub fn of(path: &Path, bytes: &[u8]) -> Self {
+        Self {
+            name: name_of(path),
+            sha256: sha256_hex(bytes),
+            path: path.to_owned(),
+            ..Self::default()
+        }
+    }
+
     /// Whether our own programs made its frames.
     pub fn is_ours(&self) -> bool {
         let generator = self.generator.as_deref().unwrap_or_default();

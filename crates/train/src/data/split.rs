@@ -152,11 +152,11 @@ fn held_out_sensors(
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// Presses of the level, the object and the sensor.
-    fn presses(of: impl IntoIterator<Item = (u8, u32, u32)>) -> Presses {
+    pub(crate) fn presses(of: impl IntoIterator<Item = (u8, u32, u32)>) -> Presses {
         let press = |(level, object, sensor)| Press {
             level,
             object: Some(object),

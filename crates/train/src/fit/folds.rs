@@ -76,19 +76,12 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::data::presses::Press;
+    use crate::data::split::tests::presses as presses_of;
 
     /// Five presses of each object, in turn. The objects have these levels.
     fn presses(levels: &[u8]) -> (Presses, Vec<usize>) {
-        let mut presses = Presses::default();
-        for _ in 0..5 {
-            let objects = (0..).zip(levels);
-            presses.all.extend(objects.map(|(object, &level)| Press {
-                level,
-                object: Some(object),
-                ..Press::default()
-            }));
-        }
+        let objects = (0..5).flat_map(|_| levels.iter().zip(0..));
+        let presses = presses_of(objects.map(|(&level, object)| (level, object, 0)));
         let places = (0..presses.all.len()).collect();
         (presses, places)
     }

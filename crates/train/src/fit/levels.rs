@@ -95,16 +95,11 @@ mod tests {
 
     #[test]
     fn levels_are_those_of_the_labels() {
+        let papers = "hard >70, firm 61-70, soft 51-60, very-soft <=50";
         // The labels `level` and `shore` of each recording, and the levels that follow.
         for (given, expected) in [
-            (
-                "1, 3 55",
-                "hard >70, firm 61-70, soft 51-60, very-soft <=50",
-            ),
-            (
-                "Soft, hard",
-                "hard >70, firm 61-70, soft 51-60, very-soft <=50",
-            ),
+            ("1, 3 55", papers),
+            ("Soft, hard", papers),
             ("1, 5", "1 -, 2 -, 3 -, 4 -, 5 -"),
             ("ripe, green, Ripe", "green -, ripe -"),
             (

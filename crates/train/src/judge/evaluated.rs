@@ -7,15 +7,13 @@ use serde::Serialize;
 use super::interval::{self, Drawn, Mean};
 use super::metrics::{accuracy, category_accuracy, kappa, kappa_quadratic};
 use crate::data::presses::{Presses, Unit};
-use hardnessd_core::verdict::{Borders, Level, Shore, Verdict, argmax};
+use hardnessd_core::verdict::{Level, Shore, Verdict, argmax};
 
 /// Number of equal bins of the largest probability in the expected calibration error.
 const CALIBRATION_BINS: usize = 15;
 /// The least probability in the NLL, because a probability of 0 for the true level would make it
 /// infinite.
 const SMALLEST_PROBABILITY: f64 = 1e-12;
-/// The distance from a border of two levels that counts as near, in Shore OO.
-pub const NEAR_BORDER: f64 = 3.0;
 
 /// A verdict on a labelled press, and the truth.
 #[derive(Debug, Clone)]
@@ -130,9 +128,6 @@ pub struct ShoreEvaluation {
     pub rmse: f64,
     /// Root mean square error of each level; null for a level without verdicts.
     pub rmse_by_level: Vec<Option<f64>>,
-    /// Root mean square error where the truth is at most [`NEAR_BORDER`] from a border of two
-    /// levels; null without such verdicts.
-    pub rmse_near_borders: Option<f64>,
     /// Share of verdicts whose interval contains the true hardness. The model promises 0.9.
     pub coverage: f64,
     /// Mean width of the intervals, in Shore OO.
@@ -215,7 +210,7 @@ impl Evaluated {
             accuracy_interval_by_object: interval.filter(|_| unit == Some(Unit::Object)),
             accuracy_interval_by_cover: interval.filter(|_| unit == Some(Unit::Cover)),
             beyond_neighbour: cases.iter().filter(is_far).count() as f64 / n,
-            shore: shore(cases, levels),
+            shore: shore(cases, levels.len()),
             sets: sets(cases),
         }
     }
@@ -257,20 +252,14 @@ impl Difference {
 }
 
 /// The evaluation of the Shore hardness of verdicts; `None` for a model or data without it.
-fn shore(cases: &[Case], levels: &[Level]) -> Option<ShoreEvaluation> {
+fn shore(cases: &[Case], levels: usize) -> Option<ShoreEvaluation> {
     let both = |case: &Case| Some((case.level, f64::from(case.shore?), case.verdict.shore?));
     let pairs: Vec<(u8, f64, Shore)> = cases.iter().filter_map(both).collect();
-    let rmse = |of: &dyn Fn(u8, f64) -> bool| {
-        let chosen = pairs.iter().filter(|(level, truth, _)| of(*level, *truth));
+    let rmse = |of: &dyn Fn(u8) -> bool| {
+        let chosen = pairs.iter().filter(|(level, ..)| of(*level));
         let errors = chosen.map(|(_, truth, shore)| f64::from(shore.value) - truth);
         let squares: Vec<f64> = errors.map(|error| error.powi(2)).collect();
         (!squares.is_empty()).then(|| mean(squares.into_iter()).sqrt())
-    };
-    let borders = Borders::of(levels).ok();
-    let is_near = |truth: f64| {
-        let mut inner =
-            (1..levels.len()).filter_map(|place| Some(borders.as_ref()?.part(place)[1]));
-        inner.any(|border| (truth - f64::from(border)).abs() <= NEAR_BORDER)
     };
     let holds = |(_, truth, shore): &(u8, f64, Shore)| {
         let interval = f64::from(shore.low)..=f64::from(shore.high);
@@ -278,11 +267,10 @@ fn shore(cases: &[Case], levels: &[Level]) -> Option<ShoreEvaluation> {
     };
     let width = |(.., shore): &(u8, f64, Shore)| f64::from(shore.high - shore.low);
     Some(ShoreEvaluation {
-        rmse: rmse(&|_, _| true)?,
-        rmse_by_level: (1..=levels.len() as u8)
-            .map(|level| rmse(&|of, _| of == level))
+        rmse: rmse(&|_| true)?,
+        rmse_by_level: (1..=levels as u8)
+            .map(|level| rmse(&|of| of == level))
             .collect(),
-        rmse_near_borders: rmse(&|_, truth| is_near(truth)),
         coverage: mean(pairs.iter().map(holds)),
         width: mean(pairs.iter().map(width)),
     })
@@ -409,8 +397,8 @@ mod tests {
     }
 
     #[test]
-    fn shore_is_evaluated_over_all_over_each_level_and_near_the_borders() {
-        // The paper's borders are 50.5, 60.5 and 70.5. The second verdict alone does not hold the truth.
+    fn shore_is_evaluated_over_all_and_over_each_level() {
+        // The second verdict alone does not hold the truth.
         let cases = [
             (1, 80.0, 83.0),
             (2, 63.0, 57.0),
@@ -428,12 +416,9 @@ mod tests {
         let expected = ShoreEvaluation {
             rmse: (49.0_f64 / 4.0).sqrt(),
             rmse_by_level: vec![Some(3.0), Some(20.0_f64.sqrt()), None, Some(0.0)],
-            rmse_near_borders: Some(6.0),
             coverage: 0.75,
             width: 9.0,
         };
         assert_eq!(evaluated(&cases).shore, Some(expected));
-        let far = evaluated(&cases[3..]).shore.unwrap();
-        assert_eq!(far.rmse_near_borders, None);
     }
 }

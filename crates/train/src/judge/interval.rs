@@ -151,29 +151,25 @@ fn of_share(right: f64, units: usize) -> [f64; 2] {
         }
         sum
     };
-    let right = right * units as f64;
-    let (low, high) = (right.floor() as usize, right.ceil() as usize);
-    let where_it_is = |is_above: &dyn Fn(f64) -> bool| {
+    // The greatest share that is not excluded by so many right ones.
+    let greatest = |right: usize| {
+        if right == units {
+            return 1.0;
+        }
         let (mut below, mut above) = (0.0, 1.0);
         for _ in 0..50 {
             let middle = 0.5 * (below + above);
-            match is_above(middle) {
+            match at_most(right, middle) < 0.025 {
                 true => above = middle,
                 false => below = middle,
             }
         }
         0.5 * (below + above)
     };
-    [
-        match low {
-            0 => 0.0,
-            _ => where_it_is(&|share| 1.0 - at_most(low - 1, share) > 0.025),
-        },
-        match high == units {
-            true => 1.0,
-            false => where_it_is(&|share| at_most(high, share) < 0.025),
-        },
-    ]
+    let right = right * units as f64;
+    // The least share of right ones is what the greatest share of wrong ones leaves.
+    let least = 1.0 - greatest(units - right.floor() as usize);
+    [least, greatest(right.ceil() as usize)]
 }
 
 fn total(sums: impl Iterator<Item = Sum>) -> Sum {

@@ -204,6 +204,11 @@ mod tests {
         generate(weights, reading, samples, (1, &mut stream), &Device::flex())
     }
 
+    fn change(weights: &mut Weights, name: &str, with: fn(Tensor<1>) -> Tensor<1>) {
+        let weight = weights.entries.iter_mut().find(|w| w.name == name).unwrap();
+        weight.values = with(weight.values.clone());
+    }
+
     #[test]
     fn the_network_has_the_papers_number_of_parameters() {
         let weights = initial(1, &Device::flex());
@@ -221,12 +226,7 @@ mod tests {
     fn generated_frames_are_equally_many_of_each_component() {
         // The components are far apart and without spread, so each gives one picture for any eta.
         let mut weights = initial(1, &Device::flex());
-        let sigma = weights
-            .entries
-            .iter_mut()
-            .find(|w| w.name == "mixture.sigma");
-        let sigma = &mut sigma.unwrap().values;
-        *sigma = sigma.zeros_like();
+        change(&mut weights, "mixture.sigma", |sigma| sigma.zeros_like());
         let frames = generated(&weights, 20);
         assert_eq!(frames.len(), 20 * COMPONENTS);
         for component in 0..COMPONENTS {
@@ -248,13 +248,10 @@ mod tests {
         // The images are dark, and not every draw has enough light taxels for a press.
         let device = Device::flex();
         let mut weights = initial(1, &device);
-        let mut change = |name: &str, with: fn(Tensor<1>) -> Tensor<1>| {
-            let weight = weights.entries.iter_mut().find(|w| w.name == name).unwrap();
-            weight.values = with(weight.values.clone());
-        };
-        change("mixture.sigma", |sigma| sigma.ones_like());
-        change("deconv3.kernel", |kernel| kernel.mul_scalar(3.0));
-        change("deconv3.bias", |bias| bias.sub_scalar(3.4));
+        let own = &mut weights;
+        change(own, "mixture.sigma", |sigma| sigma.ones_like());
+        change(own, "deconv3.kernel", |kernel| kernel.mul_scalar(3.0));
+        change(own, "deconv3.bias", |bias| bias.sub_scalar(3.4));
         let statistics = statistics(&weights, 1, &device);
         let eta = noise(4, &mut Stream::new(1, "drawn"), &device);
         let once = images(&weights, eta, &mut Normalisation::Fixed(&statistics));

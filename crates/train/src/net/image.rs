@@ -1,13 +1,12 @@
 //! The scale from newtons to the image that a network sees, and back.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use serde::{Deserialize, Serialize};
 
 use crate::net::graph::INPUT;
 use hardnessd_core::verdict::{COLS, ModelFrame, ROWS, TAXELS};
 
 /// One scale for all frames, because force carries hardness: 0 N is -1, the full scale is 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PixelScale {
     /// The force on a taxel, in newtons, that becomes 1.
     pub full_scale_n: f64,

@@ -150,7 +150,8 @@ mod tests {
     }
 
     #[track_caller]
-    fn check(found: f64, expected: f64) {
+    fn check(loss: &Tensor<1>, expected: f64) {
+        let found = number(loss);
         assert!((found - expected).abs() < 1e-5, "{found} {expected}");
     }
 
@@ -170,12 +171,9 @@ mod tests {
         let expected = -f64::midpoint(sigmoid(0.3).ln(), sigmoid(-1.2).ln())
             - f64::midpoint((1.0 - sigmoid(0.7)).ln(), (1.0 - sigmoid(2.0)).ln());
         let loss = discriminator(Game::RealOrFake, real.clone(), fake.clone(), None);
-        check(number(&loss), expected);
+        check(&loss, expected);
         let expected = -f64::midpoint(sigmoid(0.7).ln(), sigmoid(2.0).ln());
-        check(
-            number(&generator(Game::RealOrFake, || real, fake)),
-            expected,
-        );
+        check(&generator(Game::RealOrFake, || real, fake), expected);
     }
 
     #[test]
@@ -187,9 +185,9 @@ mod tests {
             - p_fake.ln()
             - softmax(&[0.5, 0.6, 0.7])[1].ln();
         let loss = discriminator(Game::FakeLevel, real.clone(), fake.clone(), Some(labelled));
-        check(number(&loss), expected);
+        check(&loss, expected);
         let loss = generator(Game::FakeLevel, || real, fake);
-        check(number(&loss), -(1.0 - p_fake).ln());
+        check(&loss, -(1.0 - p_fake).ln());
     }
 
     #[test]
@@ -200,18 +198,11 @@ mod tests {
         let expected = -0.5 * (1.0 - p_fake(&[0.1, -0.4])).ln()
             - 0.5 * p_fake(&[1.1, 0.2]).ln()
             - softmax(&[0.5, 0.6])[1].ln();
-        let loss = discriminator(
-            Game::FeatureMatching,
-            real.clone(),
-            fake.clone(),
-            Some(labelled),
-        );
-        check(number(&loss), expected);
-        let loss = generator(Game::FeatureMatching, || real, fake);
-        check(
-            number(&loss),
-            f64::midpoint(1.0_f64.powi(2), 0.6_f64.powi(2)),
-        );
+        let game = Game::FeatureMatching;
+        let loss = discriminator(game, real.clone(), fake.clone(), Some(labelled));
+        check(&loss, expected);
+        let loss = generator(game, || real, fake);
+        check(&loss, f64::midpoint(1.0_f64.powi(2), 0.6_f64.powi(2)));
     }
 
     #[test]
@@ -228,9 +219,7 @@ mod tests {
 
     #[test]
     fn the_penalty_is_a_mean() {
-        check(
-            number(&sigma_penalty(rows(&[[1.0, 0.0], [0.5, 2.0]]))),
-            2.25 / 4.0,
-        );
+        let sigma = rows(&[[1.0, 0.0], [0.5, 2.0]]);
+        check(&sigma_penalty(sigma), 2.25 / 4.0);
     }
 }

@@ -15,7 +15,7 @@ use crate::net::network::Weights;
 use crate::net::standard::Standard;
 use crate::run::disk::read;
 use hardnessd_core::trial;
-use hardnessd_core::verdict::{MAX_FILE_BYTES, sha256_hex};
+use hardnessd_core::verdict::MAX_FILE_BYTES;
 
 /// What a training takes of a model.
 #[derive(Debug)]
@@ -46,16 +46,10 @@ impl Start {
         let (weights, standard) = exported
             .ok_or_else(|| anyhow!("not a model of the method course, or of another revision"))
             .with_context(shown)?;
-        let name = path.file_name().unwrap_or_default();
-        let source = Source {
-            name: name.to_string_lossy().into_owned(),
-            sha256: sha256_hex(&bytes),
-            ..Source::default()
-        };
         Ok(Self {
             weights,
             standard,
-            source,
+            source: Source::of(path, &bytes),
         })
     }
 }

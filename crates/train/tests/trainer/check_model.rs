@@ -1,30 +1,18 @@
 //! `hrn-train check-model`: what the daemon would refuse in a model file, all at once.
 
-use std::path::Path;
-
 use hardnessd_core::tests::graph::node;
 use hardnessd_core::verdict::BUILT_IN_HRN;
 use prost::Message as _;
 use tract_onnx::pb;
 
-use crate::hrn_train_in;
-
-fn check(path: &Path, more: &str) -> (Option<i32>, String) {
-    let command = format!("check-model {} {more}", path.display());
-    let output = hrn_train_in(Path::new("."), &command);
-    let lines = [output.stdout, output.stderr].concat();
-    (output.status.code(), String::from_utf8(lines).unwrap())
-}
+use crate::{Desk, MODELS};
 
 #[test]
 fn the_built_in_models_pass() {
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models");
+    let expected = "a model that hardnessd loads, for sensors of up to 5 frames/s";
     for name in ["hrn.onnx", "course.onnx"] {
-        let (code, lines) = check(&models.join(name), "");
-        assert!(
-            code == Some(0) && lines.contains("a model that hardnessd loads"),
-            "{lines}"
-        );
+        let said = Desk::new().succeeds(&format!("check-model {MODELS}/{name} --fps 5"));
+        assert!(said.contains(expected), "{said}");
     }
 }
 
@@ -66,22 +54,17 @@ fn slow() -> Vec<u8> {
 
 #[test]
 fn a_slow_model_passes_for_a_slow_sensor_alone() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("slow.onnx");
-    std::fs::write(&path, slow()).unwrap();
-    let (code, lines) = check(&path, "--fps 5");
-    let expected = "a model that hardnessd loads, for sensors of up to 5 frames/s";
-    assert!(code == Some(0) && lines.contains(expected), "{lines}");
-    let (code, lines) = check(&path, "--fps 1000");
+    let desk = Desk::new();
+    desk.write("slow.onnx", slow());
+    desk.succeeds("check-model slow.onnx --fps 5");
     let expected =
         "ms for a verdict: expected at most 1.0 ms, a tenth of the fastest sensor's frame period";
-    assert!(code == Some(78) && lines.contains(expected), "{lines}");
+    desk.fails("check-model slow.onnx --fps 1000", 78, expected);
 }
 
 #[test]
 fn all_errors_of_a_file_are_said_at_once() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("m.onnx");
+    let desk = Desk::new();
     let mut model = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
     model
         .metadata_props
@@ -94,20 +77,13 @@ fn all_errors_of_a_file_are_said_at_once() {
     let graph = model.graph.as_mut().unwrap();
     graph.input[0].name = "image".to_owned();
     graph.output[0].name = "result".to_owned();
-    std::fs::write(&path, model.encode_to_vec()).unwrap();
-    let (code, lines) = check(&path, "");
-    assert_eq!((code, lines.lines().count()), (Some(78), 1), "{lines}");
-    for part in [
-        "pitch_mm",
-        "hrn.range",
-        "image",
-        "result",
-        "hardnessd.adopt",
-    ] {
-        assert!(lines.contains(part), "no {part} in\n{lines}");
+    desk.write("m.onnx", model.encode_to_vec());
+    let error = desk.fails("check-model m.onnx", 78, "hardnessd.adopt");
+    for part in ["pitch_mm", "hrn.range", "image", "result"] {
+        assert!(error.contains(part), "no {part} in\n{error}");
     }
 
-    std::fs::write(&path, "not a model").unwrap();
-    assert_eq!(check(&path, "").0, Some(78));
-    assert_eq!(check(&directory.path().join("none.onnx"), "").0, Some(66));
+    desk.write("m.onnx", "not a model");
+    desk.fails("check-model m.onnx", 78, "m.onnx: not an ONNX model");
+    desk.fails("check-model none.onnx", 66, "none.onnx");
 }

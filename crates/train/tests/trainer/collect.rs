@@ -1,46 +1,28 @@
 //! Recordings become a data set: the frames that the daemon would judge, with labels.
 
 use std::fs;
-use std::path::PathBuf;
-use std::process::Output;
 
 use hardnessd_core::frame::Pitch;
 use hardnessd_core::recording::{Labels, MAGIC};
 use hardnessd_core::sensor::Description;
 use hardnessd_core::tests::support::of_a_labelled_press;
-use hardnessd_core::verdict::{Card, Model, Piece};
+use hardnessd_core::verdict::{Card, Piece};
 use hardnessd_simulator::Split;
-use hrn_train::data::presses::{Press, Presses, meta, read_one};
+use hrn_train::data::presses::{Layout, Press};
 use hrn_train::data::source::Kind;
 use hrn_train::run::disk;
 use serde_json::{Value, json};
 
-use crate::{errors, hrn_train_in, json_in, succeed_in, write_data};
+use crate::{Desk, FIXTURES, MODELS};
 
-const FIXTURES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fixtures");
-const COURSE_MODEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/course.onnx");
-
-/// A directory of recordings and data sets. `foam.bin` has raw bytes of presses, which have no labels.
-struct Desk(tempfile::TempDir);
+/// A desk with `foam.bin`, raw bytes of presses, which have no labels.
+fn desk() -> Desk {
+    let desk = Desk::new();
+    fs::copy(format!("{FIXTURES}/foam.5hz.bin"), desk.path("foam.bin")).unwrap();
+    desk
+}
 
 impl Desk {
-    fn new() -> Self {
-        let desk = Self(tempfile::tempdir().unwrap());
-        let fixture = format!("{FIXTURES}/foam.5hz.bin");
-        fs::copy(fixture, desk.path("foam.bin")).unwrap();
-        desk
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
-    }
-
-    fn write(&self, name: &str, content: impl AsRef<[u8]>) {
-        let path = self.path(name);
-        fs::create_dir_all(path.parent().unwrap()).unwrap();
-        fs::write(path, content).unwrap();
-    }
-
     /// A recording of one press with these labels, such as `level=1 object=7`.
     fn recording(&self, name: &str, labels: &str) {
         self.recording_of(name, labels, |_| ());
@@ -57,51 +39,32 @@ impl Desk {
         self.write(name, bytes);
     }
 
-    fn collect(&self, out: &str, arguments: &str) -> Output {
-        hrn_train_in(self.0.path(), &format!("collect --out {out} {arguments}"))
-    }
-
-    fn presses(&self, name: &str) -> Presses {
-        read_one(&self.path(name)).unwrap()
-    }
-
     /// The presses of the data set after they were collected.
     #[track_caller]
     fn collected(&self, out: &str, arguments: &str) -> Vec<Press> {
-        let output = self.collect(out, arguments);
-        assert!(output.status.success(), "{arguments}: {output:?}");
+        self.succeeds(&format!("collect --out {out} {arguments}"));
         self.presses(out).all
     }
 
-    fn meta(&self, name: &str) -> Value {
-        meta(&self.path(name)).unwrap()
-    }
-
-    /// Asserts that the command is refused with this exit code and one line that contains `part`, and
-    /// that nothing is written.
+    /// Asserts that the command is refused with this exit code and a line that contains `part`, and that nothing is
+    /// written.
     #[track_caller]
     fn assert_refused(&self, out: &str, arguments: &str, code: i32, part: &str) {
         let before = fs::read(self.path(out)).ok();
-        let output = self.collect(out, arguments);
-        let errors = errors(&output);
-        assert_eq!(output.status.code(), Some(code), "{errors}");
-        assert!(errors.contains(part), "{errors}\nshould contain\n{part}");
-        assert_eq!(errors.lines().count(), 1, "{errors}");
+        self.fails(&format!("collect --out {out} {arguments}"), code, part);
         assert!(fs::read(self.path(out)).ok() == before);
     }
 
     /// The card of a model trained on the data.
     fn trained(&self, data: &str) -> Card {
-        let train = format!("train --method features --out run --data {data}");
-        succeed_in(self.0.path(), &train);
-        let model = fs::read(self.path("run/hrn.onnx")).unwrap();
-        Model::load(&model).unwrap().card().clone()
+        self.succeeds(&format!("train --method features --out run --data {data}"));
+        self.model("run/hrn.onnx").card().clone()
     }
 }
 
 #[test]
 fn samples_are_the_frames_that_the_daemon_judges() {
-    let desk = Desk::new();
+    let desk = desk();
     let samples = desk.collected("bytes.npz", "--level 0 --object 9 foam.bin");
     let events = fs::read_to_string(format!("{FIXTURES}/foam.5hz.jsonl")).unwrap();
     let events = events
@@ -122,7 +85,7 @@ fn samples_are_the_frames_that_the_daemon_judges() {
 
 #[test]
 fn labels_are_those_of_the_recording_unless_options_give_others() {
-    let desk = Desk::new();
+    let desk = desk();
     desk.recording("a.mcap", "level=1 object=7 material=oak shore=95");
     let samples = desk.collected("own.npz", "a.mcap");
     let [sample] = &samples[..] else {
@@ -162,10 +125,10 @@ fn labels_are_those_of_the_recording_unless_options_give_others() {
 
 #[test]
 fn recordings_can_be_added_to_simulated_samples() {
-    let desk = Desk::new();
+    let desk = desk();
     desk.recording("a.mcap", "level=1 object=7 material=oak shore=95");
     let simulate = "simulate --out own.npz --objects 1 --test-objects 1 --presses 1";
-    succeed_in(desk.0.path(), simulate);
+    desk.succeeds(simulate);
     let both = desk.collected("own.npz", "--append a.mcap");
     let (first, last) = (&both[0], both.last().unwrap());
     // A material keeps its index, and a new one gets the next one.
@@ -179,12 +142,11 @@ fn recordings_can_be_added_to_simulated_samples() {
 
 #[test]
 fn whole_presses_with_the_arms_approach_are_evaluated() {
-    let desk = Desk::new();
+    let desk = desk();
     desk.recording_of("a.mcap", "level=1 object=7 shore=95", |described| {
         described.sensor.arm.stiffness_n_per_mm = Some(10.0);
     });
-    let output = desk.collect("courses.npz", "--sequences --split test a.mcap");
-    let account = String::from_utf8(output.stdout).unwrap();
+    let account = desk.succeeds("collect --out courses.npz --sequences --split test a.mcap");
     let expected = "presses collected: 1, with the arm's approach: 1, in all: 1";
     assert!(account.contains(expected), "{account}");
     let presses = desk.presses("courses.npz");
@@ -208,8 +170,8 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
     let new = all[1].object;
     let is_new = |press: &Press| press.object == new && press.shore.is_none();
     assert!(new != Some(7) && all[1..].iter().all(is_new));
-    let evaluate = format!("evaluate --json --data courses.npz --model {COURSE_MODEL}");
-    assert_eq!(json_in(desk.0.path(), &evaluate)["n"], all.len());
+    let evaluate = format!("evaluate --json --data courses.npz --model {MODELS}/course.onnx");
+    assert_eq!(desk.json(&evaluate)["n"], all.len());
 
     // One file cannot hold both single frames and presses over time.
     let expected = "has whole presses, not single frames";
@@ -218,7 +180,7 @@ fn whole_presses_with_the_arms_approach_are_evaluated() {
 
 #[test]
 fn the_sensor_and_the_rigid_piece_of_a_press_are_kept() {
-    let desk = Desk::new();
+    let desk = desk();
     for (name, sensor, labels) in [
         ("a.mcap", "left", "level=1 object=7"),
         ("b.mcap", "right", "level=2 object=8"),
@@ -242,17 +204,15 @@ fn the_sensor_and_the_rigid_piece_of_a_press_are_kept() {
         (0, 0, Some(Piece::Flat { width_mm: 20.0 })),
     ];
     assert!(found.eq(expected), "{all:?}");
-    assert_eq!(
-        desk.meta("presses.npz")["sensors"],
-        json!(["left", "right"])
-    );
+    let sensors = json!(["left", "right"]);
+    assert_eq!(desk.meta("presses.npz")["sensors"], sensors);
     let expected = "label reference: found \"cube:3\"";
     desk.assert_refused("presses.npz", "--append --sequences e.mcap", 1, expected);
 }
 
 #[test]
 fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
-    let desk = Desk::new();
+    let desk = desk();
     let calibration =
         "[[sensor]]\nname = \"a\"\nport = \"b\"\n[sensor.calibration]\npitch_mm = 2.0\n";
     desk.write("narrow.toml", calibration);
@@ -262,10 +222,8 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     desk.collected("narrow.npz", "--level 1 narrow.mcap");
     assert_eq!(desk.meta("narrow.npz")["pitch_mm"], 2.0);
     // A .bin file belongs to the configuration's sensor.
-    desk.collected(
-        "narrow.npz",
-        "--append --level 2 --config narrow.toml foam.bin",
-    );
+    let append = "--append --level 2 --config narrow.toml foam.bin";
+    desk.collected("narrow.npz", append);
     assert_eq!(desk.trained("narrow.npz").pitch_mm, 2.0);
 
     desk.collected("wide.npz", "--level 1 foam.bin");
@@ -275,21 +233,19 @@ fn a_model_is_of_the_pitch_of_its_recordings_and_pitches_do_not_mix() {
     desk.recording("usual.mcap", "level=1 material=oak");
     let skip = "--append --skip-unusable --level 1 narrow.mcap usual.mcap";
     desk.collected("wide.npz", skip);
-    assert_eq!(
-        desk.meta("wide.npz")["materials"],
-        json!(["unknown", "oak"])
-    );
+    let named = json!(["unknown", "oak"]);
+    assert_eq!(desk.meta("wide.npz")["materials"], named);
 
     // A model can be evaluated on data of another pitch.
     for data in ["narrow.npz", "wide.npz"] {
         let evaluate = format!("evaluate --split train --model run/hrn.onnx --data {data}");
-        succeed_in(desk.0.path(), &evaluate);
+        desk.succeeds(&evaluate);
     }
 }
 
 #[test]
 fn the_levels_of_a_configuration_are_those_of_the_labels_and_of_the_data_set() {
-    let desk = Desk::new();
+    let desk = desk();
     let sensor = "[[sensor]]\nname = \"a\"\nport = \"b\"\n";
     let level = |label, shore| format!("[[level]]\nlabel = \"{label}\"\nshore = {shore}\n");
     let levels = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 50.0]");
@@ -304,37 +260,23 @@ fn the_levels_of_a_configuration_are_those_of_the_labels_and_of_the_data_set() {
     assert!(all.iter().all(|press| press.level == 2), "{all:?}");
     assert_eq!(desk.meta("own.npz")["levels"][1]["label"], "limp");
     // Others are refused, and tables that no data set can have.
-    let other = level("stiff", "[70.0, 100.0]") + &level("limp", "[0.0, 70.0]");
-    let overlap = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 60.0]");
-    for (levels, append, code, part) in [
-        (
-            other,
-            "--append ",
-            1,
-            "its levels are not those of --config",
-        ),
-        (
-            level("stiff", "[0.0, 100.0]"),
-            "",
-            78,
-            "level: found 1 tables",
-        ),
-        (overlap, "", 78, "level: found"),
-    ] {
+    let check = |levels: &str, (out, append): (&str, &str), code: i32, part: &str| {
         desk.write("other.toml", format!("{sensor}{levels}"));
-        let out = if append.is_empty() {
-            "new.npz"
-        } else {
-            "own.npz"
-        };
-        let collect = format!("{append}--config other.toml b.mcap");
+        let collect = format!("{append} --config other.toml b.mcap");
         desk.assert_refused(out, &collect, code, part);
-    }
+    };
+    let other = level("stiff", "[70.0, 100.0]") + &level("limp", "[0.0, 70.0]");
+    let expected = "its levels are not those of --config";
+    check(&other, ("own.npz", "--append"), 1, expected);
+    let one = level("stiff", "[0.0, 100.0]");
+    check(&one, ("new.npz", ""), 78, "level: found 1 tables");
+    let overlap = level("stiff", "[50.0, 100.0]") + &level("limp", "[0.0, 60.0]");
+    check(&overlap, ("new.npz", ""), 78, "level: found");
 }
 
 #[test]
 fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
-    let desk = Desk::new();
+    let desk = desk();
     desk.collected("own.npz", "--object 1 --level 1 foam.bin");
     desk.recording("a.mcap", "level=1");
     // The same recording once more, and another call that may be writing the same data set.
@@ -352,7 +294,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
         let mut presses = own.clone();
         presses.all.iter_mut().for_each(change);
         let meta = json!({"materials": ["oak", 7]});
-        write_data(&desk.path("own.npz"), &presses, &meta);
+        desk.write_presses("own.npz", Layout::Frames, &presses, &meta);
     };
     write(|press| press.object = None);
     desk.assert_refused("own.npz", append, 1, "own.npz: has no array `object`");
@@ -368,7 +310,7 @@ fn nothing_of_a_data_set_is_lost_when_it_is_added_to() {
 
 #[test]
 fn what_cannot_be_collected_is_said_and_nothing_is_written() {
-    let desk = Desk::new();
+    let desk = desk();
     // An MCAP file of another program: a header, the end of its data and a footer.
     let (header, end, footer) = ([1, 8], [15, 4], [2, 20]);
     let records = [header, end, footer].map(|[kind, length]| {
@@ -380,33 +322,30 @@ fn what_cannot_be_collected_is_said_and_nothing_is_written() {
     desk.write("archive.npz", "PK\x03\x04");
     desk.recording("wrong.mcap", "level=99");
     desk.write("taken.npz", "somebody's");
-    // The data set, the rest of the command, its exit code, and what it says.
-    let cases = "
-        own.npz | foam.bin | 2 | has no label `level`: give its level with --level
-        own.npz | --level 17 foam.bin | 2 | 17
-        own.npz | --level 1 none.mcap | 66 | none.mcap
-        own.npz | --level 1 foreign.mcap | 1 | found no state of a sensor
-        own.npz | archive.npz | 1 | is a data set, not a recording
-        own.npz | wrong.mcap | 1 | label level: found \"99\", expected the name
-        own.npz | empty | 1 | empty: no recording is in this directory
-        own.npz | --level 1 --config none.toml foam.bin | 66 | none.toml
-        taken.npz | --level 1 foam.bin | 74 | --append adds to a data set:
-        /dev/null | --append --level 1 foam.bin | 66 | /dev/null: found a device";
-    for case in cases.trim().lines() {
-        let [out, arguments, code, part] = case.trim().split(" | ").collect::<Vec<_>>()[..] else {
-            panic!("{case}");
-        };
-        desk.assert_refused(out, arguments, code.parse().unwrap(), part);
-    }
+    desk.fails_each(
+        "
+        collect --out own.npz foam.bin | 2 | has no label `level`: give its level with --level
+        collect --out own.npz --level 17 foam.bin | 2 | 17
+        collect --out own.npz --level 1 none.mcap | 66 | none.mcap
+        collect --out own.npz --level 1 foreign.mcap | 1 | found no state of a sensor
+        collect --out own.npz archive.npz | 1 | is a data set, not a recording
+        collect --out own.npz wrong.mcap | 1 | label level: found \"99\", expected the name
+        collect --out own.npz empty | 1 | empty: no recording is in this directory
+        collect --out own.npz --level 1 --config none.toml foam.bin | 66 | none.toml
+        collect --out taken.npz --level 1 foam.bin | 74 | --append adds to a data set:
+        collect --out /dev/null --append --level 1 foam.bin | 66 | /dev/null: found a device",
+    );
+    assert!(!desk.path("own.npz").exists());
+    assert_eq!(desk.read("taken.npz"), b"somebody's");
 }
 
 #[test]
 fn what_cannot_be_used_is_left_out_with_its_reason() {
-    let desk = Desk::new();
+    let desk = desk();
     desk.recording("fleet/b.mcap", "level=1 object=7 note=near");
     desk.recording("fleet/a/deep/a.mcap", "level=1 object=7");
     // The length of the first record becomes larger than any.
-    let mut bytes = fs::read(desk.path("fleet/b.mcap")).unwrap();
+    let mut bytes = desk.read("fleet/b.mcap");
     bytes[9..17].fill(0xff);
     desk.write("fleet/a/damaged.mcap", bytes);
     // Neither of these is a recording.
@@ -414,9 +353,8 @@ fn what_cannot_be_used_is_left_out_with_its_reason() {
     desk.write("fleet/empty.mcap", "");
     desk.write("zeros.bin", [0; 100]);
     let skip = "--skip-unusable foam.bin zeros.bin fleet none.mcap";
-    let output = desk.collect("fleet.npz", skip);
-    let errors = errors(&output);
-    assert!(output.status.success(), "{errors}");
+    let (code, _, errors) = desk.run(&format!("collect --out fleet.npz {skip}"));
+    assert_eq!(code, 0, "{errors}");
     let lines: Vec<&str> = errors.lines().collect();
     assert_eq!(lines.len(), 4, "{errors}");
     for (line, (path, reason)) in lines.into_iter().zip([
@@ -430,9 +368,8 @@ fn what_cannot_be_used_is_left_out_with_its_reason() {
     }
     // The others are there, in the order of the paths.
     desk.collected("only.npz", "fleet/a/deep/a.mcap fleet/b.mcap");
-    let [only, fleet] = ["only.npz", "fleet.npz"].map(|name| fs::read(desk.path(name)).unwrap());
-    assert!(only == fleet);
+    assert!(desk.read("only.npz") == desk.read("fleet.npz"));
     // A data set needs one recording at least.
-    let output = desk.collect("unusable.npz", "--skip-unusable none.mcap foam.bin");
-    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let unusable = "collect --out unusable.npz --skip-unusable none.mcap foam.bin";
+    desk.fails(unusable, 1, "no recording can be used");
 }

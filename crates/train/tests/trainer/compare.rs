@@ -1,44 +1,32 @@
 //! `hrn-train compare` on tiny data: the files that it writes, and the runs that it does not repeat.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-use std::process::Output;
 use std::sync::OnceLock;
 
 use serde_json::Value;
 
-use crate::{data, errors, hrn_train_in, json_in, succeed_in};
-
-/// The directory of the data.
-fn at() -> &'static Path {
-    data().0.path()
-}
+use crate::{Desk, data};
 
 const COMPARE: &str = "compare --profile smoke --data tiny.npz";
 
-fn compare(more: &str) -> Output {
-    hrn_train_in(at(), &format!("{COMPARE} {more}"))
-}
-
 fn json(path: &str) -> Vec<Value> {
-    serde_json::from_slice(&std::fs::read(at().join(path)).unwrap()).unwrap()
+    serde_json::from_slice(&data().read(path)).unwrap()
 }
 
-/// A comparison that several tests share.
-fn whole() -> PathBuf {
-    static WHOLE: OnceLock<String> = OnceLock::new();
+/// The desk of the data, with a comparison that several tests share, `whole`.
+fn compared() -> &'static Desk {
+    static WHOLE: OnceLock<()> = OnceLock::new();
     WHOLE.get_or_init(|| {
         let of = "--methods hrn100,features --labels 24 --seeds 2 --jobs 2 --out whole";
-        let printed = succeed_in(at(), &format!("{COMPARE} {of}"));
+        let printed = data().succeeds(&format!("{COMPARE} {of}"));
         assert!(printed.starts_with("# Comparison"), "{printed}");
-        printed
     });
-    at().join("whole")
+    data()
 }
 
 #[test]
 fn the_counts_of_objects_add_up_to_the_accuracies() {
-    let csv = std::fs::read_to_string(whole().join("objects.csv")).unwrap();
+    let csv = compared().text("whole/objects.csv");
     let mut lines = csv.lines();
     let head = "run,set,level,object,geometry,right,samples";
     assert_eq!(lines.next(), Some(head));
@@ -64,7 +52,7 @@ fn the_counts_of_objects_add_up_to_the_accuracies() {
 
 #[test]
 fn results_have_the_documented_fields_and_agree_with_evaluate() {
-    whole();
+    let desk = compared();
     let results = json("whole/results.json");
     let row = |result: &Value| {
         let number = |key: &str| result[key].as_u64().unwrap();
@@ -91,89 +79,57 @@ fn results_have_the_documented_fields_and_agree_with_evaluate() {
         }
     }
     let model = "evaluate --json --model whole/runs/hrn100-1/hrn.onnx --data tiny.npz";
-    assert_eq!(json_in(at(), model), results[0]["paper_split"]);
-}
-
-#[test]
-fn tables_stand_beside_the_papers_and_can_be_made_again() {
-    let tables = std::fs::read_to_string(whole().join("tables.md")).unwrap();
-    let line = |heading: &str| {
-        let mut sections = tables.split("\n## ");
-        let section = sections.find(|part| part.starts_with(heading)).unwrap();
-        let mut lines = section.lines();
-        let line = lines.find(|line| line.starts_with("| hrn100, 160 labels |"));
-        line.unwrap_or_else(|| panic!("{section}")).to_owned()
-    };
-    let accuracies = line("Table 2");
-    for paper in ["(97.6)", "(94.4)", "(92.4)", "(99.2)", "(95.9)"] {
-        assert!(accuracies.contains(paper), "{accuracies}");
-    }
-    assert!(line("Table 3: kappa").contains("(0.9453)"));
-    let confusion = line("Table 3: confusion");
-    assert!(confusion.ends_with("| 244 | 5 | 1 | 0 |"), "{confusion}");
-    assert!(tables.contains("| features, 24 labels |"), "{tables}");
-
-    // From the results alone, as from an archive.
-    std::fs::create_dir(at().join("copy")).unwrap();
-    let to = at().join("copy/results.json");
-    std::fs::copy(whole().join("results.json"), to).unwrap();
-    assert_eq!(succeed_in(at(), "compare --out copy"), tables);
-    let none = hrn_train_in(at(), "compare --out nothing");
-    assert!(errors(&none).contains("no finished run"), "{none:?}");
+    assert_eq!(desk.json(model), results[0]["paper_split"]);
 }
 
 #[test]
 fn what_is_done_is_not_done_again_and_what_fails_is_named() {
-    let two = "--methods features,hrn100 --seeds 1 --out again";
+    let desk = data();
+    let compare = |of: &str| desk.run(&format!("{COMPARE} {of} --seeds 1 --out again"));
+    let two = "--methods features,hrn100";
     // A run of other settings is in the way of one.
     let other = "train --method features --data tiny.npz --profile smoke --seed 7 --out again/runs/hrn100-1";
-    succeed_in(at(), other);
-    std::fs::remove_file(at().join("again/runs/hrn100-1/hrn.onnx")).unwrap();
-    let first = compare(two);
-    let message = errors(&first);
-    assert!(!first.status.success(), "{message}");
-    assert!(message.contains("features-1: done"), "{message}");
-    assert!(message.contains("hrn100-1: "), "{message}");
-    assert!(message.contains("again/logs"), "{message}");
+    desk.succeeds(other);
+    std::fs::remove_file(desk.path("again/runs/hrn100-1/hrn.onnx")).unwrap();
+    let (code, _, message) = compare(two);
+    assert_ne!(code, 0, "{message}");
+    for part in ["features-1: done", "hrn100-1: ", "again/logs"] {
+        assert!(message.contains(part), "{message}");
+    }
 
     // The other run counts.
     let results = json("again/results.json");
-    assert_eq!(
-        (results.len(), &results[0]["run"]),
-        (1, &"features-1".into())
-    );
-    let model = at().join("again/runs/features-1/hrn.onnx");
+    let runs: Vec<&Value> = results.iter().map(|result| &result["run"]).collect();
+    assert_eq!(runs, ["features-1"]);
+    let model = desk.path("again/runs/features-1/hrn.onnx");
     let written = || model.metadata().unwrap().modified().unwrap();
     let before = written();
-    std::fs::remove_dir_all(at().join("again/runs/hrn100-1")).unwrap();
-    let second = compare(two);
-    assert!(second.status.success(), "{second:?}");
-    assert!(!errors(&second).contains("features-1: begun"), "{second:?}");
+    std::fs::remove_dir_all(desk.path("again/runs/hrn100-1")).unwrap();
+    let (code, _, message) = compare(two);
+    let is_repeated = message.contains("features-1: begun");
+    assert!(code == 0 && !is_repeated, "{message}");
     assert_eq!((written(), json("again/results.json").len()), (before, 2));
 
     // A comparison of fewer runs keeps the results of the others.
-    let third = compare("--methods hrn100 --seeds 1 --out again");
-    assert!(third.status.success(), "{third:?}");
-    assert!(errors(&third).is_empty(), "{third:?}");
+    let (code, _, message) = compare("--methods hrn100");
+    assert_eq!((code, &*message), (0, ""));
     assert_eq!(json("again/results.json").len(), 2);
 }
 
 #[test]
 fn a_plan_has_a_line_for_each_run_that_is_not_done() {
     let of = "--methods features,ours --labels 8 --out planned";
-    let plan = succeed_in(at(), &format!("{COMPARE} {of} --plan"));
-    assert!(!at().join("planned").exists());
+    let desk = data();
+    let plan = desk.succeeds(&format!("{COMPARE} {of} --plan"));
+    assert!(!desk.path("planned").exists());
     let lines: Vec<&str> = plan.lines().collect();
     assert_eq!(lines.len(), 4, "{plan}");
     let is_run = |line: &&str| line.contains(" hrn-train train --resume");
     assert!(lines.iter().all(is_run), "{plan}");
     // Another program runs a line.
-    let line = lines
-        .iter()
-        .find(|line| line.contains("features-8-1"))
-        .unwrap();
-    let (_, arguments) = line.split_once("hrn-train ").unwrap();
-    succeed_in(at(), arguments);
-    let rest = succeed_in(at(), &format!("{COMPARE} {of} --plan"));
+    let line = lines.iter().find(|line| line.contains("features-8-1"));
+    let (_, arguments) = line.unwrap().split_once("hrn-train ").unwrap();
+    desk.succeeds(arguments);
+    let rest = desk.succeeds(&format!("{COMPARE} {of} --plan"));
     assert_eq!(rest.lines().count(), 3, "{rest}");
 }

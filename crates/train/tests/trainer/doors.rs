@@ -25,7 +25,7 @@ fn a_user_who_may_have_no_more_threads_is_told_so() {
         shell.uid(65_534).gid(65_534);
     }
     let output = shell.current_dir("/").stdin(program).output().unwrap();
-    let said = super::errors(&output);
+    let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(74), "{said}");
     assert!(said.starts_with("hrn-train: threads: "), "{said}");
     assert_eq!(said.lines().count(), 1, "{said}");

@@ -1,34 +1,30 @@
 //! `fit`: recordings in, the best model out.
 
 use std::fs;
-use std::fs::File;
-use std::path::Path;
-
 use std::sync::Arc;
 
 use hardnessd_core::event::{Event, Note, Phase};
 use hardnessd_core::frame::Array;
-use hardnessd_core::npz::Writer;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Found, Playback};
 use hardnessd_core::references;
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::tests::support::at;
-use hardnessd_core::verdict::{Format, Model, ModelFrame};
+use hardnessd_core::verdict::{Format, ModelFrame};
 use hardnessd_simulator::Split;
-use hrn_train::data::presses::{self, Layout, Press, Presses};
+use hrn_train::data::presses::{Layout, Press, Presses};
 use serde_json::{Value, json};
 
-use crate::{errors, hrn_train_in, json_in, succeed_in};
+use crate::Desk;
 
 /// Five presses of each object on an array of 4x4 taxels. Each object is its level and the column of the array
 /// that feels it, 0 to 3.
-fn write(path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
-    write_by("another program", path, objects, levels);
+fn write(desk: &Desk, name: &str, objects: &[(u8, usize)], levels: &[&str]) {
+    write_by("another program", desk, name, objects, levels);
 }
 
 /// The same, as this generator would say it.
-fn write_by(generator: &str, path: &Path, objects: &[(u8, usize)], levels: &[&str]) {
+fn write_by(generator: &str, desk: &Desk, name: &str, objects: &[(u8, usize)], levels: &[&str]) {
     let mut presses = Presses::default();
     for (object, &(level, col)) in (0..).zip(objects) {
         for number in 0..5_u8 {
@@ -64,25 +60,18 @@ fn write_by(generator: &str, path: &Path, objects: &[(u8, usize)], levels: &[&st
     let meta = json!({
         "grid": [4, 4], "pitch_mm": 3.5, "levels": levels, "generator": generator
     });
-    presses::write(
-        Writer::new(File::create(path).unwrap()),
-        &presses,
-        Layout::OverTime,
-        &meta,
-    )
-    .unwrap();
+    desk.write_presses(name, Layout::OverTime, &presses, &meta);
 }
 
 const PAPERS: [&str; 4] = ["hard", "firm", "soft", "very-soft"];
 
 #[test]
 fn taxels_that_tell_the_level_become_a_model_of_the_array() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
+    let desk = Desk::new();
     // What is pressed looks the same from every column, so only the taxels tell the level.
     let objects = [(1, 0), (1, 0), (2, 2), (2, 2), (2, 2)];
-    write(&path("d.npz"), &objects, &PAPERS);
-    let report = json_in(directory.path(), "fit d.npz --out m.onnx --json");
+    write(&desk, "d.npz", &objects, &PAPERS);
+    let report = desk.json("fit d.npz --out m.onnx --json");
     let found = |name: &str, by: &str| {
         let mut rows = report["candidates"].as_array().unwrap().iter();
         let row = rows.find(|row| row["name"] == name).unwrap();
@@ -97,18 +86,16 @@ fn taxels_that_tell_the_level_become_a_model_of_the_array() {
     );
     assert_eq!(report["wrong"], json!([]));
 
-    let hrn = Model::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
+    let hrn = desk.model("m.onnx");
     assert_eq!(hrn.format(), Format::Parts);
     assert_eq!(hrn.card().grid, Some(Array { rows: 4, cols: 4 }));
-    let evaluation = "evaluate --json --split train --model m.onnx --data d.npz";
-    let evaluation = json_in(directory.path(), evaluation);
+    let evaluation = desk.json("evaluate --json --split train --model m.onnx --data d.npz");
     assert_eq!(evaluation["accuracy"], 1.0);
     // The same through `train`, which takes no copies of presses.
-    write(&path("e.npz"), &[(1, 0), (1, 1), (2, 2), (2, 3)], &PAPERS);
-    let train = "train --method taxels --profile smoke --data e.npz --out run";
-    succeed_in(directory.path(), train);
-    let again = Model::load(&fs::read(path("run/hrn.onnx")).unwrap()).unwrap();
-    assert_eq!(again.card().grid, hrn.card().grid);
+    let objects = [(1, 0), (1, 1), (2, 2), (2, 3)];
+    write(&desk, "e.npz", &objects, &PAPERS);
+    desk.succeeds("train --method taxels --profile smoke --data e.npz --out run");
+    assert_eq!(desk.model("run/hrn.onnx").card().grid, hrn.card().grid);
 }
 
 /// The configuration of a sensor with so many taxels a side.
@@ -138,39 +125,39 @@ fn pressed(side: usize, bar: [usize; 2], hardest: u8) -> Vec<u8> {
     pressed_at(side, bar, hardest, 0)
 }
 
+/// Collects presses of an object as its file. The first two objects are of level 1, the next two of level 2.
+fn collect(desk: &Desk, object: u8, presses: [Vec<u8>; 3]) {
+    for (number, bytes) in presses.iter().enumerate() {
+        desk.write(&format!("{object}{number}.bin"), bytes);
+    }
+    let level = object / 2 + 1;
+    desk.succeeds(&format!(
+        "collect --sequences --config wide.toml --level {level} --object {object} --out {object}.npz {object}0.bin \
+         {object}1.bin {object}2.bin"
+    ));
+}
+
 #[test]
 fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
     for side in [32, 64] {
-        let directory = tempfile::tempdir().unwrap();
-        let path = |name: &str| directory.path().join(name);
+        let desk = Desk::new();
         let config = config_of(side);
-        fs::write(path("wide.toml"), &config).unwrap();
+        desk.write("wide.toml", &config);
         // Features do not tell a bar along the rows from one along the columns.
         let bars = [[2, 8], [8, 2]];
-        for (object, bar) in [bars[0], bars[0], bars[1], bars[1]].into_iter().enumerate() {
-            for number in 0..3 {
-                let bytes = pressed(side, bar, 100 + 10 * object as u8 + 30 * number);
-                fs::write(path(&format!("{object}{number}.bin")), bytes).unwrap();
-            }
-            let level = object / 2 + 1;
-            let collect = format!(
-                "collect --sequences --config wide.toml --level {level} --object {object} --out {object}.npz \
-                 {object}0.bin {object}1.bin {object}2.bin"
-            );
-            succeed_in(directory.path(), &collect);
+        for (object, bar) in (0..).zip([bars[0], bars[0], bars[1], bars[1]]) {
+            let hardest = [100, 130, 160].map(|hardest| hardest + 10 * object);
+            let presses = hardest.map(|hardest| pressed(side, bar, hardest));
+            collect(&desk, object, presses);
         }
-        let fit = "fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx --json";
-        let report = json_in(directory.path(), fit);
-        assert_eq!(
-            (&report["best"], &report["writes"]),
-            (&json!("taxels"), &json!("model"))
-        );
+        let report =
+            desk.json("fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx --json");
+        let written = [&report["best"], &report["writes"]];
+        assert_eq!(written, ["taxels", "model"]);
 
-        let hrn = Model::load(&fs::read(path("m.onnx")).unwrap()).unwrap();
-        let array = Array {
-            rows: side,
-            cols: side,
-        };
+        let hrn = desk.model("m.onnx");
+        let [rows, cols] = [side; 2];
+        let array = Array { rows, cols };
         assert_eq!((hrn.card().grid, hrn.card().pitch_mm), (Some(array), 2.0));
         let config: toml::Table = config.parse().unwrap();
         let sensor: sensor::Settings = config["sensor"][0].clone().try_into().unwrap();
@@ -200,65 +187,44 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
         }
         // The pitch is the model's.
         let evaluate = "evaluate --split train --model m.onnx --data 0.npz";
-        let output = hrn_train_in(directory.path(), evaluate);
-        assert_eq!(
-            (output.status.code(), errors(&output)),
-            (Some(0), String::new())
-        );
+        let (code, _, errors) = desk.run(evaluate);
+        assert_eq!((code, &*errors), (0, ""));
         // Presses of an array of another size have no parts of this one, and none are kept.
-        fs::write(path("less.toml"), config_of(side - 2)).unwrap();
-        fs::write(path("less.bin"), pressed(side - 2, bars[0], 100)).unwrap();
+        desk.write("less.toml", config_of(side - 2));
+        desk.write("less.bin", pressed(side - 2, bars[0], 100));
         let append = "collect --sequences --append --config less.toml --level 1 --object 9 --out 0.npz less.bin";
-        let output = hrn_train_in(directory.path(), append);
+        let (_, _, errors) = desk.run(append);
         let warning = "warning: not all presses have parts of one array";
-        assert!(errors(&output).starts_with(warning), "{output:?}");
-        let meta = presses::meta(&path("0.npz")).unwrap();
-        assert_eq!(
-            (&meta["grid"], meta.get("grid_pitch_mm")),
-            (&Value::Null, None)
-        );
-        assert_eq!(Presses::read(&[path("0.npz")]).unwrap().all.len(), 4);
+        assert!(errors.starts_with(warning), "{errors}");
+        let meta = desk.meta("0.npz");
+        let grid = (&meta["grid"], meta.get("grid_pitch_mm"));
+        assert_eq!(grid, (&Value::Null, None));
+        assert_eq!(desk.presses("0.npz").all.len(), 4);
     }
 }
 
 #[test]
 fn presses_scattered_on_a_large_array_are_no_model_of_its_taxels() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
-    fs::write(path("wide.toml"), config_of(64)).unwrap();
-    for object in 0..4_u8 {
-        for right in [0, 9, 18] {
-            let bytes = pressed_at(64, [4, 4], 100 + 20 * object, right);
-            fs::write(path(&format!("{object}{right}.bin")), bytes).unwrap();
-        }
-        let collect = format!(
-            "collect --sequences --config wide.toml --level {} --object {object} --out {object}.npz {object}0.bin \
-             {object}9.bin {object}18.bin",
-            object / 2 + 1
-        );
-        succeed_in(directory.path(), &collect);
+    let desk = Desk::new();
+    desk.write("wide.toml", config_of(64));
+    for object in 0..4 {
+        let presses = [0, 9, 18].map(|right| pressed_at(64, [4, 4], 100 + 20 * object, right));
+        collect(&desk, object, presses);
     }
-    let fit = "fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx";
-    let output = hrn_train_in(directory.path(), fit);
-    let text = String::from_utf8_lossy(&output.stdout);
+    let (_, text, _) = desk.run("fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx");
     let expected = "left out: presses fall on different places of a large array";
     assert!(text.contains(expected), "{text}");
 }
 
 #[test]
 fn an_object_of_two_collected_files_is_one_and_a_copied_press_counts_once() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
     let monday = [(1, 0), (1, 1), (2, 2), (2, 3)];
     let tuesday = [(1, 1), (1, 0), (2, 3), (2, 2)];
     let of = |first: &str, second: &str, objects: &[(u8, usize)]| {
-        write_by(first, &path("mon.npz"), &monday, &PAPERS);
-        write_by(second, &path("tue.npz"), objects, &PAPERS);
-        let words = "fit mon.npz tue.npz --out m.onnx --json";
-        let report = json_in(directory.path(), words);
-        for file in ["m.onnx", "m.npz", "mon.npz", "tue.npz"] {
-            let _ = fs::remove_file(path(file));
-        }
+        let desk = Desk::new();
+        write_by(first, &desk, "mon.npz", &monday, &PAPERS);
+        write_by(second, &desk, "tue.npz", objects, &PAPERS);
+        let report = desk.json("fit mon.npz tue.npz --out m.onnx --json");
         let remarks = report["remarks"].to_string();
         (
             report["levels"][0]["objects"].as_u64(),
@@ -274,88 +240,64 @@ fn an_object_of_two_collected_files_is_one_and_a_copied_press_counts_once() {
     assert!(remarks.contains("20 presses are copies"), "{remarks}");
     let (objects, _, remarks) = of("another", "another", &tuesday);
     assert_eq!(objects, Some(4));
-    assert!(
-        remarks.contains("objects of different data sets"),
-        "{remarks}"
-    );
+    let expected = "objects of different data sets";
+    assert!(remarks.contains(expected), "{remarks}");
 }
 
 #[test]
 fn presses_that_tell_nothing_become_references() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
+    let desk = Desk::new();
     // Each column has every level.
     let objects = [(1, 0), (1, 2), (2, 0), (2, 2), (3, 0), (3, 2)];
-    write(&path("d.npz"), &objects, &PAPERS);
-    fs::write(path("unpressed.bin"), [0; 100]).unwrap();
-    let output = hrn_train_in(directory.path(), "fit d.npz unpressed.bin --out m.onnx");
-    let (text, errors) = (String::from_utf8_lossy(&output.stdout), errors(&output));
-    assert!(
-        errors.contains("left out: unpressed.bin: no press found"),
-        "{errors}"
-    );
+    write(&desk, "d.npz", &objects, &PAPERS);
+    desk.write("unpressed.bin", [0; 100]);
+    let (_, text, errors) = desk.run("fit d.npz unpressed.bin --out m.onnx");
+    let expected = "left out: unpressed.bin: no press found";
+    assert!(errors.contains(expected), "{errors}");
     assert!(text.contains("these presses become references"), "{text}");
-    assert!(!path("m.onnx").exists());
-    let references = references::read(&fs::read(path("m.npz")).unwrap()).unwrap();
+    assert!(!desk.path("m.onnx").exists());
+    let references = references::read(&desk.read("m.npz")).unwrap();
     assert_eq!(references.len(), 30, "all presses");
-    let line = format!("references = \"{}\"", path("m.npz").display());
+    let line = format!("references = \"{}\"", desk.path("m.npz").display());
     assert!(text.contains(&line), "{text}");
 }
 
 #[test]
 fn references_that_the_daemon_would_not_use_are_not_written() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
+    let desk = Desk::new();
     let simulate =
         "simulate --sequences --objects 3 --test-objects 1 --presses 4 --shapes flat --out s.npz";
-    succeed_in(directory.path(), simulate);
-    let mut presses = Presses::read(&[path("s.npz")]).unwrap();
+    desk.succeeds(simulate);
+    let mut presses = desk.presses("s.npz");
     // Levels that have nothing to do with the hardness.
     for (number, press) in (0_u8..).zip(&mut presses.all) {
         let level = (u32::from(number) * 7 / 3 % 4) as u8 + 1;
         (press.level, press.shore, press.split) = (level, None, Split::Train);
     }
-    let file = Writer::new(File::create(path("d.npz")).unwrap());
-    let meta = presses::meta(&path("s.npz")).unwrap();
-    presses::write(file, &presses, Layout::OverTime, &meta).unwrap();
-    let output = hrn_train_in(directory.path(), "fit d.npz --out m.onnx");
-    let text = String::from_utf8_lossy(&output.stdout);
-    assert!(text.contains("make verdicts on each other worse"), "{text}");
-    assert_eq!(output.status.code(), Some(1));
-    assert!(!path("m.npz").exists() && !path("m.onnx").exists());
+    desk.write_presses("d.npz", Layout::OverTime, &presses, &desk.meta("s.npz"));
+    let (code, _, errors) = desk.run("fit d.npz --out m.onnx");
+    assert_eq!(code, 1, "{errors}");
+    assert!(!desk.path("m.npz").exists() && !desk.path("m.onnx").exists());
 }
 
 #[test]
 fn what_cannot_be_fitted_is_said_in_one_line() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = |name: &str| directory.path().join(name);
-    let refused_of = |data: &str, expected: &str| {
-        let output = hrn_train_in(directory.path(), &format!("fit {data} --out m.onnx"));
-        assert_eq!(output.status.code(), Some(1));
-        let errors = errors(&output);
-        assert_eq!(
-            errors
-                .lines()
-                .filter(|line| line.contains(expected))
-                .count(),
-            1,
-            "{errors}"
-        );
-        assert!(!path("m.onnx").exists() && !path("m.npz").exists());
+    let desk = Desk::new();
+    let refused = |data: &str, expected: &str| {
+        desk.fails(&format!("fit {data} --out m.onnx"), 1, expected);
+        assert!(!desk.path("m.onnx").exists() && !desk.path("m.npz").exists());
     };
-    let refused = |expected: &str| refused_of("d.npz", expected);
     // The built-in model cannot say levels without ranges, and nothing else is better than guessing.
     let five = ["a", "b", "c", "d", "e"];
-    write(&path("d.npz"), &[(1, 0), (1, 2), (5, 0), (5, 2)], &five);
-    refused("nothing was written, because no candidate is better than guessing");
-    write(&path("d.npz"), &[(1, 0), (2, 2)], &five);
-    refused("found 10 labelled presses of 2 objects");
-    refused_of(
-        "d.npz d.npz",
-        "d.npz and d.npz are the same file: name it once",
-    );
-    fs::copy(path("d.npz"), path("copy.npz")).unwrap();
-    refused_of("d.npz copy.npz", "copy.npz and d.npz are the same file");
-    write(&path("d.npz"), &[(1, 0), (1, 2), (1, 3)], &five);
-    refused("all presses are of one level");
+    write(&desk, "d.npz", &[(1, 0), (1, 2), (5, 0), (5, 2)], &five);
+    let expected = "nothing was written, because no candidate is better than guessing";
+    refused("d.npz", expected);
+    write(&desk, "d.npz", &[(1, 0), (2, 2)], &five);
+    refused("d.npz", "found 10 labelled presses of 2 objects");
+    let expected = "d.npz and d.npz are the same file: name it once";
+    refused("d.npz d.npz", expected);
+    fs::copy(desk.path("d.npz"), desk.path("copy.npz")).unwrap();
+    refused("d.npz copy.npz", "copy.npz and d.npz are the same file");
+    write(&desk, "d.npz", &[(1, 0), (1, 2), (1, 3)], &five);
+    refused("d.npz", "all presses are of one level");
 }

@@ -2,15 +2,15 @@
 
 use std::fs;
 use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
+use std::process::Stdio;
 
 use hardnessd_core::verdict::{BUILT_IN_HRN, Model};
 use hardnessd_simulator::Split;
-use hrn_train::data::presses::{Presses, meta, read_one};
+use hrn_train::data::presses::{Layout, Presses, read_one};
 use rustix::process::{Pid, Signal};
 use serde_json::{Value, json};
 
-use crate::{data, errors, few, hrn_train_in, json_in, succeed_in, trainer, write_data};
+use crate::{Desk, MODELS, TRAINER, data};
 
 /// Settings with Adam on small batches: enough steps in few epochs to learn something.
 const SETTINGS: &str = "
@@ -43,10 +43,9 @@ struct Trial {
 impl Trial {
     /// A run of a method on `data`, a file in the directory.
     fn on(data_name: &str, method: &str, name: &str, settings: &str) -> Self {
-        let directory = data().0.path();
-        fs::write(directory.join(format!("{name}.toml")), settings).unwrap();
+        data().write(&format!("{name}.toml"), settings);
         Self {
-            out: directory.join(name),
+            out: data().path(name),
             command: format!(
                 "train --method {method} --profile smoke --data {data_name} --out {name} --config {name}.toml"
             ),
@@ -57,13 +56,14 @@ impl Trial {
         Self::on("tiny.npz", method, name, settings)
     }
 
-    fn output(&self, more: &str) -> Output {
-        hrn_train_in(data().0.path(), &format!("{} {more}", self.command))
+    #[track_caller]
+    fn train(&self, more: &str) {
+        data().succeeds(&format!("{} {more}", self.command));
     }
 
     #[track_caller]
-    fn train(&self, more: &str) {
-        succeed_in(data().0.path(), &format!("{} {more}", self.command));
+    fn fails(&self, more: &str, part: &str) -> String {
+        data().fails(&format!("{} {more}", self.command), 1, part)
     }
 
     fn read(&self, name: &str) -> Vec<u8> {
@@ -86,17 +86,14 @@ impl Trial {
 
 #[test]
 fn a_run_learns_and_leaves_what_it_promises() {
-    let at = data().0.path();
+    let desk = data();
     let trial = Trial::of("hrn100", "whole-run", SETTINGS);
-    let message = errors(&trial.output(""));
-    assert!(!message.contains("warning"), "{message}");
+    let (code, _, message) = desk.run(&trial.command);
+    assert!(code == 0 && !message.contains("warning"), "{message}");
 
     let rows = trial.metrics();
-    let losses = rows
-        .lines()
-        .skip(1)
-        .map(|row| row.split(',').nth(3).unwrap());
-    let losses: Vec<f64> = losses.map(|loss| loss.parse().unwrap()).collect();
+    let losses = rows.lines().skip(1).map(|row| row.split(',').nth(3));
+    let losses: Vec<f64> = losses.map(|loss| loss.unwrap().parse().unwrap()).collect();
     assert!(losses.len() == 6 && losses[5] < 0.8 * losses[0], "{rows}");
     let hrn = Model::load(&trial.read("hrn.onnx")).unwrap();
     assert_eq!(hrn.card().method, "hrn100");
@@ -107,22 +104,19 @@ fn a_run_learns_and_leaves_what_it_promises() {
     }
 
     // `evaluate` measures the same on an exported copy as the run recorded.
-    succeed_in(at, "export whole-run --out copy.onnx");
-    assert_eq!(
-        fs::read(at.join("copy.onnx")).unwrap(),
-        trial.read("hrn.onnx")
-    );
-    let printed = json_in(at, "evaluate --model copy.onnx --data tiny.npz --json");
+    desk.succeeds("export whole-run --out copy.onnx");
+    assert_eq!(desk.read("copy.onnx"), trial.read("hrn.onnx"));
+    let printed = desk.json("evaluate --model copy.onnx --data tiny.npz --json");
     let written: Value = serde_json::from_slice(&trial.read("evaluation.json")).unwrap();
     assert_eq!(printed, written);
     assert_eq!(printed["n"], 40);
-    let inspected = succeed_in(at, "inspect copy.onnx");
-    let temperature = hrn.card().metrics["temperature"].as_f64().unwrap();
-    for line in [
-        "simulated data only",
-        &format!("\ntemperature   {temperature:.3}\n"),
+    let inspected = desk.succeeds("inspect copy.onnx");
+    let temperature = &hrn.card().metrics["temperature"];
+    for part in [
+        "\nvalidation    simulated data only\n",
+        &format!("\"temperature\":{temperature}"),
     ] {
-        assert!(inspected.contains(line), "{inspected}");
+        assert!(inspected.contains(part), "{inspected}");
     }
 }
 
@@ -133,9 +127,8 @@ fn the_whole_method_interrupted_between_stages_resumes_bit_for_bit() {
     // Ends the run once the second STGAN has a checkpoint, wherever it is by then.
     let ended = Trial::of("ours", "ended-method", GAN_SETTINGS);
     let command = format!("{} --seed 6 --resume", ended.command);
-    let mut process: Command = trainer(&command.split(' ').collect::<Vec<_>>());
-    let process = process.current_dir(data().0.path()).stderr(Stdio::piped());
-    let mut process = process.spawn().unwrap();
+    let mut process = data().command(&command);
+    let mut process = process.stderr(Stdio::piped()).spawn().unwrap();
     while !ended.checkpoints().contains(&"stgan2".to_owned()) {
         let status = process.try_wait().unwrap();
         assert!(status.is_none(), "ended before it could be interrupted");
@@ -144,11 +137,9 @@ fn the_whole_method_interrupted_between_stages_resumes_bit_for_bit() {
     rustix::process::kill_process(Pid::from_child(&process), Signal::TERM).unwrap();
     let output = process.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(143), "{output:?}");
-    let expected = format!(
-        "; to continue: {} {command}\n",
-        env!("CARGO_BIN_EXE_hrn-train")
-    );
-    assert!(errors(&output).contains(&expected), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    let expected = format!("; to continue: {TRAINER} {command}\n");
+    assert!(said.contains(&expected), "{said}");
     assert!(!ended.out.join("hrn.onnx").exists());
     ended.train("--seed 6 --resume");
     assert!(ended.read("hrn.onnx") == whole.read("hrn.onnx"));
@@ -173,59 +164,35 @@ fn the_whole_method_interrupted_between_stages_resumes_bit_for_bit() {
 
 #[test]
 fn a_training_that_diverges_ends_where_it_does() {
-    let one_step = "epochs = 1\nbatch = 1000\n";
-    for (method, table, more, rate, expected) in [
-        ("sgan", "ustgan", "", 1e30, "sgan: epoch 1: loss: found NaN"),
-        // The weights become infinite or NaN in the very last step.
-        (
-            "hrn100",
-            "training",
-            one_step,
-            1e300,
-            "hrn: epoch 1: weights: found ",
-        ),
-        // Nothing is infinite, but no network learns with a loss of millions.
-        (
-            "hrn15",
-            "training",
-            "epochs = 30\n",
-            100.0,
-            "expected at most 1e6",
-        ),
-    ] {
-        let settings = format!("[{table}]\n{more}learning_rate = {rate:e}\n");
-        let trial = Trial::of(method, &format!("diverging-{method}"), &settings);
-        let output = trial.output("");
-        let error = errors(&output);
-        assert_eq!(output.status.code(), Some(1), "{method}: {error}");
-        let last = error.lines().last().unwrap();
-        assert!(last.contains(expected), "{method}: {error}");
-        assert!(last.ends_with(": the training has diverged"), "{error}");
+    let check = |method: &str, settings: &str, expected: &str| {
+        let trial = Trial::of(method, &format!("diverging-{method}"), settings);
+        let error = trial.fails("", expected);
+        assert!(error.ends_with(": the training has diverged"), "{error}");
         assert!(!trial.checkpoints().contains(&"hrn".to_owned()), "{method}");
-    }
+    };
+    let settings = "[ustgan]\nlearning_rate = 1e30";
+    check("sgan", settings, "sgan: epoch 1: loss: found NaN");
+    // The weights become infinite or NaN in the very last step.
+    let settings = "[training]\nepochs = 1\nbatch = 1000\nlearning_rate = 1e300";
+    check("hrn100", settings, "hrn: epoch 1: weights: found ");
+    // Nothing is infinite, but no network learns with a loss of millions.
+    let settings = "[training]\nepochs = 30\nlearning_rate = 100.0";
+    check("hrn15", settings, "expected at most 1e6");
 }
 
 #[test]
 fn methods_with_parts_of_their_own_make_models_that_the_loader_reproduces() {
-    let mut presses = read_one(&data().1).unwrap();
+    let mut presses = data().presses("tiny.npz");
     // Two presses of each object become unlabelled, so the first presses of all are.
     for (number, press) in presses.all.iter_mut().enumerate() {
         press.level *= u8::from(number % 10 > 1);
     }
-    write_data(
-        &data().0.path().join("unlabelled.npz"),
-        &presses,
-        &json!({}),
-    );
+    data().write_presses("unlabelled.npz", Layout::Frames, &presses, &json!({}));
     // Discriminators learn from unlabelled samples too. `hrn` has a logarithmic image, and means beside the greatest
     // values.
     for method in ["sgan", "igan", "hrn"] {
-        let trial = Trial::on(
-            "unlabelled.npz",
-            method,
-            &format!("unlabelled-{method}"),
-            GAN_SETTINGS,
-        );
+        let name = format!("unlabelled-{method}");
+        let trial = Trial::on("unlabelled.npz", method, &name, GAN_SETTINGS);
         trial.train("");
         let hrn = Model::load(&trial.read("hrn.onnx")).unwrap();
         assert_eq!(hrn.card().method, method);
@@ -234,14 +201,12 @@ fn methods_with_parts_of_their_own_make_models_that_the_loader_reproduces() {
 
 #[test]
 fn a_reader_that_goes_ends_it_quietly() {
-    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/hrn.onnx");
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
-    let output = trainer(&["inspect", model])
-        .stdout(writer)
-        .output()
-        .unwrap();
-    let error = errors(&output);
+    let desk = Desk::new();
+    let mut inspect = desk.command(&format!("inspect {MODELS}/hrn.onnx"));
+    let output = inspect.stdout(writer).output().unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
     assert!(output.status.success() && error.is_empty(), "{error}");
 }
 
@@ -253,20 +218,12 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
         trial
     });
     assert!(first.read("hrn.onnx") != other.read("hrn.onnx"));
-    let refused = |more: &str, expected: &str| {
-        let output = first.output(more);
-        let error = errors(&output);
-        assert_eq!(output.status.code(), Some(1), "{error}");
-        assert!(error.contains(expected), "{error}");
-    };
-    refused("--seed 3", "continue it with --resume");
-    refused("--seed 5 --resume", "found `seed = 5`, expected `seed = 3`");
+    first.fails("--seed 3", "continue it with --resume");
+    first.fails("--seed 5 --resume", "started with other settings or data");
     // Two processes cannot continue the same run.
     let locked = hrn_train::run::disk::lock(&first.out).unwrap();
-    refused(
-        "--seed 3 --resume",
-        "seed-3: another process is at work here",
-    );
+    let expected = "seed-3: another process is at work here";
+    first.fails("--seed 3 --resume", expected);
     drop(locked);
     // A run does not continue from a checkpoint of another run, also if that began with the same weights.
     let slower = SETTINGS.replace("0.005", "0.004");
@@ -277,20 +234,17 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
             let place = |trial: &Trial| trial.out.join("checkpoints").join(&name);
             fs::copy(place(other), place(&first)).unwrap();
         }
-        refused("--seed 3 --resume", "hrn: the checkpoint is of another run");
+        let expected = "hrn: the checkpoint is of another run";
+        first.fails("--seed 3 --resume", expected);
     }
 }
 
 #[test]
 fn broad_data_say_their_levels() {
-    let directory = tempfile::tempdir().unwrap();
-    let at = directory.path();
+    let desk = Desk::new();
     let few = "--shapes wide --presses 2 --objects 2 --test-objects 1";
-    succeed_in(at, &format!("simulate --materials broad {few} --out d.npz"));
-    let (samples, meta) = (
-        read_one(&at.join("d.npz")).unwrap().all,
-        meta(&at.join("d.npz")).unwrap(),
-    );
+    desk.succeeds(&format!("simulate --materials broad {few} --out d.npz"));
+    let (samples, meta) = (desk.presses("d.npz").all, desk.meta("d.npz"));
     assert_eq!(samples.len(), 4 * 3 * 2);
     assert_eq!(meta["materials"][11], "broad-layered");
     assert_eq!(meta["levels"][1]["shore"], "60-70");
@@ -300,141 +254,97 @@ fn broad_data_say_their_levels() {
         let expected = 1 + borders.iter().filter(|&&border| shore < border).count();
         assert_eq!(usize::from(sample.level), expected, "Shore {shore}");
     }
-    fs::write(at.join("m.onnx"), BUILT_IN_HRN).unwrap();
+    desk.write("m.onnx", BUILT_IN_HRN);
     let evaluate = "evaluate --model m.onnx --data d.npz --split train --json --verdicts v.csv";
-    let evaluation = json_in(at, evaluate);
+    let evaluation = desk.json(evaluate);
     assert!(evaluation["shore"]["rmse"].is_number(), "{evaluation}");
-    let verdicts = fs::read_to_string(at.join("v.csv")).unwrap();
+    let verdicts = desk.text("v.csv");
     assert_eq!(verdicts.lines().count(), 1 + 16, "{verdicts}");
 }
 
 #[test]
 fn forces_far_from_those_of_the_training_are_said() {
-    let (directory, path) = few();
-    let own = read_one(&path).unwrap();
+    let desk = Desk::with_few_presses();
+    let own = desk.presses("d.npz");
     let mut millinewtons = Presses::default();
     for (place, press) in own.all.iter().enumerate() {
         let newtons = own.frame(place).newtons.map(|newtons| 1000.0 * newtons);
         millinewtons.push(press.clone(), [(0.0, None, newtons)]);
     }
-    write_data(&directory.path().join("mn.npz"), &millinewtons, &json!({}));
-    fs::write(directory.path().join("m.onnx"), BUILT_IN_HRN).unwrap();
+    desk.write_presses("mn.npz", Layout::Frames, &millinewtons, &json!({}));
+    desk.write("m.onnx", BUILT_IN_HRN);
     for (data, expected) in [("d.npz", false), ("mn.npz", true)] {
         let evaluate = format!("evaluate --model m.onnx --data {data} --split train");
-        let said = errors(&hrn_train_in(directory.path(), &evaluate));
-        assert_eq!(
-            said.contains("presses are far from the "),
-            expected,
-            "{said}"
-        );
+        let (_, _, said) = desk.run(&evaluate);
+        let is_said = said.contains("presses are far from the ");
+        assert_eq!(is_said, expected, "{said}");
     }
 }
 
 #[test]
 fn rare_settings_of_simulated_presses_are_those_of_a_file() {
-    let directory = tempfile::tempdir().unwrap();
-    let at = directory.path();
-    let simulate = "simulate --sequences --materials broad --objects 1 --test-objects 1 --presses 2 --out d.npz";
+    let desk = Desk::new();
     let rate = "frame_rate_hz = [20, 20]\n[objects]\ntest_objects = 0\n";
-    fs::write(at.join("own.toml"), rate).unwrap();
-    succeed_in(at, &format!("{simulate} --config own.toml"));
-    let presses: Presses = read_one(&at.join("d.npz")).unwrap();
+    desk.write("own.toml", rate);
+    desk.succeeds(
+        "simulate --sequences --materials broad --objects 1 --test-objects 1 --presses 2 --config own.toml --out d.npz",
+    );
+    let presses = desk.presses("d.npz");
     assert!((6..=8).contains(&presses.all.len()));
     for press in 0..presses.all.len() {
         let moments = presses.course(press).moments;
         let times: Vec<f32> = moments.iter().map(|moment| moment.time_s).collect();
         let frame_s = times[1] - times[0];
-        assert!(
-            times.len() == 48 || (frame_s - 0.05).abs() < 1e-4,
-            "{times:?}"
-        );
-    }
-    for (config, expected) in [
-        ("fps = 20", "own.toml: unknown field `fps`"),
-        (
-            "frame_rate_hz = [5, 1e9]",
-            "frame_rate_hz: found [5.0, 1000000000.0], expected 1 to 200",
-        ),
-        (
-            "objects.lowest_force_n = nan",
-            "objects.lowest_force_n: found NaN",
-        ),
-    ] {
-        fs::write(at.join("own.toml"), config).unwrap();
-        let output = hrn_train_in(at, &format!("{simulate} --config own.toml"));
-        assert_eq!(output.status.code(), Some(78), "{output:?}");
-        assert!(errors(&output).contains(expected), "{output:?}");
+        let is_of_file = (frame_s - 0.05).abs() < 1e-4;
+        assert!(times.len() == 48 || is_of_file, "{times:?}");
     }
 }
 
 #[test]
 fn bad_input_has_its_exit_code_and_one_line() {
-    let at = data().0.path();
-    fs::write(at.join("text.toml"), "epoch = 3\n").unwrap();
-    fs::write(at.join("zero.toml"), "[training]\nepochs = 0\n").unwrap();
-    fs::write(at.join("log.toml"), "log_above_n = 1e-40\n").unwrap();
-    fs::write(at.join("model.onnx"), BUILT_IN_HRN).unwrap();
-    let mut presses = read_one(&data().1).unwrap();
+    let desk = data();
+    desk.write("text.toml", "epoch = 3\n");
+    desk.write("zero.toml", "[training]\nepochs = 0\n");
+    desk.write("fps.toml", "fps = 20");
+    desk.write("rate.toml", "frame_rate_hz = [5, 1e9]");
+    desk.write("force.toml", "objects.lowest_force_n = nan");
+    desk.write("model.onnx", BUILT_IN_HRN);
+    let mut presses = desk.presses("tiny.npz");
     presses.all.retain(|press| press.split == Split::Train);
-    write_data(&at.join("untested.npz"), &presses, &json!({}));
+    desk.write_presses("untested.npz", Layout::Frames, &presses, &json!({}));
     for press in &mut presses.all {
         press.level *= u8::from(press.level != 3);
     }
-    write_data(&at.join("without-3.npz"), &presses, &json!({}));
-    fs::create_dir(at.join("corrupt")).unwrap();
-    fs::write(
-        at.join("corrupt/settings.toml"),
-        b"method = \"hrn100\"\nprof\xff",
-    )
-    .unwrap();
-    // The exit code, the command, and what it says.
-    let cases = "
-        66 | train hrn100 missing | missing
-        66 | train hrn100 tiny.npz --config missing | missing
-        78 | train hrn100 tiny.npz --config text.toml | text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`
-        78 | train hrn100 tiny.npz --config /dev/zero | /dev/zero: found more than 1048576 bytes
-        78 | fit tiny.npz --out m.onnx --config /dev/zero | /dev/zero: found more than 1048576 bytes
-        78 | train hrn100 tiny.npz --config zero.toml | zero.toml: training.epochs: found 0
-        78 | train hrn100 tiny.npz --config log.toml | log.toml: log_above_n: found 1e-40
-        2 | train hrn100 tiny.npz --labels 3 | --labels: found 3, expected at least 4
-        2 | train hrn100 tiny.npz --seed 9223372036854775808 | --seed
-        2 | train hrn100 tiny.npz --start model.onnx | --start: only the method course starts from a model
-        78 | train hrn100 tiny.npz --resume --out corrupt | corrupt/settings.toml: line 2
-        74 | train hrn15 tiny.npz --out /dev/null/no | /dev/null/no
-        1 | train ours tiny.npz --labels 160 | no unlabelled training presses are left
-        1 | train course tiny.npz | has single frames, not whole presses
-        1 | train ours without-3.npz | no labelled training presses of level 3 for its STGAN
-        1 | evaluate --model model.onnx --data untested.npz | untested.npz: no press of the test split has a level: add
-        2 | fit tiny.npz --out m.txt | --out: found m.txt, expected a name that ends with .onnx
-        74 | fit tiny.npz --out tiny.onnx | --out tiny.onnx: references would be written beside it
-        2 | simulate --out refused --objects 0 --test-objects 0 | found 0 and 0, expected one or more
-        74 | simulate --presses 1 --out /dev/null/no | /dev/null/no
-        78 | inspect text.toml | not an ONNX model
-        66 | export corrupt --out refused | corrupt/hrn.onnx:";
-    for line in cases.trim().lines() {
-        let [code, command, expected] = line.split(" | ").collect::<Vec<_>>()[..] else {
-            panic!("{line}");
-        };
-        let words: Vec<&str> = command.split(' ').collect();
-        let command = match words[..] {
-            ["train", method, data, ref more @ ..] => {
-                let out = if more.contains(&"--out") {
-                    ""
-                } else {
-                    "--out refused"
-                };
-                let more = more.join(" ");
-                format!("train --method {method} --data {data} {out} {more}")
-            }
-            _ => command.to_owned(),
-        };
-        let output = hrn_train_in(at, &command);
-        let error = errors(&output);
-        let code: i32 = code.trim().parse().unwrap();
-        assert_eq!(output.status.code(), Some(code), "{command}: {error}");
-        assert!(error.contains(expected), "{command}: {error}");
-        assert!(code != 2 || error.lines().count() == 1, "{error}");
-    }
+    desk.write_presses("without-3.npz", Layout::Frames, &presses, &json!({}));
+    desk.write("corrupt/settings.toml", b"method = \"hrn100\"\nprof\xff");
+    let table = "
+        train --method hrn100 --out refused --data missing | 66 | missing
+        train of hrn100 --config missing | 66 | missing
+        train of hrn100 --config text.toml | 78 | text.toml: line 1, column 1, `epoch = 3`: unknown field `epoch`
+        train of hrn100 --config /dev/zero | 78 | /dev/zero: found more than 1048576 bytes
+        fit tiny.npz --out m.onnx --config /dev/zero | 78 | /dev/zero: found more than 1048576 bytes
+        train of hrn100 --config zero.toml | 78 | zero.toml: training.epochs: found 0
+        train of hrn100 --labels 3 | 2 | --labels: found 3, expected at least 4
+        train of hrn100 --seed 9223372036854775808 | 2 | --seed
+        train of hrn100 --start model.onnx | 2 | --start: only the method course starts from a model
+        train --method hrn100 --data tiny.npz --resume --out corrupt | 78 | corrupt/settings.toml: line 2
+        train --method hrn15 --data tiny.npz --out /dev/null/no | 74 | /dev/null/no
+        train of ours --labels 160 | 1 | no unlabelled training presses are left
+        train of course | 1 | has single frames, not whole presses
+        train --method ours --out refused --data without-3.npz | 1 | no labelled training presses of level 3 for its STGAN
+        compare --out nothing | 1 | nothing/results.json: has no finished run
+        evaluate --model model.onnx --data untested.npz | 1 | untested.npz: no press of the test split has a level: add
+        fit tiny.npz --out m.txt | 2 | --out: found m.txt, expected a name that ends with .onnx
+        fit tiny.npz --out tiny.onnx | 74 | --out tiny.onnx: references would be written beside it
+        simulate --out refused --objects 0 --test-objects 0 | 2 | found 0 and 0, expected one or more
+        simulate --sequences --out refused --config fps.toml | 78 | fps.toml: unknown field `fps`
+        simulate --sequences --out refused --config rate.toml | 78 | frame_rate_hz: found [5.0, 1000000000.0], expected 1
+        simulate --sequences --out refused --config force.toml | 78 | objects.lowest_force_n: found NaN
+        simulate --presses 1 --out /dev/null/no | 74 | /dev/null/no
+        inspect text.toml | 78 | not an ONNX model
+        export corrupt --out refused | 66 | corrupt/hrn.onnx:";
+    let train = "train --data tiny.npz --out refused --method";
+    desk.fails_each(&table.replace("train of", train));
     // If a stage cannot be done, nothing is trained, and no run is begun.
-    assert!(!at.join("refused").exists());
+    assert!(!desk.path("refused").exists());
 }

@@ -123,7 +123,7 @@ pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
 }
 
 pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
-    Ok(account::of_model(path, &load(path)?.0))
+    account::of_model(path, &load(path)?.0)
 }
 
 /// Checks a model file. The time limit for a verdict follows from the frame rate.

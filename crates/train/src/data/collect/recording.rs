@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::{ARCHIVE, Settings};
 use crate::data::presses::file::SHORE;
 use crate::data::presses::{Layout, Press, Presses};
-use crate::data::source::{Grid, Kind, PITCH_MM, Source};
+use crate::data::source::{Grid, Kind, PITCH_MM, Source, name_of};
 use crate::exit::coded;
 use hardnessd_core::event::{self, Event, PressState};
 use hardnessd_core::exit::USAGE;
@@ -340,12 +340,6 @@ impl Recording {
             ..Source::default()
         })
     }
-}
-
-/// The name of a file without its directory.
-pub(super) fn name_of(path: &Path) -> String {
-    let name = path.file_name().unwrap_or_default();
-    name.to_string_lossy().into_owned()
 }
 
 /// The level that a label names or numbers.

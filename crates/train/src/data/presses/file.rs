@@ -18,7 +18,7 @@ use hardnessd_core::npy::Element;
 use hardnessd_core::npz::{ANY, Reader, Unexpected, Writer, within};
 use hardnessd_core::verdict::parts::PARTS;
 use hardnessd_core::verdict::{
-    COLS, COURSE_FRAMES, Level, MOST_LEVELS, Piece, ROWS, TAXELS, are_levels, sha256_hex,
+    COLS, COURSE_FRAMES, Level, MOST_LEVELS, Piece, ROWS, TAXELS, are_levels,
 };
 use hardnessd_simulator::{BroadSensors, Split};
 
@@ -336,17 +336,14 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
         let is_array = is_side(of.array.rows) && is_side(of.array.cols);
         is_array && (of.is_kept() || meta.grid_pitch_mm.is_some())
     };
-    let name = path.file_name().unwrap_or_default();
     Ok(Source {
-        name: name.to_string_lossy().into_owned(),
-        path: path.to_owned(),
         seed: meta.seed.and_then(|seed| u64::try_from(seed).ok()),
-        sha256: sha256_hex(bytes),
         pitch_mm: meta.pitch_mm,
         grid: grid.filter(fits),
         pitches_mm,
         levels: meta.levels,
         generator: meta.generator,
+        ..Source::of(path, bytes)
     })
 }
 
