@@ -45,7 +45,6 @@ use std::fs::File;
 use std::future::Future;
 use std::io::Read;
 use std::net::SocketAddr;
-use std::path::PathBuf;
 use std::pin::pin;
 use std::time::Duration;
 
@@ -60,7 +59,7 @@ use self::config::{Publish, Setup};
 use self::hub::Hub;
 use self::own::{Store, Written};
 use self::publish::Publishers;
-use self::record::{Progress, Recorder, Target, WithoutSensor};
+use self::record::{Recorder, Target};
 use self::reload::Refusal;
 pub use self::reload::Reload;
 use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
@@ -171,21 +170,15 @@ impl Daemon {
         Self::start_with(setup, target)
     }
 
-    /// A daemon with `sockets` that records into `file`, an empty file at `path`, and reports in
-    /// `progress` what the file holds. If a sensor is missing at the start, or all are lost, it does
-    /// what `without_sensor` says.
+    /// A daemon with `sockets` that records into the file of `target`.
     ///
     /// # Errors
     ///
     /// Fails if the system gives no random numbers, or a socket cannot be bound.
-    pub fn recording(
+    pub(crate) fn recording(
         mut setup: Setup,
-        path: PathBuf,
-        file: File,
-        labels: Labels,
-        progress: watch::Sender<Progress>,
         sockets: Sockets,
-        without_sensor: WithoutSensor,
+        target: Target,
     ) -> Result<Self, Error> {
         let mut unix = setup.config.publish.unix;
         unix.enabled &= sockets == Sockets::Configured;
@@ -195,13 +188,6 @@ impl Daemon {
         };
         setup.config.http = None;
         setup.config.record = None;
-        let target = Target::File {
-            path,
-            file,
-            labels,
-            progress,
-            without_sensor,
-        };
         Self::start_with(setup, Some(target))
     }
 

@@ -25,7 +25,7 @@ use super::accept::Serve;
 use super::hub::{Hub, Line, Subscriber};
 use super::lines::{LineError, Lines, lines};
 use super::request::motion::{self, Positions};
-use super::request::{self, Context, Query, Request, Subscription};
+use super::request::{self, Context, Merge, Query, Request, Subscription};
 use super::sensor::{Answer, Command, Done, SensorHandle, Sensors};
 use super::{now, realtime};
 use hardnessd_core::event::Reply;
@@ -258,7 +258,11 @@ async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Str
     };
     match request {
         Request::Tare(sensor) => ask(sensors, "tare", &sensor, Command::Tare).await,
-        Request::Context(context) => set_context(sensors, context).await,
+        Request::Context(Context { sensor, context }) => {
+            let command = |reply| Command::Take(Input::Context(context), reply);
+            ask(sensors, "context.sensor", &sensor, command).await
+        }
+        Request::Merge(keys) => merge(sensors, keys).await,
         Request::Motion(Positions { sensor, points }) => {
             // Read the clocks now, because the sensor's task may have other work to do first.
             let input = Input::Motion(motion::placed(&points, now())?);
@@ -271,13 +275,13 @@ async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Str
     }
 }
 
-/// Sets the context of a sensor.
-pub(super) async fn set_context(
+/// Sets keys of a sensor's context.
+pub(super) async fn merge(
     sensors: &Sensors,
-    Context { sensor, context }: Context,
+    Merge { sensor, keys }: Merge,
 ) -> Result<Done, String> {
-    let command = |reply| Command::Take(Input::Context(context), reply);
-    ask(sensors, "context.sensor", &sensor, command).await
+    let command = |reply| Command::Merge(keys, reply);
+    ask(sensors, "merge.sensor", &sensor, command).await
 }
 
 /// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's

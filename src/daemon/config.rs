@@ -23,6 +23,7 @@ use serde_json::Value;
 
 use self::error::Problem;
 pub use self::error::{Error, Text};
+pub(crate) use self::parse::read_at_most;
 pub use self::publish::{
     Foxglove, Http, Mode, Publish, RmwZenoh, Ros2, Tcp, Unix, Zenoh, domain_id,
 };
@@ -314,11 +315,6 @@ impl Setup {
         is_same
             && self.config.press == other.config.press
             && at_its_port(self) == at_its_port(other)
-    }
-
-    /// Whether a sensor has references that make verdicts on themselves worse, and so are not used.
-    pub fn ignores_references_of(&self, sensor: &str) -> bool {
-        self.hrn_of(sensor).known_references().are_ignored()
     }
 
     /// The model for the presses of a sensor.

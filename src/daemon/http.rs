@@ -36,7 +36,7 @@ use tokio::net::TcpStream;
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
-use super::client::set_context;
+use super::client::merge;
 use super::hub::{Hub, Snapshot};
 use super::sensor::Sensors;
 use hardnessd_core::event::{self, Event, LinkState, Reply, Status};
@@ -145,18 +145,18 @@ impl Http {
     }
 }
 
-/// Sets the context of a sensor. A page from elsewhere cannot send this type of content without a question
+/// Sets keys of the context of a sensor. A page from elsewhere cannot send this type of content without a question
 /// first, and gets no answer to that.
 async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response {
-    if headers
-        .get(header::CONTENT_TYPE)
-        .is_none_or(|kind| kind != "application/json")
-    {
+    let kind = headers.get(header::CONTENT_TYPE);
+    let kind = kind.and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    let (kind, _parameters) = kind.split_once(';').unwrap_or((kind, ""));
+    if !kind.trim().eq_ignore_ascii_case("application/json") {
         let why = "Content-Type: expected application/json";
         return refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, why);
     }
     let read = serde_json::from_slice(&body).map_err(|error| cut_found(&error.to_string()));
-    let set = async { set_context(sensors, read?).await }.await;
+    let set = async { merge(sensors, read?).await }.await;
     match set {
         Ok(_) => text("application/json", "{}".to_owned()),
         Err(why) => refusal(StatusCode::BAD_REQUEST, why),

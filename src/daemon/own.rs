@@ -24,6 +24,7 @@ use crate::thread::{NoThread, spawn_thread};
 use hardnessd_core::judge::{OwnPresses, owner};
 use hardnessd_core::part::{Part, directory_of};
 use hardnessd_core::pipeline::Pipeline;
+use hardnessd_core::sensor::Sensor;
 
 /// The largest file that is read. Ours have a tenth of it.
 const MOST_BYTES: u64 = 1 << 20;
@@ -78,9 +79,17 @@ impl Store {
         Ok((Self(Some(directory)), written))
     }
 
+    /// Where the presses of a sensor are, if any are kept. Of a simulated one a user keeps none: it may have the name of
+    /// a real one.
+    fn directory_for(&self, sensor: &Sensor) -> Option<&Directory> {
+        let sensor = &sensor.description().sensor;
+        let directory = self.0.as_ref().filter(|_| sensor.own_presses > 0);
+        directory.filter(|directory| !(directory.is_of_user && is_simulated(&sensor.port)))
+    }
+
     /// Gives a pipeline the own presses of its sensor, if they are of its calibration and model.
     pub(super) fn load(&self, pipeline: &mut Pipeline) {
-        let Some(directory) = &self.0 else {
+        let Some(directory) = self.directory_for(pipeline.sensor()) else {
             return;
         };
         let path = directory.file_of(pipeline.sensor().name());
@@ -95,12 +104,10 @@ impl Store {
 
     /// Writes the own presses of a pipeline, soon.
     pub(super) fn save(&self, pipeline: &Pipeline) {
-        let (Some(directory), sensor) = (&self.0, pipeline.sensor()) else {
+        let sensor = pipeline.sensor();
+        let Some(directory) = self.directory_for(sensor) else {
             return;
         };
-        if directory.is_of_user && is_simulated(&sensor.description().sensor.port) {
-            return;
-        }
         let kept = Kept {
             owner: owner(sensor, pipeline.hrn()),
             presses: pipeline.own_presses().clone().for_another_start(),
@@ -162,16 +169,14 @@ mod tests {
 
     use super::*;
     use hardnessd_core::pipeline::{Clock, Input};
-    use hardnessd_core::sensor::{Description, Sensor};
-    use hardnessd_core::tests::support::at;
+    use hardnessd_core::sensor::Description;
+    use hardnessd_core::tests::support::{at, sensor_of};
     use hardnessd_core::verdict::{BUILT_IN, Model};
     use hardnessd_simulator::{Sequence, SequenceSettings};
 
     fn pipeline(change: impl FnOnce(&mut Description)) -> Pipeline {
-        let mut described = Description::default();
-        change(&mut described);
         let hrn = Arc::new(Model::load(BUILT_IN).unwrap());
-        Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::FrameRate)
+        Pipeline::new(sensor_of(change), hrn, Clock::FrameRate)
     }
 
     fn store(directory: &Path) -> Store {
@@ -210,7 +215,7 @@ mod tests {
         saving.save(&first);
         drop(saving);
         written.blocking_recv().unwrap();
-        let path = directory.path().join("own-sensor.json");
+        let path = directory.path().join("own-forearm.json");
 
         let loaded = |pipeline: Pipeline| {
             let mut pipeline = pipeline;

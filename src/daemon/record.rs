@@ -38,8 +38,8 @@ const STATE_EVERY_BYTES: usize = 4 << 20;
 /// The target of a recording.
 #[derive(Debug)]
 pub(crate) enum Target {
-    /// One file, which the caller has made. The recording ends when the file cannot be written, and
-    /// `without_sensor` as it says.
+    /// One file, which the caller has made, and which is empty. `progress` gets what it holds so far. The
+    /// recording ends when the file cannot be written, and `without_sensor` as it says.
     File {
         path: PathBuf,
         file: File,

@@ -65,6 +65,23 @@ impl Worker {
         Ok(Self { lines, ended })
     }
 
+    /// The same for a session that only publishes: `publish` gets each event with its line. The error of opening
+    /// begins with `publish.WAY`, the table in the configuration.
+    #[cfg(any(feature = "ros2", feature = "zenoh"))]
+    pub(super) fn publishing<O, E: std::fmt::Display>(
+        way: &'static str,
+        open: impl FnOnce() -> Result<O, E> + Send + 'static,
+        mut publish: impl FnMut(&mut O, &Event, &Line) + Send + 'static,
+    ) -> Result<Self, Error> {
+        let open = move || open().map_err(|error| Error::Io(format!("publish.{way}: {error}")));
+        Self::start(way, open, move |mut session, mut lines| {
+            let mut each = |event: &Event, line: &Line| publish(&mut session, event, line);
+            while let Some(lines) = lines.blocking_recv() {
+                each_event(way, &lines, &mut each);
+            }
+        })
+    }
+
     /// Passes on what the hub publishes, until the log is closed and the thread has ended.
     pub(super) async fn serve(self, hub: Hub) {
         let wanted = Subscription {

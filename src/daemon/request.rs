@@ -27,6 +27,8 @@ pub(crate) enum Request {
     Tare(String),
     /// Set the context that the controller reports of its work.
     Context(Context),
+    /// Set some keys of that context.
+    Merge(Merge),
     /// Take positions of the arm that the robot reports.
     Motion(Positions),
     /// Write the last minute of this sensor to a file.
@@ -134,6 +136,14 @@ impl TryFrom<Map<String, Value>> for Context {
     }
 }
 
+/// Keys of a context as they came. Those that are null are removed, and all others stay.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub(crate) struct Merge {
+    pub(crate) sensor: String,
+    #[serde(flatten)]
+    pub(crate) keys: Map<String, Value>,
+}
+
 /// Reads one line, without its newline. Returns the `id` to echo in the answer, and the request, or the reason
 /// the line cannot be used, in words.
 pub(crate) fn parse(line: &[u8]) -> (Option<Value>, Result<Request, String>) {
@@ -213,6 +223,7 @@ mod tests {
             "subscribe":[],"sinse":"ab:7" | unknown field `sinse`
             "tare":"a","context":{} | expected map with a single key
             "context":{"tag":"x"} | context: sensor: found null, expected a sensor's name
+            "merge":{"tag":"x"} | merge: missing field `sensor`
             "retare":"a" | retare: unknown variant `retare`, expected one of `subscribe`
             "motion":{"sensor":"a"} | motion: missing field `at`"#;
         for case in cases.trim().lines() {

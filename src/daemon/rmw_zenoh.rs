@@ -21,7 +21,7 @@ use zenoh_ext::{
 
 use super::Error;
 use super::config;
-use super::relay::{Worker, each_event};
+use super::relay::Worker;
 use super::sensor::{SensorHandle, Sensors};
 use super::zenoh::{check_listen, configuration as plain_configuration};
 use hardnessd_core::event::{Event, Kind};
@@ -84,17 +84,10 @@ pub(super) fn open(settings: &config::RmwZenoh, sensors: &Sensors) -> Result<Wor
     let (namespace, connect) = (&settings.namespace, &settings.connect);
     info!(way = "rmw_zenoh", domain, namespace, ?connect, "publishing");
     let (settings, sensors) = (settings.clone(), sensors.clone());
-    Worker::start(
+    Worker::publishing(
         "rmw_zenoh",
-        move || {
-            let opened = Node::open(&settings, domain, &sensors);
-            opened.map_err(|error| Error::Io(format!("publish.rmw_zenoh: {error}")))
-        },
-        |mut node, mut lines| {
-            while let Some(lines) = lines.blocking_recv() {
-                each_event("rmw_zenoh", &lines, |event, _| node.publish(event));
-            }
-        },
+        move || Node::open(&settings, domain, &sensors),
+        |node, event, _| node.publish(event),
     )
 }
 

@@ -15,7 +15,7 @@ use tracing::{info, warn};
 
 use super::Error;
 use super::config;
-use super::relay::{Worker, each_event};
+use super::relay::Worker;
 use super::sensor::{SensorHandle, Sensors};
 use hardnessd_core::event::{Event, Kind};
 use hardnessd_core::ros::{self, Topic};
@@ -40,17 +40,10 @@ pub(super) fn open(settings: &config::Ros2, sensors: &Sensors) -> Result<Worker,
     let namespace = &settings.namespace;
     info!(way = "ros2", domain, namespace, "publishing");
     let (settings, sensors) = (settings.clone(), sensors.clone());
-    Worker::start(
+    Worker::publishing(
         "ros2",
-        move || {
-            let opened = Ros2::open(&settings, domain, &sensors);
-            opened.map_err(|error| Error::Io(format!("publish.ros2: {error}")))
-        },
-        |ros2, mut lines| {
-            while let Some(lines) = lines.blocking_recv() {
-                each_event("ros2", &lines, |event, _| ros2.publish(event));
-            }
-        },
+        move || Ros2::open(&settings, domain, &sensors),
+        |node, event, _| node.publish(event),
     )
 }
 
@@ -149,7 +142,7 @@ fn kept(depth: usize) -> QosProfile {
         .history(History::KeepLast { depth })
 }
 
-/// A message as [`ros::encode`] makes it. The library writes the encapsulation header; the bytes
+/// A message as [`ros::encode_all`] makes it. The library writes the encapsulation header; the bytes
 /// after it are sent unchanged.
 struct Message(Vec<u8>);
 

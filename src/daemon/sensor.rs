@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 use tracing::{error, info, warn};
@@ -45,6 +45,8 @@ pub(crate) enum Command {
     /// Take a context of the controller, or positions of the arm. The answer comes when the pipeline has it, or
     /// says why it is refused.
     Take(Input, Answer),
+    /// Set these keys of the context, as [`Self::Take`] sets a whole one.
+    Merge(Map<String, Value>, Answer),
     /// Write the last minute to a file. The answer comes when it is written.
     Blackbox(Answer),
     /// Judge with another model from the next rest on. Of the sensor's tables, only `[model]` may differ.
@@ -125,12 +127,14 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Take(input, reply)) => {
-                    // Whoever sent it may not wait for the answer.
-                    if let Err(Err(reason)) = reply.send(core.take_asked(input)) {
-                        log::limited(core.name(), || {
-                            warn!(sensor = core.name(), reason, "refused");
-                        });
-                    }
+                    let taken = core.take_asked(input);
+                    core.answer(reply, taken);
+                    continue;
+                }
+                Some(Command::Merge(keys, reply)) => {
+                    let merged = merged(core.pipeline.context(), core.name(), keys);
+                    let taken = merged.and_then(|merged| core.take_asked(Input::Context(merged)));
+                    core.answer(reply, taken);
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
@@ -142,6 +146,8 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Finish) | None => {
+                    let ended = "tare: the sensor's task ends, with the daemon or for other settings: ask again";
+                    let _ = taring.map(|reply| reply.send(Err(ended.to_owned())));
                     hub.publish(core.taken(Input::Shutdown));
                     source.close().await;
                     return core;
@@ -215,6 +221,15 @@ impl SensorCore {
         }
     }
 
+    /// Answers a client, which may not wait for it.
+    fn answer(&self, reply: Answer, taken: Result<Done, String>) {
+        if let Err(Err(reason)) = reply.send(taken) {
+            log::limited(self.name(), || {
+                warn!(sensor = self.name(), reason, "refused");
+            });
+        }
+    }
+
     /// The state of the sensor, which the hub has for everybody who asks.
     pub(super) fn state(&self) -> SensorState {
         let pipeline = &self.pipeline;
@@ -238,6 +253,27 @@ fn tared(sensor: &str, outcome: Result<Tared, RetareError>) -> Result<Done, Stri
         }),
         Err(refusal) => Err(format!("tare: {refusal}")),
     }
+}
+
+/// The context of a sensor in which these keys are set, and those that are null removed.
+fn merged(
+    context: Option<&Value>,
+    sensor: &str,
+    keys: Map<String, Value>,
+) -> Result<Option<Value>, String> {
+    let mut merged = context
+        .and_then(Value::as_object)
+        .cloned()
+        .unwrap_or_default();
+    merged.extend(keys);
+    merged.retain(|_, value| !value.is_null());
+    if merged.keys().all(|key| key == "sensor") {
+        return Ok(None);
+    }
+    merged.insert("sensor".to_owned(), sensor.into());
+    let merged = Value::Object(merged);
+    event::check_context(&merged).map_err(|problem| format!("merge: {problem}"))?;
+    Ok(Some(merged))
 }
 
 /// Checks the keys of a context that say what is pressed, for a model with so many levels.
@@ -272,6 +308,24 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    #[test]
+    fn keys_are_merged_into_a_context() {
+        let merged = |context: Option<Value>, keys: Value| {
+            let Value::Object(keys) = keys else {
+                unreachable!()
+            };
+            merged(context.as_ref(), "palm", keys)
+        };
+        let context = json!({"sensor": "palm", "tag": "x", "level": 2});
+        let keys = json!({"level": null, "object": "cup"});
+        let expected = json!({"sensor": "palm", "tag": "x", "object": "cup"});
+        assert_eq!(merged(Some(context), keys.clone()), Ok(Some(expected)));
+        let expected = json!({"sensor": "palm", "object": "cup"});
+        assert_eq!(merged(None, keys), Ok(Some(expected.clone())));
+        assert_eq!(merged(Some(expected), json!({"object": null})), Ok(None));
+        assert!(merged(None, json!({"tag": "x".repeat(2000)})).is_err());
+    }
 
     #[test]
     fn the_truth_in_a_context_is_a_text_and_a_level_of_the_model() {

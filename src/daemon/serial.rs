@@ -462,7 +462,7 @@ mod tests {
     use std::net::UdpSocket;
 
     use super::*;
-    use hardnessd_core::sensor::Description;
+    use hardnessd_core::tests::support::sensor_of;
 
     #[tokio::test]
     async fn datagrams_of_many_frames_are_passed_on_in_pieces_or_skipped() {
@@ -472,12 +472,13 @@ mod tests {
             let free = UdpSocket::bind("127.0.0.1:0").unwrap();
             let address = free.local_addr().unwrap();
             drop(free);
-            let mut described = Description::default();
-            described.sensor.port = format!("udp://{address}").parse().unwrap();
+            let sensor = sensor_of(|described| {
+                described.sensor.port = format!("udp://{address}").parse().unwrap();
+            });
             let settings = Settings {
                 bytes_at_once: 160,
                 bytes_per_s,
-                ..Settings::of(&Sensor::new(described).unwrap())
+                ..Settings::of(&sensor)
             };
             let mut sources = open(&Port::Udp(address), 9600, &[settings]);
             assert_eq!(sources[0].next().await, Input::Opened);

@@ -7,9 +7,7 @@
 //! changes anything.
 
 use std::net::TcpListener;
-use std::sync::Arc;
 
-use tokio::sync::mpsc;
 use tracing::{info, warn};
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
@@ -20,7 +18,7 @@ use zenoh::{Session, Wait};
 use super::Error;
 use super::config::{self, Config};
 use super::hub::{Hub, Line, Snapshot};
-use super::relay::{Worker, each_event};
+use super::relay::Worker;
 use hardnessd_core::event::{self, Event, Kind, Reply};
 
 /// Opens a session as `settings` say, with keys below `tactile/SITE`.
@@ -35,13 +33,10 @@ pub(super) fn open(settings: &config::Zenoh, config: &Config, hub: &Hub) -> Resu
     let (listen, connect) = (&settings.listen, &settings.connect);
     info!(way = "zenoh", site, ?listen, ?connect, "publishing");
     let (settings, hub) = (settings.clone(), hub.clone());
-    Worker::start(
+    Worker::publishing(
         "zenoh",
-        move || {
-            let opened = Zenoh::open(&settings, site, hub);
-            opened.map_err(|error| Error::Io(format!("publish.zenoh: {error}")))
-        },
-        Zenoh::work,
+        move || Zenoh::open(&settings, site, hub),
+        |session, event, line| session.publish(event, line),
     )
 }
 
@@ -83,12 +78,6 @@ impl Zenoh {
             _alive: alive,
             session,
         })
-    }
-
-    fn work(self, mut lines: mpsc::Receiver<Vec<Arc<Line>>>) {
-        while let Some(lines) = lines.blocking_recv() {
-            each_event("zenoh", &lines, |event, line| self.publish(event, line));
-        }
     }
 
     fn publish(&self, event: &Event, line: &Line) {

@@ -65,11 +65,11 @@ pub(super) fn named(level: u64, labels: &[String]) -> String {
     label.map_or_else(|| format!("level {level}"), Clone::clone)
 }
 
-/// The level of this label or number.
+/// The level of this label, or else of this number.
 pub(super) fn level_of(word: &str, labels: &[String]) -> Option<u64> {
-    let mut levels = (1..).zip(labels);
-    let known = levels.find(|(level, label)| *label == word || level.to_string() == word);
-    known.map(|(level, _)| level)
+    let labelled = labels.iter().position(|label| label == word);
+    let numbered = || (0..labels.len()).find(|index| (index + 1).to_string() == word);
+    labelled.or_else(numbered).map(|index| index as u64 + 1)
 }
 
 /// The levels that a rejected verdict lies between: its set of levels, otherwise the two likeliest.

@@ -24,6 +24,7 @@ use super::exit::{Fail, Failure};
 use super::live;
 use crate::daemon::config::Setup;
 use hardnessd_core::exit::{FAILED, IO, USAGE};
+use hardnessd_core::line::extent;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::Sensor;
@@ -260,7 +261,8 @@ fn of_taxels(
         is_dead[array.place(row, col)] = true;
     }
     let plain = presses.iter().map(gather::Press::without_gains);
-    let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead).exit(FAILED)?;
+    let pitch = sensor.calibration().pitch_mm;
+    let fit = taxels::Fit::of(&plain.collect::<Vec<_>>(), &is_dead, pitch).exit(FAILED)?;
     let gains: Vec<f32> = fit.gains.iter().map(|gain| gain.unwrap_or(1.0)).collect();
     let bytes = npy::to_bytes(&[array.rows, array.cols], &gains);
     part.write(&bytes).of(path.display(), IO)?;
@@ -273,19 +275,18 @@ fn of_taxels(
         };
         text += &(row.iter().map(shown).collect::<String>() + "\n");
     }
-    let known: Vec<f32> = fit.gains.iter().flatten().copied().collect();
+    let known = fit.gains.iter().flatten();
+    let [least, most] = extent(known.clone().map(|&gain| gain.into()));
     text += &format!(
         "\ntaxels  {} of {} measured in {} presses\n\
-         gains   {:.2} to {:.2}, spread {:.1} %\n\
+         gains   {least:.2} to {most:.2}, spread {:.1} %\n\
          error   {:.1} % of a gain\n\
          \n\
          [sensor.calibration]\n\
          gains = {}\n",
-        known.len(),
+        known.count(),
         gains.len(),
         fit.presses,
-        known.iter().copied().fold(f32::INFINITY, f32::min),
-        known.iter().copied().fold(0.0, f32::max),
         100.0 * fit.spread,
         100.0 * fit.error,
         toml::Value::from(super::as_in(config, path))

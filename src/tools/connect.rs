@@ -316,23 +316,43 @@ mod tests {
     }
 
     #[test]
-    fn a_server_without_newlines_is_left() {
+    fn what_is_no_daemon_is_left_and_named() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("hostile.sock");
+        let path = directory.path().join("other.sock");
         let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
-        let sender = std::thread::spawn(move || {
+        // The first line, and the bytes that follow again and again.
+        for (first, more, expected) in [
+            // A byte now and then is no hello.
+            ("", 1, "no answer for 5 s"),
+            ("", 1 << 16, "which no daemon sends"),
+            (
+                "{\"type\":\"hello\",\"protocol\":2}\n",
+                1,
+                "found protocol 2, expected the hello of a daemon of protocol 1",
+            ),
+            ("{\"type\":\"ok\"}\n", 1, "found \"ok\", expected the hello"),
+            ("SSH-2.0\n", 1, "found a line that is no JSON"),
+            ("HTTP/1.1 400 Bad\r\n", 1, "of [publish.tcp]"),
+        ] {
+            let mut connection = control(Some(path.clone())).unwrap();
             let (mut stream, _) = listener.accept().unwrap();
-            let mut sent = 0;
-            while stream.write_all(&[b'x'; 65536]).is_ok() {
-                sent += 65536;
-            }
-            sent
-        });
-        let mut connection = control(Some(path)).unwrap();
-        let error = connection.next().unwrap_err();
-        assert!(error.line().contains("which no daemon sends"), "{error:?}");
-        drop(connection);
-        // The sender wrote more than the reader took, because the system's buffers hold the rest.
-        assert!(sender.join().unwrap() < 4 * LONGEST_LINE_BYTES);
+            let sender = std::thread::spawn(move || {
+                stream.write_all(first.as_bytes()).unwrap();
+                let mut sent = 0;
+                while stream.write_all(&vec![b'x'; more]).is_ok() {
+                    sent += more;
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                sent
+            });
+            let error = connection.meet().unwrap_err();
+            let line = error.line();
+            assert!(line.starts_with(&path.display().to_string()), "{line}");
+            assert!(line.contains(expected) && !line.contains('\n'), "{line}");
+            assert_eq!(error.code, UNAVAILABLE, "{line}");
+            drop(connection);
+            // The sender wrote more than the reader took, because the system's buffers hold the rest.
+            assert!(sender.join().unwrap() < 4 * LONGEST_LINE_BYTES);
+        }
     }
 }

@@ -80,8 +80,10 @@ pub fn run(command: Command) -> Result<(), Failure> {
             let hello = daemon.meet()?;
             let mut context: Map<String, Value> = pairs.into_iter().collect();
             context.insert("sensor".to_owned(), target.sensor.into());
-            let level = context.get("level").and_then(Value::as_str);
-            if let Some(level) = level.and_then(|level| level_of(level, &labels(&hello))) {
+            // A label may be a number, such as 80.
+            let word = |level: &Value| level.as_str().map_or(level.to_string(), str::to_owned);
+            let level = context.get("level").map(word);
+            if let Some(level) = level.and_then(|level| level_of(&level, &labels(&hello))) {
                 context.insert("level".to_owned(), level.into());
             }
             json!({"context": context})

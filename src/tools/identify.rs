@@ -6,7 +6,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::{ErrorKind, Read as _};
+use std::io::ErrorKind;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,6 +21,7 @@ use super::played::Played;
 use super::{cannot_read, live, print_apart};
 use crate::daemon::config::{self, Config, Setup};
 use hardnessd_core::exit::{FAILED, IO, USAGE};
+use hardnessd_core::line::extent;
 use hardnessd_core::part::Part;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::references;
@@ -56,7 +57,7 @@ pub struct Args {
     /// Sensor that was pressed [default: the first]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Presses to make, or to take of each file, from light to hard: 1 to 64
+    /// Presses to make, or to take of each file, from light to hard. A model takes 32 or so in all
     #[arg(long, value_name = "N", default_value_t = 5,
         value_parser = clap::value_parser!(u64).range(1..=MOST_REFERENCES as u64))]
     presses: u64,
@@ -95,6 +96,24 @@ pub async fn run(
     // A file that cannot be made or added to shows before anything is pressed.
     let (mut all, part) = begin(&args)?;
     let hrn = setup.hrn.clone();
+    // A model without references may be followed by one that has them.
+    let most = match hrn.most_references() {
+        0 => MOST_REFERENCES,
+        most => most,
+    };
+    let check_count = |found: usize, remedy: &str| match found > most {
+        true => {
+            let many = format!("found {found} presses, expected at most {most}: {remedy}");
+            Err(Failure::new(FAILED, many))
+        }
+        false => Ok(()),
+    };
+    if args.files.is_empty() {
+        check_count(
+            all.len() + args.presses as usize,
+            "make fewer, or another file",
+        )?;
+    }
     let levels = &hrn.card().levels;
     let what = args.what.as_deref().map(|what| piece(what, levels));
     let what = what.transpose().of("--as", USAGE)?;
@@ -126,16 +145,7 @@ pub async fn run(
         ));
     }
     all.extend(made);
-    // A model without references may be followed by one that has them.
-    let most = match hrn.most_references() {
-        0 => MOST_REFERENCES,
-        most => most,
-    };
-    if all.len() > most {
-        let found = all.len();
-        let many = format!("found {found} presses, expected at most {most}: leave recordings out");
-        return Err(Failure::new(FAILED, many));
-    }
+    check_count(all.len(), "leave recordings out")?;
     let bytes = references::write(&all).of(args.out.display(), IO)?;
     part.write(&bytes).of(args.out.display(), IO)?;
     let tried = if all.len() <= hrn.most_references() {
@@ -166,11 +176,8 @@ fn begin(args: &Args) -> Result<(Vec<ReferencePress>, Part), Failure> {
     }
     // It refuses a pipe, whose reading might never end.
     let part = Part::over(out).of(out.display(), IO)?;
-    let mut bytes = Vec::new();
-    let most = references::MAX_FILE_BYTES as u64 + 1;
-    let read = File::open(out).and_then(|file| file.take(most).read_to_end(&mut bytes));
-    match read {
-        Ok(_) => Ok((references::read(&bytes).of(out.display(), FAILED)?, part)),
+    match config::read_at_most(out, references::MAX_FILE_BYTES) {
+        Ok(bytes) => Ok((references::read(&bytes).of(out.display(), FAILED)?, part)),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok((Vec::new(), part)),
         Err(error) => Err(cannot_read(out)(error)),
     }
@@ -287,9 +294,7 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
         references.len() - flat - ball - unknown
     );
     let forces = references.iter().map(|press| greatest_n(&press.course));
-    let (least, most) = forces.fold((f64::INFINITY, 0.0), |(least, most), force_n| {
-        (force_n.min(least), force_n.max(most))
-    });
+    let [least, most] = extent(forces);
     text += &format!("greatest force of a press  {least:.1} to {most:.1} N\n");
     let is_without = |press: &&ReferencePress| {
         let mut moments = press.course.moments.iter();
@@ -314,7 +319,8 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
     if flat + ball > 0 && (flat < 2 || ball < 2) {
         text += "a light and a hard press on a rigid flat piece and on a rigid ball tell most\n";
     }
-    text + &format!("\n[[sensor]]\nreferences = {out:?}\n")
+    let out = toml::Value::from(out);
+    text + &format!("\n[[sensor]]\nreferences = {out}\n")
 }
 
 #[cfg(test)]

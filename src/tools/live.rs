@@ -18,8 +18,9 @@ use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
 use crate::daemon::record::{Progress, WithoutSensor};
 use crate::thread;
-use hardnessd_core::exit::IO;
+use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::recording::Labels;
+use hardnessd_core::sensor::Sensor;
 use hardnessd_core::stderr_line;
 
 /// How long to wait for positions after the last press.
@@ -74,6 +75,12 @@ async fn record(
 ) -> Result<File, Failure> {
     setup.sensors.retain(|one| one.name() == sensor);
     setup.config.sensors.retain(|one| one.name == sensor);
+    for sensor in &mut setup.sensors {
+        // What is pressed now is a tool, and no everyday object of the robot.
+        let mut described = sensor.description().clone();
+        described.sensor.own_presses = 0;
+        *sensor = Sensor::new(described).exit(FAILED)?;
+    }
     let path = std::env::temp_dir();
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
     let mut file = tempfile::tempfile().of(path.display(), IO)?;

@@ -19,7 +19,7 @@ use super::doctor;
 use super::exit::{Fail as _, Failure};
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::{Progress, WithoutSensor};
+use crate::daemon::record::{Progress, Target, WithoutSensor};
 use crate::daemon::{self, Daemon, Sockets};
 use crate::maybe;
 use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
@@ -161,9 +161,14 @@ pub(super) async fn record(
         let file = file.try_clone();
         let file =
             file.map_err(|error| daemon::Error::Io(format!("{}: {error}", path.display())))?;
-        let path = path.to_owned();
-        let daemon =
-            Daemon::recording(setup, path, file, labels, progress, sockets, without_sensor)?;
+        let target = Target::File {
+            path: path.to_owned(),
+            file,
+            labels,
+            progress,
+            without_sensor,
+        };
+        let daemon = Daemon::recording(setup, sockets, target)?;
         daemon.run(end(counted.clone()), None).await
     };
     let recorded = recorded.await;

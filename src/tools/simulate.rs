@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::future::Future;
-use std::io::Write;
+use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
@@ -16,7 +16,7 @@ use crate::daemon::config::Unix;
 use crate::daemon::port::BITS_A_BYTE;
 use crate::thread;
 use hardnessd_core::exit::{IO, USAGE};
-use hardnessd_core::part;
+use hardnessd_core::part::Part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::verdict::Piece;
 use hardnessd_core::wire::{Layout, Preset, Settings as Frame};
@@ -160,24 +160,24 @@ fn record(
     settings: SequenceSettings,
     mut faults: Faults,
 ) -> std::io::Result<()> {
+    // A device takes the bytes as they come. A file is there once it is whole.
     let is_device = path.metadata().is_ok_and(|file| !file.is_file());
-    let mut options = File::options();
-    let mut file = options.write(true).create_new(!is_device).open(path)?;
+    let part = (!is_device).then(|| Part::new(path)).transpose()?;
+    let file = match &part {
+        Some(part) => part.as_file().try_clone()?,
+        None => File::options().write(true).open(path)?,
+    };
+    let mut file = BufWriter::new(file);
     let frame_rate_hz = settings.frame_rate_hz;
     let mut bytes = Vec::with_capacity(layout.max_frame_bytes());
     for (index, frame) in (0_u32..).zip(Sequence::new(settings)) {
         let time_s = f64::from(index) / frame_rate_hz;
-        let line = faults.encode(time_s, &frame.raw, layout, &mut bytes);
-        if line == Line::Up
-            && let Err(error) = file.write_all(&bytes)
-        {
-            if !is_device {
-                part::remove(path, &file);
-            }
-            return Err(error);
+        if faults.encode(time_s, &frame.raw, layout, &mut bytes) == Line::Up {
+            file.write_all(&bytes)?;
         }
     }
-    Ok(())
+    file.flush()?;
+    part.map_or(Ok(()), Part::finish)
 }
 
 /// The baud rate of the line: the given one, or the first usual one from 115,200 on that carries the
@@ -199,41 +199,6 @@ fn baud(args: &Args, layout: &Layout) -> Result<u32, Failure> {
             );
             let problem = format!("--baud: found {baud}, expected {expected}");
             Err(Failure::new(USAGE, problem))
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use clap::Parser;
-
-    use super::*;
-
-    #[derive(Debug, Parser)]
-    struct Line {
-        #[command(flatten)]
-        args: Args,
-    }
-
-    #[test]
-    fn the_longest_frame_chooses_the_rate_and_the_shortest_one_bounds_it() {
-        // Texts of 784 values are 1,568 to 5,610 bytes.
-        for (arguments, expected) in [
-            ("", Some(115_200)),
-            ("--fps 20", Some(230_400)),
-            ("--preset csv", Some(460_800)),
-            ("--preset csv --baud 78400", Some(78_400)),
-            ("--preset csv --baud 78399", None),
-            ("--baud 39499", None),
-        ] {
-            let words = ["simulate"].into_iter().chain(arguments.split_whitespace());
-            let args = Line::try_parse_from(words).unwrap().args;
-            let layout = Layout::new(&Frame {
-                preset: Some(args.preset),
-                ..Frame::default()
-            });
-            let found = baud(&args, &layout.unwrap()).ok();
-            assert_eq!(found, expected, "{arguments}");
         }
     }
 }

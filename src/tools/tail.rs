@@ -78,9 +78,9 @@ pub async fn run(args: Args, shutdown: impl Future<Output = ()>) -> Result<(), F
 
 fn print(args: &Args, counted: &AtomicU64) -> Result<(), Failure> {
     let mut daemon = args.source.connect()?;
-    let request = json!({"subscribe": args.types}).to_string();
-    daemon.send(&request)?;
+    // A daemon that has no room for another client says so in place of its hello.
     let labels = answer::labels(&daemon.meet()?);
+    daemon.send(&json!({"subscribe": args.types}).to_string())?;
     // This comes after the connection is made: if no daemon answers, the error must be the only
     // line.
     if args.source.given().is_none() {

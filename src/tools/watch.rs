@@ -147,9 +147,9 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
                 Input::Key(key) => match view.press(key) {
                     Some(Order::Quit) => return Ok(()),
                     Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
-                    Some(Order::Context(context)) => {
+                    Some(Order::Merge(keys)) => {
                         let (daemon_at, told) = (daemon_at.clone(), sender.clone());
-                        start("command", move || tell(daemon_at, &context, &told))?;
+                        start("command", move || tell(daemon_at, &keys, &told))?;
                     }
                     None => {}
                 },
@@ -215,13 +215,13 @@ fn read(mut daemon: Connection, news: &SyncSender<Input>) -> Result<Infallible, 
     }
 }
 
-/// Sets a context at the control socket beside the daemon's other one, and sends the outcome in words.
-fn tell(daemon_at: Option<Address>, context: &Value, told: &SyncSender<Input>) {
+/// Sets keys of a context at the control socket beside the daemon's other one, and sends the outcome in words.
+fn tell(daemon_at: Option<Address>, keys: &Value, told: &SyncSender<Input>) {
     let outcome = match daemon_at {
         Some(Address::Unix(path)) => {
             let daemon = connect::control(Some(path.with_file_name("control.sock")));
-            let set = daemon
-                .and_then(|mut daemon| control::ask(&mut daemon, json!({"context": context})));
+            let set =
+                daemon.and_then(|mut daemon| control::ask(&mut daemon, json!({"merge": keys})));
             match set {
                 Ok(_) => "the daemon repeats it in every verdict from now on".to_owned(),
                 Err(error) => format!("counted here only: {}", error.line()),

@@ -4,6 +4,7 @@
     reason = "the binary of the tests has it as a module of its own"
 )]
 
+mod cable;
 mod http;
 #[path = "../../src/tools/pty/pair.rs"]
 pub mod pair;
@@ -18,11 +19,11 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+pub use cable::{Cable, PERIOD};
 use hardnessd_core::frame::RawFrame;
 use hardnessd_core::recording::{Found, Reader};
 use hardnessd_core::wire::{Layout, Settings};
 pub use http::{Answer, HTTP, answer, ask, get, open};
-use pair::Pair;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -30,6 +31,15 @@ pub use subscriber::Subscriber;
 pub use terminal::{Terminal, on_terminal};
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_hardnessd");
+
+/// The file of the paper's network.
+pub const HRN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/hrn.onnx");
+
+/// A table that records into the directory `rec`. Further keys may follow.
+pub const RECORD: &str = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
+
+/// A table for a socket at a free port.
+pub const TCP: &str = "[publish.tcp]\nlisten = \"127.0.0.1:0\"\n";
 
 /// The trainer, which `cargo test --workspace` builds beside the daemon.
 pub fn hrn_train() -> PathBuf {
@@ -296,6 +306,15 @@ impl Process {
         status.unwrap().code()
     }
 
+    /// A number that the kernel tells of it, such as its memory in kB: `VmRSS`.
+    pub fn number(&self, key: &str) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id())).unwrap();
+        let mut lines = status.lines();
+        let line = lines.find_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
+        let number = line.unwrap().split_whitespace().next();
+        number.unwrap().parse().unwrap()
+    }
+
     /// What it wrote to stderr, until its end.
     pub fn errors(&mut self) -> String {
         let mut text = String::new();
@@ -413,22 +432,10 @@ impl Daemon {
     }
 }
 
-/// Writes at the sensor's end of a cable. Until the other end is opened, there is room for 4 kB.
-pub fn write_all(cable: &Pair, mut bytes: &[u8]) {
-    while !bytes.is_empty() {
-        bytes = &bytes[rustix::io::write(&cable.master, bytes).unwrap()..];
-    }
-}
-
-/// Waits until everything that was written is read.
-pub fn drain(cable: &Pair) {
-    // Written bytes reach the device a moment later.
-    let mut empty = 0;
-    wait_for("a reader", || {
-        let is_empty = rustix::io::ioctl_fionread(&cable.device).unwrap() == 0;
-        empty = if is_empty { empty + 1 } else { 0 };
-        empty > 10
-    });
+/// The clock whose times a daemon's events have.
+pub fn mono() -> Duration {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    Duration::try_from(now).unwrap()
 }
 
 pub fn wait_for(what: &str, mut there: impl FnMut() -> bool) {

@@ -52,21 +52,6 @@ fn presses_on_wood_say_the_arms_stiffness_and_delay() {
 }
 
 #[test]
-fn without_positions_there_are_no_values() {
-    let bench = configured();
-    let _sensor = bench.sensor("");
-    for (more, expected, part) in [
-        ("--presses 2", 1, "only 0 of 2 presses have positions"),
-        ("--sensor foot", 2, "foot"),
-        ("--presses 1", 2, "--presses"),
-    ] {
-        let (code, text, errors) = bench.run(&format!("{ARM} {more}"));
-        assert_eq!((code, text.as_str()), (expected, ""), "{errors}");
-        assert!(errors.contains(part), "{errors}");
-    }
-}
-
-#[test]
 fn a_signal_ends_it_and_its_sockets() {
     let bench = configured();
     let _sensor = bench.sensor("");
@@ -95,8 +80,13 @@ fn known_weights_say_the_newtons_of_a_count() {
     assert!(asked.contains(asks), "{asked}");
     let free = asked.find("leave the sensor free until its zero is taken");
     assert!(free < asked.find("put 15 N") && free.is_some(), "{asked}");
-    assert_eq!(bench.run(&format!("{FORCE} 0")).0, 2);
-    assert_eq!(bench.run(&format!("{ARM} --newtons 5")).0, 2);
+    bench.fails_each(
+        "
+        calibrate force --config hardnessd.toml --newtons 0 | 2 | --newtons
+        calibrate arm --config hardnessd.toml --newtons 5 | 2 | --newtons
+        calibrate arm --config hardnessd.toml --presses 1 | 2 | --presses
+        calibrate arm --config hardnessd.toml --sensor foot | 2 | \"foot\"",
+    );
 }
 
 /// Raw bytes of presses on the whole array. A taxel in an odd column reads a fifth more than the others.

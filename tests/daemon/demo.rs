@@ -1,11 +1,13 @@
 //! The first minute of a user: `demo` on a terminal, and commands that find a daemon and a
 //! configuration by themselves.
 
+use std::fs;
 use std::io::{BufRead, BufReader};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use crate::bench::{Bench, Process, Terminal, ran, sensor};
+use crate::bench::{Bench, Process, TCP, Terminal, ran, sensor};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -18,20 +20,39 @@ fn program(bench: &Bench, line: &str) -> Command {
     command
 }
 
+/// Whether two verdicts have their force and a level in common. Frames that are late may add a level, or take one
+/// away.
+fn are_alike(shown: &str, came: &str) -> bool {
+    let [shown, came]: [Vec<&str>; 2] =
+        [shown, came].map(|line| line.split([' ', ',', '?']).collect());
+    let unit = shown.iter().position(|&word| word == "N").unwrap();
+    let levels = ["hard", "firm", "soft", "very-soft"];
+    let is_common = |level: &&str| shown.contains(level) && came.contains(level);
+    came.contains(&shown[unit - 1]) && levels.iter().any(is_common)
+}
+
 #[test]
-fn on_a_terminal_each_press_is_a_line_with_the_truth_beside_the_verdict() {
-    let mut terminal = Terminal::start("demo --speed 4");
-    for (number, pressed) in (1..).zip(["hard-plastic", "foam", "soft-candy", "yoga-mat"]) {
-        terminal.sees(&format!("press {number}  {pressed} "));
-        let line = terminal.sees("\n");
-        assert!(line.contains(" OO -> ") && line.contains(" N"), "{line}");
-    }
-    // Ctrl-C ends it, and the count comes nevertheless.
-    terminal.process.signal(Signal::INT);
-    let rest = terminal.ends();
-    let count = rest.split(" right").next().unwrap();
-    let judged = count.rsplit(" of ").next().unwrap().parse::<u32>();
-    assert!(judged.is_ok_and(|judged| judged >= 4), "{rest}");
+fn on_a_terminal_each_press_is_a_line_as_the_readme_shows() {
+    let readme = fs::read_to_string("README.md").unwrap();
+    let shown: Vec<_> = readme
+        .lines()
+        .filter_map(|line| line.split_once(" -> "))
+        .collect();
+    assert!(readme.contains("\nhardnessd demo ") && shown.len() == 4);
+    let is_as_shown = || {
+        let mut terminal = Terminal::start("demo");
+        let is_alike = shown.iter().all(|(pressed, verdict)| {
+            terminal.sees(&format!("{pressed} -> "));
+            are_alike(verdict, &terminal.sees("\n"))
+        });
+        // Ctrl-C ends it, and the count comes nevertheless.
+        terminal.process.signal(Signal::INT);
+        let rest = terminal.ends();
+        assert!(rest.contains(" right, "), "{rest}");
+        is_alike
+    };
+    // A busy machine delays the frames of a try.
+    assert!((0..3).any(|_| is_as_shown()), "{shown:?}");
 }
 
 /// One status from `tail`, with its exit code and its stderr.
@@ -58,13 +79,14 @@ fn a_running_demo_is_found_and_a_daemon_goes_before_it() {
     assert!(printed[0].starts_with("live page: http://"), "{printed:?}");
     let socket = printed[1].strip_prefix("socket: ").unwrap();
     let socket = socket.split(' ').next().unwrap();
+    let place = Path::new(socket).parent().unwrap();
+    assert_eq!(fs::metadata(place).unwrap().mode() & 0o777, 0o700);
     let found =
         |socket: &str, sensor: &str| (0, sensor.into(), format!("hardnessd: events of {socket}\n"));
     assert_eq!(tail(&bench, ""), found(socket, "demo"));
 
     let own = bench.text_path("hardnessd/events.sock");
-    let tcp = "[publish.tcp]\nlisten = \"127.0.0.1:0\"\n";
-    let sockets = format!("[publish.unix]\npath = \"{own}\"\n{tcp}");
+    let sockets = format!("[publish.unix]\npath = \"{own}\"\n{TCP}");
     bench.write("hardnessd.toml", sensor("forearm", "port", 20) + &sockets);
     let daemon = bench.daemon_as_configured();
     assert_eq!(tail(&bench, ""), found(&own, "forearm"));

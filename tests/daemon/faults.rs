@@ -4,80 +4,15 @@
 //! The test writes every byte of the sensor, so no fault depends on how busy the machine is.
 
 use std::fs;
-use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, drain, frame, sensor, wait_for, write_all};
+use crate::bench::{Bench, Cable, Daemon, Subscriber, frame, sensor, wait_for};
 use rustix::fs::{FlockOperation, flock};
 use serde_json::{Value, json};
 
-/// The time between two frames.
-const PERIOD: Duration = Duration::from_millis(10);
-
 /// The counts of a press.
 const PRESSED: f32 = 20.0;
-
-/// The sensor's end of a cable. The test writes every byte on it.
-struct Cable {
-    pair: Option<Pair>,
-    link: PathBuf,
-}
-
-impl Cable {
-    fn plug(link: PathBuf) -> Self {
-        let mut cable = Self { pair: None, link };
-        cable.replug();
-        cable
-    }
-
-    /// Puts a new port behind the link. The old port, if there is one, is closed after that.
-    fn replug(&mut self) {
-        self.replug_at(Pair::raw().unwrap());
-    }
-
-    fn replug_at(&mut self, pair: Pair) {
-        let born = self.link.with_extension("new");
-        std::os::unix::fs::symlink(&pair.path, &born).unwrap();
-        fs::rename(&born, &self.link).unwrap();
-        self.pair = Some(pair);
-    }
-
-    /// Pulls the cable and returns the time.
-    fn unplug(&mut self) -> SystemTime {
-        self.drain();
-        let now = SystemTime::now();
-        fs::remove_file(&self.link).unwrap();
-        self.pair = None;
-        now
-    }
-
-    fn write(&self, bytes: &[u8]) {
-        write_all(self.pair.as_ref().unwrap(), bytes);
-    }
-
-    /// Writes frames at their pace.
-    fn play(&self, counts: f32, frames: usize) {
-        for _ in 0..frames {
-            self.write(&frame(counts));
-            std::thread::sleep(PERIOD);
-        }
-    }
-
-    fn drain(&self) {
-        drain(self.pair.as_ref().unwrap());
-    }
-
-    /// Sends frames without load until the sensor is live: the daemon drops what came before the port was opened.
-    fn wake(&self, bench: &Bench, sensor: &str) {
-        let mut subscriber = bench.subscriber();
-        wait_for("a live sensor", || {
-            self.write(&frame(0.0));
-            self.drain();
-            subscriber.status(sensor)["state"] == "live"
-        });
-    }
-}
 
 /// The table of a sensor whose cable a test holds.
 fn cabled(name: &str, port: &str, stale_after_ms: u32) -> String {

@@ -3,14 +3,13 @@
 use std::fs;
 use std::io::Write;
 use std::net::{TcpListener, TcpStream, UdpSocket};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hardnessd_simulator::random::Stream;
 use tempfile::TempDir;
 
-use crate::bench::{Bench, HTTP, frame, free_address, get, sensor};
+use crate::bench::{Bench, HTTP, RECORD, frame, free_address, get, sensor};
 
 const PERIOD: Duration = Duration::from_millis(20);
 const STALE_AFTER: Duration = Duration::from_millis(500);
@@ -20,7 +19,7 @@ const FLOODS: usize = 6;
 
 /// Sends the good sensor's frames: a press of half a second every two seconds. Returns the longest pause, which a busy
 /// machine may cause.
-fn play(good: &mut TcpStream) -> Duration {
+fn play(mut good: TcpStream) -> Duration {
     let (free, pressed) = (frame(0.0), frame(60.0));
     let begin = Instant::now();
     let (mut last, mut longest) = (begin, Duration::ZERO);
@@ -34,15 +33,6 @@ fn play(good: &mut TcpStream) -> Duration {
     longest
 }
 
-/// Sets a flag when it is dropped, also by a failed assertion: without it, a scope waits for its threads for ever.
-struct Done<'a>(&'a AtomicBool);
-
-impl Drop for Done<'_> {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
 /// Six floods beside a good sensor. Returns how often that was stale, or nothing if its own sender was late.
 fn stale_beside_six_floods() -> Option<u64> {
     let bench = Bench::new();
@@ -52,40 +42,35 @@ fn stale_beside_six_floods() -> Option<u64> {
         sensor(&format!("s{number}"), &port, 50) + "stale_after_ms = 500\n"
     });
     let mut daemon = bench.daemon_of(&tables.collect::<String>(), HTTP);
-    let mut peers = listeners.map(|listener| listener.accept().unwrap().0);
+    let mut peers = listeners
+        .map(|listener| listener.accept().unwrap().0)
+        .into_iter();
     let mut subscriber = bench.subscriber();
     subscriber.ask(r#"{"subscribe":["frame","status","press","hardness"]}"#);
-    let (good, floods) = peers.split_first_mut().unwrap();
+    let good = peers.next().unwrap();
     let short = [frame(0.0).repeat(4), frame(60.0).repeat(4)].concat();
-    let done = AtomicBool::new(false);
+    // They end with the daemon.
+    for mut flood in peers {
+        let short = short.clone();
+        thread::spawn(move || while flood.write_all(&short).is_ok() {});
+    }
+    let playing = thread::spawn(move || play(good));
+    let begin = Instant::now();
     let (mut stale, mut next) = (0, 0);
-    let (longest, flood) = thread::scope(|scope| {
-        let until_the_end = Done(&done);
-        for flood in floods {
-            scope.spawn(|| {
-                while !done.load(Ordering::Relaxed) && flood.write_all(&short).is_ok() {
-                    std::hint::spin_loop();
-                }
-            });
+    while next < u64::from(FRAMES) && begin.elapsed() < 4 * PERIOD * FRAMES {
+        let line = subscriber.next().unwrap();
+        if line["sensor"] != "s0" {
+            continue;
         }
-        let playing = scope.spawn(|| play(good));
-        let begin = Instant::now();
-        while next < u64::from(FRAMES) && begin.elapsed() < 4 * PERIOD * FRAMES {
-            let line = subscriber.next().unwrap();
-            if line["sensor"] != "s0" {
-                continue;
-            }
-            stale += u64::from(line["state"] == "stale");
-            if line["type"] == "frame" {
-                assert_eq!(line["frame"], next, "none is missing");
-                next += 1;
-            }
+        stale += u64::from(line["state"] == "stale");
+        if line["type"] == "frame" {
+            assert_eq!(line["frame"], next, "none is missing");
+            next += 1;
         }
-        // While they flood: some seconds later nothing is said of it any more.
-        let flood = bench.subscriber().status("s1");
-        drop(until_the_end);
-        (playing.join().unwrap(), flood)
-    });
+    }
+    // While they flood: some seconds later nothing is said of it any more.
+    let flood = bench.subscriber().status("s1");
+    let longest = playing.join().unwrap();
     assert_eq!(next, u64::from(FRAMES), "frames in time");
     let metrics = get(daemon.address("http"), "/metrics").body;
     let log = daemon.end();
@@ -115,22 +100,12 @@ fn six_floods_take_nothing_from_a_good_sensor() {
     assert!(tries.len() < 3, "stale in each of three tries: {tries:?}");
 }
 
-/// The resident memory of a process, in bytes.
-fn resident(process: u32) -> u64 {
-    let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap();
-    let mut lines = status.lines();
-    let line = lines.find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
-    line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() << 10
-}
-
 #[test]
 fn noise_over_udp_is_recorded_at_no_more_than_the_line_carries() {
     let bench = Bench::new();
     let address = free_address();
-    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
-    let mut daemon = bench.daemon_of(&sensor("noisy", &format!("udp://{address}"), 50), record);
-    let process = daemon.process.0.id();
-    let before = resident(process);
+    let mut daemon = bench.daemon_of(&sensor("noisy", &format!("udp://{address}"), 50), RECORD);
+    let before_kb = daemon.process.number("VmRSS");
     let noise: Vec<u8> = (0..60_000_u32).map(|n| ((n * n) >> 7) as u8).collect();
     let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
     let begin = Instant::now();
@@ -138,7 +113,7 @@ fn noise_over_udp_is_recorded_at_no_more_than_the_line_carries() {
         let _ = sender.send_to(&noise, address);
     }
     let taken_s = begin.elapsed().as_secs_f64();
-    let grown = resident(process).saturating_sub(before);
+    let grown_kb = daemon.process.number("VmRSS").saturating_sub(before_kb);
     let status = bench.subscriber().status("noisy");
     let skipped = status["bytes_skipped"].as_u64().unwrap();
     let log = daemon.end();
@@ -152,7 +127,7 @@ fn noise_over_udp_is_recorded_at_no_more_than_the_line_carries() {
     let most = 4.0 * 50.0 * 790.0 * (taken_s + 5.0) + 2e5;
     assert!((recorded as f64) < most, "{recorded} of {most}");
     assert!(skipped > recorded, "{skipped}");
-    assert!(grown < 40 << 20, "{grown}");
+    assert!(grown_kb < 40 << 10, "{grown_kb}");
 }
 
 #[test]

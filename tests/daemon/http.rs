@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::net::{SocketAddr, TcpStream};
 
 use crate::bench::{Answer, Bench, Daemon, HTTP, answer, ask, get, open, wait_for};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 /// A daemon with a page, and the page's address.
 fn serving(bench: &Bench) -> (Daemon, SocketAddr) {
@@ -82,6 +82,11 @@ fn the_page_may_say_what_is_pressed_and_no_page_from_elsewhere_may() {
         ("Content-Type: text/plain", body, 415),
         (json, r#"{"sensor":"palm"}"#, 400),
         (json, "[]", 400),
+        (
+            "Content-Type: application/json; charset=utf-8",
+            r#"{"sensor":"forearm","tag":"x"}"#,
+            200,
+        ),
         (json, body, 200),
     ] {
         let answer = set_context(address, content_type, body);
@@ -93,7 +98,7 @@ fn the_page_may_say_what_is_pressed_and_no_page_from_elsewhere_may() {
     );
     let _sensor = bench.sensor("--presses 1");
     let press = bench.subscriber().press("begin");
-    let expected: Value = serde_json::from_str(body).unwrap();
+    let expected = json!({"sensor": "forearm", "level": 2, "object": "cup", "tag": "x"});
     assert_eq!(press["context"], expected);
 }
 

@@ -1,28 +1,21 @@
 //! Positions of the arm: sent to the real daemon on the control socket, recorded and replayed.
 
-use std::time::Duration;
-
-use crate::bench::{Bench, HTTP, get, sensor};
+use crate::bench::{Bench, HTTP, RECORD, get, mono, sensor};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::Entry;
 use serde_json::{Value, json};
 
-fn mono_ns() -> u64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    u64::try_from(Duration::try_from(now).unwrap().as_nanos()).unwrap()
-}
-
 #[test]
 fn positions_are_checked_counted_and_recorded() {
     let bench = Bench::new();
-    let record = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
-    let mut daemon = bench.daemon_with(&format!("{HTTP}{record}"));
+    let mut daemon = bench.daemon_with(&format!("{HTTP}{RECORD}"));
     let _sensor = bench.sensor("");
     bench.subscriber().state("live");
     let mut control = bench.control();
     let mut send = |at: Value| {
         control.ask(&json!({"motion": {"sensor": "forearm", "at": at}, "id": 7}).to_string())
     };
+    let mono_ns = || u64::try_from(mono().as_nanos()).unwrap();
     let now = mono_ns();
     let ok = json!({"type": "ok", "id": 7});
     assert_eq!(send(json!([[now - 2_000_000, 3.5], [now, 3.75]])), ok);
@@ -55,19 +48,6 @@ fn positions_are_checked_counted_and_recorded() {
     assert_eq!(lines.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
     // This point was sent with a calendar time. The daemon reads both clocks at the same moment.
     assert!((lines[1][0].0 - at).abs() < 60_000_000_000 && lines[1][0].1 == 4.0);
-}
-
-#[test]
-fn positions_of_raw_bytes_come_from_a_table() {
-    let bench = Bench::new();
-    bench.succeeds("simulate --presses 1 --to raw.bin");
-    let replay = "replay raw.bin --motion motion.csv";
-    bench.fails(replay, 66, &["motion.csv: cannot read"]);
-    bench.write("motion.csv", "time_s,approach_mm\n0,0\n0.1,x\n");
-    bench.fails(replay, 1, &["motion.csv:3: approach_mm: found \"x\""]);
-    bench.write("motion.csv", "time_s,approach_mm\n0,0\n0.1,1\n");
-    let events = bench.succeeds(replay);
-    assert_eq!(bench.succeeds(&format!("{replay} --speed 1e6")), events);
 }
 
 #[test]

@@ -9,9 +9,9 @@ use std::fs;
 use std::io::{BufRead, BufReader, Cursor, Read, Write};
 use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpStream};
 use std::os::unix::net::UnixStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use hardnessd::daemon::Daemon;
@@ -26,6 +26,7 @@ use hardnessd_core::wire::{
     Cell, Checksum, ChecksumOver, Decoder, Framing, HexBytes, Layout, LengthField, Packets, Preset,
     Settings,
 };
+use tempfile::NamedTempFile;
 
 /// How long the daemon may take to answer.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -166,33 +167,30 @@ struct Served {
     http: SocketAddr,
 }
 
-fn served() -> &'static Served {
-    static SERVED: OnceLock<Served> = OnceLock::new();
-    SERVED.get_or_init(|| {
-        // The directory stays after the process, because there is no point at which to remove it.
-        let directory = tempfile::tempdir().expect("a directory").keep();
-        let path = directory.join("hardnessd.toml");
-        let text = "robot = \"r\"\n[[sensor]]\nname = \"a\"\nport = \"absent\"\n\
-                    [publish.unix]\npath = \"events.sock\"\n[http]\nlisten = \"0.0.0.0:0\"\n";
-        fs::write(&path, text).expect("a configuration");
-        let (bound, address) = std::sync::mpsc::channel();
-        std::thread::spawn(move || {
-            let runtime = tokio::runtime::Builder::new_current_thread()
-                .enable_all()
-                .build()
-                .expect("a runtime");
-            runtime.block_on(async {
-                let setup = Setup::load(&path, None).expect("a configuration that is good");
-                let daemon = Daemon::start(setup).expect("sockets");
-                bound.send(daemon.http_address()).expect("who waits");
-                let ended = daemon.run(std::future::pending(), None).await;
-                panic!("the daemon ended: {ended:?}");
-            });
+static SERVED: LazyLock<Served> = LazyLock::new(|| {
+    // The directory stays after the process, because there is no point at which to remove it.
+    let directory = tempfile::tempdir().expect("a directory").keep();
+    let path = directory.join("hardnessd.toml");
+    let text = "robot = \"r\"\n[[sensor]]\nname = \"a\"\nport = \"absent\"\n\
+                [publish.unix]\npath = \"events.sock\"\n[http]\nlisten = \"0.0.0.0:0\"\n";
+    fs::write(&path, text).expect("a configuration");
+    let (bound, address) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .expect("a runtime");
+        runtime.block_on(async {
+            let setup = Setup::load(&path, None).expect("a configuration that is good");
+            let daemon = Daemon::start(setup).expect("sockets");
+            bound.send(daemon.http_address()).expect("who waits");
+            let ended = daemon.run(std::future::pending(), None).await;
+            panic!("the daemon ended: {ended:?}");
         });
-        let http = address.recv().expect("a daemon").expect("an address");
-        Served { directory, http }
-    })
-}
+    });
+    let http = address.recv().expect("a daemon").expect("an address");
+    Served { directory, http }
+});
 
 /// Each line of a subscriber or a controller is answered by one line of JSON, whatever the line is.
 /// The next question after the lines is answered too. Only a line that is too long ends the
@@ -203,7 +201,7 @@ pub fn lines(bytes: &[u8]) {
         Some((_, message)) => ("events.sock", message),
         None => return,
     };
-    let mut stream = UnixStream::connect(served().directory.join(socket)).expect("a daemon");
+    let mut stream = UnixStream::connect(SERVED.directory.join(socket)).expect("a daemon");
     stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
     let last = b"\n{\"get\":\"status\",\"id\":\"the last question\"}\n";
     let longest = message.split(|&byte| byte == b'\n').map(<[u8]>::len).max();
@@ -253,7 +251,7 @@ fn ask(request: &[u8], end: Option<Shutdown>, patience: Duration) -> Vec<u8> {
     static NEXT: AtomicU32 = AtomicU32::new(1);
     let next = NEXT.fetch_add(1, Ordering::Relaxed) % 0x00ff_fff0 + 1;
     let address = Ipv4Addr::from_bits((127 << 24) | next);
-    let port = served().http.port();
+    let port = SERVED.http.port();
     let mut stream = TcpStream::connect((address, port)).expect("a daemon");
     stream.set_read_timeout(Some(patience)).expect("a timeout");
     // The other end may close before everything is sent.
@@ -267,42 +265,23 @@ fn ask(request: &[u8], end: Option<Shutdown>, patience: Duration) -> Vec<u8> {
     answer
 }
 
-/// Writes `bytes` to a file of this process.
-fn file(name: &str, bytes: &[u8]) -> PathBuf {
-    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
-    let directory = DIRECTORY.get_or_init(|| {
-        let memory = Path::new("/dev/shm");
-        let made = if memory.is_dir() {
-            tempfile::tempdir_in(memory)
-        } else {
-            tempfile::tempdir()
-        };
-        made.expect("a directory").keep()
-    });
-    let path = directory.join(name);
-    fs::write(&path, bytes).expect("room for a small file");
-    path
-}
-
 /// A configuration is used, or refused in a line that begins with the file's name.
 pub fn configuration(bytes: &[u8]) {
-    let path = file("fuzzed.toml", bytes);
-    if let Err(error) = Config::load(&path) {
+    static FILE: LazyLock<NamedTempFile> = LazyLock::new(|| NamedTempFile::new().expect("a file"));
+    let path = FILE.path();
+    fs::write(path, bytes).expect("room for a small file");
+    if let Err(error) = Config::load(path) {
         let line = error.to_string();
         let name = path.display().to_string();
         assert!(line.starts_with(&name) && !line.contains('\n'), "{line}");
     }
 }
 
-fn hrn() -> Arc<Model> {
-    static HRN: OnceLock<Arc<Model>> = OnceLock::new();
-    let load = || Arc::new(Model::load(BUILT_IN_HRN).expect("the model in the binary is one"));
-    Arc::clone(HRN.get_or_init(load))
-}
-
 /// A recording is played up to its first damage.
 pub fn recording(bytes: &[u8]) {
-    let mut playback = Playback::new(hrn());
+    static HRN: LazyLock<Arc<Model>> =
+        LazyLock::new(|| Arc::new(Model::load(BUILT_IN_HRN).expect("the model built in")));
+    let mut playback = Playback::new(Arc::clone(&HRN));
     for found in Reader::new(bytes) {
         let Ok(found) = found else { break };
         if playback.feed(found).is_err() {

@@ -3,17 +3,13 @@
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::MetadataExt;
-use std::os::unix::net::{UnixListener, UnixStream};
+use std::os::unix::net::UnixStream;
 use std::process::{Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 
-use crate::bench::{Bench, PATIENCE, Process, Subscriber, events, ran, wait_for};
+use crate::bench::{Bench, PATIENCE, Process, Subscriber, TCP, events, ran, wait_for};
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use serde_json::{Value, json};
 
-const TCP: &str = "[publish.tcp]\nlisten = \"127.0.0.1:0\"\n";
 const TARE: &str = r#"{"tare":"forearm"}"#;
 
 #[test]
@@ -133,73 +129,19 @@ fn tail_gives_a_script_the_events_it_counts_or_an_exit_code() {
     assert_eq!(left.exit_code(), Some(69), "the daemon has ended");
 }
 
-#[test]
-fn tail_does_not_wait_for_a_hello_that_does_not_come_nor_take_another_protocol() {
-    let bench = Bench::new();
-    let other = "{\"type\":\"hello\",\"protocol\":2}\n";
-    for (line, parts) in [
-        ("", ["no answer for 5 s", "events.sock"]),
-        (other, ["protocol 2", "protocol 1"]),
-        ("{\"type\":\"ok\"}\n", ["\"ok\"", "expected the hello"]),
-        ("SSH-2.0\n", ["no JSON", "events.sock"]),
-        (
-            "HTTP/1.1 400 Bad\r\n",
-            ["a web server answers", "[publish.tcp]"],
-        ),
-    ] {
-        let path = bench.path("events.sock");
-        let _ = fs::remove_file(&path);
-        let listener = UnixListener::bind(&path).unwrap();
-        let listening = std::thread::spawn(move || {
-            let (mut stream, _) = listener.accept().unwrap();
-            stream.write_all(line.as_bytes()).unwrap();
-            // A byte now and then is no hello either.
-            while line.is_empty() && stream.write_all(b"7").is_ok() {
-                std::thread::sleep(std::time::Duration::from_secs(1));
+/// Reads up to the event with this number, and checks that nothing was missed.
+fn assert_whole(mut subscriber: Subscriber, until: u64) {
+    let mut last = [None; 2];
+    while last[1] < Some(until) {
+        let event = subscriber.next().expect("the connection stays");
+        assert_ne!(event["type"], "gap", "{event}");
+        for (key, last) in ["frame", "seq"].into_iter().zip(&mut last) {
+            let is_own = key == "seq" || event["type"] == "frame";
+            if let Some(number) = event[key].as_u64().filter(|_| is_own) {
+                assert!(last.is_none_or(|last| number == last + 1), "{event}");
+                *last = Some(number);
             }
-            // Wait until the client disconnects.
-            let _ = stream.read_to_end(&mut Vec::new());
-        });
-        let (code, _, stderr) = ran(&mut tail(&bench, ""));
-        listening.join().unwrap();
-        assert_eq!((code, stderr.lines().count()), (69, 1), "{stderr}");
-        for part in parts {
-            assert!(stderr.contains(part), "{part:?} not in {stderr}");
         }
-    }
-}
-
-/// Reads everything on a thread of its own until it is stopped, and checks that nothing was missed.
-struct Witness {
-    stop: Arc<AtomicBool>,
-    reading: JoinHandle<()>,
-}
-
-impl Witness {
-    fn start(mut subscriber: Subscriber) -> Self {
-        subscriber.ask(r#"{"subscribe":["frame","status","press","hardness"]}"#);
-        let stop = Arc::new(AtomicBool::new(false));
-        let stopped = stop.clone();
-        let reading = std::thread::spawn(move || {
-            let mut last = [None; 2];
-            while !stopped.load(Ordering::Relaxed) {
-                let event = subscriber.next().expect("the connection stays");
-                assert_ne!(event["type"], "gap", "{event}");
-                for (key, last) in ["frame", "seq"].into_iter().zip(&mut last) {
-                    let is_own = key == "seq" || event["type"] == "frame";
-                    if let Some(number) = event[key].as_u64().filter(|_| is_own) {
-                        assert!(last.is_none_or(|last| number == last + 1), "{event}");
-                        *last = Some(number);
-                    }
-                }
-            }
-        });
-        Self { stop, reading }
-    }
-
-    fn end(self) {
-        self.stop.store(true, Ordering::Relaxed);
-        self.reading.join().expect("nothing was missed");
     }
 }
 
@@ -234,7 +176,8 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
     let address = daemon.address("tcp");
     let _sensor = bench.sensor("");
     bench.subscriber().state("live");
-    let witness = Witness::start(bench.subscriber());
+    let mut witness = bench.subscriber();
+    witness.ask(r#"{"subscribe":["frame","status","press","hardness"]}"#);
 
     let mut kept = Vec::new();
     let over_unix = || bench.subscriber();
@@ -264,5 +207,6 @@ fn bad_subscribers_get_an_error_or_a_refusal_and_cost_nobody_anything() {
     assert!((240..=255).contains(&served), "{served} served");
     drop(crowd);
     wait_for("room", || is_served(&bench).1);
-    witness.end();
+    let hello = bench.subscriber().next().unwrap();
+    assert_whole(witness, hello["seq"].as_u64().unwrap());
 }

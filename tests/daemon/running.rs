@@ -226,6 +226,7 @@ fn bad_input_ends_with_its_exit_code_and_one_line() {
         check --config . | 66 | cannot read: Is a directory
         replay . | 66 | .: cannot read: Is a directory
         replay /no/such.bin | 66 | /no/such.bin
+        replay hardnessd.toml --motion none.csv | 66 | none.csv: cannot read
         simulate --faults /dev/zero | 1 | found more than 1048576 bytes
         simulate --fps 20 --baud 115200 | 2 | --baud | 158000
         run x.toml | 2 | argument 'x.toml' | tip: --config x.toml

@@ -65,26 +65,15 @@ fn the_shipped_configuration_shows_every_key_and_its_default_also_in_lines_that_
 
 #[test]
 fn every_file_that_names_the_version_names_this_one() {
-    let version = env!("CARGO_PKG_VERSION");
-    for (file, expected) in [
-        (
-            "clients/python/pyproject.toml",
-            format!("\nversion = \"{version}\"\n"),
-        ),
-        (
-            "clients/lerobot/pyproject.toml",
-            format!("\nversion = \"{version}\"\n"),
-        ),
-        (
-            "clients/ros2/tactile_interfaces/package.xml",
-            format!("<version>{version}</version>"),
-        ),
-        ("CHANGELOG.md", format!("\n## {version}")),
-        (
-            "docs/operator.md",
-            format!("hardnessd_{version}-1_amd64.deb"),
-        ),
-    ] {
+    let files = "
+        clients/python/pyproject.toml | version = \"VERSION\"
+        clients/lerobot/pyproject.toml | version = \"VERSION\"
+        clients/ros2/tactile_interfaces/package.xml | <version>VERSION</version>
+        CHANGELOG.md | ## VERSION
+        docs/operator.md | hardnessd_VERSION-1_amd64.deb";
+    for file in files.trim().lines() {
+        let (file, expected) = file.trim().split_once(" | ").unwrap();
+        let expected = expected.replace("VERSION", env!("CARGO_PKG_VERSION"));
         let text = fs::read_to_string(shipped(file)).unwrap();
         assert!(text.contains(&expected), "{file}: expected {expected:?}");
     }

@@ -3,7 +3,7 @@
 //!
 //!     HARDNESSD_SOAK_MINUTES=120 cargo test --release --workspace --test program soak -- --ignored --nocapture
 //!
-//! Each sensor sends simulated presses over a pty, with a fault in every second press. Beside them, one
+//! Each sensor sends presses over a pty, with a fault in every second press. Beside them, one
 //! UDP port gets frames at ten times the sensor's rate, and one gets noise. There are subscribers of
 //! all kinds, recordings, and a reload every ten seconds. At the end, every press must have its verdict,
 //! or must be lost with the link, by its number. Memory, descriptors and threads must not have grown,
@@ -12,24 +12,25 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, UdpSocket};
-use std::os::unix::fs::symlink;
 use std::os::unix::net::UnixStream;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
-use crate::bench::pair::Pair;
-use crate::bench::{Bench, Daemon, Subscriber, drain, free_address, sensor, wait_for, write_all};
-use hardnessd_core::wire::{Layout, Settings};
+use crate::bench::{
+    Bench, Cable, Daemon, PERIOD, RECORD, Subscriber, frame, free_address, sensor, wait_for,
+};
 use hardnessd_simulator::random::Stream;
-use hardnessd_simulator::{Material, Sequence, SequenceSettings};
 use rustix::process::Signal;
 
 const SENSORS: usize = 8;
-const FRAMES_PER_S: f64 = 100.0;
-const PERIOD: Duration = Duration::from_millis(10);
+/// The frames of a press, and those of the rest after it.
+const PRESSED: usize = 60;
+const FREE: usize = 120;
+/// The frame of a press at which its fault begins.
+const MIDDLE: usize = PRESSED / 2;
 /// The number of recordings that are kept.
 const KEPT: usize = 16;
 /// The time until memory grows no more: the black boxes hold a minute, and up to a stretch of ten
@@ -38,102 +39,50 @@ const KEPT: usize = 16;
 /// leaves out its first quarter.
 const WARM: Duration = Duration::from_secs(120);
 
-/// One simulated press as frames on the wire, with the rest after it.
-#[derive(Default)]
-struct Press {
-    frames: Vec<Vec<u8>>,
-    /// The index of a frame in the middle of the contact.
-    middle: usize,
-}
-
-/// A press of each material, and a frame without load.
-fn library() -> (Vec<Press>, Vec<u8>) {
-    let layout = Layout::new(&Settings::default()).unwrap();
-    let materials = Material::ALL.to_vec();
-    let sequence = Sequence::new(SequenceSettings {
-        frame_rate_hz: FRAMES_PER_S,
-        presses: u32::try_from(materials.len()).ok(),
-        materials,
-        ..SequenceSettings::default()
-    });
-    let (mut presses, mut rest): (Vec<Press>, _) = (Vec::new(), Vec::new());
-    for frame in sequence {
-        let mut bytes = Vec::new();
-        layout.encode(&frame.raw, &mut bytes);
-        presses.resize_with(frame.press as usize, Press::default);
-        let Some(press) = presses.last_mut() else {
-            rest = bytes;
-            continue;
-        };
-        press.frames.push(bytes);
-        if frame.loaded {
-            press.middle = press.frames.len() / 2;
-        }
-    }
-    (presses, rest)
-}
-
 const FAULTS: [&str; 7] = [
     "unplug", "silence", "stall", "flip", "drop", "noise", "double",
 ];
 
-/// A sensor on its cable, a pty behind a link.
+/// A sensor on its cable.
 struct Player {
-    port: PathBuf,
-    pair: Pair,
-    library: Arc<(Vec<Press>, Vec<u8>)>,
+    bench: Arc<Bench>,
+    name: String,
+    cable: Cable,
     stream: Stream,
-    link: Arc<Link>,
     /// For each press sent, whether it has a verdict.
     sent: Vec<bool>,
     faults: [u64; FAULTS.len()],
-    due: Instant,
-}
-
-/// How often a subscriber has read that a sensor is live, and that it is lost.
-#[derive(Default)]
-struct Link {
-    lives: AtomicU64,
-    losses: AtomicU64,
-}
-
-/// A terminal behind a link.
-fn plugged(port: &Path) -> Pair {
-    let pair = Pair::raw().unwrap();
-    symlink(&pair.path, port).unwrap();
-    pair
 }
 
 impl Player {
     /// Plays until `end`, and then to the end of the press under way.
     fn play(mut self, end: Instant) -> Self {
-        self.wake(0);
+        self.wake();
         while Instant::now() < end {
-            let library = Arc::clone(&self.library);
-            let press = &library.0[self.stream.below(library.0.len())];
             let fault = self.stream.below(2 * FAULTS.len());
             if fault < FAULTS.len() {
                 self.faults[fault] += 1;
             }
-            self.press(press, FAULTS.get(fault).copied().unwrap_or_default());
+            self.press(FAULTS.get(fault).copied().unwrap_or_default());
         }
-        drain(&self.pair);
+        self.cable.drain();
         self
     }
 
-    fn press(&mut self, press: &Press, fault: &str) {
-        let (middle, mut held) = (press.middle, Vec::new());
-        for (index, frame) in press.frames.iter().enumerate() {
-            let struck = (middle..middle + 3).contains(&index);
+    fn press(&mut self, fault: &str) {
+        let (free, pressed, mut held) = (frame(0.0), frame(60.0), Vec::new());
+        for index in 0..PRESSED + FREE {
+            let frame = if index < PRESSED { &pressed } else { &free };
+            let struck = (MIDDLE..MIDDLE + 3).contains(&index);
             let mut bytes = frame.clone();
             match fault {
-                "unplug" if index == middle => {
+                "unplug" if index == MIDDLE => {
                     self.sent.push(false);
                     return self.unplug(&bytes);
                 }
-                "silence" if index == middle => self.due += Duration::from_millis(400),
+                "silence" if index == MIDDLE => sleep(Duration::from_millis(400)),
                 // Send nothing for 30 frames, then send all of them.
-                "stall" if (middle..middle + 30).contains(&index) => {
+                "stall" if (MIDDLE..MIDDLE + 30).contains(&index) => {
                     held.append(&mut bytes);
                 }
                 "flip" if struck => bytes[self.stream.below(frame.len())] ^= 1,
@@ -147,68 +96,43 @@ impl Player {
                 "double" if struck => bytes.extend_from_slice(frame),
                 _ => {}
             }
-            if index == middle + 30 {
+            if index == MIDDLE + 30 {
                 bytes.splice(0..0, std::mem::take(&mut held));
             }
-            self.write(&bytes);
+            self.cable.write(&bytes);
+            sleep(PERIOD);
         }
-        // If the press ended before the held frames were sent, send them now.
-        self.write(&held);
         self.sent.push(true);
     }
 
     /// Pulls the cable in the middle of a frame, and plugs it in again.
     fn unplug(&mut self, frame: &[u8]) {
         let part = self.stream.below(frame.len());
-        self.write(&frame[..part]);
-        drain(&self.pair);
-        let losses = self.link.losses.load(Relaxed);
-        fs::remove_file(&self.port).unwrap();
-        // Open the new pty before the old one is closed, so that its name is a different one.
-        let next = self.port.with_extension("next");
-        self.pair = plugged(&next);
-        wait_for("the loss", || self.link.losses.load(Relaxed) > losses);
-        let lives = self.link.lives.load(Relaxed);
-        sleep(Duration::from_secs_f64(self.stream.range(0.0, 1.5)));
-        fs::rename(&next, &self.port).unwrap();
-        self.wake(lives);
-    }
-
-    /// Sends frames without load until the sensor is live once more, and then enough frames for a
-    /// tare.
-    fn wake(&mut self, lives: u64) {
-        let (library, link) = (Arc::clone(&self.library), Arc::clone(&self.link));
-        self.due = Instant::now();
-        wait_for("the sensor", || {
-            self.write(&library.1);
-            link.lives.load(Relaxed) > lives
+        self.cable.write(&frame[..part]);
+        self.cable.unplug();
+        let mut subscriber = self.bench.subscriber();
+        wait_for("the loss", || {
+            subscriber.status(&self.name)["state"] == "lost"
         });
-        (0..30).for_each(|_| self.write(&library.1));
+        sleep(Duration::from_secs_f64(self.stream.range(0.0, 1.5)));
+        self.cable.replug();
+        self.wake();
     }
 
-    /// Writes when the next frame is due.
-    fn write(&mut self, bytes: &[u8]) {
-        sleep(self.due.saturating_duration_since(Instant::now()));
-        self.due += PERIOD;
-        write_all(&self.pair, bytes);
+    /// Waits until the sensor is live, and sends enough frames for a tare.
+    fn wake(&self) {
+        self.cable.wake(&self.bench, &self.name);
+        self.cable.play(0.0, 30);
     }
 }
 
 /// Reads to the end. The numbers of events and of presses must be consecutive. Returns for each sensor
 /// and press how it ended; nothing if it has not ended.
-fn receive(mut subscriber: Subscriber, links: &[Arc<Link>]) -> Vec<Vec<String>> {
-    let (mut ends, mut last) = (vec![Vec::new(); links.len()], None);
+fn receive(mut subscriber: Subscriber) -> Vec<Vec<String>> {
+    let (mut ends, mut last) = (vec![Vec::new(); SENSORS], None);
     while let Some(event) = subscriber.next() {
         let text = |key: &str| event[key].as_str().unwrap_or_default();
         assert_ne!(text("type"), "gap", "after event {last:?}");
-        let sensor = text("sensor")
-            .strip_prefix('s')
-            .and_then(|number| number.parse::<usize>().ok());
-        if let (Some(sensor), "status") = (sensor, text("type")) {
-            let (is_live, is_lost) = (text("state") == "live", text("state") == "lost");
-            links[sensor].lives.fetch_add(is_live.into(), Relaxed);
-            links[sensor].losses.fetch_add(is_lost.into(), Relaxed);
-        }
         // The number in a hello is that of the last event before it.
         let Some(seq) = event["seq"].as_u64() else {
             continue;
@@ -218,7 +142,8 @@ fn receive(mut subscriber: Subscriber, links: &[Arc<Link>]) -> Vec<Vec<String>> 
             "{seq} after {last:?}"
         );
         last = Some(seq);
-        let Some(sensor) = sensor else {
+        let number = text("sensor").strip_prefix('s');
+        let Some(sensor) = number.and_then(|number| number.parse::<usize>().ok()) else {
             continue;
         };
         let ends = &mut ends[sensor];
@@ -260,15 +185,10 @@ fn flood(address: SocketAddr, over: &AtomicBool, mut datagram: impl FnMut() -> V
 
 /// The daemon's memory in kB, descriptors and threads.
 fn usage(daemon: &Daemon) -> [u64; 3] {
-    let directory = PathBuf::from(format!("/proc/{}", daemon.process.0.id()));
-    let status = fs::read_to_string(directory.join("status")).unwrap();
-    let of = |key: &str| -> u64 {
-        let line = status.lines().find_map(|line| line.strip_prefix(key));
-        let number = line.and_then(|line| line.split_whitespace().next());
-        number.unwrap().parse().unwrap()
-    };
-    let descriptors = fs::read_dir(directory.join("fd")).unwrap().count();
-    [of("VmRSS:"), descriptors as u64, of("Threads:")]
+    let descriptors = format!("/proc/{}/fd", daemon.process.0.id());
+    let descriptors = fs::read_dir(descriptors).unwrap().count();
+    let of = |key| daemon.process.number(key);
+    [of("VmRSS"), descriptors as u64, of("Threads")]
 }
 
 /// Compares the medians of the two halves of the time after the start.
@@ -306,10 +226,7 @@ fn configure(bench: &Bench, udp: [SocketAddr; 2], min_confidence: f64) {
         .into_iter()
         .zip(udp)
         .map(|(name, address)| sensor(name, &format!("udp://{address}"), 50));
-    let more = format!(
-        "[model]\nmin_confidence = {min_confidence}\n\
-         [record]\ndir = \"rec\"\nrotate_s = 20\nkeep_free_mb = 0\n"
-    );
+    let more = format!("[model]\nmin_confidence = {min_confidence}\n{RECORD}rotate_s = 20\n");
     bench.configure(&tables.chain(udp).collect::<String>(), &more);
 }
 
@@ -318,48 +235,37 @@ fn configure(bench: &Bench, udp: [SocketAddr; 2], min_confidence: f64) {
 fn soak() {
     let minutes = std::env::var("HARDNESSD_SOAK_MINUTES").unwrap_or("3".to_owned());
     let length = Duration::from_secs_f64(60.0 * minutes.parse::<f64>().unwrap().max(3.0));
-    let bench = Bench::new();
-    let library = Arc::new(library());
-    let links: Vec<Arc<Link>> = (0..SENSORS).map(|_| Arc::default()).collect();
-    let players = links.iter().enumerate().map(|(index, link)| {
-        let port = bench.path(&format!("s{index}"));
-        Player {
-            pair: plugged(&port),
-            port,
-            library: Arc::clone(&library),
-            stream: Stream::new(1, "soak").child(index as u64),
-            link: Arc::clone(link),
-            sent: Vec::new(),
-            faults: [0; FAULTS.len()],
-            due: Instant::now(),
-        }
-    });
-    let players: Vec<Player> = players.collect();
+    let bench = Arc::new(Bench::new());
+    let players: Vec<Player> = (0..SENSORS)
+        .map(|index| {
+            let name = format!("s{index}");
+            Player {
+                cable: Cable::plug(bench.path(&name)),
+                bench: Arc::clone(&bench),
+                name,
+                stream: Stream::new(1, "soak").child(index as u64),
+                sent: Vec::new(),
+                faults: [0; FAULTS.len()],
+            }
+        })
+        .collect();
     let udp = [free_address(), free_address()];
     configure(&bench, udp, 0.0);
     let mut daemon = bench.daemon_as_configured();
 
-    // Subscribers that read everything until the daemon ends. The first one's links tell the players
-    // about their sensors.
-    let listening: Vec<_> = (0..17)
-        .map(|number| {
-            let links: Vec<Arc<Link>> = match number {
-                0 => links.clone(),
-                _ => links.iter().map(|_| Arc::default()).collect(),
-            };
-            let subscriber = bench.subscriber();
-            thread::spawn(move || receive(subscriber, &links))
-        })
-        .collect();
+    // Subscribers that read everything until the daemon ends.
+    let listening = [(); 17].map(|()| {
+        let subscriber = bench.subscriber();
+        thread::spawn(move || receive(subscriber))
+    });
     // Subscribers that come and go, and one that never reads.
     let over = Arc::new(AtomicBool::new(false));
     let guests = [0, 1].map(|seed| {
         let (socket, over) = (bench.path("events.sock"), Arc::clone(&over));
         thread::spawn(move || come_and_go(&socket, seed, &over))
     });
-    let rest = library.1.clone();
     let floods = [0, 1].map(|number| {
-        let (over, rest) = (Arc::clone(&over), rest.clone());
+        let (over, rest) = (Arc::clone(&over), frame(0.0));
         let mut stream = Stream::new(number, "flood");
         thread::spawn(move || match number {
             0 => flood(udp[0], &over, || rest.clone()),

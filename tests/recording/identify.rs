@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::bench::{Bench, sensor};
+use crate::bench::{Bench, HRN, sensor};
 use serde_json::{Value, json};
 
 const IDENTIFY: &str = "identify --config hardnessd.toml --out r.npz";
@@ -139,12 +139,8 @@ fn a_recording_keeps_the_references_that_presses_of_now_gave() {
     let alone = bench.finals("take.mcap");
     assert_eq!(alone[0]["references"], "rigid", "{alone:?}");
     // Another model judges without them.
-    let hrn = concat!(
-        "take.mcap --model ",
-        env!("CARGO_MANIFEST_DIR"),
-        "/models/hrn.onnx"
-    );
-    assert_eq!(bench.finals(hrn)[0]["references"], "none");
+    let of_hrn = bench.finals(&format!("take.mcap --model {HRN}"));
+    assert_eq!(of_hrn[0]["references"], "none");
 }
 
 #[test]

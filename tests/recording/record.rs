@@ -3,14 +3,13 @@
 use std::fs;
 use std::time::Duration;
 
-use crate::bench::{Bench, Process, events, sensor, timeless, wait_for};
+use crate::bench::{Bench, Process, RECORD, events, mono, sensor, timeless, wait_for};
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::recording::{Entry, Found};
+use hardnessd_core::tests::support::of_a_press;
 use hardnessd_simulator::random::Stream;
 use rustix::process::Signal;
 use serde_json::Value;
-
-const RECORD: &str = "[record]\ndir = \"rec\"\nkeep_free_mb = 0\n";
 
 fn record(bench: &Bench, out: &str) -> Process {
     bench.start(&format!("record --config hardnessd.toml --out {out}"))
@@ -36,11 +35,6 @@ fn is_final(event: &Value) -> bool {
 
 fn is_bytes(found: &Found) -> bool {
     matches!(found.entry, Entry::Input(Input::Bytes(_)))
-}
-
-fn mono() -> Duration {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    Duration::try_from(now).unwrap()
 }
 
 #[test]
@@ -173,35 +167,29 @@ fn killed_at_any_moment_less_than_a_second_is_lost() {
 #[test]
 fn recover_says_what_it_saved_and_leaves_files_alone() {
     let bench = Bench::new();
-    let recover = |broken: &str, good: &str| {
-        let (code, _, message) = bench.run(&format!("recover {broken} --out {good}"));
-        (code, message)
-    };
-    assert_eq!(recover("none.mcap", "good.mcap").0, 66);
+    let (whole, _) = of_a_press(|_| {}, None, false);
+    bench.write("a.mcap", &whole);
+    let (code, _, message) = bench.run("recover a.mcap --out whole.mcap");
+    assert!(code == 0 && message.contains("lost nothing"), "{message}");
+    assert_eq!(replay(&bench, "whole.mcap"), replay(&bench, "a.mcap"));
     bench.write("noise.mcap", vec![7; 100_000]);
-    assert_eq!(recover("noise.mcap", "good.mcap").0, 1);
+    bench.fails_each(
+        "
+        recover none.mcap --out good.mcap | 66 | none.mcap
+        recover noise.mcap --out good.mcap | 1 | noise.mcap: not a recording
+        recover noise.mcap --out whole.mcap | 74 | whole.mcap",
+    );
     assert!(!bench.path("good.mcap").exists());
 
-    let _sensor = bench.sensor("");
-    bench.configure_forearm("");
-    bench.succeeds("record --config hardnessd.toml --out a.mcap --seconds 3");
-    let (code, message) = recover("a.mcap", "whole.mcap");
-    assert!(code == 0 && message.contains("lost nothing"), "{message}");
-    assert_eq!(recover("noise.mcap", "whole.mcap").0, 74);
-    assert_eq!(replay(&bench, "whole.mcap"), replay(&bench, "a.mcap"));
-
     // A recording that is cut off is played to its end, and ends with the same last event as raw
-    // bytes.
-    let mut bytes = fs::read(bench.path("a.mcap")).unwrap();
-    let middle = bytes.len() / 2;
-    bench.write("cut.mcap", &bytes[..middle]);
+    // bytes. This one has lost the record that ends its chunks, of 13 bytes, and a byte before it.
+    let cut = mcap::read::footer(&whole).unwrap().summary_start as usize - 14;
+    bench.write("cut.mcap", &whole[..cut]);
     let (code, events, message) = bench.run("replay cut.mcap");
-    assert_eq!((code, message.lines().count()), (1, 1), "{message}");
+    assert!(code == 1 && message.contains("`hardnessd recover` saves"));
     let last = events.lines().last().unwrap();
     assert!(last.contains(r#""reason":"end of recording""#), "{last}");
-    bytes[middle] ^= 4;
-    bench.write("a.mcap", bytes);
-    assert_eq!(recover("a.mcap", "good.mcap").0, 0);
+    bench.succeeds("recover cut.mcap --out good.mcap");
     replay(&bench, "good.mcap");
 }
 

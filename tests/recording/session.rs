@@ -118,9 +118,7 @@ fn a_session_needs_its_sensor_before_the_first_question_and_then_waits_for_it() 
     let bench = Bench::new();
     let mut daemon = bench.daemon();
     let mut sensor = bench.sensor("");
-    bench
-        .subscriber()
-        .until(&json!({"type": "status", "state": "live"}));
+    bench.subscriber().state("live");
     let mut refused = session(&bench, "");
     let before = refused.sees("held by process");
     assert_eq!(refused.process.exit_code(), Some(69));

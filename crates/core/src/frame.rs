@@ -138,12 +138,6 @@ impl Pitch {
     }
 }
 
-impl Default for Pitch {
-    fn default() -> Self {
-        Self::JX255N
-    }
-}
-
 /// A frame in sensor counts.
 ///
 /// # Example

@@ -140,10 +140,15 @@ impl Judge {
         let is_same = hrn.sha256() == self.hrn.sha256()
             && hrn.known_references() == self.hrn.known_references();
         // Another model errs in other ways, and so does one that knows the sensor better.
-        match is_same {
+        let mut kept = match is_same {
             true => self.kept.clone(),
             false => Kept::default(),
+        };
+        // The probabilities of objects are those of levels.
+        if hrn.card().levels != self.hrn.card().levels {
+            kept.objects = Objects::default();
         }
+        kept
     }
 
     /// A press begins.
@@ -254,15 +259,15 @@ impl Judge {
                 let course = ended.course(card.pitch_mm.into());
                 let references = hrn.references_with(&self.kept.own.references());
                 let judged = hrn.judge_beside(&course, &references);
-                // The press is remembered even if its verdict is missing, and its verdict stays if the
-                // press cannot be kept.
-                if phase == Phase::Final && is_felt {
+                // The press is kept even if its verdict is missing, and its verdict stays if the press cannot
+                // be kept.
+                if phase == Phase::Final && is_felt && pressed.is_new() {
                     let most = described.sensor.own_presses as usize;
-                    if let Err(error) = self.kept.own.add(pressed, &hrn, &course, most) {
+                    if let Err(error) = self.kept.own.keep(&hrn, &course, most) {
                         self.failed(press, phase, error);
                     }
                 }
-                (judged?, references)
+                (judged, references)
             }
             format => {
                 card.check_array(peak.frame.array)?;
@@ -271,9 +276,13 @@ impl Judge {
                     (_, Some(_)) => peak.frame.newtons.to_vec(),
                     (_, None) => resampling.apply(&peak.frame).newtons.to_vec(),
                 };
-                (hrn.judge_taxels(&taxels)?, References::NONE)
+                (hrn.judge_taxels(&taxels), References::NONE)
             }
         };
+        if phase == Phase::Final && is_felt {
+            self.kept.own.last = Some(pressed);
+        }
+        let verdict = verdict?;
         let is_unknown = hrn.most_references() > 0 && references.knowledge() == Knowledge::None;
         let notes = self.notes(peak, &resampling, is_unknown);
         let object = name.map(|name| {

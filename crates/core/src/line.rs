@@ -1,4 +1,5 @@
-//! Least squares: the sums from which the slope of a line through points follows.
+//! What many numbers have in common: the sums from which the slope of a line through points follows (least
+//! squares), and the extent.
 
 /// The sums of squares and products of points, about their means.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -31,4 +32,10 @@ impl Sums {
         }
         sums
     }
+}
+
+/// The least and the greatest of some numbers that are not below 0. Of none, they are infinity and 0.
+pub fn extent(numbers: impl Iterator<Item = f64>) -> [f64; 2] {
+    let with = |[least, most]: [f64; 2], number: f64| [number.min(least), number.max(most)];
+    numbers.fold([f64::INFINITY, 0.0], with)
 }

@@ -15,6 +15,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde_json::Value;
 
 pub use self::at_rest::AtRest;
 pub use self::input::{Input, Refused};
@@ -22,7 +23,7 @@ use self::link::Link;
 use self::pace::Pace;
 use crate::event::{Event, FrameEvent, Press, PressState, Tared};
 use crate::frame::{RawFrame, Stamp};
-use crate::judge::{EndedPress, Judge, Moment, OwnPresses, Unjudged};
+use crate::judge::{Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
 use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
@@ -47,7 +48,7 @@ pub struct Pipeline {
     decoder: Decoder,
     tare: Tare,
     tracker: PressTracker,
-    judge: Judge,
+    pub(crate) judge: Judge,
     link: Link,
     /// The taxels in contact when the last press timed out, in words.
     unreleased: Option<String>,
@@ -144,15 +145,9 @@ impl Pipeline {
         std::mem::take(&mut self.judge.unjudged)
     }
 
-    /// Keeps each press that ends from now on, until [`Self::ended`] returns it.
-    pub fn keep_courses(&mut self) {
-        self.judge.ended.get_or_insert_default();
-    }
-
-    /// The kept presses that were not returned yet.
-    pub fn ended(&mut self) -> Vec<EndedPress> {
-        let kept = self.judge.ended.as_mut();
-        kept.map(std::mem::take).unwrap_or_default()
+    /// The controller's context.
+    pub fn context(&self) -> Option<&Value> {
+        self.judge.context.as_ref()
     }
 
     /// The own presses of the sensor.

@@ -12,7 +12,6 @@ use serde::ser::SerializeTuple as _;
 use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value;
 
-pub use self::frame::contact;
 pub use self::frame::{CONTACT, FRAME};
 use crate::event::Event;
 
@@ -215,22 +214,14 @@ fn named(
     (topic, time, to_cdr(&message))
 }
 
-/// Every message that a recording or a viewer such as Foxglove holds of an event. A frame has two.
+/// Every message that a recording or a viewer such as Foxglove holds of an event, each with its channel and its
+/// time. A frame has two.
 pub fn encode_all(event: &Event) -> Vec<(Topic, Timestamp, Vec<u8>)> {
-    let mut messages = vec![encode(event)];
-    if let Event::Frame(frame) = event {
-        messages.push(contact(frame));
-    }
-    messages
-}
-
-/// The main message of an event, with its channel and its time.
-pub fn encode(event: &Event) -> (Topic, Timestamp, Vec<u8>) {
     match event {
-        Event::Frame(frame) => frame::image(frame),
-        Event::Hardness(verdict) => named(HARDNESS, verdict.time, &verdict.sensor, verdict),
-        Event::Press(press) => named(PRESS, press.time, &press.sensor, press),
-        Event::Status(status) => named(STATUS, status.time, &status.sensor, status),
+        Event::Frame(frame) => vec![frame::image(frame), frame::contact(frame)],
+        Event::Hardness(verdict) => vec![named(HARDNESS, verdict.time, &verdict.sensor, verdict)],
+        Event::Press(press) => vec![named(PRESS, press.time, &press.sensor, press)],
+        Event::Status(status) => vec![named(STATUS, status.time, &status.sensor, status)],
     }
 }
 

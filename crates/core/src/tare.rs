@@ -40,7 +40,7 @@ pub struct Offsets {
 }
 
 /// The reason why a requested tare is not taken. The offsets stay unchanged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum RetareError {
     /// A press is under way, and the tare would zero it away.
     #[error("a press is under way: release the sensor and ask again")]
@@ -52,8 +52,11 @@ pub enum RetareError {
     #[error("the sensor is not live: it sends no frames to average")]
     NotLive,
     /// Another tare is under way, and has to end first.
-    #[error("another tare is under way: wait for its answer")]
+    #[error("another tare is under way: wait until it ends")]
     UnderWay,
+    /// Something keeps the sensor from its first tare.
+    #[error("the first tare is under way: {0}")]
+    First(Touch),
     /// `tare_frames` is 0.
     #[error("no tare is configured: set calibration.tare_frames to 1 or more")]
     NoFrames,
@@ -175,9 +178,9 @@ struct Taking {
 }
 
 impl Taking {
-    fn add(&mut self, raw: &RawFrame) {
+    fn add(&mut self, counts: &[f32]) {
         self.seen += 1;
-        for (place, &count) in raw.counts.iter().enumerate() {
+        for (place, &count) in counts.iter().enumerate() {
             self.sum[place] += f64::from(count);
             self.least[place] = self.least[place].min(count);
             self.most[place] = self.most[place].max(count);
@@ -185,18 +188,23 @@ impl Taking {
     }
 }
 
-/// The state of a [`Tare`] of which no frame is taken in yet, or that has ended.
+/// The state of a [`Tare`] that has taken in one frame at most, or has ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AtRest {
     baseline: Vec<f32>,
-    /// The purpose of the tare that begins with the next frame.
+    /// The purpose of the tare under way.
     aim: Option<Aim>,
+    /// The counts of its first frame, if that has come.
+    first: Option<Vec<f32>>,
 }
 
 impl AtRest {
     /// Whether a tare of `array` can continue from it. A recording may hold anything.
     pub(crate) fn is_usable(&self, array: Array) -> bool {
-        self.baseline.len() == array.taxels() && self.baseline.iter().all(|mean| mean.is_finite())
+        let is_usable = |counts: &Vec<f32>| {
+            counts.len() == array.taxels() && counts.iter().all(|count| count.is_finite())
+        };
+        is_usable(&self.baseline) && self.first.iter().all(is_usable)
     }
 }
 
@@ -248,16 +256,19 @@ impl Tare {
         });
     }
 
-    /// Whether no tare is under way, or the one under way has taken in no frame.
+    /// Whether no tare is under way, or the one under way has taken in one frame at most: a first tare of a sensor that
+    /// never holds still has always one.
     pub fn is_at_rest(&self) -> bool {
-        self.taking.as_ref().is_none_or(|taking| taking.seen == 0)
+        self.taking.as_ref().is_none_or(|taking| taking.seen <= 1)
     }
 
     /// The state of the tare at rest.
     pub fn at_rest(&self) -> AtRest {
+        let begun = self.taking.as_ref().filter(|taking| taking.seen > 0);
         AtRest {
             baseline: self.baseline.clone(),
             aim: self.aim(),
+            first: begun.map(|taking| taking.least.clone()),
         }
     }
 
@@ -266,6 +277,9 @@ impl Tare {
         self.taking = None;
         if let Some(aim) = state.aim {
             self.begin(aim);
+        }
+        if let (Some(taking), Some(first)) = (&mut self.taking, state.first) {
+            taking.add(&first);
         }
         self.baseline = state.baseline;
     }
@@ -282,8 +296,10 @@ impl Tare {
     /// Returns an error if a tare is under way, or if the settings allow none. Nothing has changed
     /// then.
     pub fn retake(&mut self) -> Result<(), RetareError> {
-        if self.aim().is_some() {
-            return Err(RetareError::UnderWay);
+        match self.aim() {
+            None => {}
+            Some(Aim::First { touch: Some(touch) }) => return Err(RetareError::First(touch)),
+            Some(_) => return Err(RetareError::UnderWay),
         }
         if self.settings.tare_frames == 0 {
             return Err(RetareError::NoFrames);
@@ -367,10 +383,13 @@ impl Tare {
         if !self.settings.auto_tare || self.live.iter().any(is_touched) {
             return;
         }
-        for (place, baseline) in self.baseline.iter_mut().enumerate() {
-            let above = raw.counts[place] - *baseline;
-            let most = MOST_STEP_N / (self.settings.newtons_per_count * self.gains[place]);
-            *baseline += above.clamp(-most, most);
+        for (place, &count) in raw.counts.iter().enumerate() {
+            let above = count - self.baseline[place];
+            // The newtons that stay after the step, and their counts.
+            let stays_n = (self.newtons(above, place).abs() - MOST_STEP_N).max(0.0);
+            let scale = self.settings.newtons_per_count * self.gains[place];
+            let stays = (stays_n / scale).powf(self.settings.exponent.recip());
+            self.baseline[place] += above - stays.copysign(above);
         }
     }
 
@@ -387,7 +406,7 @@ impl Tare {
         let Some(mut taking) = self.taking.take() else {
             return;
         };
-        taking.add(raw);
+        taking.add(&raw.counts);
         let seen = taking.seen as f32;
         let mean: Vec<f32> = taking.sum.iter().map(|&sum| sum as f32 / seen).collect();
         let is_whole = taking.seen == self.settings.tare_frames;
@@ -400,7 +419,7 @@ impl Tare {
                 self.begin(Aim::First { touch });
                 // A frame unlike those before it may be the first one without a touch.
                 if let (Some(_), Some(again)) = (moving, &mut self.taking) {
-                    again.add(raw);
+                    again.add(&raw.counts);
                 }
             }
             (Aim::Request, Some(_)) => self.outcome = Some(Err(RetareError::Touched)),

@@ -159,14 +159,8 @@ fn limit() {
         (Resource::Cpu, PROCESSOR.as_secs()),
     ] {
         // Where the system forbids a limit, the others still hold.
-        let most = Some(most);
-        let _ = rustix::process::setrlimit(
-            resource,
-            Rlimit {
-                current: most,
-                maximum: most,
-            },
-        );
+        let (current, maximum) = (Some(most), Some(most));
+        let _ = rustix::process::setrlimit(resource, Rlimit { current, maximum });
     }
     // When memory is short, the system kills this process before the daemon.
     let _ = std::fs::write("/proc/self/oom_score_adj", "1000");

@@ -16,7 +16,7 @@ impl Setup {
             let frame = table.frame.in_force();
             table.frame = frame.expect("a sensor has been checked");
             let gains = table.calibration.gains.as_ref();
-            if let Some((least, most)) = gains.and_then(Gains::extent) {
+            if let Some([least, most]) = gains.and_then(Gains::extent) {
                 let shown = format!("{least:.2} to {most:.2}");
                 table.calibration.gains = Some(Gains::File(shown.into()));
             }

@@ -22,7 +22,7 @@ pub(super) fn load(path: &Path) -> Result<(Config, Text), Error> {
 }
 
 fn text(path: &Path) -> Result<Text, Problem> {
-    let bytes = read(path, MAX_BYTES).map_err(|error| Problem::unreadable(&error))?;
+    let bytes = read_at_most(path, MAX_BYTES).map_err(|error| Problem::unreadable(&error))?;
     if bytes.len() > MAX_BYTES {
         let problem = "no configuration is so long: name another file";
         return Err(Problem::of_file(format!(
@@ -88,7 +88,7 @@ fn gains(given: &Gains, directory: &Path) -> Result<Gains, Problem> {
 }
 
 /// Reads at most one byte more than `most` from a file. That byte shows that the file is too long.
-fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
+pub(crate) fn read_at_most(path: &Path, most: usize) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let file = File::open(path)?;
     file.take(most as u64 + 1).read_to_end(&mut bytes)?;
@@ -97,7 +97,7 @@ fn read(path: &Path, most: usize) -> io::Result<Vec<u8>> {
 
 /// Reads the file that the configuration names at `key`.
 fn read_named(key: &str, file: &Path, most: usize) -> Result<Vec<u8>, Problem> {
-    let bytes = read(file, most);
+    let bytes = read_at_most(file, most);
     bytes.map_err(|error| unusable(key, file, format!("cannot read: {error}")))
 }
 

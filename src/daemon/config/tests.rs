@@ -18,23 +18,6 @@ fn checked(path: &Path) -> Result<Config, String> {
 const LEAST: &str = "[[sensor]]\nport = \"/dev/ttyUSB0\"\n";
 
 #[test]
-fn every_key_but_port_has_a_default() {
-    let config = load(LEAST).unwrap();
-    assert_eq!(
-        config,
-        Config::new(vec![sensor::Settings::new(PathBuf::from("/dev/ttyUSB0"))])
-    );
-    let config = load(&format!(
-        "{LEAST}[publish.tcp]\n[http]\n[publish.unix]\npath = \"/x/y.sock\""
-    ));
-    let config = config.unwrap();
-    assert_eq!(config.publish.tcp, Some(Tcp::default()));
-    assert_eq!(config.http, Some(Http::default()));
-    let control = config.publish.unix.control_path();
-    assert_eq!(control, Path::new("/x/control.sock"));
-}
-
-#[test]
 fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
     // What follows the sensor's port, and what is said of it.
     let cases = "

@@ -3,7 +3,7 @@
 use super::{Config, Setup};
 use hardnessd_core::sensor::Settings;
 use hardnessd_core::verdict::{self, Card, Format};
-use hardnessd_core::wire::{Layout, Preset};
+use hardnessd_core::wire::{Checksum, Framing, HexBytes, Layout, Preset};
 use hardnessd_core::wording::as_written;
 use hardnessd_core::{motion, press, sensor};
 
@@ -22,6 +22,7 @@ impl Setup {
         for (index, (sensor, checked)) in sensors.enumerate() {
             let of_sensor = [
                 self.guess(index),
+                self.endless(index),
                 pitch(sensor, self.hrn.card()),
                 scale(sensor, checked.layout()),
                 self.ignored(&sensor.name),
@@ -84,6 +85,30 @@ impl Setup {
             let problem =
                 "the default is a guess, and a wrong one gives wrong verdicts: measure it";
             ("calibration", format!("{guesses} not written: {problem}"))
+        })
+    }
+
+    /// The frames of another sensor follow those of this one, and nothing shows where each of them ends.
+    fn endless(&self, index: usize) -> Option<Warning> {
+        let sensor = &self.config.sensors[index];
+        let frame = sensor.frame.in_force().ok()?;
+        let is_empty =
+            |bytes: &Option<HexBytes>| bytes.as_ref().is_none_or(|bytes| bytes.0.is_empty());
+        let is_endless = frame.checksum.unwrap_or_default() == Checksum::None
+            && is_empty(&frame.tail)
+            && !is_empty(&frame.sync)
+            && frame.framing.unwrap_or_default() == Framing::None;
+        let mut others = self.config.sensors.iter().filter(|other| {
+            other.port == sensor.port && other.frame.request == sensor.frame.request
+        });
+        let other = others.find(|other| other.frame.sync != sensor.frame.sync)?;
+        is_endless.then(|| {
+            let problem = format!(
+                "found none, and no tail: a frame then ends where the next one of the same sync begins, but those \
+                 of {:?} come between them",
+                other.name
+            );
+            ("frame.checksum", problem)
         })
     }
 

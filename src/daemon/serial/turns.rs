@@ -1,9 +1,9 @@
 //! Who is asked next at a port: sensors that send a frame only when they are asked take turns.
 //!
 //! Bytes after a request go to the sensors that asked, because the answers of equal modules are alike. The
-//! next one is asked when a frame came or the time for it is over. After a request without an answer, all others have
-//! their turn, those first that are far from it: modules beside each other go silent together. A sensor that is alone
-//! is asked at its own pace, whether it answers or not. This has no clock.
+//! next one is asked when their frames came or the time for it is over. After a request without an answer, all
+//! others have their turn, those first that are far from it: modules beside each other go silent together. A
+//! sensor that is alone is asked at its own pace, whether it answers or not. This has no clock.
 
 use std::cmp::Reverse;
 use std::time::Duration;
@@ -36,7 +36,14 @@ struct Ask {
     is_heard: bool,
     /// The last rest, if the last request had no answer.
     rest: Option<Duration>,
+    /// How often it was asked.
+    count: u32,
 }
+
+/// A sensor that shares its request is not waited for if no frame of it came for this time.
+const GONE_AFTER: Duration = Duration::from_secs(1);
+/// All sensors that share a request are waited for when it has been sent so often: one may be there again.
+const ALL_EVERY: u32 = 20;
 
 /// The requests of the sensors at a port.
 #[derive(Debug)]
@@ -46,6 +53,10 @@ pub(super) struct Turns {
     of_sensors: Vec<Option<usize>>,
     /// Who is asked, and until when the answer may come.
     asking: Option<(usize, Instant)>,
+    /// The sensors whose frame of the answer has not come.
+    missing: Vec<usize>,
+    /// When the last frame of each sensor came, since the port was opened.
+    heard: Vec<Option<Instant>>,
     /// The last one that was asked, for bytes that come late.
     last: Option<usize>,
     /// The last request without an answer, and when the time for it was over.
@@ -65,7 +76,7 @@ impl Turns {
             let known = asks.iter().position(|ask| ask.request == *request);
             if let Some(ask) = known.map(|index| &mut asks[index]) {
                 ask.every = ask.every.min(*every);
-                ask.timeout = ask.timeout.max(timeout);
+                ask.timeout += sensor.on_the_line;
             } else {
                 asks.push(Ask {
                     request: request.clone(),
@@ -75,6 +86,7 @@ impl Turns {
                     asked: None,
                     is_heard: false,
                     rest: None,
+                    count: 0,
                 });
             }
             Some(known.unwrap_or(asks.len() - 1))
@@ -83,6 +95,8 @@ impl Turns {
             of_sensors: sensors.iter().map(&mut of).collect(),
             asks,
             asking: None,
+            missing: Vec::new(),
+            heard: vec![None; sensors.len()],
             last: None,
             failed: None,
             may_try: now,
@@ -93,14 +107,22 @@ impl Turns {
     pub(super) fn begin(&mut self, now: Instant) {
         (self.asking, self.last) = (None, None);
         for ask in &mut self.asks {
-            (ask.due, ask.is_heard) = (now, false);
+            (ask.due, ask.is_heard, ask.count) = (now, false, 0);
         }
+        self.heard.fill(None);
     }
 
     /// Whether bytes are for this sensor: it was asked last, or it sends by itself.
     pub(super) fn hears(&self, sensor: usize) -> bool {
         let own = self.of_sensors[sensor];
         own.is_none() || self.last.is_none() || own == self.last
+    }
+
+    /// The sensors that share a request.
+    fn sharing(&self, request: usize) -> impl Iterator<Item = usize> {
+        let of_sensors = self.of_sensors.iter().enumerate();
+        let sharing = of_sensors.filter(move |(_, of)| **of == Some(request));
+        sharing.map(|(sensor, _)| sensor)
     }
 
     /// When there is something to do.
@@ -125,20 +147,32 @@ impl Turns {
         if self.asks[index].rest.take().is_some() {
             self.asks[index].due = now;
         }
-        self.asking = self.asking.filter(|(asked, _)| *asked != index);
+        self.heard[sensor] = Some(now);
+        self.missing.retain(|&missing| missing != sensor);
+        let is_for_all = self.asks[index].count % ALL_EVERY == 1;
+        let is_there = |&missing: &usize| {
+            let heard = self.heard[missing];
+            is_for_all || heard.is_some_and(|heard| now - heard < GONE_AFTER)
+        };
+        let is_whole = !self.missing.iter().any(is_there);
+        self.asking = self
+            .asking
+            .filter(|(asked, _)| *asked != index || !is_whole);
     }
 
     /// Ends the wait for an answer, and returns the next request, if one is due.
     pub(super) fn ask(&mut self, now: Instant) -> Option<&[u8]> {
-        if let Some((silent, _)) = self.asking.take() {
-            let ask = &mut self.asks[silent];
+        if let Some((asked, _)) = self.asking.take()
+            && self.missing.len() == self.sharing(asked).count()
+        {
+            let ask = &mut self.asks[asked];
             let least = ask.timeout.mul_f64(REST);
             let most = ask.timeout.mul_f64(LONGEST_REST);
             let rest = ask.rest.map_or(least, |rest| most.min(2 * rest));
             ask.rest = Some(rest);
             ask.due = now + rest;
             self.may_try = now + least;
-            self.failed = Some((silent, now));
+            self.failed = Some((asked, now));
         }
         let (may_try, is_alone) = (self.may_try <= now, self.asks.len() == 1);
         let (failed, failed_at) = self.failed.unzip();
@@ -158,25 +192,28 @@ impl Turns {
             })?;
         ask.asked = Some(now);
         ask.due = (ask.due + ask.every).max(now);
+        ask.count = ask.count.wrapping_add(1);
         self.last = Some(index);
         self.asking = (!is_alone).then_some((index, now + ask.timeout));
-        Some(&ask.request)
+        self.missing = self.sharing(index).collect();
+        Some(&self.asks[index].request)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hardnessd_core::sensor::{Description, Sensor};
+    use hardnessd_core::tests::support::sensor_of;
 
     /// A sensor of 50 frames a second, at a port whose line takes no time.
     fn settings(request: &[u8]) -> Settings {
-        let mut described = Description::default();
-        described.sensor.port = "tcp://localhost:1".parse().unwrap();
+        let sensor = sensor_of(|described| {
+            described.sensor.port = "tcp://localhost:1".parse().unwrap();
+        });
         Settings {
             request: Some((request.to_vec(), Duration::from_millis(20))),
             stale_after: Duration::from_millis(150),
-            ..Settings::of(&Sensor::new(described).unwrap())
+            ..Settings::of(&sensor)
         }
     }
 
@@ -226,6 +263,40 @@ mod tests {
             let longest = longest_gap(modules, speaking, answer, silent_after);
             assert!(longest < ms(150), "{speaking} of {modules}: {longest:?}");
         }
+    }
+
+    #[test]
+    fn sensors_that_share_a_request_have_their_frames_of_its_answer() {
+        let ms = Duration::from_millis;
+        let begin = Instant::now();
+        let mut turns = Turns::new(&[settings(b"1"), settings(b"1"), settings(b"2")], begin);
+        assert_eq!(turns.ask(begin), Some(&b"1"[..]));
+        turns.answered(0, begin);
+        assert!(turns.due().unwrap() > begin + ms(30));
+        assert!(turns.hears(1) && !turns.hears(2));
+        turns.answered(1, begin + ms(30));
+        assert_eq!(turns.ask(begin + ms(30)), Some(&b"2"[..]));
+        turns.answered(2, begin + ms(30));
+        // Where one of them is silent, the other request waits for it for a second, and then once in a while.
+        let (mut now, mut longest, mut waits) = (begin + ms(30), Duration::ZERO, 0);
+        let mut last = now;
+        while now < begin + Duration::from_secs(4) {
+            now = now.max(turns.due().unwrap());
+            match turns.ask(now).map(<[u8]>::to_vec).as_deref() {
+                Some(b"1") => turns.answered(0, now),
+                Some(_) => {
+                    turns.answered(2, now);
+                    let gap = now - std::mem::replace(&mut last, now);
+                    longest = longest.max(gap);
+                    waits += u32::from(gap > ms(40));
+                }
+                None => {}
+            }
+        }
+        assert!(
+            longest < ms(150) && (15..40).contains(&waits),
+            "{longest:?}, {waits}"
+        );
     }
 
     #[test]

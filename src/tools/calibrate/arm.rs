@@ -7,7 +7,7 @@
 use anyhow::{Context as _, Result, bail};
 
 use super::gather::Press;
-use hardnessd_core::line::Sums;
+use hardnessd_core::line::{Sums, extent};
 
 /// A value, and its least and greatest over single presses.
 pub(super) type Spread = (f64, [f64; 2]);
@@ -127,13 +127,9 @@ impl Fit {
             let least = alone.iter().map(of).fold(value, f64::min);
             (value, [least, alone.iter().map(of).fold(value, f64::max)])
         };
-        let forces = known.iter().map(|press| press.force_n());
         Ok(Self {
             presses: known.len(),
-            force_n: [
-                forces.clone().fold(f64::INFINITY, f64::min),
-                forces.fold(0.0, f64::max),
-            ],
+            force_n: extent(known.iter().map(|press| press.force_n())),
             n_per_mm: spread(n_per_mm, |one| one.1),
             delay_ms: spread(delay_ms, |one| one.0),
             residual_mm,

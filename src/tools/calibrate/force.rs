@@ -9,6 +9,7 @@ use anyhow::{Result, bail, ensure};
 
 use super::gather::Press;
 use hardnessd_core::frame::{Frame, RawFrame};
+use hardnessd_core::line::extent;
 use hardnessd_core::sensor::Sensor;
 use hardnessd_core::tare::{self, Tare};
 
@@ -105,10 +106,7 @@ impl Fit {
         Ok(Self {
             weights,
             newtons_per_count,
-            alone: [
-                alone.clone().fold(f64::INFINITY, f64::min),
-                alone.fold(0.0, f64::max),
-            ],
+            alone: extent(alone),
             exponent,
             line_error,
             power,
@@ -244,15 +242,12 @@ mod tests {
     use super::*;
     use crate::tools::calibrate::gather;
     use hardnessd_core::frame::Array;
-    use hardnessd_core::sensor::Description;
     use hardnessd_core::tare::Gains;
-    use hardnessd_core::tests::support::hrn;
     use hardnessd_core::tests::support::noisy_array::{COUNT_N, NoisyArray, foot, noisy_sensor};
+    use hardnessd_core::tests::support::{hrn, sensor_of};
 
     fn sensor(calibration: tare::Settings) -> Sensor {
-        let mut described = Description::default();
-        described.sensor.calibration = calibration;
-        Sensor::new(described).unwrap()
+        sensor_of(|described| described.sensor.calibration = calibration)
     }
 
     /// Gains of 0.5 to 2, and two dead taxels under the weight.

@@ -174,18 +174,6 @@ mod tests {
     use hardnessd_core::tests::support::{hrn, of_a_press};
 
     #[test]
-    fn a_press_has_the_positions_from_before_its_recording() {
-        let (recording, sensor) = of_a_press(|_| {}, None, true);
-        let presses = presses(recording.as_slice(), Path::new("x"), &sensor, &hrn()).unwrap();
-        let [press] = &presses[..] else {
-            panic!("one press");
-        };
-        let found = press.track.approach(press.moments[0], &press.moments, 0.0);
-        let way = found.unwrap().last().copied().flatten();
-        assert!((way.unwrap() - 4.0).abs() < 1e-6, "{way:?}");
-    }
-
-    #[test]
     fn presses_that_fill_the_memory_are_refused_while_they_last() {
         let path = Path::new("x");
         let of = |bytes| Gathered {

@@ -5,6 +5,8 @@
 
 use anyhow::{Result, ensure};
 
+use hardnessd_core::frame::Pitch;
+
 /// The gains that presses give.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Fit {
@@ -19,16 +21,20 @@ pub(super) struct Fit {
     pub(super) error: f64,
 }
 
-/// A taxel is loaded well from this force on: five counts of 0.04 N.
-const LEAST_N: f32 = 0.2;
+/// A taxel of 3.5 mm pitch is loaded well from this force on, five counts of 0.04 N, and others in proportion to
+/// their area.
+const LEAST_N: f64 = 0.2;
 /// A press loads the whole array if this share of its taxels is loaded well.
 const WHOLE_SHARE: f64 = 0.9;
 
 impl Fit {
     /// Computes the gains from presses, each of them frames with the newtons that each taxel would read with a
     /// gain of 1. The newtons of a dead taxel are no measurement.
-    pub(super) fn of(presses: &[Vec<Vec<f32>>], is_dead: &[bool]) -> Result<Self> {
-        let whole = presses.iter().filter_map(|frames| compare(frames, is_dead));
+    pub(super) fn of(presses: &[Vec<Vec<f32>>], is_dead: &[bool], pitch: Pitch) -> Result<Self> {
+        let least_n = (LEAST_N * pitch.area_mm2() / Pitch::JX255N.area_mm2()) as f32;
+        let whole = presses
+            .iter()
+            .filter_map(|frames| compare(frames, is_dead, least_n));
         let whole: Vec<Vec<Option<f64>>> = whole.collect();
         ensure!(
             whole.len() > 1,
@@ -55,11 +61,11 @@ impl Fit {
 
 /// The logarithm of each live taxel's newtons over the array's median: the median over the frames that load the
 /// whole array. `None` if there is no such frame.
-fn compare(frames: &[Vec<f32>], is_dead: &[bool]) -> Option<Vec<Option<f64>>> {
+fn compare(frames: &[Vec<f32>], is_dead: &[bool], least_n: f32) -> Option<Vec<Option<f64>>> {
     let live = is_dead.iter().filter(|is_dead| !**is_dead).count();
     let logs = frames.iter().filter_map(|frame| {
         let log = |(&newtons, is_dead): (&f32, &bool)| {
-            (!is_dead && newtons >= LEAST_N).then(|| f64::from(newtons).ln())
+            (!is_dead && newtons >= least_n).then(|| f64::from(newtons).ln())
         };
         let logs: Vec<Option<f64>> = frame.iter().zip(is_dead).map(log).collect();
         let loaded: Vec<f64> = logs.iter().flatten().copied().collect();
@@ -126,7 +132,7 @@ mod tests {
             .map(|_| vec![frame(0.1), frame(1.0), frame(2.0)])
             .collect();
         let is_dead: Vec<bool> = (0..TAXELS).map(|place| place == known).collect();
-        let fit = Fit::of(&presses, &is_dead).unwrap();
+        let fit = Fit::of(&presses, &is_dead, Pitch::JX255N).unwrap();
         assert_eq!(
             (fit.presses, fit.gains[known], fit.gains[dead]),
             (6, None, None)
@@ -143,7 +149,12 @@ mod tests {
             frame[60..].fill(0.0);
             frame
         });
-        let error = Fit::of(&[presses[0].clone(), half.collect()], &is_dead).unwrap_err();
+        let error = Fit::of(
+            &[presses[0].clone(), half.collect()],
+            &is_dead,
+            Pitch::JX255N,
+        )
+        .unwrap_err();
         assert!(
             error
                 .to_string()

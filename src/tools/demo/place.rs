@@ -50,19 +50,3 @@ pub(in crate::tools) fn sockets() -> Vec<PathBuf> {
     found.sort_unstable_by(|a, b| b.cmp(a));
     found.into_iter().map(|(_, socket)| socket).collect()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_demonstration_has_a_directory_that_only_its_user_may_open() {
-        let (place, other) = (super::place().unwrap(), super::place().unwrap());
-        let directory = place.path().to_owned();
-        assert_ne!(directory, other.path());
-        let mode = fs::metadata(&directory).unwrap().mode();
-        assert_eq!(mode & 0o777, 0o700);
-        drop(place);
-        assert!(!directory.exists());
-    }
-}

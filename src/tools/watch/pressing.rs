@@ -3,7 +3,7 @@
 //! In: verdicts, whose context has the truth: `level` (a number) and `object` (a text). Out: their score since the
 //! truth last changed.
 
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use crate::score::Score;
 use crate::tools::answer::{level_of, named};
@@ -36,21 +36,9 @@ impl Truth {
         Self { level, object }
     }
 
-    /// The context with this truth, in which everything else stays.
-    pub(super) fn within(self, context: &Value, sensor: &str) -> Value {
-        let mut fields: Map<String, Value> = context.as_object().cloned().unwrap_or_default();
-        fields.insert("sensor".to_owned(), sensor.into());
-        let (level, object) = (
-            self.level.map(|level| json!(level)),
-            self.object.map(Value::from),
-        );
-        for (key, value) in [("level", level), ("object", object)] {
-            match value {
-                Some(value) => fields.insert(key.to_owned(), value),
-                None => fields.remove(key),
-            };
-        }
-        Value::Object(fields)
+    /// The keys of a sensor's context that say it.
+    pub(super) fn keys(&self, sensor: &str) -> Value {
+        json!({"sensor": sensor, "level": self.level, "object": self.object})
     }
 }
 
@@ -124,12 +112,12 @@ mod tests {
                 "{text:?}"
             );
         }
-        let context = json!({"sensor": "a", "tag": "x", "object": "old"});
-        let truth = Truth::read("2", &labels());
-        assert_eq!(
-            truth.within(&context, "a"),
-            json!({"sensor": "a", "tag": "x", "level": 2})
-        );
+        let keys = Truth::read("2", &labels()).keys("a");
+        assert_eq!(keys, json!({"sensor": "a", "level": 2, "object": null}));
+        // A label goes before a number.
+        let labels = ["80", "2"].map(str::to_owned);
+        assert_eq!(Truth::read("2", &labels).level, Some(2));
+        assert_eq!(Truth::read("80", &labels).level, Some(1));
     }
 
     #[test]

@@ -322,7 +322,7 @@ fn a_person_says_what_is_pressed_and_sees_how_many_verdicts_are_right() {
     let context = json!({"sensor": "forearm", "object": "cup", "level": 2});
     assert_eq!(
         press(&mut view, &[KeyCode::Enter]),
-        Some(Order::Context(context.clone()))
+        Some(Order::Merge(context.clone()))
     );
     assert_shown(&view, 300, 80, &["pressing cup (firm): no verdict yet"]);
     for (number, level) in [(4, 2), (5, 1)] {

@@ -85,8 +85,8 @@ impl Link {
 pub(super) enum Order {
     Quit,
     Redraw,
-    /// Set this context.
-    Context(Value),
+    /// Set these keys of a context.
+    Merge(Value),
 }
 
 /// One sensor.
@@ -107,8 +107,6 @@ pub(super) struct Sensor {
     pub(super) verdicts: VecDeque<(Duration, Value)>,
     /// What is being pressed, and how many verdicts are right.
     pub(super) count: Count,
-    /// The context of the last press.
-    context: Value,
 }
 
 impl View {
@@ -212,9 +210,9 @@ impl View {
     fn pressing(&mut self, text: &str) -> Option<Order> {
         let truth = Truth::read(text, &self.labels);
         let sensor = self.sensors.get_mut(self.chosen)?;
-        sensor.count.begin(truth.clone());
-        sensor.context = truth.within(&sensor.context, &sensor.name);
-        Some(Order::Context(sensor.context.clone()))
+        let keys = truth.keys(&sensor.name);
+        sensor.count.begin(truth);
+        Some(Order::Merge(keys))
     }
 
     /// The sensor that is shown.
@@ -270,10 +268,7 @@ impl Sensor {
     fn take(&mut self, event: Value, at: Duration) {
         match event["type"].as_str() {
             Some("status") => self.status = event,
-            Some("press") => {
-                self.context = event["context"].clone();
-                self.press = Some((at, event));
-            }
+            Some("press") => self.press = Some((at, event)),
             Some("hardness") => {
                 self.count.take(&event);
                 self.verdicts.push_front((at, event));

@@ -34,7 +34,7 @@ pub struct OwnPresses {
     /// The last press comes last.
     presses: Vec<OwnPress>,
     /// The press before, kept or not.
-    last: Option<PressedAt>,
+    pub(super) last: Option<PressedAt>,
 }
 
 /// A press as the model takes it.
@@ -56,6 +56,13 @@ pub(super) struct PressedAt {
     centre_mm: [f64; 2],
     /// How many presses of its object it makes in a row.
     pub(super) in_a_row: u32,
+}
+
+impl PressedAt {
+    /// Whether the press says something that those in a row before it did not say.
+    pub(super) fn is_new(&self) -> bool {
+        self.in_a_row <= MOST_IN_A_ROW
+    }
 }
 
 impl OwnPresses {
@@ -107,23 +114,13 @@ impl OwnPresses {
         Ok(own.references())
     }
 
-    /// Remembers a press that ended, and keeps it if it says something new. At most `most` are kept.
-    pub(super) fn add(
+    /// Keeps a press that ended. At most `most` are kept.
+    pub(super) fn keep(
         &mut self,
-        press: PressedAt,
         hrn: &Model,
         course: &TimeSeries,
         most: usize,
     ) -> Result<(), ModelError> {
-        let is_new = press.in_a_row <= MOST_IN_A_ROW;
-        self.last = Some(press);
-        match is_new {
-            true => self.keep(hrn, course, most),
-            false => Ok(()),
-        }
-    }
-
-    fn keep(&mut self, hrn: &Model, course: &TimeSeries, most: usize) -> Result<(), ModelError> {
         let most = most.min(hrn.most_references());
         if most == 0 {
             return Ok(());
@@ -179,7 +176,7 @@ impl OwnPresses {
             && presses.len() <= hrn.most_references()
             && presses.all(|press| press.shore.is_finite() && hrn.takes_own(&press.reference));
         if !is_usable {
-            return Self::default();
+            self.presses.clear();
         }
         self.keep_last(most);
         self

@@ -137,7 +137,7 @@ impl Pipeline {
             ..self.decoder.place()
         };
         let state = AtRest {
-            link: next.link.clone(),
+            link: self.link.anew(),
             decoder: place,
             tare: next.tare.at_rest(),
             judge: kept,

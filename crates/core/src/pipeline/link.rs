@@ -62,6 +62,15 @@ impl Link {
         }
     }
 
+    /// The link of the same sensor whose port was not opened since. What was published still is.
+    pub(super) fn anew(&self) -> Self {
+        let (state, reason, _) = self.published.clone();
+        Self {
+            published: (state, reason, None),
+            ..Self::new()
+        }
+    }
+
     pub(super) fn is_live(&self) -> bool {
         matches!(self.port, Port::Live { .. })
     }

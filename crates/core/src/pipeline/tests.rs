@@ -1,17 +1,14 @@
-use prost::Message as _;
-use tract_onnx::pb;
-
 use super::*;
 
 mod course;
-mod drift;
 mod arrays;
 mod bounds;
 mod noise;
-use crate::event::{Hardness, LinkState, Note, Phase, Rejection, Status};
+use crate::event::{Advice, Hardness, LinkState, Note, Phase, Rejection, Status};
 use crate::frame::Array;
 use crate::motion::Point;
 use crate::sensor::Description;
+use crate::tests::graph::{changed, metadata};
 use crate::tests::support;
 use crate::verdict::{BUILT_IN, BUILT_IN_HRN, Level};
 use crate::wire::Preset;
@@ -24,11 +21,7 @@ fn pipeline(preset: Preset) -> Pipeline {
 
 /// A pipeline of a JX255N at 5 frames/s, changed by `change`.
 fn pipeline_of(change: impl FnOnce(&mut Description)) -> Pipeline {
-    let mut described = Description::default();
-    described.sensor.name = "forearm".to_owned();
-    change(&mut described);
-    let hrn = support::hrn();
-    Pipeline::new(Sensor::new(described).unwrap(), hrn, Clock::Arrival)
+    Pipeline::new(support::sensor_of(change), support::hrn(), Clock::Arrival)
 }
 
 /// The same after the five frames of its first tare.
@@ -171,6 +164,8 @@ fn a_load_during_tare_is_said_and_tracked_as_no_press() {
         "{detail}"
     );
     assert!(play(&mut pipeline, 5, &loaded).is_empty(), "said once");
+    let refusal = pipeline.retare().unwrap_err().to_string();
+    assert!(refusal.contains("9 taxels read more"), "{refusal}");
     assert_eq!(play(&mut pipeline, 10, &vec![raw(0, 0); 5]), ["Live"]);
     assert_eq!(play(&mut pipeline, 15, &loaded[..1]), ["Begin 1"]);
 }
@@ -235,6 +230,21 @@ fn a_tare_on_request_zeroes_drift_and_is_refused_or_given_up_under_load() {
 }
 
 #[test]
+fn a_gap_and_a_busy_sensor_do_not_speed_up_a_baseline_that_follows() {
+    let mut pipeline = ready(|described| described.sensor.calibration.auto_tare = true);
+    let mut drifted = RawFrame::default();
+    drifted.counts.fill(1.0);
+    let bytes = bytes(&pipeline, &drifted);
+    // An hour without a frame is one step. More frames within a second are no further step.
+    let mut events = Vec::new();
+    for ms in 0..20 {
+        events = pipeline.push(&bytes, at(3_600_000 + ms));
+    }
+    let left = shown(&events).last().unwrap().newtons[0];
+    assert!((left - (0.04 - 1.0 / 3600.0)).abs() < 1e-4, "{left}");
+}
+
+#[test]
 fn silence_is_stale_after_three_periods_and_ends_no_press() {
     let mut pipeline = ready(|_| {});
     play(&mut pipeline, 5, &vec![raw(5, 50); 1]);
@@ -293,6 +303,9 @@ fn a_restarted_pipeline_begins_anew_and_its_numbers_go_on() {
     let status = next.status(at(0));
     assert_eq!((status.state, status.frames), (LinkState::Connecting, 7));
     assert_eq!(status.bytes_skipped, skipped + 3);
+    // Who was told that it is live is told that it is no longer.
+    let opened = next.take(Input::Opened, at(1550)).unwrap();
+    assert_eq!(words(&opened), ["Connecting"]);
     assert_eq!(play(&mut next, 8, &vec![raw(0, 0); 6]), ["Live"]);
     assert_eq!(play(&mut next, 14, &vec![raw(5, 50); 2]), ["Begin 2"]);
     assert_eq!(next.judge.context, Some(serde_json::json!({"tag": "x"})));
@@ -481,13 +494,11 @@ fn notes_name_the_edge_saturation_and_what_the_model_has_not_seen() {
     let array = Array::JX255N;
     let check = |range: [f32; 2], place: usize, count: u16, expected: &[Note]| {
         let mut pipeline = ready(|_| {});
-        let mut file = pb::ModelProto::decode(BUILT_IN_HRN).unwrap();
-        let mut entries = file.metadata_props.iter_mut();
-        let entry = entries.find(|entry| entry.key == "hrn.range").unwrap();
-        let range = serde_json::json!({"force_n": range, "contact_area_taxels": [9, 10]});
-        entry.value = range.to_string();
-        let hrn = Model::load(&file.encode_to_vec()).unwrap();
-        judge_by(&mut pipeline, Arc::new(hrn));
+        let seen = serde_json::json!({"force_n": range, "contact_area_taxels": [9, 10]});
+        let file = changed(BUILT_IN_HRN, |proto| {
+            *metadata(proto, "hrn.range") = seen.to_string();
+        });
+        judge_by(&mut pipeline, Arc::new(Model::load(&file).unwrap()));
         let mut held = RawFrame::default();
         // Three by three taxels in the middle.
         for row in 12..15 {
@@ -581,4 +592,55 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
         .with_model(next.sensor().clone(), next.hrn().clone())
         .unwrap();
     assert_eq!(judged(&mut next, 21), Some(("cup".to_owned(), 3)));
+}
+
+#[test]
+fn an_object_is_judged_anew_by_a_model_of_other_levels() {
+    let mut pipeline = ready(|_| {});
+    judge_by(&mut pipeline, Arc::new(Model::load(BUILT_IN).unwrap()));
+    pipeline.judge.context = Some(serde_json::json!({"object": "cup"}));
+    let presses = |pipeline: &mut Pipeline, first: u64| {
+        let verdict = last_verdict(pipeline, first, &short_press());
+        verdict.object.unwrap().presses
+    };
+    assert_eq!(presses(&mut pipeline, 5), 1);
+    assert_eq!(presses(&mut pipeline, 9), 2);
+    let levels = [
+        (1, "hard", ">80"),
+        (2, "firm", "60-80"),
+        (3, "soft", "40-60"),
+        (4, "jelly", "<=40"),
+    ];
+    let levels = levels.map(|(level, label, shore)| Level::new(level, label, shore));
+    let other = Model::load(BUILT_IN).unwrap().with_levels(levels.to_vec());
+    let sensor = pipeline.sensor().clone();
+    let mut next = pipeline
+        .with_model(sensor, Arc::new(other.unwrap()))
+        .unwrap();
+    assert_eq!(presses(&mut next, 13), 1);
+}
+
+#[test]
+fn four_presses_at_one_place_are_advised_whatever_the_model_keeps() {
+    for own_presses in [0, 16] {
+        let mut pipeline = ready(|described| {
+            described.sensor.own_presses = own_presses;
+            described.model.min_confidence = 1.0;
+        });
+        let mut first = 5;
+        let mut advised = |pipeline: &mut Pipeline| {
+            first += 4;
+            let light = [raw(9, 8), raw(9, 8), raw(0, 0), raw(0, 0)];
+            let verdict = last_verdict(pipeline, first, &light);
+            assert!(verdict.confidence < 0.7, "{}", verdict.confidence);
+            verdict.advice
+        };
+        for _ in 0..2 {
+            assert_eq!(advised(&mut pipeline), Some(Advice::PressAgain));
+        }
+        let (sensor, hrn) = (pipeline.sensor().clone(), pipeline.hrn().clone());
+        let mut next = pipeline.with_model(sensor, hrn).unwrap();
+        assert_eq!(advised(&mut next), Some(Advice::PressAgain));
+        assert_eq!(advised(&mut next), None);
+    }
 }

@@ -10,7 +10,7 @@ use crate::judge::{EndedPress, Unjudged};
 use crate::pipeline::{Clock, Pipeline};
 use crate::press::End;
 use crate::sensor::Sensor;
-use crate::verdict::{Model, ModelError};
+use crate::verdict::{Model, ModelError, References};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -49,14 +49,15 @@ struct Player {
     /// The moment of the last entry. `None` for raw bytes, whose times come from the frame rate.
     last: Option<Stamp>,
     labels: Labels,
-    /// The SHA-256 of the model during recording.
-    model: String,
+    /// The SHA-256 of the model during recording, and the sensor's references.
+    model: (String, References),
 }
 
 impl Player {
     fn has(&self, state: &State) -> bool {
-        self.model == state.sensor.model_sha256
-            && self.pipeline.sensor().for_recording() == state.sensor.description
+        let recorded = &state.sensor;
+        (&self.model.0, &self.model.1) == (&recorded.model_sha256, &recorded.references)
+            && self.pipeline.sensor().for_recording() == recorded.description
             && self.pipeline.at_rest().as_ref() == Some(&state.at_rest)
     }
 }
@@ -91,7 +92,7 @@ impl Playback {
     pub fn of_bytes(sensor: Sensor, hrn: Arc<Model>) -> Self {
         let mut playback = Self::new(hrn.clone());
         playback.players.push(Player {
-            model: hrn.sha256().to_owned(),
+            model: (hrn.sha256().to_owned(), References::NONE),
             pipeline: Pipeline::new(sensor, hrn, Clock::FrameRate),
             last: None,
             labels: Labels::new(),
@@ -103,14 +104,15 @@ impl Playback {
     pub fn keep_courses(&mut self) {
         self.keeps_courses = true;
         for player in &mut self.players {
-            player.pipeline.keep_courses();
+            player.pipeline.judge.ended.get_or_insert_default();
         }
     }
 
     /// The kept presses that were not returned yet. A state of a sensor forgets its own.
     pub fn ended(&mut self) -> Vec<EndedPress> {
         let players = self.players.iter_mut();
-        players.flat_map(|player| player.pipeline.ended()).collect()
+        let kept = players.filter_map(|player| player.pipeline.judge.ended.as_mut());
+        kept.flat_map(std::mem::take).collect()
     }
 
     /// Judges the presses of a sensor with `hrn`, which has references of that sensor.
@@ -154,6 +156,10 @@ impl Playback {
             // If no entry is missing, the pipeline already has this state.
             (Entry::State(state), Some(known)) if known.has(&state) => Vec::new(),
             (Entry::State(state), known) => {
+                let model = (
+                    state.sensor.model_sha256.clone(),
+                    state.sensor.references.clone(),
+                );
                 let described = state.sensor.check()?;
                 hrn.card().check_array(described.layout().array())?;
                 if !state.at_rest.is_usable(described.layout().array()) {
@@ -162,13 +168,13 @@ impl Playback {
                 }
                 let mut pipeline = Pipeline::resumed(described, hrn, state.at_rest);
                 if self.keeps_courses {
-                    pipeline.keep_courses();
+                    pipeline.judge.ended.get_or_insert_default();
                 }
                 let player = Player {
                     pipeline,
                     last: Some(at),
                     labels: state.labels,
-                    model: state.sensor.model_sha256,
+                    model,
                 };
                 match known {
                     Some(known) => {
@@ -258,7 +264,7 @@ impl Playback {
 
     /// The SHA-256 of a model during recording, if it differs from the current model.
     pub fn other_model(&self) -> Option<&str> {
-        let models = self.players.iter().map(|player| player.model.as_str());
+        let models = self.players.iter().map(|player| player.model.0.as_str());
         models.into_iter().find(|model| *model != self.hrn.sha256())
     }
 }

@@ -1,4 +1,5 @@
 use std::io::Cursor;
+use std::sync::Arc;
 
 use serde_json::{Value, json};
 
@@ -7,6 +8,7 @@ use crate::event::{Event, Press, PressState};
 use crate::frame::RawFrame;
 use crate::pipeline::Clock;
 use crate::tests::support::{about, at, hrn, labels, sensor};
+use crate::verdict::{BUILT_IN, Model, References};
 use crate::wire;
 
 mod rewritten;
@@ -209,6 +211,26 @@ fn a_press_that_lost_its_end_with_missing_entries_is_aborted() {
         (2, PressState::Begin, None),
     ];
     assert_eq!(states.take(3).collect::<Vec<_>>(), expected);
+}
+
+#[test]
+fn references_that_change_hold_from_then_on() {
+    let hrn = Arc::new(Model::load(BUILT_IN).unwrap());
+    let other = hrn.identified(References::IGNORED).unwrap();
+    let before = Pipeline::new(sensor(), hrn.clone(), Clock::Arrival);
+    let after = before.with_model(sensor(), Arc::new(other)).unwrap();
+    let mut playback = Playback::new(hrn);
+    for (pipeline, are_ignored) in [(&before, false), (&after, true), (&before, false)] {
+        let state = State::of(pipeline, &labels()).unwrap();
+        let found = Found {
+            sensor: "forearm".to_owned(),
+            at: at(0),
+            entry: Entry::State(Box::new(state)),
+        };
+        playback.feed(found).unwrap();
+        let hrn = playback.pipeline("forearm").unwrap().hrn();
+        assert_eq!(hrn.known_references().are_ignored(), are_ignored);
+    }
 }
 
 #[test]

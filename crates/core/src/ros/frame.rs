@@ -61,7 +61,7 @@ pub(super) fn image(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
 }
 
 /// The force of the contact and its area.
-pub fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
+pub(super) fn contact(frame: &FrameEvent) -> (Topic, Timestamp, Vec<u8>) {
     // Without the forces of the taxels, which are most of an event.
     let event = json!({
         "frame": frame.frame,

@@ -6,6 +6,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{Array, Pitch};
+use crate::line::extent;
 use crate::range::{OutOfRange, above_0, check, from_to};
 
 /// The force of one count of the JX255N: 8 bits are 10.2 N.
@@ -68,13 +69,11 @@ pub enum Gains {
 
 impl Gains {
     /// The least and the greatest gain. `None` for the path of a file.
-    pub fn extent(&self) -> Option<(f32, f32)> {
-        let Self::Taxels(rows) = self else {
-            return None;
-        };
-        let gains = rows.iter().flatten().copied();
-        let least = gains.clone().fold(f32::INFINITY, f32::min);
-        Some((least, gains.fold(0.0, f32::max)))
+    pub fn extent(&self) -> Option<[f64; 2]> {
+        match self {
+            Self::File(_) => None,
+            Self::Taxels(rows) => Some(extent(rows.iter().flatten().map(|&gain| gain.into()))),
+        }
     }
 }
 
@@ -125,25 +124,19 @@ fn check_gains(gains: &Gains, array: Array) -> Result<(), OutOfRange> {
         let found = format_args!("the path of a file");
         return Err(OutOfRange::new("gains", found, "its numbers"));
     };
-    let mut widths = rows.iter().map(Vec::len);
-    let first = widths.clone().next().unwrap_or_default();
-    let cols = widths.find(|&cols| cols != array.cols).unwrap_or(first);
-    check(
-        "gains",
-        format_args!("{} rows of {cols}", rows.len()),
-        rows.len() == array.rows && cols == array.cols,
-        format_args!("{} of {}", array.rows, array.cols),
-    )?;
+    // The width of the first wrong row, or else of all.
+    let widths = rows.iter().map(Vec::len);
+    let cols = widths.min_by_key(|&cols| cols == array.cols).unwrap_or(0);
+    let found = format_args!("{} rows of {cols}", rows.len());
+    let fits = rows.len() == array.rows && cols == array.cols;
+    let expected = format_args!("{} of {}", array.rows, array.cols);
+    check("gains", found, fits, expected)?;
     let (least, most) = GAINS;
-    for (row, gains) in rows.iter().enumerate() {
-        for (col, gain) in gains.iter().enumerate() {
-            check(
-                "gains",
-                format_args!("{gain:?} at [{row}, {col}]"),
-                (least..=most).contains(gain),
-                format_args!("{least} to {most}"),
-            )?;
-        }
+    for (place, gain) in rows.iter().flatten().enumerate() {
+        let (row, col) = array.position(place);
+        let found = format_args!("{gain:?} at [{row}, {col}]");
+        let expected = format_args!("{least} to {most}");
+        check("gains", found, (least..=most).contains(gain), expected)?;
     }
     Ok(())
 }

@@ -113,6 +113,41 @@ fn a_baseline_follows_by_its_bound_while_no_live_taxel_is_in_contact() {
     // A dead taxel is no contact.
     let column: Vec<[usize; 2]> = (0..28).map(|row| [row, 1]).collect();
     assert_eq!(newtons(true, 2.0, &column, 150)[0], 0.0);
+    // The bound is one of newtons, whatever power of the counts they are.
+    let settings = Settings {
+        auto_tare: true,
+        tare_frames: 1,
+        newtons_per_count: 0.001,
+        exponent: 2.0,
+        ..Settings::default()
+    };
+    let mut tare = Tare::new(&settings, Array::JX255N, CONTACT);
+    tare.observe(&raw(&[]));
+    let drifted = raw(&[(0, 10)]);
+    (0..60).for_each(|_| tare.follow(&drifted));
+    let left = tare.apply(&drifted).newtons[0];
+    assert!((left - (0.064 - 60.0 / 3600.0)).abs() < 1e-4, "{left}");
+}
+
+#[test]
+fn a_first_tare_that_always_has_its_first_frame_goes_on_from_its_rest() {
+    let mut tare = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
+    for count in [10, 2, 10, 2, 10] {
+        tare.observe(&raw(&[(0, count), (1, count), (2, count)]));
+        assert!(tare.is_at_rest());
+    }
+    let mut next = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
+    next.resume(tare.at_rest());
+    for count in [10, 11, 10] {
+        for tare in [&mut tare, &mut next] {
+            tare.observe(&raw(&[(0, count), (1, count), (2, count)]));
+        }
+        assert!(!tare.is_at_rest());
+    }
+    for tare in [&mut tare, &mut next] {
+        tare.observe(&raw(&[(0, 10), (1, 10), (2, 10)]));
+    }
+    assert_eq!((next.aim(), &next.baseline), (None, &tare.baseline));
 }
 
 #[test]

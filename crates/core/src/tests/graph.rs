@@ -1,4 +1,4 @@
-//! The parts of an ONNX graph, for tests.
+//! The parts of an ONNX graph, and changes of a model file, for tests.
 
 use tract_onnx::pb;
 use tract_onnx::pb::attribute_proto::AttributeType;
@@ -84,4 +84,20 @@ pub fn number(name: &str, value: f32) -> pb::TensorProto {
         float_data: vec![value],
         ..Default::default()
     }
+}
+
+/// A model file, changed by a closure.
+#[cfg(test)]
+pub(crate) fn changed(bytes: &[u8], change: impl FnOnce(&mut pb::ModelProto)) -> Vec<u8> {
+    use prost::Message as _;
+    let mut proto = pb::ModelProto::decode(bytes).unwrap();
+    change(&mut proto);
+    proto.encode_to_vec()
+}
+
+/// The text of a key of a model's metadata.
+#[cfg(test)]
+pub(crate) fn metadata<'a>(proto: &'a mut pb::ModelProto, key: &str) -> &'a mut String {
+    let mut entries = proto.metadata_props.iter_mut();
+    &mut entries.find(|entry| entry.key == key).unwrap().value
 }

@@ -27,18 +27,21 @@ pub fn hrn() -> Arc<Model> {
     Arc::clone(&HRN)
 }
 
-/// A sensor with a gain for each taxel and a baseline that follows drift.
-pub fn sensor() -> Sensor {
-    Sensor::new(described()).unwrap()
-}
-
-fn described() -> Description {
+/// A JX255N called "forearm", changed by a closure.
+pub fn sensor_of(change: impl FnOnce(&mut Description)) -> Sensor {
     let mut described = Description::default();
     described.sensor.name = "forearm".to_owned();
-    let gains = (1..=Array::JX255N.cols).map(|n| n as f32 / 14.3).collect();
-    described.sensor.calibration.gains = Some(Gains::Taxels(vec![gains; Array::JX255N.rows]));
-    described.sensor.calibration.auto_tare = true;
-    described
+    change(&mut described);
+    Sensor::new(described).unwrap()
+}
+
+/// A sensor with a gain for each taxel and a baseline that follows drift.
+pub fn sensor() -> Sensor {
+    sensor_of(|described| {
+        let gains = (1..=Array::JX255N.cols).map(|n| n as f32 / 14.3).collect();
+        described.sensor.calibration.gains = Some(Gains::Taxels(vec![gains; Array::JX255N.rows]));
+        described.sensor.calibration.auto_tare = true;
+    })
 }
 
 /// The moment `ms` milliseconds after the first.
@@ -71,10 +74,7 @@ pub fn of_a_labelled_press(
     context: Option<Value>,
     sends: bool,
 ) -> (Vec<u8>, Sensor) {
-    let mut described = Description::default();
-    described.sensor.name = "forearm".to_owned();
-    change(&mut described);
-    let (sensor, hrn) = (Sensor::new(described).unwrap(), hrn());
+    let (sensor, hrn) = (sensor_of(change), hrn());
     let about = about(labels, RecordedSensor::new(&sensor, &hrn));
     let mut writer = Writer::new(Vec::new(), &about).unwrap();
     let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);

@@ -268,16 +268,11 @@ impl Distribution {
     /// share `tail` of it on each side.
     pub fn shore(&self, borders: &Borders, tail: f32) -> Shore {
         let (best, _) = argmax(&self.levels(borders));
-        let [low, high] = borders.part(best);
+        let part @ [low, high] = borders.part(best);
         let middle = 0.5 * (self.below(low) + self.below(high));
-        let value = self.quantile(middle).clamp(low, high);
-        let [low, high] = [tail, 1.0 - tail].map(|share| self.quantile(share));
+        let [value, low, high] = [middle, tail, 1.0 - tail].map(|share| self.quantile(share));
         // With many levels, the most probable one may lie at an end.
-        Shore {
-            value,
-            low: low.min(value),
-            high: high.max(value),
-        }
+        Shore { value, low, high }.within(part)
     }
 }
 

@@ -1,12 +1,11 @@
 use pb::tensor_shape_proto::dimension::Value as Dimension;
-use prost::Message as _;
 use serde_json::{Value, json};
 use tract_onnx::pb;
 
 use super::*;
 use crate::frame::{Array, Pitch};
 use crate::tests::course_model::{course_model, encoded};
-use crate::tests::graph::{indices, int, node, value};
+use crate::tests::graph::{changed, int, metadata, node, value};
 
 fn graph(proto: &mut pb::ModelProto) -> &mut pb::GraphProto {
     proto.graph.as_mut().unwrap()
@@ -18,18 +17,15 @@ fn tensor<'a>(proto: &'a mut pb::ModelProto, name: &str) -> &'a mut pb::TensorPr
 }
 
 fn set(proto: &mut pb::ModelProto, key: &str, text: &str) {
-    let mut entries = proto.metadata_props.iter_mut();
-    let entry = entries.find(|entry| entry.key == key).unwrap();
-    entry.value = text.to_owned();
+    text.clone_into(metadata(proto, key));
 }
 
 /// Changes the JSON of a key.
 fn edit(proto: &mut pb::ModelProto, key: &str, change: impl FnOnce(&mut Value)) {
-    let mut entries = proto.metadata_props.iter_mut();
-    let entry = entries.find(|entry| entry.key == key).unwrap();
-    let mut json = serde_json::from_str(&entry.value).unwrap();
+    let text = metadata(proto, key);
+    let mut json = serde_json::from_str(text).unwrap();
     change(&mut json);
-    entry.value = json.to_string();
+    *text = json.to_string();
 }
 
 fn tensor_type(proto: &mut pb::ModelProto) -> &mut pb::type_proto::Tensor {
@@ -49,12 +45,6 @@ fn refused_by(bytes: &[u8], expected: &str) {
     );
 }
 
-fn changed(bytes: &[u8], change: impl FnOnce(&mut pb::ModelProto)) -> Vec<u8> {
-    let mut proto = pb::ModelProto::decode(bytes).unwrap();
-    change(&mut proto);
-    proto.encode_to_vec()
-}
-
 #[test]
 fn the_built_in_models_load_and_judge() {
     for bytes in [BUILT_IN, BUILT_IN_HRN] {
@@ -71,6 +61,9 @@ fn the_built_in_models_load_and_judge() {
         }
     }
     let hrn = Model::load(BUILT_IN_HRN).unwrap();
+    // No frame is below 0.
+    let judged = |newtons| hrn.judge_taxels(&[newtons; TAXELS]).unwrap();
+    assert_eq!(judged(-2.0), judged(0.0));
     let error = hrn.judge_course(&TimeSeries::default()).unwrap_err();
     assert!(error.to_string().contains("the model takes no courses"));
 }
@@ -207,55 +200,6 @@ fn a_model_of_frames_as_they_are_has_one_array() {
     refused_by(&of_grid("[2, 3]"), other);
     for grid in ["[0, 3]", "[2, 65]", "\"2x3\""] {
         refused_by(&of_grid(grid), "expected [rows, columns], each 1 to 64");
-    }
-}
-
-/// A model of two levels on an array of 2x3 taxels. Its logits are the first two newtons of its input.
-fn of_first_taxels(input: &str, frames: usize) -> Vec<u8> {
-    let level = |level: u8| json!({"level": level, "label": "any", "shore": "any"});
-    let check = json!({
-        "frames": vec![vec![0.0; frames * 6]; 4],
-        "probabilities": vec![[0.5; 2]; 4],
-    });
-    let metadata = [
-        ("hrn.format", json!("1")),
-        ("hrn.grid", json!([2, 3])),
-        ("hrn.levels", json!([level(1), level(2)])),
-        ("hrn.check", check),
-    ];
-    let slice = ["taxels", "from", "to", "along"];
-    encoded(3, &metadata, |proto| {
-        proto.graph = Some(pb::GraphProto {
-            name: "first taxels".to_owned(),
-            input: vec![value(input, &[1, frames, 2, 3])],
-            output: vec![value("probabilities", &[1, 2]), value("logits", &[1, 2])],
-            initializer: vec![
-                indices("from", &[0]),
-                indices("to", &[2]),
-                indices("along", &[1]),
-                indices("flat", &[1, 6 * frames as i64]),
-            ],
-            node: vec![
-                node("Reshape", &[input, "flat"], &["taxels"], &[]),
-                node("Slice", &slice, &["logits"], &[]),
-                node("Softmax", &["logits"], &["probabilities"], &[]),
-            ],
-            ..Default::default()
-        });
-    })
-}
-
-#[test]
-fn parts_keep_the_sign_and_a_frame_is_of_0_or_more() {
-    for (input, frames, format, expected) in [
-        ("frame", 1, Format::Frame, [0.5, 0.0]),
-        ("parts", 8, Format::Parts, [0.5, -2.0]),
-    ] {
-        let hrn = Model::load(&of_first_taxels(input, frames)).unwrap();
-        assert_eq!(hrn.format(), format);
-        let mut taxels = vec![0.0; 6 * frames];
-        taxels[..2].copy_from_slice(&[0.5, -2.0]);
-        assert_eq!(hrn.judge_taxels(&taxels).unwrap().logits, expected);
     }
 }
 

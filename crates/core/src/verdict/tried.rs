@@ -52,11 +52,7 @@ impl Model {
             true => References::IGNORED,
             false => references,
         };
-        let identified = Self {
-            references,
-            ..self.clone()
-        };
-        Ok((identified, tried))
+        Ok((self.identified(references)?, tried))
     }
 
     /// Tries references that this model computed of these presses.

@@ -28,6 +28,8 @@ pub struct Place {
     pub framed: u64,
     /// Whether the next byte follows the end of a frame.
     pub in_sync: bool,
+    /// Whether the bytes since the last frame or restart began with options of telnet.
+    pub is_telnet: bool,
 }
 
 /// Finds frames in a stream of bytes.
@@ -67,8 +69,6 @@ pub struct Decoder {
     /// The damaged candidates that were not returned yet.
     damaged: u64,
     lines: Lines,
-    /// Whether the bytes since the last frame or restart began with options of telnet.
-    is_telnet: bool,
 }
 
 impl Decoder {
@@ -79,6 +79,7 @@ impl Decoder {
             skipped: 0,
             framed: 0,
             in_sync: layout.begins_in_sync(),
+            is_telnet: false,
         };
         Self::at(layout, place)
     }
@@ -92,7 +93,6 @@ impl Decoder {
             settled: false,
             damaged: 0,
             lines: Lines::default(),
-            is_telnet: false,
             layout,
         }
     }
@@ -105,7 +105,7 @@ impl Decoder {
         }
         self.settled = false;
         if self.unframed() == 0 {
-            self.is_telnet = is_telnet(bytes);
+            self.place.is_telnet = is_telnet(bytes);
         }
         self.bytes.drain(..self.start);
         self.start = 0;
@@ -136,7 +136,7 @@ impl Decoder {
         self.skip(0);
         self.place.framed = self.place.decoded;
         self.lines = Lines::default();
-        self.is_telnet = false;
+        self.place.is_telnet = false;
     }
 
     /// Counts bytes that came and that nobody reads: they are no sign of a wrong layout. The next bytes do
@@ -189,7 +189,7 @@ impl Decoder {
     /// Why the bytes since the last frame are none. `None` if they are so few that they may be the
     /// beginning of one.
     pub fn problem(&self) -> Option<String> {
-        let guess = match self.is_telnet {
+        let guess = match self.place.is_telnet {
             true => TELNET,
             false => "is the baud rate or the layout wrong?",
         };

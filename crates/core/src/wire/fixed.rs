@@ -131,8 +131,12 @@ impl Fixed {
         if keys.packets.is_some() {
             fixed.number = fixed.constants[1].clone();
         }
+        let key = match count * header_bytes > cells * stride {
+            true => "header_bytes",
+            false => "stride_bytes",
+        };
         range::check(
-            "stride_bytes",
+            key,
             format_args!("a frame of {} bytes", fixed.bytes),
             fixed.bytes <= MOST_BYTES,
             format_args!("at most {MOST_BYTES} bytes"),

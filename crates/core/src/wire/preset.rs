@@ -57,12 +57,11 @@ impl Settings {
     pub fn in_force(&self) -> Result<Self, OutOfRange> {
         let preset = self.preset();
         let written = Table::try_from(self).expect("the keys are plain values");
-        let mut not_text = written
-            .keys()
-            .filter(|key| !KEYS_OF_TEXT.contains(&key.as_str()));
-        if preset.is_text()
-            && let Some(key) = not_text.next()
-        {
+        let is_of_other = |key: &&String| match preset.is_text() {
+            true => !KEYS_OF_TEXT.contains(&key.as_str()),
+            false => *key == "heading",
+        };
+        if let Some(key) = written.keys().find(is_of_other) {
             let problem = format_args!(
                 "found a value, expected none: frames of preset {preset} have no such part"
             );

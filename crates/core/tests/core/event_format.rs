@@ -167,58 +167,22 @@ fn frame_is_frozen_and_never_numbered() {
 
 #[test]
 fn replies_are_frozen() {
-    check(
-        &Reply::Gap { lost: Some(12) }.to_line(),
-        r#"{"type":"gap","lost":12}"#,
-    );
-    check(
-        &Reply::Gap { lost: None }.to_line(),
-        r#"{"type":"gap","lost":null}"#,
-    );
-    check(
-        &Reply::Error {
-            message: "no".to_owned(),
-            id: None,
-        }
-        .to_line(),
-        r#"{"type":"error","message":"no"}"#,
-    );
-    check(
-        &Reply::Ok {
-            id: Some(json!("a")),
-            tare: None,
-            blackbox: None,
-        }
-        .to_line(),
-        r#"{"type":"ok","id":"a"}"#,
-    );
-    check(
-        &Reply::Ok {
-            id: None,
-            tare: None,
-            blackbox: Some("/var/lib/hardnessd/blackbox.mcap".to_owned()),
-        }
-        .to_line(),
-        r#"{"type":"ok","blackbox":"/var/lib/hardnessd/blackbox.mcap"}"#,
-    );
+    let ok = |id, tare, blackbox| Reply::Ok { id, tare, blackbox };
+    let error = Reply::Error {
+        message: "no".to_owned(),
+        id: None,
+    };
     let offsets = |mean_counts| Offsets {
         mean_counts,
         least_counts: 1.5,
         most_counts: 9.0,
     };
-    check(
-        &Reply::Ok {
-            id: None,
-            tare: Some(Tared {
-                sensor: "forearm".to_owned(),
-                old: offsets(2.25),
-                new: offsets(2.5),
-            }),
-            blackbox: None,
-        }
-        .to_line(),
-        r#"{"type":"ok","tare":{"sensor":"forearm","old":{"mean_counts":2.25,"least_counts":1.5,"most_counts":9.0},"new":{"mean_counts":2.5,"least_counts":1.5,"most_counts":9.0}}}"#,
-    );
+    let tared = Tared {
+        sensor: "forearm".to_owned(),
+        old: offsets(2.25),
+        new: offsets(2.5),
+    };
+    let blackbox = "/var/lib/hardnessd/blackbox.mcap".to_owned();
     let hello = Hello {
         protocol: PROTOCOL,
         server: "hardnessd",
@@ -242,8 +206,27 @@ fn replies_are_frozen() {
             without_effect: vec!["sensor.arm of \"forearm\"".to_owned()],
         },
     };
-    check(
-        &Reply::Hello(hello).to_line(),
-        r#"{"type":"hello","protocol":1,"server":"hardnessd","version":"0.1.0","robot":"arm-7","run":"r","boot_id":"b","seq":0,"sensors":[{"name":"forearm","rows":28,"cols":28,"pitch_mm":3.5}],"model":{"sha256":"00","validation":"simulated data only","levels":[{"level":1,"label":"hard","shore":">70"}],"name":"built in","needs":"judges single frames, needs no arm","without_effect":["sensor.arm of \"forearm\""]}}"#,
-    );
+    for (reply, text) in [
+        (Reply::Gap { lost: Some(12) }, r#"{"type":"gap","lost":12}"#),
+        (Reply::Gap { lost: None }, r#"{"type":"gap","lost":null}"#),
+        (error, r#"{"type":"error","message":"no"}"#),
+        (
+            ok(Some(json!("a")), None, None),
+            r#"{"type":"ok","id":"a"}"#,
+        ),
+        (
+            ok(None, None, Some(blackbox)),
+            r#"{"type":"ok","blackbox":"/var/lib/hardnessd/blackbox.mcap"}"#,
+        ),
+        (
+            ok(None, Some(tared), None),
+            r#"{"type":"ok","tare":{"sensor":"forearm","old":{"mean_counts":2.25,"least_counts":1.5,"most_counts":9.0},"new":{"mean_counts":2.5,"least_counts":1.5,"most_counts":9.0}}}"#,
+        ),
+        (
+            Reply::Hello(hello),
+            r#"{"type":"hello","protocol":1,"server":"hardnessd","version":"0.1.0","robot":"arm-7","run":"r","boot_id":"b","seq":0,"sensors":[{"name":"forearm","rows":28,"cols":28,"pitch_mm":3.5}],"model":{"sha256":"00","validation":"simulated data only","levels":[{"level":1,"label":"hard","shore":">70"}],"name":"built in","needs":"judges single frames, needs no arm","without_effect":["sensor.arm of \"forearm\""]}}"#,
+        ),
+    ] {
+        check(&reply.to_line(), text);
+    }
 }

@@ -126,7 +126,7 @@ fn pressed(side: usize, bar: [usize; 2], hardest: u8) -> Vec<u8> {
 }
 
 /// Collects presses of an object as its file. The first two objects are of level 1, the next two of level 2.
-fn collect(desk: &Desk, object: u8, presses: [Vec<u8>; 3]) {
+fn collect(desk: &Desk, object: u8, presses: &[Vec<u8>; 3]) {
     for (number, bytes) in presses.iter().enumerate() {
         desk.write(&format!("{object}{number}.bin"), bytes);
     }
@@ -148,7 +148,7 @@ fn an_array_larger_than_the_models_is_learnt_and_judged_as_it_is() {
         for (object, bar) in (0..).zip([bars[0], bars[0], bars[1], bars[1]]) {
             let hardest = [100, 130, 160].map(|hardest| hardest + 10 * object);
             let presses = hardest.map(|hardest| pressed(side, bar, hardest));
-            collect(&desk, object, presses);
+            collect(&desk, object, &presses);
         }
         let report =
             desk.json("fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx --json");
@@ -209,7 +209,7 @@ fn presses_scattered_on_a_large_array_are_no_model_of_its_taxels() {
     desk.write("wide.toml", config_of(64));
     for object in 0..4 {
         let presses = [0, 9, 18].map(|right| pressed_at(64, [4, 4], 100 + 20 * object, right));
-        collect(&desk, object, presses);
+        collect(&desk, object, &presses);
     }
     let (_, text, _) = desk.run("fit 0.npz 1.npz 2.npz 3.npz --config wide.toml --out m.onnx");
     let expected = "left out: presses fall on different places of a large array";

@@ -144,29 +144,12 @@ fn a_sensor_whose_bytes_are_skipped_is_live_as_long_as_its_frames_come() {
 }
 
 #[test]
-fn a_silent_sensor_says_that_bytes_come_and_not_with_each_of_them() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    pipeline.opened(at(0));
-    let mut events = pipeline.tick(at(600));
-    for ms in (1_000..30_000).step_by(100) {
-        events.extend(pipeline.push(&[7; 100], at(ms)));
-    }
-    let silent = "Stale (no frame for 500 ms";
-    let bytes = "but bytes come: is the baud rate or the layout wrong?)";
-    assert_eq!(
-        words(&events),
-        [format!("{silent})"), format!("{silent}, {bytes}")]
-    );
-}
-
-#[test]
 fn bare_frames_follow_a_pause_and_those_of_a_file_each_other_also_after_a_damaged_one() {
-    let mut described = Description::default();
-    described.sensor.frame.preset = Some(Preset::None);
-    described.sensor.frame.cell = Some(Cell::F32le);
-    described.sensor.frame.rows = Some(4);
-    described.sensor.frame.cols = Some(4);
-    let sensor = Sensor::new(described).unwrap();
+    let sensor = support::sensor_of(|described| {
+        let frame = &mut described.sensor.frame;
+        (frame.preset, frame.cell) = (Some(Preset::None), Some(Cell::F32le));
+        (frame.rows, frame.cols) = (Some(4), Some(4));
+    });
     let frames = |clock, ms, cells: &[f32]| {
         let mut pipeline = Pipeline::new(sensor.clone(), support::hrn(), clock);
         if clock == Clock::Arrival {
@@ -186,21 +169,4 @@ fn bare_frames_follow_a_pause_and_those_of_a_file_each_other_also_after_a_damage
     assert_eq!(frames(Clock::FrameRate, 0, &cells), (8, 1));
     cells[2] = f32::INFINITY;
     assert_eq!(frames(Clock::FrameRate, 0, &cells), (7, 2));
-}
-
-#[test]
-fn totals_balance_with_damage() {
-    let mut pipeline = pipeline(Preset::Jx255n);
-    let mut stream = vec![1, 2, 3];
-    let mut broken = bytes(&pipeline, &raw(1, 1));
-    broken[400] ^= 1;
-    stream.extend(broken);
-    stream.extend(bytes(&pipeline, &raw(0, 0)));
-    stream.extend([0xBB, 0xAA, 0x10]);
-    pipeline.push(&stream, at(0));
-    let status = pipeline.status(at(0));
-    let totals = (status.frames, status.frames_damaged, status.bytes_skipped);
-    assert_eq!(totals, (1, 1, 793));
-    pipeline.end_of_recording(None);
-    assert_eq!(pipeline.status(at(0)).bytes_skipped, 796);
 }

@@ -1,6 +1,7 @@
 //! Tests with a model that judges the course of a press.
 
 use serde_json::{Value, json};
+use tract_onnx::pb;
 
 use super::*;
 use crate::event::ApproachSource;
@@ -123,6 +124,15 @@ fn without_positions_the_arm_moves_at_its_speed_and_then_holds() {
         assert_eq!(found[1].course, Some(ApproachSource::Speed));
         assert!(found[1].stiffness_n_per_mm.is_some());
     }
+    // Below a baseline that stands too high, no frame of a press has a force.
+    let mut pipeline = pipeline_of(|described| described.sensor.arm.speed_mm_s = Some(5.0));
+    let hrn = Model::read(&course_model(8, &[])).unwrap();
+    judge_by(&mut pipeline, Arc::new(hrn));
+    let mut unloaded = raw(0, 0);
+    unloaded.counts.fill(2.0);
+    play(&mut pipeline, 1, &vec![unloaded; 5]);
+    let below = [raw(9, 4), raw(9, 4), raw(0, 0), raw(0, 0)];
+    assert!(last_verdict(&mut pipeline, 6, &below).force_n < 0.0);
     // A context may be any JSON.
     let mut pipeline = tared(&[], |_| {});
     pipeline.judge.context = Some(json!({"speed_mm_s": "fast"}));
@@ -305,11 +315,9 @@ fn spoil(proto: &mut pb::ModelProto, output: &str, most: f32, other: &str) {
 #[test]
 fn a_press_that_cannot_be_kept_has_its_verdict() {
     // The model fails on presses of objects of which nothing is known, and judges the press.
-    let mut proto = pb::ModelProto::decode(BUILT_IN).unwrap();
-    spoil(&mut proto, "reference", 99.0, "high");
+    let file = changed(BUILT_IN, |proto| spoil(proto, "reference", 99.0, "high"));
     let mut pipeline = tared(&[], |_| {});
-    let hrn = Model::load(&proto.encode_to_vec()).unwrap();
-    judge_by(&mut pipeline, Arc::new(hrn));
+    judge_by(&mut pipeline, Arc::new(Model::load(&file).unwrap()));
     let found = judged(&mut pipeline, |_| Vec::new());
     assert_eq!(found.last().unwrap().phase, Phase::Final);
     let [error] = &pipeline.unjudged()[..] else {

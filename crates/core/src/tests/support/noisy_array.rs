@@ -2,8 +2,9 @@
 
 use std::f64::consts::TAU;
 
+use super::sensor_of;
 use crate::frame::{Array, RawFrame};
-use crate::sensor::{Description, Sensor};
+use crate::sensor::Sensor;
 use crate::wire::Cell;
 
 /// The array.
@@ -66,14 +67,12 @@ impl NoisyArray {
 
 /// The sensor of such an array, as a configuration with this scale describes it.
 pub fn noisy_sensor(newtons_per_count: f32) -> Sensor {
-    let mut described = Description::default();
-    described.sensor.name = "forearm".to_owned();
-    described.sensor.frame.cell = Some(Cell::U16le);
-    described.sensor.frame.mask = Some(MOST_COUNTS);
-    (described.sensor.frame.rows, described.sensor.frame.cols) =
-        (Some(ARRAY.rows), Some(ARRAY.cols));
-    described.sensor.calibration.newtons_per_count = newtons_per_count;
-    Sensor::new(described).unwrap()
+    sensor_of(|described| {
+        let frame = &mut described.sensor.frame;
+        (frame.rows, frame.cols) = (Some(ARRAY.rows), Some(ARRAY.cols));
+        (frame.cell, frame.mask) = (Some(Cell::U16le), Some(MOST_COUNTS));
+        described.sensor.calibration.newtons_per_count = newtons_per_count;
+    })
 }
 
 /// The forces of a round foot of three taxels' radius that presses with `force_n`. A cover spreads a
