@@ -57,7 +57,7 @@ pub struct Args {
     /// Sensor that was pressed [default: the first]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
-    /// Presses to make, or to take of each file, from light to hard. A model takes 32 or so in all
+    /// Presses to make, or to take of each file, from light to hard: 1 to 64
     #[arg(long, value_name = "N", default_value_t = 5,
         value_parser = clap::value_parser!(u64).range(1..=MOST_REFERENCES as u64))]
     presses: u64,
