@@ -88,6 +88,9 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
             let _log = Log::start(LogSettings::default(), "error")?;
             demo::run(args, signals.received()).await
         }
+        Command::Simulate(args) if args.is_for_file() => {
+            finish(signals, simulate::run(args, std::future::pending())).await
+        }
         Command::Simulate(args) => simulate::run(args, signals.received()).await,
         Command::Record(args) => {
             let mut end = pin!(signals.received());

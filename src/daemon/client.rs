@@ -252,7 +252,7 @@ fn end(done: Result<Done, String>, id: Option<Value>) -> Arc<Line> {
 }
 
 /// Carries out a request that changes something. Of all sockets, only the control socket may.
-async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, String> {
+pub(super) async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, String> {
     let Some(sensors) = sensors else {
         return Err("this socket changes nothing: send it to the control socket".to_owned());
     };
@@ -262,7 +262,10 @@ async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Str
             let command = |reply| Command::Take(Input::Context(context), reply);
             ask(sensors, "context.sensor", &sensor, command).await
         }
-        Request::Merge(keys) => merge(sensors, keys).await,
+        Request::Merge(Merge { sensor, keys }) => {
+            let command = |reply| Command::Merge(keys, reply);
+            ask(sensors, "merge.sensor", &sensor, command).await
+        }
         Request::Motion(Positions { sensor, points }) => {
             // Read the clocks now, because the sensor's task may have other work to do first.
             let input = Input::Motion(motion::placed(&points, now())?);
@@ -273,15 +276,6 @@ async fn change(sensors: Option<&Sensors>, request: Request) -> Result<Done, Str
         // They change nothing.
         Request::Subscribe(_) | Request::Get(_) => Ok(Done::default()),
     }
-}
-
-/// Sets keys of a sensor's context.
-pub(super) async fn merge(
-    sensors: &Sensors,
-    Merge { sensor, keys }: Merge,
-) -> Result<Done, String> {
-    let command = |reply| Command::Merge(keys, reply);
-    ask(sensors, "merge.sensor", &sensor, command).await
 }
 
 /// Passes a command on to the sensor called `name`, and waits for the answer. `key` is the request's

@@ -30,14 +30,16 @@ use hyper::service::{Service, service_fn};
 use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use tokio::net::TcpStream;
 use tracing::debug;
 
 use super::accept::{Serve, Stop, stopped};
-use super::client::merge;
+use super::client::change;
 use super::hub::{Hub, Snapshot};
+use super::request::{self, Merge};
 use super::sensor::Sensors;
 use hardnessd_core::event::{self, Event, LinkState, Reply, Status};
 use hardnessd_core::wording::cut_found;
@@ -145,8 +147,19 @@ impl Http {
     }
 }
 
-/// Sets keys of the context of a sensor. A page from elsewhere cannot send this type of content without a question
-/// first, and gets no answer to that.
+/// What is being pressed at a sensor. What is missing is no longer said.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "an object")]
+struct Pressed {
+    sensor: String,
+    #[serde(default)]
+    object: Value,
+    #[serde(default)]
+    level: Value,
+}
+
+/// Sets what is being pressed. A page from elsewhere cannot send this type of content without a question first, and
+/// gets no answer to that.
 async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response {
     let kind = headers.get(header::CONTENT_TYPE);
     let kind = kind.and_then(|kind| kind.to_str().ok()).unwrap_or_default();
@@ -156,8 +169,24 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
         return refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, why);
     }
     let read = serde_json::from_slice(&body).map_err(|error| cut_found(&error.to_string()));
-    let set = async { merge(sensors, read?).await }.await;
-    match set {
+    let done = async {
+        let Pressed {
+            sensor,
+            object,
+            level,
+        } = read?;
+        let keys = [("object", object), ("level", level)];
+        let keys = keys
+            .map(|(key, value)| (key.to_owned(), value))
+            .into_iter()
+            .collect();
+        change(
+            Some(sensors),
+            request::Request::Merge(Merge { sensor, keys }),
+        )
+        .await
+    };
+    match done.await {
         Ok(_) => text("application/json", "{}".to_owned()),
         Err(why) => refusal(StatusCode::BAD_REQUEST, why),
     }

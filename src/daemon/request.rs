@@ -138,6 +138,7 @@ impl TryFrom<Map<String, Value>> for Context {
 
 /// Keys of a context as they came. Those that are null are removed, and all others stay.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(expecting = "an object")]
 pub(crate) struct Merge {
     pub(crate) sensor: String,
     #[serde(flatten)]

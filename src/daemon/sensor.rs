@@ -146,7 +146,7 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Finish) | None => {
-                    let ended = "tare: the sensor's task ends, with the daemon or for other settings: ask again";
+                    let ended = "tare: the daemon stops, or the sensor begins anew after a reload: ask again";
                     let _ = taring.map(|reply| reply.send(Err(ended.to_owned())));
                     hub.publish(core.taken(Input::Shutdown));
                     source.close().await;
@@ -265,8 +265,12 @@ fn merged(
         .and_then(Value::as_object)
         .cloned()
         .unwrap_or_default();
-    merged.extend(keys);
-    merged.retain(|_, value| !value.is_null());
+    for (key, value) in keys {
+        match value {
+            Value::Null => merged.remove(&key),
+            value => merged.insert(key, value),
+        };
+    }
     if merged.keys().all(|key| key == "sensor") {
         return Ok(None);
     }
@@ -317,9 +321,9 @@ mod tests {
             };
             merged(context.as_ref(), "palm", keys)
         };
-        let context = json!({"sensor": "palm", "tag": "x", "level": 2});
+        let context = json!({"sensor": "palm", "tag": null, "level": 2});
         let keys = json!({"level": null, "object": "cup"});
-        let expected = json!({"sensor": "palm", "tag": "x", "object": "cup"});
+        let expected = json!({"sensor": "palm", "tag": null, "object": "cup"});
         assert_eq!(merged(Some(context), keys.clone()), Ok(Some(expected)));
         let expected = json!({"sensor": "palm", "object": "cup"});
         assert_eq!(merged(None, keys), Ok(Some(expected.clone())));

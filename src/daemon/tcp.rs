@@ -77,3 +77,16 @@ pub(crate) fn keep_alive(stream: impl AsFd, patience: Duration) -> io::Result<()
         patience.as_millis() as u32,
     )?)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_connection_ends_when_its_other_end_takes_nothing_for_long() {
+        let mut listener = Tcp::bind("key", "127.0.0.1:0".parse().unwrap()).unwrap();
+        let _client = std::net::TcpStream::connect(listener.address).unwrap();
+        let stream = listener.accept().await.unwrap();
+        assert_eq!(sockopt::tcp_user_timeout(&stream).unwrap(), 60_000);
+    }
+}

@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use super::answer::{labels, level_of};
 use super::connect::{self, Connection};
 use super::exit::Failure;
-use hardnessd_core::exit::FAILED;
+use hardnessd_core::exit::{FAILED, USAGE};
 use hardnessd_core::wording;
 
 /// The sensor and the socket of a command.
@@ -78,8 +78,13 @@ pub fn run(command: Command) -> Result<(), Failure> {
         Command::Blackbox(target) => json!({"blackbox": target.sensor}),
         Command::Context(Context { target, pairs }) => {
             let hello = daemon.meet()?;
-            let mut context: Map<String, Value> = pairs.into_iter().collect();
-            context.insert("sensor".to_owned(), target.sensor.into());
+            let mut context = Map::from_iter([("sensor".to_owned(), target.sensor.into())]);
+            for (key, value) in pairs {
+                if context.insert(key.clone(), value).is_some() {
+                    let twice = format!("{key}: given twice: give it once");
+                    return Err(Failure::new(USAGE, twice));
+                }
+            }
             // A label may be a number, such as 80.
             let word = |level: &Value| level.as_str().map_or(level.to_string(), str::to_owned);
             let level = context.get("level").map(word);

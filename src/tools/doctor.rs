@@ -18,7 +18,7 @@ use super::absolute;
 use super::exit::Failure;
 use crate::daemon::serial;
 use crate::holders::{holders, processes, under};
-use hardnessd_core::exit::FAILED;
+use hardnessd_core::exit::{FAILED, USAGE};
 use hardnessd_core::port::Port;
 use hardnessd_core::wording::escaped;
 
@@ -59,6 +59,9 @@ pub(super) fn group(gid: u32) -> Option<String> {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let root = Path::new("/");
     let ports = match &args.port {
+        Some(Port::Device(path)) if path.as_os_str().is_empty() => {
+            return Err(Failure::new(USAGE, "--port: found none, expected a path"));
+        }
         Some(port) => vec![port.clone()],
         None => ports(root).into_iter().map(Port::Device).collect(),
     };

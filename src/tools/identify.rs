@@ -103,7 +103,7 @@ pub async fn run(
     };
     let check_count = |found: usize, remedy: &str| match found > most {
         true => {
-            let many = format!("found {found} presses, expected at most {most}: {remedy}");
+            let many = format!("{found} presses in all, expected at most {most}: {remedy}");
             Err(Failure::new(FAILED, many))
         }
         false => Ok(()),
@@ -133,12 +133,12 @@ pub async fn run(
     };
     let made = live::gather(setup, name, wanted, &args.files, print_next, end, read);
     let made = made.await?;
-    let is_twice = |press: &ReferencePress| {
-        let mut earlier = all.iter();
+    let is_twice = |(place, press): (usize, &ReferencePress)| {
+        let mut earlier = all.iter().chain(&made[..place]);
         earlier.any(|earlier| earlier.course.moments == press.course.moments)
     };
-    if made.iter().any(is_twice) {
-        let twice = "has these presses already: name each recording once";
+    if made.iter().enumerate().any(is_twice) {
+        let twice = "would have presses twice: name each recording once";
         return Err(Failure::new(
             FAILED,
             format!("{} {twice}", args.out.display()),

@@ -76,6 +76,13 @@ pub struct Args {
     faults: Option<PathBuf>,
 }
 
+impl Args {
+    /// Whether it ends once a file has all presses.
+    pub fn is_for_file(&self) -> bool {
+        self.to.is_some()
+    }
+}
+
 /// Plays until the presses are over or `shutdown` comes.
 ///
 /// # Errors

@@ -15,6 +15,7 @@ mod view;
 use std::convert::Infallible;
 use std::future::Future;
 use std::io::{self, IsTerminal};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
@@ -35,7 +36,7 @@ use super::control;
 use super::exit::{Fail, Failure};
 use crate::daemon::now;
 use crate::thread::{spawn_thread, start};
-use hardnessd_core::exit::{IO, USAGE};
+use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
 
@@ -124,7 +125,7 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
     let news = sender.clone();
     start("daemon", move || follow(&source, &news))?;
     // The address of the last daemon.
-    let mut daemon_at = None;
+    let (mut daemon_at, mut run) = (None, String::new());
     let mut whole_at = Instant::now() + WHOLE_PICTURES;
     while !is_over.load(Ordering::Relaxed) {
         if Instant::now() >= whole_at {
@@ -149,12 +150,14 @@ fn show(source: Source, is_over: &AtomicBool) -> Result<(), Failure> {
                     Some(Order::Redraw) => screen.forget().of("terminal", IO)?,
                     Some(Order::Merge(keys)) => {
                         let (daemon_at, told) = (daemon_at.clone(), sender.clone());
-                        start("command", move || tell(daemon_at, &keys, &told))?;
+                        let run = run.clone();
+                        start("command", move || tell(daemon_at, &run, &keys, &told))?;
                     }
                     None => {}
                 },
                 Input::Hello(address, hello) => {
                     let is_remote = matches!(address, Address::Tcp(_));
+                    run = hello["run"].as_str().unwrap_or_default().to_owned();
                     view.meet(hello, is_remote, now().mono);
                     daemon_at = Some(address);
                 }
@@ -216,17 +219,21 @@ fn read(mut daemon: Connection, news: &SyncSender<Input>) -> Result<Infallible, 
 }
 
 /// Sets keys of a context at the control socket beside the daemon's other one, and sends the outcome in words.
-fn tell(daemon_at: Option<Address>, keys: &Value, told: &SyncSender<Input>) {
-    let outcome = match daemon_at {
-        Some(Address::Unix(path)) => {
-            let daemon = connect::control(Some(path.with_file_name("control.sock")));
-            let set =
-                daemon.and_then(|mut daemon| control::ask(&mut daemon, json!({"merge": keys})));
-            match set {
-                Ok(_) => "the daemon repeats it in every verdict from now on".to_owned(),
-                Err(error) => format!("counted here only: {}", error.line()),
-            }
+fn tell(daemon_at: Option<Address>, run: &str, keys: &Value, told: &SyncSender<Input>) {
+    let tell = |path: &Path| {
+        let mut daemon = connect::control(Some(path.with_file_name("control.sock")))?;
+        if daemon.meet()?["run"] != run {
+            let other =
+                "control.sock beside the socket is that of another daemon, use `hardnessd context`";
+            return Err(Failure::new(FAILED, other));
         }
+        control::ask(&mut daemon, json!({"merge": keys}))
+    };
+    let outcome = match daemon_at {
+        Some(Address::Unix(path)) => match tell(&path) {
+            Ok(_) => "the daemon repeats it in every verdict from now on".to_owned(),
+            Err(error) => format!("counted here only: {}", error.line()),
+        },
         _ => "counted here only: over TCP nothing can be set, use `hardnessd context`".to_owned(),
     };
     send(told, Input::Said(outcome));

@@ -27,12 +27,10 @@ impl Subscriber {
 
     /// Connects to a socket of a daemon that may still be starting.
     pub fn connect(socket: &Path) -> Self {
-        let mut stream = UnixStream::connect(socket);
+        let mut stream = None;
         wait_for("the socket", || {
-            if stream.is_err() {
-                stream = UnixStream::connect(socket);
-            }
-            stream.is_ok()
+            stream = UnixStream::connect(socket).ok();
+            stream.is_some()
         });
         let stream = stream.unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();

@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use rustix::termios::Winsize;
+use rustix::termios::{tcgetwinsize, tcsetwinsize};
 
 use super::pair::Pair;
 use super::{BINARY, PATIENCE, Process};
@@ -26,14 +26,9 @@ pub struct Terminal {
 ///
 /// `setsid` keeps it from using the terminal that the test was started from.
 pub fn on_terminal(line: &str, device: &OwnedFd) -> Process {
-    let (ws_col, ws_row, ws_xpixel, ws_ypixel) = (80, 24, 0, 0);
-    let size = Winsize {
-        ws_row,
-        ws_col,
-        ws_xpixel,
-        ws_ypixel,
-    };
-    rustix::termios::tcsetwinsize(device, size).unwrap();
+    let mut size = tcgetwinsize(device).unwrap();
+    (size.ws_col, size.ws_row) = (80, 24);
+    tcsetwinsize(device, size).unwrap();
     let end = || Stdio::from(device.try_clone().unwrap());
     let mut command = Command::new("setsid");
     command.arg(BINARY).args(line.split_whitespace());

@@ -14,12 +14,6 @@ use serde_json::{Value, json};
 /// The counts of a press.
 const PRESSED: f32 = 20.0;
 
-/// The table of a sensor whose cable a test holds.
-fn cabled(name: &str, port: &str, stale_after_ms: u32) -> String {
-    let keys = format!("baud = 1000000\nstale_after_ms = {stale_after_ms}\n");
-    sensor(name, port, 100) + &keys
-}
-
 /// A daemon with a sensor on a cable, which is live and tared.
 struct Rig {
     bench: Bench,
@@ -30,14 +24,10 @@ struct Rig {
 
 impl Rig {
     fn start() -> Self {
-        Self::beside("")
-    }
-
-    /// A rig whose configuration has other sensors too.
-    fn beside(sensors: &str) -> Self {
         let bench = Bench::new();
         let cable = Cable::plug(bench.path("port"));
-        let daemon = bench.daemon_of(&(cabled("forearm", "port", 300) + sensors), "");
+        let keys = "baud = 1000000\nstale_after_ms = 300\n";
+        let daemon = bench.daemon_of(&(sensor("forearm", "port", 100) + keys), "");
         let mut subscriber = bench.subscriber();
         subscriber.state("stale");
         let mut rig = Self {
@@ -74,10 +64,8 @@ impl Rig {
     fn release(&mut self, press: u64) -> Value {
         self.cable.play(0.0, 4);
         let end = self.subscriber.press("end");
-        assert_eq!(
-            (&end["press"], &end["reason"]),
-            (&json!(press), &Value::Null)
-        );
+        assert_eq!(end["press"], press);
+        assert_eq!(end["reason"], Value::Null);
         assert_eq!(self.subscriber.verdict()["press"], press);
         end
     }
@@ -88,11 +76,6 @@ impl Rig {
         assert_eq!(self.subscriber.press("begin")["press"], press);
         self.release(press);
     }
-}
-
-/// How much `key` grew from one status to another.
-fn growth(before: &Value, after: &Value, key: &str) -> u64 {
-    after[key].as_u64().unwrap() - before[key].as_u64().unwrap()
 }
 
 fn since(moment: SystemTime, event: &Value) -> Duration {
@@ -115,10 +98,9 @@ fn unplugged_after_any_byte_of_a_frame_a_press_is_aborted_and_no_frame_is_made_u
         let unplugged = rig.cable.unplug();
         let lost = rig.subscriber.state("lost");
         let aborted = rig.subscriber.press("aborted");
-        assert_eq!(
-            (&aborted["press"], &aborted["reason"], &aborted["frames"]),
-            (&json!(press), &json!("lost"), &json!(5))
-        );
+        assert_eq!(aborted["press"], press);
+        assert_eq!(aborted["reason"], "lost");
+        assert_eq!(aborted["frames"], 5);
         assert_eq!(lost["frames"], frames + 5, "byte {byte}");
         assert_eq!(lost["frames_damaged"], 0, "byte {byte}");
         // The kernel drops what nobody had read when the cable went.
@@ -198,49 +180,9 @@ fn half_a_frame_and_silence_are_stale_and_its_other_half_makes_it_whole() {
         rig.cable.write(rest);
         rig.subscriber.state("live");
         let after = rig.status();
-        let more = |key| growth(&before, &after, key);
+        let more = |key| after[key].as_u64().unwrap() - before[key].as_u64().unwrap();
         assert_eq!((more("frames"), more("bytes_skipped")), (frames, skipped));
         before = after;
     }
     assert_eq!(rig.release(1)["frames"], 7);
-}
-
-#[test]
-fn a_lost_sensor_disturbs_no_other() {
-    let mut rig = Rig::beside(&cabled("wrist", "port-2", 60_000));
-    let wrist = Cable::plug(rig.bench.path("port-2"));
-    wrist.wake(&rig.bench, "wrist");
-    wrist.play(0.0, 8);
-    rig.sees(&json!({"type": "status", "state": "live", "sensor": "wrist"}));
-    let types = r#"{"subscribe":["status","press","hardness","frame"]}"#;
-    assert_eq!(rig.subscriber.ask(types)["type"], "ok");
-    rig.cable.play(PRESSED, 5);
-    rig.subscriber.press("begin");
-    rig.cable.unplug();
-    for _ in 0..2 {
-        wrist.play(PRESSED, 10);
-        wrist.play(0.0, 4);
-    }
-    let (mut latest, mut finals) = (None, 0);
-    while finals < 2 {
-        let event = rig.subscriber.next().unwrap();
-        if event["sensor"] == "forearm" {
-            // What came before the loss, the rest of the press, and why the sensor stays lost.
-            let is_loss = event["type"] == "press" && event["reason"] == "lost"
-                || event["type"] == "status" && event["state"] != "live";
-            assert!(is_loss || event["type"] == "frame", "{event}");
-            continue;
-        }
-        assert_eq!(event["sensor"], "wrist", "{event}");
-        match event["type"].as_str().unwrap() {
-            "frame" => {
-                let number = event["frame"].as_u64().unwrap();
-                assert!(latest.is_none_or(|last| number == last + 1), "{event}");
-                latest = Some(number);
-            }
-            "hardness" => finals += u32::from(event["phase"] == "final"),
-            "press" => {}
-            other => panic!("a {other} of the wrist: {event}"),
-        }
-    }
 }

@@ -71,10 +71,8 @@ fn the_control_socket_has_its_mode_and_group_tares_and_gives_presses_their_conte
         }
         assert!(answer.to_string().contains("tare: found"), "{answer}");
     };
-    assert_eq!(
-        (&tared["id"], &tared["tare"]["sensor"]),
-        (&json!(2), &json!("forearm"))
-    );
+    assert_eq!(tared["id"], 2);
+    assert_eq!(tared["tare"]["sensor"], "forearm");
     daemon.logged("new_mean_counts=");
     control.ask(r#"{"context":{"sensor":"forearm"}}"#);
     assert_eq!(subscriber.press("begin")["context"], Value::Null);

@@ -24,18 +24,14 @@ fn a_press_on_the_port_becomes_a_verdict_on_the_socket() {
     let mut daemon = bench.daemon();
     let mut subscriber = bench.subscriber();
     let hello = subscriber.next().unwrap();
-    assert_eq!(
-        (&hello["type"], &hello["protocol"]),
-        (&json!("hello"), &json!(1))
-    );
+    assert_eq!(hello["type"], "hello");
+    assert_eq!(hello["protocol"], 1);
     assert_eq!(hello["robot"], "arm-7");
     assert_eq!(hello["sensors"][0]["name"], "forearm");
     assert_eq!(hello["model"]["levels"].as_array().unwrap().len(), 4);
     let status = subscriber.next().unwrap();
-    assert_eq!(
-        (&status["state"], &status["seq"]),
-        (&json!("connecting"), &Value::Null)
-    );
+    assert_eq!(status["state"], "connecting");
+    assert_eq!(status["seq"], Value::Null);
 
     let _sensor = bench.sensor("--presses 1");
     let begin = subscriber.press("begin");

@@ -284,7 +284,9 @@ def parted(path, directory):
         f"select recording, robot, count(*) from read_parquet('{out}/contact/**/*.parquet', hive_partitioning = true) "
         "group by all order by all"
     ).fetchall()
-    assert [row[:2] for row in counts] == [("a.mcap", "arm-7"), ("b.mcap", "arm-7")] and counts[0][2] == counts[1][2], counts
+    assert [(row[0][:2], row[1]) for row in counts] == [("a-", "arm-7"), ("b-", "arm-7")], counts
+    assert counts[0][2] == counts[1][2], counts
+    assert not list(out.rglob("*.part"))
     assert "--partition" in run(path, "--to", "parquet", "--append", "--out", out, code=2)
 
 

@@ -1,13 +1,11 @@
 //! `hardnessd record --session` on a real pty, with a simulated sensor: its questions and files.
 
 use std::fs;
-use std::process::Command;
 
 use hardnessd_core::recording::{Entry, object_of};
-
 use serde_json::json;
 
-use crate::bench::{Bench, Terminal, hrn_train, ran};
+use crate::bench::{Bench, Terminal};
 
 /// Starts a session in the directory `own`, with a sensor.
 fn session(bench: &Bench, options: &str) -> Terminal {
@@ -57,20 +55,18 @@ fn a_session_asks_for_each_object_and_labels_its_recording() {
     ];
     talk(&mut session, &answers);
     session.sees("recorded 2 objects");
-    // Only presses of a known level count.
-    let score = session.sees(" right");
-    let (right, all) = score
-        .trim_start_matches(" in this session")
-        .trim()
-        .split_once(" of ")
-        .unwrap();
-    let [right, all] = [right, all].map(|count| count.parse::<u64>().unwrap());
-    assert!(right <= all && all >= 2, "{score}");
+    session.sees(" right");
     let fit = format!("hrn-train fit {} --out own.onnx", bench.text_path("own"));
     session.sees(&fit);
     session.ends();
     assert_eq!(files(&bench), 2);
-    assert_collects(&bench);
+    assert!(bench.path("own/002-a--b---c.mcap").exists());
+    let Entry::State(state) = &bench.entries("own/001-yoga-mat.mcap")[0].entry else {
+        panic!("a recording begins with a state");
+    };
+    let labels = ["object", "name", "level"].map(|key| state.labels[key].as_str());
+    let object = object_of("Yoga mat").to_string();
+    assert_eq!(labels, [object.as_str(), "Yoga mat", "4"]);
 
     // The next session continues, and a session without a press leaves no file.
     let mut session = self::session(&bench, "");
@@ -146,24 +142,6 @@ fn a_session_needs_its_sensor_before_the_first_question_and_then_waits_for_it() 
     talk(&mut session, &[("verdict 2: ", "q")]);
     session.sees("recorded 1 object in");
     session.ends();
-}
-
-/// `hrn-train` accepts the recordings unchanged.
-fn assert_collects(bench: &Bench) {
-    let takes = ["001-yoga-mat.mcap", "002-a--b---c.mcap"].map(|name| bench.path("own").join(name));
-    let mut collect = Command::new(hrn_train());
-    collect
-        .arg("collect")
-        .arg("--out")
-        .arg(bench.path("own.npz"));
-    let (code, _, message) = ran(collect.args(takes));
-    assert_eq!(code, 0, "{message}");
-    let Entry::State(state) = &bench.entries("own/001-yoga-mat.mcap")[0].entry else {
-        panic!("a recording begins with a state");
-    };
-    let labels = ["object", "name", "level"].map(|key| state.labels[key].as_str());
-    let object = object_of("Yoga mat").to_string();
-    assert_eq!(labels, [object.as_str(), "Yoga mat", "4"]);
 }
 
 #[test]

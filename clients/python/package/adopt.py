@@ -33,7 +33,7 @@ LEVELS = [
 ]
 # From opset 13 to 17 no operator that the daemon runs changed, and from 9 on only these.
 CHANGED = {"Clip", "Dropout", "LogSoftmax", "Pad", "ReduceSum", "Scan", "Slice", "Softmax", "Split", "Squeeze", "Unsqueeze"}
-# A force above which a taxel is in contact.
+# A force above which a taxel of 3.5 mm pitch is in contact. Others have one in proportion to their area.
 CONTACT_N = 0.07
 
 
@@ -283,12 +283,14 @@ def data_of(path: Optional[str]) -> Dict[str, Any]:
     train = frames[(split == 0) & (level > 0)].astype(np.float32)
     if len(train) == 0:
         raise BadFile(f"{path}: no press of the train split has a level")
-    force, area = train.sum(axis=(1, 2)), (train >= CONTACT_N).sum(axis=(1, 2))
+    pitch_mm = meta.get("pitch_mm") or 3.5
+    contact_n = CONTACT_N * (pitch_mm / 3.5) ** 2
+    force, area = train.sum(axis=(1, 2)), (train >= contact_n).sum(axis=(1, 2))
     spread = np.linspace(0, len(train) - 1, 8).astype(int)
     return {
         "levels": levels,
         "frames": np.maximum(train[spread], 0),
-        "pitch_mm": meta.get("pitch_mm") or 3.5,
+        "pitch_mm": pitch_mm,
         "range": {
             "force_n": [float(force.min()), float(force.max())], "contact_area_taxels": [int(area.min()), int(area.max())],
         },

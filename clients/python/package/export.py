@@ -16,6 +16,7 @@ import argparse
 import collections
 import concurrent.futures
 import datetime
+import hashlib
 import json
 import os
 import pathlib
@@ -190,34 +191,42 @@ class Tables:
         self._rows: Dict[str, List[Dict[str, Any]]] = {name: [] for name in TABLES}
         self.counts: Dict[str, int] = dict.fromkeys(TABLES, 0)
         self._writers: Dict[str, pq.ParquetWriter] = {}
+        self._parts: List[Tuple[pathlib.Path, pathlib.Path]] = []
         # The folder of a partition says the robot.
         self._schemas = dict(TABLES)
         if self._is_parted:
             columns = TABLES["recording"]
             self._schemas["recording"] = columns.remove(columns.get_field_index("robot"))
 
-    def _begin(self, name: str, take: recording.Recording) -> bool:
-        """Opens the files of a recording. Returns whether they are new."""
+    def _begin(self, name: str, take: recording.Recording) -> Optional[str]:
+        """Opens the files of a recording. Returns its name in the tables, or None if they have it."""
         folder, file = "", ""
         if self._is_parted:
             first = next(take._messages(["input", "frame", "contact", "press", "hardness", "status"]), None)
-            day = datetime.datetime.fromtimestamp(first[2] / 1e9 if first else 0, datetime.timezone.utc)
+            first_ns = first[2] if first else 0
+            day = datetime.datetime.fromtimestamp(first_ns / 1e9, datetime.timezone.utc)
             robot = urllib.parse.quote(take.about.get("robot", "unknown"), safe=" ")
             folder = f"robot={robot}/date={day:%Y-%m-%d}/"
-            file = pathlib.PurePath(name).as_posix().replace("/", "_").removesuffix(".mcap")
+            # Recordings of one name are told apart by what they are.
+            made_of = hashlib.sha256(f"{take.about.get('run')} {first_ns}".encode()).hexdigest()[:8]
+            name = file = f"{os.path.basename(name).removesuffix('.mcap')}-{made_of}"
         elif self._writers:
-            return True
+            return name
         for table, schema in self._schemas.items():
             path = f"{table}/{folder}{file}.parquet" if self._is_parted else f"{table}.parquet"
             if (self._output.folder / path).exists():
-                return False
-            self._writers[table] = pq.ParquetWriter(self._output.path(path), schema, compression="zstd")
-        return True
+                return None
+            part = self._output.path(f"{path}.part")
+            self._writers[table] = pq.ParquetWriter(part, schema, compression="zstd")
+            self._parts.append((part, self._output.path(path)))
+        return name
 
     def add(self, name: str, take: recording.Recording) -> None:
-        if not self._begin(name, take):
+        name_in_tables = self._begin(name, take)
+        if name_in_tables is None:
             print(f"{take.path}: it is there already", file=sys.stderr)
             return
+        name = name_in_tables
         about = {key: take.about.get(key) for key in ("robot", "run", "version")}
         settings = json.dumps(take.sensors)
         self._row("recording", recording=name, labels=list(take.labels.items()), sensors=settings, **about)
@@ -261,6 +270,10 @@ class Tables:
                 self._write(name)
             writer.close()
         self._writers.clear()
+        # A file is there once it is whole. The one by which a recording is known comes last.
+        for part, path in reversed(self._parts):
+            part.rename(path)
+        self._parts.clear()
 
     def summary(self) -> str:
         return "rows: " + ", ".join(f"{name} {count}" for name, count in self.counts.items())

@@ -145,7 +145,7 @@ pub struct State {
 }
 
 impl State {
-    /// The current state of `pipeline`. `None` while a press or a tare is under way.
+    /// The current state of `pipeline`. `None` unless it is at rest.
     pub fn of(pipeline: &Pipeline, labels: &Labels) -> Option<Self> {
         Some(Self {
             format: FORMAT,

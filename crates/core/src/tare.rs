@@ -22,7 +22,7 @@ pub struct Contact {
 
 /// The largest force by which [`Tare::follow`] moves a taxel's baseline in one step. One step a
 /// second is 1 N in an hour. Film arrays drift by half as much. A touch that is too light for a
-/// press, below 0.07 N on a taxel, takes four minutes to disappear.
+/// press, below 0.07 N on a taxel, takes four minutes to disappear, also where newtons are a power of the counts.
 pub const MOST_STEP_N: f32 = 1.0 / 3600.0;
 
 /// The largest force of a taxel: more than any sensor feels.
@@ -383,13 +383,13 @@ impl Tare {
         if !self.settings.auto_tare || self.live.iter().any(is_touched) {
             return;
         }
-        for (place, &count) in raw.counts.iter().enumerate() {
-            let above = count - self.baseline[place];
-            // The newtons that stay after the step, and their counts.
-            let stays_n = (self.newtons(above, place).abs() - MOST_STEP_N).max(0.0);
+        let threshold_n = self.contact.threshold_n;
+        for (place, baseline) in self.baseline.iter_mut().enumerate() {
+            let above = raw.counts[place] - *baseline;
             let scale = self.settings.newtons_per_count * self.gains[place];
-            let stays = (stays_n / scale).powf(self.settings.exponent.recip());
-            self.baseline[place] += above - stays.copysign(above);
+            let threshold = (threshold_n / scale).powf(self.settings.exponent.recip());
+            let most = threshold * MOST_STEP_N / threshold_n;
+            *baseline += above.clamp(-most, most);
         }
     }
 

@@ -195,12 +195,6 @@ mod tests {
             let shore = material.properties().shore;
             assert!((shore.low..=shore.high).contains(&f64::from(sample.labels.shore)));
             assert!(begins_press(&sample.frame));
-            // Gains, crosstalk and film creep add force, and thresholds remove it.
-            let ratio = sample.frame.force_n() / f64::from(sample.force_n);
-            assert!(
-                (0.2..1.5).contains(&ratio),
-                "{material:?}: reads {ratio} of the force"
-            );
         }
         let objects: std::collections::BTreeSet<u32> =
             samples.iter().map(|s| s.labels.object).collect();

@@ -335,42 +335,6 @@ mod tests {
     }
 
     #[test]
-    fn the_arm_touches_when_the_sensor_is_loaded_and_never_jumps() {
-        let rate = 50.0;
-        let settings = SequenceSettings {
-            seed: 6,
-            frame_rate_hz: rate,
-            presses: Some(3),
-            ..Default::default()
-        };
-        let frames: Vec<SequenceFrame> = Sequence::new(settings).collect();
-        let mut before = None;
-        for (number, frame) in (0_u32..).zip(&frames) {
-            // Check four positions per frame.
-            for part in 0..4 {
-                let time_s = (f64::from(number) + 0.25 * f64::from(part)) / rate;
-                let now = frame.approach.mm(time_s);
-                let moved: f64 = before.replace(now).map_or(0.0, |before| now - before);
-                assert!(
-                    moved.abs() <= 1.1 * 5.0 * 0.25 / rate,
-                    "{moved} mm at {time_s} s"
-                );
-            }
-            let now = frame.approach.mm(f64::from(number) / rate);
-            assert!(!frame.loaded || now > -1e-9, "touches at {now} mm");
-            assert!(now < 15.0);
-        }
-        let top = |press| {
-            let own = (0_u32..)
-                .zip(&frames)
-                .filter(|(_, frame)| frame.press == press);
-            own.map(|(n, frame)| frame.approach.mm(f64::from(n) / rate))
-                .fold(0.0, f64::max)
-        };
-        assert!((1..=3).all(|press| top(press) > 0.4), "5 N and more");
-    }
-
-    #[test]
     fn every_second_round_is_of_random_materials_whose_hardness_is_known() {
         let settings = SequenceSettings {
             seed: 8,

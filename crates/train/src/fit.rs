@@ -12,7 +12,7 @@ pub mod levels;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use anyhow::{Context as _, ensure};
+use anyhow::{Context as _, bail, ensure};
 use serde_json::json;
 
 use self::candidate::Candidate;
@@ -189,12 +189,20 @@ fn read(
     let sets: Vec<Presses> = sets.collect::<anyhow::Result<_>>()?;
     let layout = Layout::of(sets.is_empty() || sets.iter().any(Presses::are_over_time));
     let mut played = Vec::new();
-    collect::recordings(&recordings, sensor, layout, false, |recording| {
+    collect::recordings(&recordings, sensor, layout, true, |recording| {
         played.push(recording);
         Ok(())
     })?;
     played.sort_by_key(|recording| recording.began);
     let mut doubtful = Vec::new();
+    let all = played.len();
+    played.retain(|recording| !recording.is_unlabelled());
+    if played.len() < all {
+        doubtful.push(format!(
+            "{} recordings are left out, because nothing says what was pressed: give them a label `level`",
+            all - played.len()
+        ));
+    }
     let unnumbered = played
         .iter()
         .filter(|recording| recording.is_unnumbered())
@@ -211,6 +219,19 @@ fn read(
         Some(levels) => levels,
         None => levels::of_labels(played.iter().map(|recording| &recording.labels))?,
     };
+    let mut stated = sets.iter().flat_map(|set| &set.sources);
+    let differs = |source: &&Source| {
+        source
+            .levels
+            .as_ref()
+            .is_some_and(|stated| *stated != levels)
+    };
+    if let Some(source) = stated.find(differs) {
+        bail!(
+            "{}: states other levels than the other data or the configuration, and its numbers are of those",
+            source.path.display()
+        );
+    }
     let settings = Settings {
         levels,
         level: None,

@@ -265,7 +265,6 @@ mod tests {
     #[test]
     fn unusable_settings_are_refused_by_name() {
         for (text, expected) in [
-            ("epoch = 3", "unknown field `epoch`"),
             ("[training]\nepochs = \"3\"", "invalid type: string \"3\""),
             ("[stgan]\nbeta1 = 1", "stgan.beta1: found 1"),
             ("held_out = nan", "held_out: found NaN"),

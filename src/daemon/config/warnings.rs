@@ -101,7 +101,8 @@ impl Setup {
         let mut others = self.config.sensors.iter().filter(|other| {
             other.port == sensor.port && other.frame.request == sensor.frame.request
         });
-        let other = others.find(|other| other.frame.sync != sensor.frame.sync)?;
+        let sync_of = |other: &Settings| other.frame.in_force().ok()?.sync;
+        let other = others.find(|other| sync_of(other) != frame.sync)?;
         is_endless.then(|| {
             let problem = format!(
                 "found none, and no tail: a frame then ends where the next one of the same sync begins, but those \

@@ -1,6 +1,7 @@
 use std::sync::mpsc::Receiver;
 
 use super::*;
+use hardnessd_core::frame::RawFrame;
 use hardnessd_core::pipeline::Clock;
 use hardnessd_core::recording::Ring;
 use hardnessd_core::tests::support::{self, at};
@@ -67,34 +68,21 @@ fn after_a_gap_comes_a_state() {
 #[test]
 fn a_recorder_that_starts_in_a_press_waits_for_the_next_rest() {
     let (sender, inbox) = channel();
-    let (mut recorder, _) = recorder(sender, QUEUED_BYTES);
-    let pressed = support::of_a_press(|_| {}, None, false);
-    let entries = hardnessd_core::recording::Reader::new(&pressed.0[..]);
-    let inputs: Vec<_> = entries
-        .map(Result::unwrap)
-        .filter_map(|found| match found.entry {
-            Entry::Input(input) => Some((input, found.at)),
-            _ => None,
-        })
-        .collect();
-    let mut pipeline = Pipeline::new(pressed.1, support::hrn(), Clock::Arrival);
-    let mut note = |pipeline: &mut Pipeline, (input, at): &(Input, Stamp)| {
-        recorder.note(pipeline, input, *at);
-        pipeline.take(input.to_owned(), *at).unwrap();
-    };
-    // The zero is taken of five frames of a free sensor, which come as the last one here.
-    for _ in 0..5 {
-        pipeline
-            .take(inputs.last().unwrap().0.to_owned(), at(0))
-            .unwrap();
+    let (mut recorder, mut pipeline) = recorder(sender, QUEUED_BYTES);
+    // The first five frames are the zero, and the recorder starts with the second one of a press.
+    let counts = [&[0.0; 5][..], &[60.0; 2], &[0.0; 3]].concat();
+    for (frame, counts) in (0..).zip(counts) {
+        let mut raw = RawFrame::default();
+        raw.counts[400..409].fill(counts);
+        let mut bytes = Vec::new();
+        pipeline.sensor().layout().encode(&raw, &mut bytes);
+        let (input, at) = (Input::Bytes(bytes), at(200 * frame));
+        if frame >= 6 {
+            assert_eq!(pipeline.is_at_rest(), frame == 9, "frame {frame}");
+            recorder.note(&pipeline, &input, at);
+        }
+        pipeline.take(input, at).unwrap();
     }
-    pipeline.take(inputs[0].0.to_owned(), inputs[0].1).unwrap();
-    assert!(!pipeline.is_at_rest(), "a press is under way");
-    for input in &inputs[1..] {
-        note(&mut pipeline, input);
-    }
-    assert!(pipeline.is_at_rest(), "it is released");
-    note(&mut pipeline, inputs.last().unwrap());
     drop(recorder);
     let entries: Vec<Entry> = inbox
         .into_iter()

@@ -21,6 +21,7 @@ use hardnessd_core::part;
 use hardnessd_core::pipeline::Input;
 use hardnessd_core::press::End;
 use hardnessd_core::recording::{self, About, Entry, Ring, Writer};
+use hardnessd_core::wording::escaped;
 
 /// How often written entries are passed to the system. `kill -9` loses no more than this time.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
@@ -167,7 +168,7 @@ impl Worker {
             // If a sensor was missing at the start, the file is not kept, so do not report it.
             if !matches!(gone, Err(Error::Unavailable { .. })) {
                 info!(
-                    path = %path.display(),
+                    path = %escaped(&path.display().to_string()),
                     frames = self.progress.frames,
                     presses = self.progress.presses,
                     "recorded"

@@ -36,14 +36,7 @@ struct Ask {
     is_heard: bool,
     /// The last rest, if the last request had no answer.
     rest: Option<Duration>,
-    /// How often it was asked.
-    count: u32,
 }
-
-/// A sensor that shares its request is not waited for if no frame of it came for this time.
-const GONE_AFTER: Duration = Duration::from_secs(1);
-/// All sensors that share a request are waited for when it has been sent so often: one may be there again.
-const ALL_EVERY: u32 = 20;
 
 /// The requests of the sensors at a port.
 #[derive(Debug)]
@@ -55,13 +48,14 @@ pub(super) struct Turns {
     asking: Option<(usize, Instant)>,
     /// The sensors whose frame of the answer has not come.
     missing: Vec<usize>,
-    /// When the last frame of each sensor came, since the port was opened.
-    heard: Vec<Option<Instant>>,
+    /// Of each sensor without a frame in the last answer to its request: how long the port waits for it no more, and
+    /// until when.
+    absent: Vec<Option<(Duration, Instant)>>,
     /// The last one that was asked, for bytes that come late.
     last: Option<usize>,
     /// The last request without an answer, and when the time for it was over.
     failed: Option<(usize, Instant)>,
-    /// From then on a silent module may be asked.
+    /// From then on a silent module may be asked or waited for.
     may_try: Instant,
 }
 
@@ -86,7 +80,6 @@ impl Turns {
                     asked: None,
                     is_heard: false,
                     rest: None,
-                    count: 0,
                 });
             }
             Some(known.unwrap_or(asks.len() - 1))
@@ -96,7 +89,7 @@ impl Turns {
             asks,
             asking: None,
             missing: Vec::new(),
-            heard: vec![None; sensors.len()],
+            absent: vec![Some((Duration::ZERO, now)); sensors.len()],
             last: None,
             failed: None,
             may_try: now,
@@ -107,9 +100,9 @@ impl Turns {
     pub(super) fn begin(&mut self, now: Instant) {
         (self.asking, self.last) = (None, None);
         for ask in &mut self.asks {
-            (ask.due, ask.is_heard, ask.count) = (now, false, 0);
+            (ask.due, ask.is_heard) = (now, false);
         }
-        self.heard.fill(None);
+        self.absent.fill(Some((Duration::ZERO, now)));
     }
 
     /// Whether bytes are for this sensor: it was asked last, or it sends by itself.
@@ -147,14 +140,14 @@ impl Turns {
         if self.asks[index].rest.take().is_some() {
             self.asks[index].due = now;
         }
-        self.heard[sensor] = Some(now);
+        self.absent[sensor] = None;
         self.missing.retain(|&missing| missing != sensor);
-        let is_for_all = self.asks[index].count % ALL_EVERY == 1;
-        let is_there = |&missing: &usize| {
-            let heard = self.heard[missing];
-            is_for_all || heard.is_some_and(|heard| now - heard < GONE_AFTER)
+        let is_past = |moment: Instant| Some(moment) <= self.asks[index].asked;
+        let is_awaited = |&sensor: &usize| {
+            let absent = self.absent[sensor];
+            absent.is_none_or(|(_, until)| is_past(until) && is_past(self.may_try))
         };
-        let is_whole = !self.missing.iter().any(is_there);
+        let is_whole = !self.missing.iter().any(is_awaited);
         self.asking = self
             .asking
             .filter(|(asked, _)| *asked != index || !is_whole);
@@ -162,15 +155,21 @@ impl Turns {
 
     /// Ends the wait for an answer, and returns the next request, if one is due.
     pub(super) fn ask(&mut self, now: Instant) -> Option<&[u8]> {
-        if let Some((asked, _)) = self.asking.take()
-            && self.missing.len() == self.sharing(asked).count()
-        {
-            let ask = &mut self.asks[asked];
-            let least = ask.timeout.mul_f64(REST);
-            let most = ask.timeout.mul_f64(LONGEST_REST);
-            let rest = ask.rest.map_or(least, |rest| most.min(2 * rest));
-            ask.rest = Some(rest);
-            ask.due = now + rest;
+        if let Some((asked, _)) = self.asking.take() {
+            let timeout = self.asks[asked].timeout;
+            let [least, most] = [REST, LONGEST_REST].map(|share| timeout.mul_f64(share));
+            let longer = |rest: Option<Duration>| (2 * rest.unwrap_or_default()).clamp(least, most);
+            if self.missing.len() == self.sharing(asked).count() {
+                let ask = &mut self.asks[asked];
+                let rest = longer(ask.rest);
+                (ask.rest, ask.due) = (Some(rest), now + rest);
+            } else {
+                for &sensor in &self.missing {
+                    let absent = &mut self.absent[sensor];
+                    let rest = longer(absent.map(|(rest, _)| rest));
+                    *absent = Some((rest, now + rest));
+                }
+            }
             self.may_try = now + least;
             self.failed = Some((asked, now));
         }
@@ -192,7 +191,6 @@ impl Turns {
             })?;
         ask.asked = Some(now);
         ask.due = (ask.due + ask.every).max(now);
-        ask.count = ask.count.wrapping_add(1);
         self.last = Some(index);
         self.asking = (!is_alone).then_some((index, now + ask.timeout));
         self.missing = self.sharing(index).collect();
@@ -277,26 +275,35 @@ mod tests {
         turns.answered(1, begin + ms(30));
         assert_eq!(turns.ask(begin + ms(30)), Some(&b"2"[..]));
         turns.answered(2, begin + ms(30));
-        // Where one of them is silent, the other request waits for it for a second, and then once in a while.
-        let (mut now, mut longest, mut waits) = (begin + ms(30), Duration::ZERO, 0);
-        let mut last = now;
-        while now < begin + Duration::from_secs(4) {
-            now = now.max(turns.due().unwrap());
-            match turns.ask(now).map(<[u8]>::to_vec).as_deref() {
-                Some(b"1") => turns.answered(0, now),
-                Some(_) => {
-                    turns.answered(2, now);
-                    let gap = now - std::mem::replace(&mut last, now);
-                    longest = longest.max(gap);
-                    waits += u32::from(gap > ms(40));
+    }
+
+    #[test]
+    fn sensors_that_are_silent_beside_others_make_none_stale() {
+        let ms = Duration::from_millis;
+        let begin = Instant::now();
+        // Four requests, each of two sensors. The second ones were never there, or come 30 ms after the first ones.
+        for is_there in [false, true] {
+            let all: Vec<Settings> = (0..8).map(|sensor| settings(&[sensor / 2])).collect();
+            let mut turns = Turns::new(&all, begin);
+            let (mut now, mut last, mut longest) = (begin, [begin; 8], Duration::ZERO);
+            let mut hear = |turns: &mut Turns, sensor: usize, now: Instant| {
+                turns.answered(sensor, now);
+                longest = longest.max(now - std::mem::replace(&mut last[sensor], now));
+            };
+            while now < begin + Duration::from_secs(4) {
+                now = now.max(turns.due().unwrap());
+                let Some(asked) = turns.ask(now).map(|request| usize::from(request[0])) else {
+                    continue;
+                };
+                now += ms(1);
+                hear(&mut turns, 2 * asked, now);
+                if is_there && turns.due().is_some_and(|due| due >= now + ms(30)) {
+                    now += ms(30);
+                    hear(&mut turns, 2 * asked + 1, now);
                 }
-                None => {}
             }
+            assert!(longest < ms(150), "{is_there}: {longest:?}");
         }
-        assert!(
-            longest < ms(150) && (15..40).contains(&waits),
-            "{longest:?}, {waits}"
-        );
     }
 
     #[test]

@@ -110,37 +110,23 @@ mod tests {
                 "shore": {"value": 84.2, "low": 72.4, "high": 90.0},
                 "rejected": level.is_none().then_some("ambiguous"), "levels": [1, 2]})
         };
-        let [first, second, third, tenth] = [1, 2, 3, 10].map(|press| {
-            let pressed = SequenceSettings::default().pressed(press);
-            format!("{:<14} {:.0} OO -> ", pressed.name, pressed.shore)
-        });
-        assert!(first.starts_with("hard-plastic   8"), "{first}");
-        for (event, expected) in [
-            (
-                verdict(1, Some(1), "hard", 1.0),
-                format!(
-                    "press 1  {first}84 +- 12 OO, hard                   ok     7.4 N  at edge"
-                ),
-            ),
-            (
-                verdict(2, Some(1), "hard", 0.61),
-                format!(
-                    "press 2  {second}84 +- 12 OO, hard?                  wrong  7.4 N  at edge"
-                ),
-            ),
-            (
-                verdict(3, None, "", 0.3),
-                format!(
-                    "press 3  {third}84 +- 12 OO, hard or medium         -      7.4 N  at edge"
-                ),
-            ),
-            (
-                json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"}),
-                format!("press 10 {tenth}no verdict (short)"),
-            ),
+        let of = |press: u32| {
+            let Pressed { name, shore, .. } = SequenceSettings::default().pressed(press);
+            format!("press {press:<2} {name:<14} {shore:.0} OO -> ")
+        };
+        assert!(of(1).starts_with("press 1  hard-plastic   8"), "{}", of(1));
+        for (press, level, label, confidence, expected) in [
+            (1, Some(1), "hard", 1.0, "hard                   ok   "),
+            (2, Some(1), "hard", 0.61, "hard?                  wrong"),
+            (3, None, "", 0.3, "hard or medium         -    "),
         ] {
+            let expected = format!("{}84 +- 12 OO, {expected}  7.4 N  at edge", of(press));
+            let event = verdict(press.into(), level, label, confidence);
             assert_eq!(account.line(&event), Some(expected));
         }
+        let aborted = json!({"type": "press", "state": "aborted", "press": 10, "reason": "short"});
+        let expected = format!("{}no verdict (short)", of(10));
+        assert_eq!(account.line(&aborted), Some(expected));
         let early = json!({"type": "hardness", "phase": "early", "press": 5, "level": 1});
         assert_eq!(account.line(&early), None);
         assert_eq!(

@@ -87,16 +87,12 @@ fn live_sensor() -> View {
 
 /// A view of one sensor that is live and has been pressed.
 fn pressed_sensor() -> View {
-    view_of(&[
-        (0, hello("a", &["forearm"])),
-        (0, status("forearm", "live")),
-        (
-            0,
-            json!({"type": "press", "sensor": "forearm", "press": 3, "state": "begin"}),
-        ),
-        (100, frame("forearm", 1.5, 8)),
-        (200, verdict(3, Some(2), None)),
-    ])
+    let mut view = live_sensor();
+    let begin = json!({"type": "press", "sensor": "forearm", "press": 3, "state": "begin"});
+    take_event(&mut view, 0, begin);
+    take_event(&mut view, 100, frame("forearm", 1.5, 8));
+    take_event(&mut view, 200, verdict(3, Some(2), None));
+    view
 }
 
 fn picture(view: &View, ms: u64, (width, height): (u16, u16)) -> Buffer {

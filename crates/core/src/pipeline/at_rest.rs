@@ -66,7 +66,7 @@ impl AtRest {
 }
 
 impl Pipeline {
-    /// Whether neither a press nor a tare is under way.
+    /// Whether neither a press is under way nor a tare that has taken in more than a frame.
     pub fn is_at_rest(&self) -> bool {
         self.tracker.is_idle() && self.tare.is_at_rest()
     }

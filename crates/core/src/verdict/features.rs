@@ -19,10 +19,11 @@ pub const FEATURES: usize = FRAME + 103;
 
 /// A taxel of the model's grid is in contact at or above this force.
 const CONTACT_N: f32 = 0.07;
-/// Thresholds above which taxels are counted, in newtons.
-const COUNTED_N: [f32; 5] = [0.2, 0.5, 1.0, 2.0, 4.0];
+/// Thresholds above which taxels are counted, in newtons. They lie a little below round numbers, as the shares do: whole
+/// counts and whole millinewtons of one force round apart.
+const COUNTED_N: [f32; 5] = [0.1999, 0.4999, 0.9999, 1.9999, 3.9999];
 /// Shares of the peak above which taxels are counted.
-const COUNTED_SHARES: [f32; 3] = [0.5, 0.25, 0.75];
+const COUNTED_SHARES: [f32; 3] = [0.4999, 0.2499, 0.7499];
 /// Added before a logarithm or to a divisor to keep it finite.
 const LITTLE_N: f32 = 0.05;
 const LITTLE_MM: f32 = 0.1;
@@ -509,6 +510,22 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+
+    #[test]
+    fn counts_of_0_04_n_give_the_features_of_their_millinewtons() {
+        let of = |newtons: [f32; 2]| {
+            let mut frame = ModelFrame {
+                newtons: [0.0; crate::verdict::TAXELS],
+            };
+            frame.newtons[..2].copy_from_slice(&newtons);
+            of_frame(&frame)
+        };
+        let counts = of([5.0_f32, 10.0].map(|counts| counts * 0.04));
+        let millinewtons = of([200.0_f32, 400.0].map(|newtons| newtons * 1e-3));
+        for (one, other) in counts.into_iter().zip(millinewtons) {
+            assert!((one - other).abs() < 1e-4, "{one}, {other}");
+        }
+    }
 
     proptest! {
         #[test]

@@ -29,6 +29,7 @@ pub struct Place {
     /// Whether the next byte follows the end of a frame.
     pub in_sync: bool,
     /// Whether the bytes since the last frame or restart began with options of telnet.
+    #[serde(default)]
     pub is_telnet: bool,
 }
 

@@ -71,10 +71,8 @@ fn check(line: &str, expected: &str) {
 
 #[test]
 fn status_is_frozen() {
-    check(
-        &Event::Status(status()).to_line(),
-        r#"{"type":"status","seq":7,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"lost","reason":"end of file","frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":5.0,"detail":null}"#,
-    );
+    let frozen = r#"{"type":"status","seq":7,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"lost","reason":"end of file","frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":5.0,"detail":null}"#;
+    check(&Event::Status(status()).to_line(), frozen);
     let asked = Status {
         seq: None,
         reason: None,
@@ -82,10 +80,8 @@ fn status_is_frozen() {
         frame_rate_hz: None,
         ..status()
     };
-    check(
-        &Event::Status(asked).to_line(),
-        r#"{"type":"status","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"connecting","reason":null,"frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":null,"detail":null}"#,
-    );
+    let frozen = r#"{"type":"status","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","state":"connecting","reason":null,"frames":100,"frames_damaged":2,"frames_dropped":3,"bytes_skipped":1580,"frame_rate_hz":null,"detail":null}"#;
+    check(&Event::Status(asked).to_line(), frozen);
 }
 
 #[test]
@@ -101,18 +97,14 @@ fn press_is_frozen() {
         frames: 1,
         context: None,
     };
-    check(
-        &Event::Press(press).to_line(),
-        r#"{"type":"press","seq":1,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"state":"aborted","frame":44,"reason":"short","frames":1,"context":null}"#,
-    );
+    let frozen = r#"{"type":"press","seq":1,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"state":"aborted","frame":44,"reason":"short","frames":1,"context":null}"#;
+    check(&Event::Press(press).to_line(), frozen);
 }
 
 #[test]
 fn hardness_is_frozen() {
-    check(
-        &Event::Hardness(hardness()).to_line(),
-        r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#,
-    );
+    let frozen = r#"{"type":"hardness","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"final","level":2,"label":"firm","rejected":null,"notes":["at_edge","saturated","outside_training"],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":{"tag":"pick-17"},"mono_ns":5000000000,"age_at_publish_ms":0.25,"latency_us":150,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#;
+    check(&Event::Hardness(hardness()).to_line(), frozen);
     let mut rejected = Event::Hardness(Hardness {
         phase: Phase::Early,
         level: None,
@@ -126,10 +118,8 @@ fn hardness_is_frozen() {
         ..hardness()
     });
     rejected.number(9);
-    check(
-        &rejected.to_line(),
-        r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#,
-    );
+    let frozen = r#"{"type":"hardness","seq":9,"sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","press":3,"phase":"early","level":null,"label":null,"rejected":"low_confidence","notes":[],"probabilities":[0.125,0.75,0.125,0.0],"confidence":0.75,"frame":41,"contact_area_taxels":25,"contact_area_mm2":306.25,"force_n":12.346,"model":"0123456789ab","state":"live","context":null,"mono_ns":null,"age_at_publish_ms":null,"latency_us":null,"shore":null,"levels":null,"course":null,"stiffness_n_per_mm":null,"references":"none","advice":null,"object":null}"#;
+    check(&rejected.to_line(), frozen);
 }
 
 #[test]
@@ -159,10 +149,8 @@ fn frame_is_frozen_and_never_numbered() {
         approach_mm: None,
     });
     frame.number(9);
-    check(
-        &frame.to_line(),
-        r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":1,"cols":3,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"force_n":10.323,"tared":true,"approach_mm":null}"#,
-    );
+    let frozen = r#"{"type":"frame","sensor":"forearm","time":"2023-11-14T22:13:20.123456Z","frame":5,"rows":1,"cols":3,"newtons":[0.0,0.123,10.2],"contact_area_taxels":2,"force_n":10.323,"tared":true,"approach_mm":null}"#;
+    check(&frame.to_line(), frozen);
 }
 
 #[test]

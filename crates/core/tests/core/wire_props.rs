@@ -47,9 +47,6 @@ fn layouts() -> impl Iterator<Item = (&'static str, Layout)> {
 /// The most bytes of a mark of these layouts.
 const MARK_BYTES: usize = 5;
 
-/// The counts of a small frame.
-const SIX: [f32; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
-
 /// Press-like frames: mostly zeros, some counts up to 250.
 fn frames(layout: &Layout, seed: u64, count: usize) -> Vec<RawFrame> {
     // Knuth's linear congruential generator.
@@ -178,19 +175,13 @@ fn flipped_bits_are_caught_and_counted_where_there_is_a_checksum() {
     }
 }
 
-/// A frame whose counts hold a header of jq from `first` on.
-fn with_header_inside(mut raw: RawFrame, first: usize) -> RawFrame {
-    raw.counts[first..first + 4].copy_from_slice(&[0xAA as f32, 0x55 as f32, 3.0, 0x99 as f32]);
-    raw
-}
-
 #[test]
 fn a_header_in_the_data_of_jq_costs_no_frame_in_sync_and_none_after_damage_unless_another_follows()
 {
     let layout = layout("preset = 'jq'");
-    let plain = frames(&layout, 8, 6);
-    let mut sent = plain;
-    sent[1] = with_header_inside(sent[1].clone(), 300);
+    let mut sent = frames(&layout, 8, 6);
+    let header = [0xAA_u8, 0x55, 0x03, 0x99].map(f32::from);
+    sent[1].counts[300..304].copy_from_slice(&header);
     let whole = encode(&layout, &sent);
     assert_eq!(decode(&layout, [whole.as_slice()]), (sent.clone(), 0));
     for lost in (788 + 4..2 * 788).step_by(5) {
@@ -241,7 +232,8 @@ fn in_rows(frames: &[RawFrame], end: &str) -> Vec<u8> {
 fn every_part_of_a_frame_stands_where_it_should() {
     // Two rows of three cells: the sensor's first row is 1 2 3, and its second is 4 5 6.
     let mut frame = RawFrame::zero(Array { rows: 2, cols: 3 });
-    frame.counts.copy_from_slice(&SIX);
+    let counts = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+    frame.counts.copy_from_slice(&counts);
     for (text, expected) in [
         ("order = 'serpentine'", &[1, 2, 3, 6, 5, 4][..]),
         ("order = 'column-major'", &[1, 4, 2, 5, 3, 6]),
@@ -302,13 +294,8 @@ fn a_layout_that_cannot_work_is_refused_with_its_key() {
         let error = Layout::new(&settings).unwrap_err().to_string();
         assert!(error.starts_with(expected), "{keys}: {error}");
     }
-    for (text, expected) in [
-        ("sync = 'B'", "pairs of hex digits"),
-        ("footer_bytes = -1", "invalid value: integer `-1`"),
-    ] {
-        let error = toml::from_str::<Settings>(text).unwrap_err().to_string();
-        assert!(error.contains(expected), "{error}");
-    }
+    let error = toml::from_str::<Settings>("sync = 'B'").unwrap_err();
+    assert!(error.to_string().contains("pairs of hex digits"), "{error}");
 }
 
 proptest! {
@@ -445,13 +432,8 @@ fn a_damaged_line_is_counted_and_costs_no_other() {
 fn counts(text: &str, bytes: &[u8]) -> (Vec<Vec<f32>>, u64) {
     let layout = layout(&format!("rows = 1\ncols = 3\n{text}"));
     let (found, damaged) = decode(&layout, [bytes]);
-    (
-        found
-            .into_iter()
-            .map(|frame| frame.counts.into_vec())
-            .collect(),
-        damaged,
-    )
+    let counts = found.into_iter().map(|frame| frame.counts.into_vec());
+    (counts.collect(), damaged)
 }
 
 #[test]

@@ -63,16 +63,15 @@ impl Number {
             jitter,
         }
     }
+}
 
-    fn write(self, value: u64, out: &mut Vec<u8>) {
-        let little = value.to_le_bytes();
-        let bytes = &little[..self.bytes];
-        if self.is_big_endian {
-            out.extend(bytes.iter().rev());
-        } else {
-            out.extend(bytes);
-        }
+/// A whole number of so many bytes.
+fn whole(value: u64, bytes: usize, is_big_endian: bool) -> Vec<u8> {
+    let mut written = value.to_le_bytes()[..bytes].to_vec();
+    if is_big_endian {
+        written.reverse();
     }
+    written
 }
 
 /// A stream of bytes of a random layout.
@@ -141,26 +140,20 @@ pub(crate) fn case(seed: u64) -> Case {
         let start = bytes.len();
         bytes.extend(&sync);
         let cells_bytes = array.taxels() * cell_bytes;
-        match length {
-            0 => bytes.extend((cells_bytes as u16).to_le_bytes()),
-            1 => bytes.extend((cells_bytes as u16).to_be_bytes()),
-            _ => {}
+        if length < 2 {
+            bytes.extend(whole(cells_bytes as u64, 2, length == 1));
         }
         let mut write = |which: usize, number: Option<Number>, bytes: &mut Vec<u8>| {
             if let Some(number) = number {
-                number.write(numbers[which], bytes);
+                bytes.extend(whole(numbers[which], number.bytes, number.is_big_endian));
                 let jitter = stream.below(2 * number.jitter as usize + 1) as u64;
                 numbers[which] += number.step + jitter - number.jitter;
             }
         };
         write(0, header, &mut bytes);
         let cells_at = bytes.len();
-        for count in frame.counts.iter().map(|&count| count as u16) {
-            match (cell_bytes, is_big_endian) {
-                (1, _) => bytes.push(count as u8),
-                (_, false) => bytes.extend(count.to_le_bytes()),
-                (_, true) => bytes.extend(count.to_be_bytes()),
-            }
+        for &count in &frame.counts {
+            bytes.extend(whole(count as u64, cell_bytes, is_big_endian));
         }
         let cells_end = bytes.len();
         write(1, footer, &mut bytes);

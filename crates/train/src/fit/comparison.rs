@@ -130,6 +130,8 @@ impl Estimate {
         let balanced_accuracy = interval::mean(&chosen_by, Mean::OfStrata);
         let worth = match interval::of(&chosen_by, Mean::OfStrata) {
             Some([low, _]) if balanced_accuracy < 1.0 => low,
+            // One press of a level says little, unless all are right.
+            None if balanced_accuracy < 1.0 => 0.0,
             _ => balanced_accuracy,
         };
         let shown = drawn(has_several || division == Division::NewObjects);

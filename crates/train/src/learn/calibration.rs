@@ -323,16 +323,4 @@ mod tests {
         let expected = 9.0_f32.ln() / 1.5_f32.ln();
         assert!((found - expected).abs() < 0.05, "{found}");
     }
-
-    #[test]
-    fn few_objects_give_no_sets_and_promise_nothing() {
-        let press = |n: u64| judged(n / 3, (n % 2) as usize, true, 1.0);
-        let of = |objects: u64| {
-            let judged = (0..3 * objects).map(press);
-            calibrated(judged, Unit::Object).conformal()
-        };
-        let enough = of(9).unwrap().threshold;
-        assert!((enough - 0.5).abs() < 1e-3, "{enough}");
-        assert_eq!([of(8), of(0)], [None, None]);
-    }
 }

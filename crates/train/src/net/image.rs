@@ -47,7 +47,8 @@ impl PixelScale {
         let batch = frames.len();
         let mut values = Vec::with_capacity(batch * TAXELS);
         for frame in frames {
-            values.extend(frame.newtons.map(|newtons| self.pixel(newtons)));
+            // As the daemon does: noise may be below 0.
+            values.extend(frame.newtons.map(|newtons| self.pixel(newtons.max(0.0))));
         }
         Tensor::from_data(TensorData::new(values, [batch, 1, ROWS, COLS]), device)
     }
@@ -79,6 +80,12 @@ mod tests {
                 let back = scale.newtons(scale.pixel(newtons));
                 assert!((back - newtons).abs() < 1e-5 * newtons.max(1.0), "{back}");
             }
+            // Noise below 0 is no force, as in the daemon.
+            let frames = [-0.3, 0.0].map(|newtons| ModelFrame {
+                newtons: [newtons; TAXELS],
+            });
+            let image = scale.images(frames.iter(), &Device::default()).into_data();
+            assert_eq!(image.try_to_vec::<f32>().unwrap(), [-1.0; 2 * TAXELS]);
         }
     }
 }

@@ -46,7 +46,12 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     let hrn = desk.model("whole/hrn.onnx");
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     assert!(hrn.card().conformal.is_some());
-    let presses = desk.presses("d.npz");
+    let (presses, meta) = (desk.presses("d.npz"), desk.meta("d.npz"));
+    assert_eq!(meta["materials"][11], "broad-layered");
+    assert_eq!(meta["levels"][1]["shore"], "60-70");
+    let mut courses = (0..presses.all.len()).map(|press| presses.course(press).moments);
+    let is_slow = courses.all(|moments| moments[1].time_s - moments[0].time_s > 0.049);
+    assert!(is_slow, "the frame rates are those of the file");
     let mut course = presses.course(0);
     desk.succeeds("inspect whole/hrn.onnx");
     let known = hrn.judge_course(&course).unwrap();
@@ -65,8 +70,10 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     assert!(rmse(&evaluation) < spread_of_shore(&presses));
     // A model of one frame judges each press's best frame of the same file.
     desk.write("m.onnx", BUILT_IN_HRN);
-    let evaluation = desk.json("evaluate --model m.onnx --data d.npz --json");
+    let evaluation = desk.json("evaluate --model m.onnx --data d.npz --json --verdicts v.csv");
     assert!(rmse(&evaluation) < spread_of_shore(&presses));
+    let verdicts = desk.text("v.csv").lines().skip(1).count();
+    assert_eq!(evaluation["n"], verdicts);
     assert_eq!(evaluation["sets"], Value::Null);
     assert_eq!(evaluation["n"], known["n"]);
 

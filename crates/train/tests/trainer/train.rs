@@ -240,29 +240,6 @@ fn another_seed_gives_other_weights_and_a_run_is_not_overwritten() {
 }
 
 #[test]
-fn broad_data_say_their_levels() {
-    let desk = Desk::new();
-    let few = "--shapes wide --presses 2 --objects 2 --test-objects 1";
-    desk.succeeds(&format!("simulate --materials broad {few} --out d.npz"));
-    let (samples, meta) = (desk.presses("d.npz").all, desk.meta("d.npz"));
-    assert_eq!(samples.len(), 4 * 3 * 2);
-    assert_eq!(meta["materials"][11], "broad-layered");
-    assert_eq!(meta["levels"][1]["shore"], "60-70");
-    for sample in &samples {
-        let shore = sample.shore.unwrap();
-        let borders = [70.0, 60.0, 50.0];
-        let expected = 1 + borders.iter().filter(|&&border| shore < border).count();
-        assert_eq!(usize::from(sample.level), expected, "Shore {shore}");
-    }
-    desk.write("m.onnx", BUILT_IN_HRN);
-    let evaluate = "evaluate --model m.onnx --data d.npz --split train --json --verdicts v.csv";
-    let evaluation = desk.json(evaluate);
-    assert!(evaluation["shore"]["rmse"].is_number(), "{evaluation}");
-    let verdicts = desk.text("v.csv");
-    assert_eq!(verdicts.lines().count(), 1 + 16, "{verdicts}");
-}
-
-#[test]
 fn forces_far_from_those_of_the_training_are_said() {
     let desk = Desk::with_few_presses();
     let own = desk.presses("d.npz");
@@ -278,25 +255,6 @@ fn forces_far_from_those_of_the_training_are_said() {
         let (_, _, said) = desk.run(&evaluate);
         let is_said = said.contains("presses are far from the ");
         assert_eq!(is_said, expected, "{said}");
-    }
-}
-
-#[test]
-fn rare_settings_of_simulated_presses_are_those_of_a_file() {
-    let desk = Desk::new();
-    let rate = "frame_rate_hz = [20, 20]\n[objects]\ntest_objects = 0\n";
-    desk.write("own.toml", rate);
-    desk.succeeds(
-        "simulate --sequences --materials broad --objects 1 --test-objects 1 --presses 2 --config own.toml --out d.npz",
-    );
-    let presses = desk.presses("d.npz");
-    assert!((6..=8).contains(&presses.all.len()));
-    for press in 0..presses.all.len() {
-        let moments = presses.course(press).moments;
-        let times: Vec<f32> = moments.iter().map(|moment| moment.time_s).collect();
-        let frame_s = times[1] - times[0];
-        let is_of_file = (frame_s - 0.05).abs() < 1e-4;
-        assert!(times.len() == 48 || is_of_file, "{times:?}");
     }
 }
 

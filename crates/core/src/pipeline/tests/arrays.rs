@@ -76,24 +76,19 @@ fn a_contact_is_the_same_on_arrays_of_any_size_and_pitch() {
         let array = Array { rows, cols };
         let pitch = Pitch { rows_mm, cols_mm };
         let found = verdict(array, pitch);
-        assert_eq!(found.notes, notes, "{array} at {pitch}");
-        assert!(
-            (found.force_n / FORCE_N - 1.0).abs() < 0.01,
-            "{array} at {pitch}"
-        );
+        let what = format!("{array} at {pitch}: {found:?}");
+        assert_eq!(found.notes, notes, "{what}");
+        assert!((found.force_n / FORCE_N - 1.0).abs() < 0.01, "{what}");
         let area_mm2 = std::f64::consts::PI * RADIUS_MM.powi(2);
         let share = found.contact_area_mm2 / area_mm2;
         // A taxel that the contact only touches counts with its whole area.
         let most = (1.0 + rows_mm.max(cols_mm) / RADIUS_MM).powi(2);
-        assert!(
-            (0.7..most).contains(&share),
-            "{share} on {array} at {pitch}"
-        );
+        assert!((0.7..most).contains(&share), "{share} on {what}");
         if pitch.area_mm2() <= 12.5 {
-            assert_eq!(found.level, known.level, "{array} at {pitch}");
+            assert_eq!(found.level, known.level, "{what}");
             let apart = found.probabilities.iter().zip(&known.probabilities);
             let apart = apart.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(apart < 0.1, "{apart} on {array} at {pitch}");
+            assert!(apart < 0.1, "{apart} on {what}");
         }
     }
 }

@@ -23,11 +23,7 @@ fn frames() -> Presses {
             material: Some((i / 6) as u8),
             force_n: Some(2.5),
             shore: Some(70.0).filter(|_| i > 0),
-            kind: if i > 9 {
-                Kind::Recorded
-            } else {
-                Kind::Simulated
-            },
+            kind: [Kind::Simulated, Kind::Recorded][usize::from(i > 9)],
             ..Press::default()
         };
         presses.push(press, [(0.0, None, frame.newtons)]);
@@ -320,15 +316,14 @@ fn what_is_not_as_agreed_is_named_with_what_was_found_and_expected() {
         add_frames(npz, 2, 0.0);
         npz.add_list("shore", &[1.0, f32::INFINITY]).unwrap();
     });
-    let check_meta = |expected: &str, meta: &str| {
-        let meta = meta.as_bytes();
-        check(expected, |npz| npz.add_list("meta", meta).unwrap());
-    };
-    check_meta("array `meta`: found EOF", "{");
-    let expected = "array `meta`: found pitch_mm -1, expected millimetres from 0.01 to 1000";
-    check_meta(expected, r#"{"pitch_mm":-1}"#);
-    let expected = "array `meta`: found grid_pitch_mm 0, expected";
-    check_meta(expected, r#"{"grid_pitch_mm":0}"#);
+    for (meta, expected) in [
+        (&b"{"[..], "found EOF"),
+        (b"{\"pitch_mm\":-1}", "found pitch_mm -1, expected milli"),
+        (b"{\"grid_pitch_mm\":0}", "found grid_pitch_mm 0, expected"),
+    ] {
+        let expected = format!("array `meta`: {expected}");
+        check(&expected, |npz| npz.add_list("meta", meta).unwrap());
+    }
     for (level, expected) in [
         (0.5, "found 0.5 at 1, expected u8 [N]"),
         (-1.0, "found -1.0 at 1, expected u8 [N]"),
