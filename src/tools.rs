@@ -16,6 +16,7 @@ pub mod identify;
 pub mod live;
 mod played;
 mod player;
+mod prompts;
 pub(crate) mod pty;
 pub mod record;
 pub mod recover;

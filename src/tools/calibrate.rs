@@ -139,8 +139,8 @@ pub async fn run(
         move |file, path: &Path| gather::presses(file, path, &sensor, &hrn)
     };
     let (name, wanted) = (sensor.name(), args.wanted());
-    let print_next = |seen| print_next(&args, seen);
-    let presses = live::gather(setup, name, wanted, &args.from, print_next, end, read);
+    let next = |seen| next(&args, seen);
+    let presses = live::gather(setup, name, wanted, &args.from, next, end, read);
     let presses = presses.await?;
     let text = match out {
         None if matches!(args.what, What::Arm) => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
@@ -151,19 +151,19 @@ pub async fn run(
     Ok(())
 }
 
-/// Says on stderr what to do next, after `seen` presses.
-fn print_next(args: &Args, seen: u64) {
+/// What to do next, after `seen` presses.
+fn next(args: &Args, seen: u64) -> String {
     let wanted = args.wanted();
     match (args.what, args.newtons.get(seen as usize)) {
         (What::Force, Some(newtons)) => {
-            stderr_line!("put {newtons} N on the sensor, wait until it rests, and take it off");
+            format!("put {newtons} N on the sensor, wait until it rests, and take it off")
         }
-        (What::Force, None) => stderr_line!("done"),
-        _ if seen > 0 => stderr_line!("press {seen} of {wanted}"),
-        (What::Arm, _) => stderr_line!(
-            "press something rigid {wanted} times, while the robot tells where its arm is"
-        ),
-        (What::Taxels, _) => stderr_line!(
+        (What::Force, None) => "done".to_owned(),
+        _ if seen > 0 => format!("press {seen} of {wanted}"),
+        (What::Arm, _) => {
+            format!("press something rigid {wanted} times, while the robot tells where its arm is")
+        }
+        (What::Taxels, _) => format!(
             "lay a bag of air or water on the whole array, and press it through a plate {wanted} times"
         ),
     }

@@ -26,7 +26,6 @@ use hardnessd_core::part::Part;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::references;
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::stderr_line;
 use hardnessd_core::verdict::{
     Borders, Level, MOST_REFERENCES, Model, Piece, ReferencePress, TimeSeries, Tried,
 };
@@ -127,11 +126,11 @@ pub async fn run(
         move |file, path: &Path| of_file(&args, what, file, path, &sensor, &hrn)
     };
     let (name, wanted) = (sensor.name(), args.presses);
-    let print_next = |seen: u64| match seen {
-        0 => stderr_line!("press it {wanted} times, harder each time"),
-        _ => stderr_line!("press {seen} of {wanted}"),
+    let next = |seen: u64| match seen {
+        0 => format!("press it {wanted} times, harder each time"),
+        _ => format!("press {seen} of {wanted}"),
     };
-    let made = live::gather(setup, name, wanted, &args.files, print_next, end, read);
+    let made = live::gather(setup, name, wanted, &args.files, next, end, read);
     let made = made.await?;
     let is_twice = |(place, press): (usize, &ReferencePress)| {
         let mut earlier = all.iter().chain(&made[..place]);

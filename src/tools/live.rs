@@ -13,6 +13,7 @@ use rustix::process::Signal;
 use tokio::sync::watch;
 
 use super::exit::{Fail, Failure};
+use super::prompts::Prompts;
 use super::record;
 use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
@@ -21,12 +22,11 @@ use crate::thread;
 use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::recording::Labels;
 use hardnessd_core::sensor::Sensor;
-use hardnessd_core::stderr_line;
 
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
 
-/// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now. `print_next` is that of
+/// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now. `next` is that of
 /// [`record`].
 ///
 /// # Errors
@@ -37,12 +37,12 @@ pub(super) async fn gather<T: Send + 'static>(
     sensor: &str,
     wanted: u64,
     files: &[PathBuf],
-    print_next: impl Fn(u64),
+    next: impl Fn(u64) -> String,
     end: impl Future<Output = Signal>,
     read: impl Fn(File, &Path) -> Result<Vec<T>, Failure> + Send + 'static,
 ) -> Result<Vec<T>, Failure> {
     if files.is_empty() {
-        let made = record(setup, sensor, wanted, print_next, end).await?;
+        let made = record(setup, sensor, wanted, next, end).await?;
         let mut all = read(made, Path::new("what was recorded"))?;
         // Something else may have been pressed before the recording ended.
         all.truncate(wanted as usize);
@@ -63,14 +63,14 @@ pub(super) async fn gather<T: Send + 'static>(
     }
 }
 
-/// Records `wanted` presses of `sensor`. `print_next` is called with the number of presses so far, when the zero is
+/// Records `wanted` presses of `sensor`. `next` says what to do after the number of presses so far, when the zero is
 /// taken and after each press. The other sensors of the configuration stay closed: their presses would count, and a
 /// missing one would end the command.
 async fn record(
     mut setup: Setup,
     sensor: &str,
     wanted: u64,
-    print_next: impl Fn(u64),
+    next: impl Fn(u64) -> String,
     end: impl Future<Output = Signal>,
 ) -> Result<File, Failure> {
     setup.sensors.retain(|one| one.name() == sensor);
@@ -85,16 +85,17 @@ async fn record(
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
     let mut file = tempfile::tempfile().of(path.display(), IO)?;
     let mut stopped = None;
+    let prompts = Prompts::start()?;
     let enough = async |mut counted: watch::Receiver<Progress>| {
         let made = async {
-            stderr_line!("leave the sensor free until its zero is taken");
+            prompts.say("leave the sensor free until its zero is taken\n");
             // The presses at the last prompt.
             let mut shown = None;
             while shown < Some(wanted) && counted.changed().await.is_ok() {
                 let Progress { tared, presses, .. } = *counted.borrow_and_update();
                 if tared > 0 && shown != Some(presses) {
                     shown = Some(presses);
-                    print_next(presses);
+                    prompts.say(&format!("{}\n", next(presses)));
                 }
             }
             tokio::time::sleep(LAST_POSITIONS).await;
@@ -107,6 +108,7 @@ async fn record(
     let (sockets, labels) = (Sockets::Configured, Labels::new());
     let without = WithoutSensor::End;
     let (recorded, _) = record::record(setup, sockets, &path, &file, labels, without, enough).await;
+    prompts.end().await;
     recorded?;
     if let Some(signal) = stopped {
         return Err(Failure::interrupted(signal));

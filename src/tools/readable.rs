@@ -16,22 +16,9 @@ pub(super) fn printed(json: &str, is_json: bool, labels: &[String]) -> String {
     let text = match (is_json, io::stdout().is_terminal()) {
         (false, _) => line(&serde_json::from_str(json).unwrap_or_default(), labels),
         (true, false) => json.to_owned(),
-        (true, true) => json_escaped(json),
+        (true, true) => wording::json_escaped(json),
     };
     text + "\n"
-}
-
-/// The same JSON without hidden characters, for a terminal. They are inside strings only.
-pub(super) fn json_escaped(line: &str) -> String {
-    let mut escaped = String::with_capacity(line.len());
-    for c in line.chars() {
-        if wording::is_hidden(c) {
-            escaped += &format!("\\u{:04x}", u32::from(c));
-        } else {
-            escaped.push(c);
-        }
-    }
-    escaped
 }
 
 /// The line of one event, without its newline.
@@ -171,7 +158,7 @@ mod tests {
     #[test]
     fn on_a_terminal_the_same_json_has_no_hidden_characters() {
         let line = "{\"label\":\"a\u{202e}b\u{9b}é\"}";
-        let safe = json_escaped(line);
+        let safe = wording::json_escaped(line);
         assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
         let [same, of] = [&safe, line].map(|text| serde_json::from_str::<Value>(text).unwrap());
         assert_eq!(same, of);

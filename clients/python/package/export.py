@@ -702,7 +702,8 @@ def export(paths: Sequence[str], options: argparse.Namespace) -> str:
                     writer.add(name, take)
         writer.close()
         if left_out:
-            lines = "".join(f"{path}\t{why}\n" for path, why in left_out)
+            rows = [[json.dumps(str(cell), ensure_ascii=False)[1:-1] for cell in row] for row in left_out]
+            lines = "".join("\t".join(row) + "\n" for row in rows)
             with open(output.path(LEFT_OUT), "a") as file:
                 file.write(lines)
         counted = f"; {len(left_out)} recordings left out, see {LEFT_OUT}" if left_out else ""

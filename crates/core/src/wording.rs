@@ -94,6 +94,19 @@ pub fn lines(text: &str) -> String {
     lines.join("\n")
 }
 
+/// The same JSON without hidden characters, for a terminal. They are inside strings only.
+pub fn json_escaped(json: &str) -> String {
+    let mut escaped = String::with_capacity(json.len());
+    for c in json.chars() {
+        if is_hidden(c) {
+            escaped += &format!("\\u{:04x}", u32::from(c));
+        } else {
+            escaped.push(c);
+        }
+    }
+    escaped
+}
+
 /// The error of a command line, as clap renders it, on one line.
 pub fn of_usage(rendered: &str) -> String {
     let error = rendered.split("\n\nUsage:").next().unwrap_or_default();

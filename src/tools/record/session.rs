@@ -6,7 +6,7 @@
 
 use std::fs;
 use std::future::Future;
-use std::io::{self, BufRead as _, IsTerminal, Write};
+use std::io::{self, BufRead as _, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 
@@ -21,6 +21,7 @@ use crate::daemon::serial;
 use crate::score::Score;
 use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
+use crate::tools::prompts::Prompts;
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, object_of};
 use hardnessd_core::verdict::{Borders, Level};
@@ -28,6 +29,7 @@ use hardnessd_core::verdict::{Borders, Level};
 /// The user at the terminal.
 struct User<'a> {
     lines: mpsc::Receiver<String>,
+    prompts: Prompts,
     shutdown: Pin<&'a mut dyn Future<Output = ()>>,
 }
 
@@ -46,7 +48,15 @@ impl User<'_> {
                 }
             }
         })?;
-        Ok(User { lines, shutdown })
+        Ok(User {
+            lines,
+            prompts: Prompts::start()?,
+            shutdown,
+        })
+    }
+
+    fn say(&self, text: &str) {
+        self.prompts.say(text);
     }
 
     /// The next line. `None` if no more lines come: do not ask again then.
@@ -65,14 +75,14 @@ impl User<'_> {
         usable: impl Fn(&str) -> Result<T, String>,
     ) -> Option<T> {
         loop {
-            print(&format!("{question}: "));
+            self.say(&format!("{question}: "));
             let answer = self.line().await?;
             if answer == "q" {
                 return None;
             }
             match usable(&answer) {
                 Ok(answer) => return Some(answer),
-                Err(problem) => print(&format!("{problem}\n")),
+                Err(problem) => self.say(&format!("{problem}\n")),
             }
         }
     }
@@ -99,7 +109,8 @@ impl User<'_> {
         let hardness = |answer: &str| hardness(answer, levels);
         let (shore, level) = self.ask(&question, hardness).await?;
         if let (Some(_), Some(level)) = (&shore, level) {
-            print(&format!("level {} ({})\n", level.level, level.label));
+            let level = format!("level {} ({})\n", level.level, level.label);
+            self.say(&level);
         }
         let level = level.map_or(0, |level| level.level);
         let path = directory.join(format!("{number:03}-{}.mcap", slug(&name)));
@@ -156,33 +167,36 @@ pub(super) async fn run(
         opened.map_err(|reason| unavailable(sensor, reason))?;
     }
     let mut user = User::at_terminal(shutdown)?;
-    print("One recording for each object. `q` ends the session.\n");
+    user.say("One recording for each object. `q` ends the session.\n");
     let levels = &setup.hrn.card().levels;
     // The verdicts on objects whose level the user named.
     let mut score = Score::default();
-    let (mut number, mut goes_on) = (first, true);
+    let (mut number, mut goes_on, mut ended) = (first, true, Ok(()));
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
-        goes_on = record_object(&mut user, &object, setup, sockets, &mut score).await?;
+        let recorded = record_object(&mut user, &object, setup, sockets, &mut score).await;
+        goes_on = recorded.as_ref().is_ok_and(|goes_on| *goes_on);
+        ended = recorded.map(drop);
         number += u32::from(object.path.exists());
         // A late line would cut through the next question.
         log.flush();
     }
     let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
-    print(&format!("\nrecorded {recorded} in this session\n"));
+    user.say(&format!("\nrecorded {recorded} in this session\n"));
     if score.verdicts > 0 {
-        print(&format!("{}\n", score.in_words()));
+        user.say(&format!("{}\n", score.in_words()));
     }
     if count > 0 {
         let directory = directory.to_string_lossy();
         // No path has the byte 0, which alone cannot be quoted.
         let directory = shlex::try_quote(&directory).unwrap_or_default();
-        print(&format!(
+        user.say(&format!(
             "to make a model of them: hrn-train fit {directory} --out own.onnx\n"
         ));
     }
-    Ok(())
+    user.prompts.end().await;
+    ended
 }
 
 /// The reading and the level that an answer says.
@@ -221,7 +235,7 @@ async fn record_object(
 ) -> Result<bool, Failure> {
     let path = &object.path;
     let file = create(path)?;
-    print("do not touch the sensor until the zero is taken\n");
+    user.say("do not touch the sensor until the zero is taken\n");
     let mut goes_on = false;
     let levels = &setup.hrn.card().levels;
     let end = async |counted| goes_on = wait_for_user(user, counted, object, levels).await;
@@ -231,7 +245,7 @@ async fn record_object(
     if progress.presses == 0 {
         // It would stop `hrn-train collect`.
         part::remove(path, &file);
-        print("no press was recorded\n");
+        user.say("no press was recorded\n");
     } else if object.level > 0 {
         score.add(progress.score);
     }
@@ -261,18 +275,18 @@ async fn wait_for_user(
                 let Progress { tared, lost, missing, score, said, .. } = *counted.borrow_and_update();
                 if (missing > 0) != is_missing {
                     is_missing = missing > 0;
-                    print(match is_missing {
+                    user.say(match is_missing {
                         true => "a sensor is missing: waiting for it (q: quit)\n",
                         false => "the sensor is back\n",
                     });
                 }
                 if lost > lost_before {
                     lost_before = lost;
-                    print("the press under way is lost: press again\n");
+                    user.say("the press under way is lost: press again\n");
                 }
                 if tared > 0 && !is_tared {
                     is_tared = true;
-                    print("the zero is taken: press now (Enter: next object, q: quit)\n");
+                    user.say("the zero is taken: press now (Enter: next object, q: quit)\n");
                 }
                 if score.verdicts > shown {
                     shown = score.verdicts;
@@ -280,19 +294,11 @@ async fn wait_for_user(
                         0 => String::new(),
                         level => format!(", you said {}; {}", label(level), score.in_words()),
                     };
-                    print(&format!("verdict {shown}: {}{beside}\n", label(said.unwrap_or(0))));
+                    user.say(&format!("verdict {shown}: {}{beside}\n", label(said.unwrap_or(0))));
                 }
             }
         }
     }
-}
-
-/// Writes to the terminal. Errors are ignored: if the terminal has gone, its signal ends the
-/// session.
-fn print(text: &str) {
-    let mut stderr = io::stderr();
-    let _ = stderr.write_all(text.as_bytes());
-    let _ = stderr.flush();
 }
 
 /// A name as a part of a file's name.

@@ -17,10 +17,10 @@ pub const FRAME: usize = 20;
 /// The numbers of a press.
 pub const FEATURES: usize = FRAME + 103;
 
-/// A taxel of the model's grid is in contact at or above this force.
-const CONTACT_N: f32 = 0.07;
-/// Thresholds above which taxels are counted, in newtons. They lie a little below round numbers, as the shares do: whole
-/// counts and whole millinewtons of one force round apart.
+/// A taxel of the model's grid is in contact at or above this force. It lies a little below 0.07 N, and the next numbers
+/// below round ones: whole counts and whole millinewtons of one force round apart.
+const CONTACT_N: f32 = 0.0699;
+/// Thresholds above which taxels are counted, in newtons.
 const COUNTED_N: [f32; 5] = [0.1999, 0.4999, 0.9999, 1.9999, 3.9999];
 /// Shares of the peak above which taxels are counted.
 const COUNTED_SHARES: [f32; 3] = [0.4999, 0.2499, 0.7499];

@@ -19,7 +19,7 @@ use walkdir::WalkDir;
 
 pub use self::recording::Recording;
 use crate::data::presses::{self, Layout, Presses, file, read_one};
-use crate::data::source::{COLLECTOR, Source, name_of};
+use crate::data::source::{COLLECTOR, Source, name_of, papers_levels};
 use crate::exit::unreadable;
 use crate::progress;
 use hardnessd_core::npz::Writer;
@@ -328,7 +328,7 @@ impl Collection {
         meta.remove("grid_pitch_mm");
         for (key, value) in [
             ("captures", json!(self.captures)),
-            ("levels", json!(self.levels())),
+            ("levels", json!(self.levels()?)),
             ("materials", json!(self.materials)),
             ("pitch_mm", json!(self.presses.pitch_mm())),
             ("grid", json!(grid.map(|of| [of.array.rows, of.array.cols]))),
@@ -349,15 +349,23 @@ impl Collection {
 
     /// The levels of an earlier data set, of the configuration or the paper's, or as many as the presses have, with
     /// their numbers for names.
-    fn levels(&self) -> Vec<Level> {
+    fn levels(&self) -> anyhow::Result<Vec<Level>> {
         let stated = self.presses.levels();
         let most = self.presses.all.iter().map(|press| press.level).max();
         let most = most.unwrap_or_default();
         if usize::from(most) <= stated.len() {
-            return stated;
+            return Ok(stated);
         }
+        let are_numbers = stated
+            .iter()
+            .all(|level| level.label == level.level.to_string());
+        ensure!(
+            are_numbers || stated == papers_levels(),
+            "level: found {most}, expected at most {}, as many as the data set has names for",
+            stated.len()
+        );
         let level = |level: u8| Level::new(level, level.to_string(), "-");
-        (1..=most.min(MOST_LEVELS as u8)).map(level).collect()
+        Ok((1..=most.min(MOST_LEVELS as u8)).map(level).collect())
     }
 }
 

@@ -7,6 +7,7 @@ use anyhow::{Context as _, bail};
 use hardnessd_core::exit::USAGE;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{Borders, Level};
+use hardnessd_core::wording;
 use hrn_train::exit::coded;
 use hrn_train::fit::{self, Division, Estimate, Report, Row, Written};
 
@@ -35,7 +36,7 @@ pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
     })?;
     let (report, written) = fit::fit(&arguments.data, &sensor, levels)?;
     let text = match arguments.json {
-        true => serde_json::to_string(&report)? + "\n",
+        true => wording::json_escaped(&serde_json::to_string(&report)?) + "\n",
         false => of_report(&report),
     };
     match save(written, &arguments.out, &references, sensor.frame_rate_hz()) {

@@ -42,7 +42,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     }
     let [first, second] = &judged[..] else {
         return Ok(match arguments.json {
-            true => serde_json::to_string(&evaluations[0])? + "\n",
+            true => wording::json_escaped(&serde_json::to_string(&evaluations[0])?) + "\n",
             false => account::of_evaluated(&evaluations[0]),
         });
     };
@@ -54,7 +54,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let difference = Difference::of(first, second);
     if arguments.json {
         let both = serde_json::json!({"models": evaluations, "difference": difference});
-        return Ok(both.to_string() + "\n");
+        return Ok(wording::json_escaped(&both.to_string()) + "\n");
     }
     let mut text = String::new();
     for (path, of) in arguments.model.iter().zip(&evaluations) {
