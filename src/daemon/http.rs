@@ -31,7 +31,7 @@ use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 use tokio::net::TcpStream;
 use tracing::debug;
@@ -176,15 +176,10 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
             level,
         } = read?;
         let keys = [("object", object), ("level", level)];
-        let keys = keys
-            .map(|(key, value)| (key.to_owned(), value))
-            .into_iter()
-            .collect();
-        change(
-            Some(sensors),
-            request::Request::Merge(Merge { sensor, keys }),
-        )
-        .await
+        let keys = keys.map(|(key, value)| (key.to_owned(), value));
+        let keys = Map::from_iter(keys);
+        let request = request::Request::Merge(Merge { sensor, keys });
+        change(Some(sensors), request).await
     };
     match done.await {
         Ok(_) => text("application/json", "{}".to_owned()),

@@ -316,10 +316,7 @@ mod tests {
     #[test]
     fn keys_are_merged_into_a_context() {
         let merged = |context: Option<Value>, keys: Value| {
-            let Value::Object(keys) = keys else {
-                unreachable!()
-            };
-            merged(context.as_ref(), "palm", keys)
+            merged(context.as_ref(), "palm", keys.as_object().unwrap().clone())
         };
         let context = json!({"sensor": "palm", "tag": null, "level": 2});
         let keys = json!({"level": null, "object": "cup"});

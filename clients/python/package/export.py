@@ -212,21 +212,21 @@ class Tables:
             name = file = f"{os.path.basename(name).removesuffix('.mcap')}-{made_of}"
         elif self._writers:
             return name
-        for table, schema in self._schemas.items():
-            path = f"{table}/{folder}{file}.parquet" if self._is_parted else f"{table}.parquet"
-            if (self._output.folder / path).exists():
-                return None
+        paths = {table: f"{table}/{folder}{file}.parquet" if self._is_parted else f"{table}.parquet" for table in TABLES}
+        # Its file comes last: others without it are of an export that was killed.
+        if (self._output.folder / paths["recording"]).exists():
+            return None
+        for table, path in paths.items():
             part = self._output.path(f"{path}.part")
-            self._writers[table] = pq.ParquetWriter(part, schema, compression="zstd")
+            self._writers[table] = pq.ParquetWriter(part, self._schemas[table], compression="zstd")
             self._parts.append((part, self._output.path(path)))
         return name
 
-    def add(self, name: str, take: recording.Recording) -> None:
-        name_in_tables = self._begin(name, take)
-        if name_in_tables is None:
+    def add(self, file: str, take: recording.Recording) -> None:
+        name = self._begin(file, take)
+        if name is None:
             print(f"{take.path}: it is there already", file=sys.stderr)
             return
-        name = name_in_tables
         about = {key: take.about.get(key) for key in ("robot", "run", "version")}
         settings = json.dumps(take.sensors)
         self._row("recording", recording=name, labels=list(take.labels.items()), sensors=settings, **about)
@@ -270,7 +270,7 @@ class Tables:
                 self._write(name)
             writer.close()
         self._writers.clear()
-        # A file is there once it is whole. The one by which a recording is known comes last.
+        # A file is there once it is whole, and that of the table `recording` once all are.
         for part, path in reversed(self._parts):
             part.rename(path)
         self._parts.clear()

@@ -23,7 +23,7 @@ use self::link::Link;
 use self::pace::Pace;
 use crate::event::{Event, FrameEvent, Press, PressState, Tared};
 use crate::frame::{RawFrame, Stamp};
-use crate::judge::{Judge, Moment, OwnPresses, Unjudged};
+use crate::judge::{EndedPress, Judge, Moment, OwnPresses, Unjudged};
 use crate::motion::Track;
 use crate::press::{Change, ContactFrame, End, FrameAt, PressTracker, Thresholds};
 use crate::sensor::Sensor;
@@ -48,7 +48,7 @@ pub struct Pipeline {
     decoder: Decoder,
     tare: Tare,
     tracker: PressTracker,
-    pub(crate) judge: Judge,
+    judge: Judge,
     link: Link,
     /// The taxels in contact when the last press timed out, in words.
     unreleased: Option<String>,
@@ -143,6 +143,17 @@ impl Pipeline {
     /// Takes out the missing verdicts. Each is returned once.
     pub fn unjudged(&mut self) -> Vec<Unjudged> {
         std::mem::take(&mut self.judge.unjudged)
+    }
+
+    /// Keeps each press that ends from now on, until [`Self::ended`] returns it.
+    pub fn keep_courses(&mut self) {
+        self.judge.ended.get_or_insert_default();
+    }
+
+    /// The kept presses that were not returned yet.
+    pub fn ended(&mut self) -> Vec<EndedPress> {
+        let kept = self.judge.ended.as_mut();
+        kept.map(std::mem::take).unwrap_or_default()
     }
 
     /// The controller's context.

@@ -154,9 +154,7 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     if plan.data.is_empty() {
         return write_tables(&plan.out);
     }
-    refuse_foreign(&plan.out, "results.json", |name| {
-        ["objects.csv", "tables.md"].contains(&name)
-    })?;
+    refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
     let presses = Presses::read(&plan.data)?;
     let mut open = plan.runs(presses.are_over_time());
     for run in &open {

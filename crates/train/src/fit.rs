@@ -148,15 +148,12 @@ pub fn fit(
     let judged = judged.context("the best candidate was judged")?;
     let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
         let mut stream = Stream::new(SEED, "calibration");
-        let mut calibration =
+        let calibration =
             comparison::calibration(judged, &presses, &learning.outputs(), &mut stream);
-        let by = match division {
-            Division::NewObjects => "new objects",
-            Division::LaterPresses => {
-                // Presses of known objects promise nothing of others.
-                calibration.limits.clear();
-                "later presses"
-            }
+        let (calibration, by) = match division {
+            Division::NewObjects => (calibration, "new objects"),
+            // Presses of known objects promise nothing of others.
+            Division::LaterPresses => (calibration.without_sets(), "later presses"),
         };
         let learnt = Learnt {
             learning,
@@ -195,12 +192,12 @@ fn read(
     })?;
     played.sort_by_key(|recording| recording.began);
     let mut doubtful = Vec::new();
-    let all = played.len();
+    let found = played.len();
     played.retain(|recording| !recording.is_unlabelled());
-    if played.len() < all {
+    let unlabelled = found - played.len();
+    if unlabelled > 0 {
         doubtful.push(format!(
-            "{} recordings are left out, because nothing says what was pressed: give them a label `level`",
-            all - played.len()
+            "{unlabelled} recordings are left out, because nothing says what was pressed: give them a label `level`"
         ));
     }
     let unnumbered = played
@@ -219,16 +216,14 @@ fn read(
         Some(levels) => levels,
         None => levels::of_labels(played.iter().map(|recording| &recording.labels))?,
     };
-    let mut stated = sets.iter().flat_map(|set| &set.sources);
+    let mut sources = sets.iter().flat_map(|set| &set.sources);
     let differs = |source: &&Source| {
-        source
-            .levels
-            .as_ref()
-            .is_some_and(|stated| *stated != levels)
+        let stated = source.levels.as_ref();
+        stated.is_some_and(|stated| *stated != levels)
     };
-    if let Some(source) = stated.find(differs) {
+    if let Some(source) = sources.find(differs) {
         bail!(
-            "{}: states other levels than the other data or the configuration, and its numbers are of those",
+            "{}: its levels are others than those of the other data or of the configuration",
             source.path.display()
         );
     }

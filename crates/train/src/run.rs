@@ -12,7 +12,7 @@ use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, ensure};
+use anyhow::{Context as _, bail, ensure};
 use serde::{Deserialize, Serialize};
 
 use crate::data::source::Source;
@@ -42,13 +42,21 @@ pub struct Description {
 }
 
 impl Description {
-    /// Whether both are of one run. Data are the same if their bytes are, because a file may have been renamed.
-    fn is_same_as(&self, other: &Self) -> anyhow::Result<bool> {
-        let mut renamed = self.clone();
-        for (own, other) in renamed.data.iter_mut().zip(&other.data) {
+    /// The first line of `settings.toml` that differs from that of `expected`, with both. Data are the same if
+    /// their bytes are, because a file may have been renamed.
+    fn difference(&self, expected: &Self) -> anyhow::Result<Option<String>> {
+        let mut found = self.clone();
+        for (own, other) in found.data.iter_mut().zip(&expected.data) {
             own.name.clone_from(&other.name);
         }
-        Ok(toml::to_string(&renamed)? == toml::to_string(other)?)
+        let (found, expected) = (toml::to_string(&found)?, toml::to_string(expected)?);
+        let mut pairs = found.lines().zip(expected.lines());
+        let differing = pairs.find(|(found, expected)| found != expected);
+        Ok(match differing {
+            Some((found, expected)) => Some(format!("found `{found}`, expected `{expected}`")),
+            None if found != expected => Some("the one has more files than the other".to_owned()),
+            None => None,
+        })
     }
 }
 
@@ -60,6 +68,22 @@ const OF_A_RUN: [&str; 4] = ["hrn.onnx", "metrics.csv", "evaluation.json", "chec
 pub struct Run {
     directory: PathBuf,
     _lock: File,
+}
+
+/// Returns an error if a directory without a run has files. A run that was killed before it had its settings leaves
+/// only a part of a file.
+fn refuse_to_continue(directory: &Path) -> anyhow::Result<()> {
+    for entry in fs::read_dir(directory)? {
+        let name = entry?.file_name();
+        let name = name.to_string_lossy();
+        ensure!(
+            name.ends_with(".part"),
+            "{}: has {name} but no settings.toml, so there is no run to continue: leave out --resume, or choose \
+             another --out",
+            directory.display()
+        );
+    }
+    Ok(())
 }
 
 impl Run {
@@ -99,10 +123,10 @@ impl Run {
             _lock: lock(directory)?,
         };
         let before = Self::description_at(directory)?;
-        // A run that was killed before it had its settings leaves only a part of a file.
-        refuse_foreign(directory, "settings.toml", |name| {
-            OF_A_RUN.contains(&name) || resume && !name.ends_with(".part")
-        })?;
+        refuse_foreign(directory, "settings.toml", &OF_A_RUN)?;
+        if resume && before.is_none() {
+            refuse_to_continue(directory)?;
+        }
         ensure!(
             before.is_none() || resume,
             "{}: has a run already: continue it with --resume, or choose another --out",
@@ -111,12 +135,15 @@ impl Run {
         // First, because a directory with checkpoints and no settings is refused.
         match before {
             None => run.write("settings.toml", toml::to_string(description)?.as_bytes())?,
-            Some(before) => ensure!(
-                description.is_same_as(&before)?,
-                "{}: this run was started with other settings or data: give --resume the same ones, or choose another \
-                 --out",
-                run.path("settings.toml").display()
-            ),
+            Some(before) => {
+                if let Some(difference) = description.difference(&before)? {
+                    bail!(
+                        "{}: this run was started with other settings or data; {difference}; give \
+                         --resume the same ones, or choose another --out",
+                        run.path("settings.toml").display()
+                    );
+                }
+            }
         }
         for part in ["checkpoints", "samples"] {
             let part = run.path(part);

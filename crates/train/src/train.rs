@@ -11,9 +11,10 @@ use crate::data::split::Parts;
 use crate::exit::coded;
 use crate::judge::evaluated::Evaluated;
 use crate::learn;
-use crate::learn::calibration::{Calibration, LEAST_UNITS};
+use crate::learn::calibration::Calibration;
 use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
+use crate::progress::ensure_learning;
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::start::Start;
 use crate::run::{Description, Run, disk};
@@ -155,14 +156,24 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     };
     let learning = &*last_stage(recipe, &stages)?;
     let weights = learn::run(learning, &run)?;
+    // Finite weights can still give a logit that is not. One press is enough for this check.
+    let first = learn::Question::alone(&parts.train[..1]);
+    for logit in learning.judge(&weights, &[first], None).concat() {
+        ensure_learning(
+            learning.stage(),
+            settings.training.epochs,
+            "logit",
+            logit.into(),
+        )?;
+    }
     let mut stream = Stream::new(seed, &format!("{} calibration", learning.stage()));
     let held_out = &parts.held_out;
     let calibration = Calibration::of(learning, &presses, held_out, &weights, &mut stream);
-    if recipe.learning == Kind::Course && calibration.conformal().is_none() {
-        hardnessd_core::stderr_line!(
-            "warning: the model gives no sets of levels, and nothing promises that its interval of the Shore hardness \
-             holds: this takes {LEAST_UNITS} held-out objects, or as many covers if there are several sensors"
-        );
+    if let Some(missing) = calibration
+        .missing()
+        .filter(|_| recipe.learning == Kind::Course)
+    {
+        hardnessd_core::stderr_line!("{missing}");
     }
     let learnt = Learnt {
         learning,

@@ -48,8 +48,8 @@ pub(super) struct Turns {
     asking: Option<(usize, Instant)>,
     /// The sensors whose frame of the answer has not come.
     missing: Vec<usize>,
-    /// Of each sensor without a frame in the last answer to its request: how long the port waits for it no more, and
-    /// until when.
+    /// Of each sensor without a frame in the last answer to its request: for how long, and until when, the port
+    /// does not wait for it.
     absent: Vec<Option<(Duration, Instant)>>,
     /// The last one that was asked, for bytes that come late.
     last: Option<usize>,
@@ -203,6 +203,10 @@ mod tests {
     use super::*;
     use hardnessd_core::tests::support::sensor_of;
 
+    fn ms(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
     /// A sensor of 50 frames a second, at a port whose line takes no time.
     fn settings(request: &[u8]) -> Settings {
         let sensor = sensor_of(|described| {
@@ -248,7 +252,6 @@ mod tests {
 
     #[test]
     fn silent_modules_make_no_other_one_stale() {
-        let ms = Duration::from_millis;
         for (modules, speaking, answer, silent_after) in [
             (3, 2, ms(30), ms(0)),
             (4, 1, ms(1), ms(0)),
@@ -265,7 +268,6 @@ mod tests {
 
     #[test]
     fn sensors_that_share_a_request_have_their_frames_of_its_answer() {
-        let ms = Duration::from_millis;
         let begin = Instant::now();
         let mut turns = Turns::new(&[settings(b"1"), settings(b"1"), settings(b"2")], begin);
         assert_eq!(turns.ask(begin), Some(&b"1"[..]));
@@ -274,12 +276,10 @@ mod tests {
         assert!(turns.hears(1) && !turns.hears(2));
         turns.answered(1, begin + ms(30));
         assert_eq!(turns.ask(begin + ms(30)), Some(&b"2"[..]));
-        turns.answered(2, begin + ms(30));
     }
 
     #[test]
     fn sensors_that_are_silent_beside_others_make_none_stale() {
-        let ms = Duration::from_millis;
         let begin = Instant::now();
         // Four requests, each of two sensors. The second ones were never there, or come 30 ms after the first ones.
         for is_there in [false, true] {

@@ -149,12 +149,8 @@ mod tests {
             frame[60..].fill(0.0);
             frame
         });
-        let error = Fit::of(
-            &[presses[0].clone(), half.collect()],
-            &is_dead,
-            Pitch::JX255N,
-        )
-        .unwrap_err();
+        let presses = [presses[0].clone(), half.collect()];
+        let error = Fit::of(&presses, &is_dead, Pitch::JX255N).unwrap_err();
         assert!(
             error
                 .to_string()

@@ -333,14 +333,9 @@ fn a_model_of_other_levels_forgets_the_level_that_was_said_and_judges_objects_an
     assert_eq!(presses(&mut next, 9), 2);
     assert_eq!(next.judge.context, Some(said));
     // As many levels as before.
-    let levels = [
-        (1, "hard", ">80"),
-        (2, "firm", "60-80"),
-        (3, "soft", "40-60"),
-        (4, "jelly", "<=40"),
-    ];
-    let levels = levels.map(|(level, label, shore)| Level::new(level, label, shore));
-    let other = Model::load(BUILT_IN).unwrap().with_levels(levels.to_vec());
+    let levels = (1..).zip([">80", "60-80", "40-60", "<=40"]);
+    let levels = levels.map(|(level, shore)| Level::new(level, level.to_string(), shore));
+    let other = Model::load(BUILT_IN).unwrap().with_levels(levels.collect());
     let other = Arc::new(other.unwrap());
     let kept = Some(serde_json::json!({"object": "cup"}));
     let mut next = pipeline.with_model(sensor.clone(), other.clone()).unwrap();
@@ -597,10 +592,7 @@ fn presses_of_one_object_are_judged_together_also_by_a_pipeline_that_goes_on() {
 #[test]
 fn four_presses_at_one_place_are_advised_whatever_the_model_keeps() {
     for own_presses in [0, 16] {
-        let mut pipeline = ready(|described| {
-            described.sensor.own_presses = own_presses;
-            described.model.min_confidence = 1.0;
-        });
+        let mut pipeline = ready(|described| described.sensor.own_presses = own_presses);
         let mut first = 5;
         let mut advised = |pipeline: &mut Pipeline| {
             first += 4;
@@ -609,12 +601,10 @@ fn four_presses_at_one_place_are_advised_whatever_the_model_keeps() {
             assert!(verdict.confidence < 0.7, "{}", verdict.confidence);
             verdict.advice
         };
-        for _ in 0..2 {
-            assert_eq!(advised(&mut pipeline), Some(Advice::PressAgain));
-        }
+        let again = Some(Advice::PressAgain);
+        assert_eq!([advised(&mut pipeline), advised(&mut pipeline)], [again; 2]);
         let (sensor, hrn) = (pipeline.sensor().clone(), pipeline.hrn().clone());
         let mut next = pipeline.with_model(sensor, hrn).unwrap();
-        assert_eq!(advised(&mut next), Some(Advice::PressAgain));
-        assert_eq!(advised(&mut next), None);
+        assert_eq!([advised(&mut next), advised(&mut next)], [again, None]);
     }
 }

@@ -30,7 +30,8 @@ impl Phases {
         };
         let top = first(1.0);
         let falls = |&place: &usize| forces_n[place] < HELD_SHARE * greatest;
-        // Below a baseline that stands too high, no force is above 0. Such a press has fallen after its first frame.
+        // Below a baseline that stands too high, no force is above 0. Such a press has fallen after its first
+        // frame.
         let fallen = (top + 1..forces_n.len()).find(falls);
         Self {
             loaded: first(LOADED_SHARE),

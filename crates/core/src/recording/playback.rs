@@ -104,15 +104,14 @@ impl Playback {
     pub fn keep_courses(&mut self) {
         self.keeps_courses = true;
         for player in &mut self.players {
-            player.pipeline.judge.ended.get_or_insert_default();
+            player.pipeline.keep_courses();
         }
     }
 
     /// The kept presses that were not returned yet. A state of a sensor forgets its own.
     pub fn ended(&mut self) -> Vec<EndedPress> {
         let players = self.players.iter_mut();
-        let kept = players.filter_map(|player| player.pipeline.judge.ended.as_mut());
-        kept.flat_map(std::mem::take).collect()
+        players.flat_map(|player| player.pipeline.ended()).collect()
     }
 
     /// Judges the presses of a sensor with `hrn`, which has references of that sensor.
@@ -168,7 +167,7 @@ impl Playback {
                 }
                 let mut pipeline = Pipeline::resumed(described, hrn, state.at_rest);
                 if self.keeps_courses {
-                    pipeline.judge.ended.get_or_insert_default();
+                    pipeline.keep_courses();
                 }
                 let player = Player {
                     pipeline,

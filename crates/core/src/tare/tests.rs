@@ -140,14 +140,11 @@ fn a_first_tare_that_always_has_its_first_frame_goes_on_from_its_rest() {
     }
     let mut next = Tare::new(&settings(&[]), Array::JX255N, CONTACT);
     next.resume(tare.at_rest());
-    for count in [10, 11, 10] {
+    for count in [10, 11, 10, 10] {
         for tare in [&mut tare, &mut next] {
+            assert!(tare.aim().is_some());
             tare.observe(&raw(&[(0, count), (1, count), (2, count)]));
         }
-        assert!(!tare.is_at_rest());
-    }
-    for tare in [&mut tare, &mut next] {
-        tare.observe(&raw(&[(0, 10), (1, 10), (2, 10)]));
     }
     assert_eq!((next.aim(), &next.baseline), (None, &tare.baseline));
 }

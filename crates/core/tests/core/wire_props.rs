@@ -588,12 +588,13 @@ fn text_has_any_separators_signs_decimals_and_words_beside_the_rows() {
     let dual =
         "Sensor 1\n1 2 3\n4 5 6\nSensor 2\n7 8 9\n1 1 1\nSensor 11\n2 3 4\n5 6 7\nPad 12\n8 1 2\n3 4 5\nEND\n"
             .repeat(3);
-    for (heading, first) in [
+    let firsts = [
         ("Sensor 1", 1.0),
         ("Sensor 2", 7.0),
         ("Sensor 11", 2.0),
         ("Pad", 8.0),
-    ] {
+    ];
+    for (heading, first) in firsts {
         let layout = layout(&format!("heading = '{heading}'"));
         for chunk in [1, dual.len()] {
             let (found, damaged) = decode(&layout, dual.as_bytes().chunks(chunk));

@@ -279,7 +279,15 @@ impl Comparison<'_> {
     /// The report, and the place of the candidate that is written. The built-in model gets references. The best
     /// candidate is chosen by new objects, or where nothing there is better than guessing, by later presses.
     pub(super) fn report(self) -> (Report, Option<usize>) {
-        let mut remarks = Vec::from_iter(partly_judged(&self.candidates));
+        let mut remarks = self.remarks_on_objects();
+        remarks.extend(partly_judged(&self.candidates));
+        if !self.has_references && self.candidates[0].left_out.is_none() {
+            remarks.push(
+                "as references of the built-in model these presses make verdicts on each other worse, so the daemon would \
+                 not use them, and they are not written"
+                    .to_owned(),
+            );
+        }
         let divisions = [Division::NewObjects, Division::LaterPresses];
         let useful = divisions.into_iter().find_map(|division| {
             let best = self.best(division)?;
@@ -381,6 +389,25 @@ impl Comparison<'_> {
         };
         remarks.push(format!("{why}: {then}"));
         0
+    }
+
+    /// What the objects cannot show.
+    fn remarks_on_objects(&self) -> Vec<String> {
+        let levels = self.of_levels().into_iter().filter(|of| of.presses > 0);
+        let (alone, others): (Vec<_>, Vec<_>) = levels.partition(|of| of.objects == 1);
+        if alone.is_empty() {
+            return Vec::new();
+        }
+        let alone: Vec<&str> = alone.iter().map(|of| of.level.label.as_str()).collect();
+        let shown = match others.len() {
+            0 | 1 => {
+                "nothing shows whether its hardness or the object is recognised. Record at least two objects of each \
+                 level, of several shapes"
+            }
+            _ => "its presses are learnt from, and not judged as those of a new object",
+        };
+        let alone = alone.join(", ");
+        vec![format!("only one object is of level {alone}: {shown}")]
     }
 
     /// The place of the candidate with the greatest balanced accuracy, the first of equal ones.

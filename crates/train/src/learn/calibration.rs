@@ -15,7 +15,7 @@ use hardnessd_simulator::random::Stream;
 pub const ALPHA: f32 = 0.1;
 /// The fewest held-out units with which [`ALPHA`] can be promised: with n units, at least one in
 /// n + 1 cases may exceed the greatest value among them.
-pub const LEAST_UNITS: usize = 9;
+const LEAST_UNITS: usize = 9;
 /// A quantile is the mean over this many draws of one press from each unit.
 const DRAWS: usize = 50;
 /// The share of the covers, the worst ones, whose confidence is calibrated: a robot's own cover may be one. A tenth of
@@ -32,6 +32,10 @@ pub struct Calibration {
     pub temperature: f32,
     /// The limits for each knowledge of a sensor. Empty if nothing can be promised.
     pub limits: BTreeMap<Knowledge, Limits>,
+    /// The number of held-out units, and of those whose Shore hardness was measured.
+    units: [usize; 2],
+    /// What a unit is.
+    unit: Unit,
 }
 
 /// What the network says of a press of a held-out object.
@@ -145,7 +149,7 @@ impl Calibration {
             None => 1.0,
             Some(_) => at_most(least(loss), confidence, most_confidence(units)),
         };
-        let mut limits = BTreeMap::new();
+        let (mut limits, mut units) = (BTreeMap::new(), [0; 2]);
         for (&knowledge, judged) in judged {
             let wrong = by_unit(judged, |judged| Some(-of_truth(judged, temperature)));
             // The share of the distribution beyond the truth, on its side.
@@ -153,6 +157,10 @@ impl Calibration {
                 let below = outputs.below(&judged.row, temperature, judged.shore?)?;
                 Some(-below.min(1.0 - below))
             });
+            let measured = by_unit(judged, |judged| judged.shore).len();
+            if knowledge == Knowledge::None {
+                units = [wrong.len(), measured];
+            }
             if let Some(wrong) = quantile(&wrong, stream) {
                 let tail = quantile(&beyond, stream).map_or(TAIL, |beyond| -beyond);
                 let threshold = -wrong;
@@ -162,6 +170,17 @@ impl Calibration {
         Self {
             temperature,
             limits,
+            units,
+            unit,
+        }
+    }
+
+    /// The same without a promise of sets of levels.
+    pub(crate) fn without_sets(self) -> Self {
+        Self {
+            limits: BTreeMap::new(),
+            units: [0; 2],
+            ..self
         }
     }
 
@@ -172,6 +191,26 @@ impl Calibration {
             alpha: ALPHA,
             threshold: none.threshold,
             contexts: self.limits.clone(),
+        })
+    }
+
+    /// What the calibration cannot promise, and why, in one line. `None` if it promises both the
+    /// sets of levels and the interval of the Shore hardness.
+    pub fn missing(&self) -> Option<String> {
+        let [units, measured] = self.units;
+        let (of, found, lost) = match units < LEAST_UNITS {
+            true => ("", units, "there are no sets of levels, and "),
+            false => (" with a measured Shore hardness", measured, ""),
+        };
+        let unit = match self.unit {
+            Unit::Object => "objects",
+            Unit::Cover => "covers",
+        };
+        (found < LEAST_UNITS).then(|| {
+            format!(
+                "held-out {unit}{of}: found {found}, expected at least {LEAST_UNITS}: {lost}nothing promises that \
+                 the interval of the Shore hardness holds"
+            )
         })
     }
 }
@@ -277,10 +316,10 @@ mod tests {
         }
     }
 
-    fn calibrated(judged: impl Iterator<Item = Judged>, unit: Unit) -> Calibration {
+    fn temperature(judged: impl Iterator<Item = Judged>, unit: Unit) -> f32 {
         let judged = BTreeMap::from([(Knowledge::None, judged.collect())]);
         let stream = &mut Stream::new(1, "calibration");
-        Calibration::on(&judged, unit, &Outputs::Levels, stream)
+        Calibration::on(&judged, unit, &Outputs::Levels, stream).temperature
     }
 
     #[test]
@@ -291,7 +330,7 @@ mod tests {
             let level = usize::from(unit % 2 == 0);
             judged(unit, level, unit % 8 >= 2, 3.0_f32.powi(4))
         });
-        let found = calibrated(judged, Unit::Object).temperature;
+        let found = temperature(judged, Unit::Object);
         assert!((found - 4.0).abs() < 1e-2, "{found}");
     }
 
@@ -302,7 +341,7 @@ mod tests {
                 let object = press / 10;
                 judged(object, usize::from(object % 2 == 0), true, 1e6)
             });
-            let found = calibrated(judged, Unit::Object).temperature;
+            let found = temperature(judged, Unit::Object);
             let confidence = 1.0 / (1.0 + 1e-6_f32.powf(1.0 / found));
             assert!(
                 (confidence - expected).abs() < 1e-3,
@@ -319,8 +358,36 @@ mod tests {
             let right = if unit % 2 == 0 { 6 } else { 9 };
             judged(unit, level, press % 10 < right, 9.0)
         });
-        let found = calibrated(judged, Unit::Cover).temperature;
+        let found = temperature(judged, Unit::Cover);
         let expected = 9.0_f32.ln() / 1.5_f32.ln();
         assert!((found - expected).abs() < 0.05, "{found}");
+    }
+
+    #[test]
+    fn few_objects_give_no_sets_and_promise_nothing() {
+        let of = |objects: u64, measured: u64| {
+            let press = |n: u64| Judged {
+                unit: n / 3,
+                level: (n % 2) as usize,
+                shore: (n / 3 < measured).then_some(50.0),
+                row: vec![1.0, 1.0],
+            };
+            let judged = (0..3 * objects).map(press).collect();
+            let judged = BTreeMap::from([(Knowledge::None, judged)]);
+            let stream = &mut Stream::new(1, "calibration");
+            Calibration::on(&judged, Unit::Object, &Outputs::Levels, stream)
+        };
+        let threshold = |found: &Calibration| Some(found.limits.get(&Knowledge::None)?.threshold);
+        let (enough, few, unmeasured) = (of(9, 9), of(8, 8), of(9, 2));
+        let least = threshold(&enough).unwrap();
+        assert!((least - 0.5).abs() < 1e-3, "{enough:?}");
+        assert_eq!((enough.missing(), threshold(&few)), (None, None));
+        let missing = few.missing().unwrap();
+        let expected = "found 8, expected at least 9";
+        assert!(missing.contains(expected), "{missing}");
+        assert!(threshold(&unmeasured).unwrap() > 0.0);
+        let missing = unmeasured.missing().unwrap();
+        assert!(missing.contains("Shore hardness: found 2"), "{missing}");
+        assert!(of(0, 0).missing().unwrap().contains("found 0"));
     }
 }

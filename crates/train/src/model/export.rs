@@ -89,9 +89,15 @@ impl Learnt<'_> {
     /// Fails if the names of the files cannot be written as JSON.
     pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
         let graph = self.learning.graph(self.weights);
+        let mut metrics = json!({ "temperature": self.calibration.temperature });
         let (format, conformal) = match graph.inputs {
             Inputs::Frame | Inputs::Parts(_) => ("1", None),
-            Inputs::Features | Inputs::References => ("3", self.calibration.conformal()),
+            Inputs::Features | Inputs::References => {
+                if let Some(missing) = self.calibration.missing() {
+                    metrics["not_promised"] = json!(missing);
+                }
+                ("3", self.calibration.conformal())
+            }
         };
         let pitches = self.presses.pitches_mm(self.train);
         let grid = match graph.inputs {
@@ -116,7 +122,7 @@ impl Learnt<'_> {
             pitch_mm: grid.map_or(self.presses.pitch_mm(), |grid| grid.pitch_mm) as f32,
             method: method.to_owned(),
             data: data(sources)?,
-            metrics: json!({ "temperature": self.calibration.temperature }),
+            metrics,
             validation: validation(&self.presses.validated()).to_owned(),
             range: Range {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),

@@ -54,20 +54,15 @@ pub fn read_text(path: &Path) -> anyhow::Result<String> {
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Returns an error if a directory has a foreign file, but not the one that a command always writes first: then the
-/// directory is somebody else's.
+/// Returns an error if a directory has files that a command would replace, but not the one that the
+/// command always writes first: then they are somebody else's.
 ///
 /// # Errors
 ///
 /// Names the directory and the file.
-pub fn refuse_foreign(
-    directory: &Path,
-    first: &str,
-    is_foreign: impl Fn(&str) -> bool,
-) -> anyhow::Result<()> {
-    let names = std::fs::read_dir(directory).into_iter().flatten().flatten();
-    let mut names = names.map(|entry| entry.file_name().to_string_lossy().into_owned());
-    match names.find(|name| is_foreign(name)) {
+pub fn refuse_foreign(directory: &Path, first: &str, others: &[&str]) -> anyhow::Result<()> {
+    let found = others.iter().find(|name| directory.join(name).exists());
+    match found {
         Some(name) if !directory.join(first).exists() => bail!(
             "{}: has {name} but no {first}, so it is of something else: choose another --out",
             directory.display()

@@ -25,11 +25,20 @@ fn a_run_goes_on_with_its_data_under_another_name_and_with_no_other() {
     drop(open("a.npz", "12").unwrap());
     drop(open("b.npz", "12").unwrap());
     let error = open("a.npz", "34").unwrap_err().to_string();
-    assert!(error.contains("other settings or data"), "{error}");
-    // What a run leaves that is killed at its begin is in nobody's way.
-    let killed = tempfile::tempdir().unwrap();
-    fs::write(killed.path().join(".settings.toml.part"), "").unwrap();
-    Run::open(killed.path(), &description("a.npz", "12"), true).unwrap();
+    let expected = "other settings or data; found `sha256 = \"34\"`, expected `sha256 = \"12\"`; give --resume";
+    assert!(error.contains(expected), "{error}");
+    // What is no run is left as it is, but for what a killed run leaves.
+    let other = tempfile::tempdir().unwrap();
+    let open = || Run::open(other.path(), &description("a.npz", "12"), true);
+    let notes = other.path().join("notes.txt");
+    fs::write(&notes, "").unwrap();
+    fs::write(other.path().join(".settings.toml.part"), "").unwrap();
+    let error = open().err().unwrap().to_string();
+    let expected = "has notes.txt but no settings.toml, so there is no run";
+    assert!(error.contains(expected), "{error}");
+    assert_eq!(fs::read_dir(other.path()).unwrap().count(), 2);
+    fs::remove_file(notes).unwrap();
+    open().unwrap();
 }
 
 #[test]

@@ -46,6 +46,7 @@ fn a_course_model_is_trained_and_judged_by_the_daemon() {
     let hrn = desk.model("whole/hrn.onnx");
     assert_eq!(hrn.format(), Format::Course { most_frames: 48 });
     assert!(hrn.card().conformal.is_some());
+    assert_eq!(hrn.card().metrics["not_promised"], Value::Null);
     let (presses, meta) = (desk.presses("d.npz"), desk.meta("d.npz"));
     assert_eq!(meta["materials"][11], "broad-layered");
     assert_eq!(meta["levels"][1]["shore"], "60-70");
@@ -102,8 +103,10 @@ fn a_course_model_takes_the_references_of_each_sensor() {
     assert_eq!(code, 0, "{errors}");
     let hrn = desk.model("run/hrn.onnx");
     // Two covers are too few for any promise of 90 %.
-    let expected = "the model gives no sets of levels";
+    let expected = "held-out covers: found 2, expected at least 9: there are no sets";
     assert!(errors.contains(expected), "{errors}");
+    let not_promised = &hrn.card().metrics["not_promised"];
+    assert!(not_promised.as_str().unwrap().starts_with(expected));
     assert_eq!(hrn.card().conformal, None);
     let format = (hrn.card().format.as_str(), hrn.most_references());
     assert_eq!(format, ("3", 32));
