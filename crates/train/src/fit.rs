@@ -185,13 +185,20 @@ fn read(
     let sets = sets.iter().map(|path| read_one(path));
     let sets: Vec<Presses> = sets.collect::<anyhow::Result<_>>()?;
     let layout = Layout::of(sets.is_empty() || sets.iter().any(Presses::are_over_time));
+    let mut doubtful = Vec::new();
+    if !sets.iter().all(Presses::are_over_time) {
+        doubtful.push(
+            "some presses are single frames, and the daemon judges whole presses: a model of `features` is then right less \
+             often than the figures say"
+                .to_owned(),
+        );
+    }
     let mut played = Vec::new();
     collect::recordings(&recordings, sensor, layout, true, |recording| {
         played.push(recording);
         Ok(())
     })?;
     played.sort_by_key(|recording| recording.began);
-    let mut doubtful = Vec::new();
     let found = played.len();
     played.retain(|recording| !recording.is_unlabelled());
     let unlabelled = found - played.len();

@@ -96,8 +96,9 @@ pub struct Estimate {
     pub balanced_accuracy: f64,
     /// 95 %, over objects, or over the later presses of known objects where a level has one object.
     pub interval: Option<[f64; 2]>,
-    /// The low end of the bootstrap's interval alone, by which a candidate is chosen. If nothing varies, it is the value: a
-    /// few objects that are all judged rightly are worth a model, whose confidence is as low as they are few.
+    /// The low end of the bootstrap's intervals alone, over objects and over presses, by which a candidate is chosen: two
+    /// objects a level may be alike by chance. If nothing varies, it is the value: a few objects that are all judged
+    /// rightly are worth a model, whose confidence is as low as they are few.
     #[serde(skip)]
     worth: f64,
 }
@@ -126,14 +127,14 @@ impl Estimate {
             };
             values.iter().map(one).collect()
         };
-        let chosen_by = drawn(has_several);
-        let balanced_accuracy = interval::mean(&chosen_by, Mean::OfStrata);
-        let worth = match interval::of(&chosen_by, Mean::OfStrata) {
+        let balanced_accuracy = interval::mean(&drawn(false), Mean::OfStrata);
+        let low = |by_object| match interval::of(&drawn(by_object), Mean::OfStrata) {
             Some([low, _]) if balanced_accuracy < 1.0 => low,
             // One press of a level says little, unless all are right.
             None if balanced_accuracy < 1.0 => 0.0,
             _ => balanced_accuracy,
         };
+        let worth = low(has_several).min(low(false));
         let shown = drawn(has_several || division == Division::NewObjects);
         Self {
             balanced_accuracy,
@@ -393,10 +394,19 @@ impl Comparison<'_> {
 
     /// What the objects cannot show.
     fn remarks_on_objects(&self) -> Vec<String> {
-        let levels = self.of_levels().into_iter().filter(|of| of.presses > 0);
-        let (alone, others): (Vec<_>, Vec<_>) = levels.partition(|of| of.objects == 1);
+        let (unseen, levels): (Vec<_>, Vec<_>) =
+            self.of_levels().into_iter().partition(|of| of.objects == 0);
+        let mut remarks = Vec::new();
+        if !unseen.is_empty() {
+            let unseen: Vec<&str> = unseen.iter().map(|of| of.level.label.as_str()).collect();
+            let unseen = unseen.join(", ");
+            remarks.push(format!(
+                "no press is of level {unseen}: what learns from these presses never names it"
+            ));
+        }
+        let (alone, others): (Vec<_>, Vec<_>) = levels.into_iter().partition(|of| of.objects == 1);
         if alone.is_empty() {
-            return Vec::new();
+            return remarks;
         }
         let alone: Vec<&str> = alone.iter().map(|of| of.level.label.as_str()).collect();
         let shown = match others.len() {
@@ -407,7 +417,8 @@ impl Comparison<'_> {
             _ => "its presses are learnt from, and not judged as those of a new object",
         };
         let alone = alone.join(", ");
-        vec![format!("only one object is of level {alone}: {shown}")]
+        remarks.push(format!("only one object is of level {alone}: {shown}"));
+        remarks
     }
 
     /// The place of the candidate with the greatest balanced accuracy, the first of equal ones.
@@ -466,6 +477,16 @@ impl Comparison<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::split::tests::presses as presses_of;
+
+    #[test]
+    fn objects_that_are_alike_by_chance_are_worth_no_model() {
+        let presses = presses_of((0..24).map(|press| (1 + press as u8 % 2, press % 4, 0)));
+        // Two of three presses of each object are judged rightly.
+        let values = (0..24).map(|press| (press, f64::from(u8::from(press / 4 % 3 > 0))));
+        let found = Estimate::of(&presses, &values.collect::<Vec<_>>(), Division::NewObjects);
+        assert!(found.worth < 0.5 + LEAST_GAIN, "{found:?}");
+    }
 
     #[test]
     fn a_candidate_that_is_judged_on_some_presses_is_named() {
