@@ -87,7 +87,9 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration) {
     let width = usize::from(area.width);
     let sensor = view.sensor();
     let (link, reason) = view.link(sensor, now);
-    let mut head = vec![title(view)];
+    let mut head = wrapped(&title(view), width, ASIDE);
+    // The state of the link is more worth.
+    head.truncate(if area.height < 20 { 1 } else { 2 });
     if view.sensors.len() > 1 {
         head.push(tabs(view, now, width));
     }
@@ -173,10 +175,10 @@ fn wrapped(text: &str, width: usize, style: Style) -> Vec<Line<'static>> {
     lines.into_iter().map(line).collect()
 }
 
-fn title(view: &View) -> Line<'static> {
+fn title(view: &View) -> String {
     let (hello, model) = (&view.hello, &view.hello["model"]);
     if hello.is_null() {
-        return span("hardnessd", STRONG).into();
+        return "hardnessd".to_owned();
     }
     let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
     // Several sensors have tabs.
@@ -184,15 +186,14 @@ fn title(view: &View) -> Line<'static> {
         [only] => format!(" · {}", only.name),
         _ => String::new(),
     };
-    let line = format!(
-        "{sensor} · hardnessd {} · model {} ({}): {}",
+    format!(
+        "{}{sensor} · hardnessd {} · model {} ({}): {}",
+        text(hello, "robot"),
         text(hello, "version"),
         text(model, "name"),
         text(model, "validation"),
         text(model, "needs")
-    );
-    let robot = span(&text(hello, "robot"), STRONG);
-    Line::from_iter([robot, span(&line, ASIDE)])
+    )
 }
 
 /// All sensors with their links. The chosen one is visible.

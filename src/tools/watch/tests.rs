@@ -284,7 +284,7 @@ fn no_name_turns_the_line() {
     let mut turned = hello("a", &["forearm"]);
     turned["robot"] = json!("b\u{202e}\u{e4}r-7");
     let turned = view_of(&[(0, turned)]);
-    assert!(shown(&turned, 0, (80, 24)).starts_with("b\u{e4}r-7 "));
+    assert!(shown(&turned, 0, (80, 24)).starts_with(" b\u{e4}r-7 "));
 }
 
 #[test]
