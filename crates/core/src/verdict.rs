@@ -423,10 +423,8 @@ impl Model {
     /// What the outputs say.
     fn verdict(&self, outputs: &[TValue], knowledge: Knowledge) -> Result<Verdict, ModelError> {
         let card = &self.file.card;
-        let limits = card
-            .conformal
-            .as_ref()
-            .map(|promised| promised.limits(knowledge));
+        let promised = card.conformal.as_ref();
+        let limits = promised.map(|promised| promised.limits(knowledge));
         let given = |output| self.numbers(outputs, output);
         let (logits, probabilities, shore) = if let Some(bins) = given("bins")? {
             let distribution = Distribution::of(&bins);
@@ -453,7 +451,9 @@ impl Model {
             level: card.levels[best].level,
             logits,
             shore,
-            levels: limits.map(|limits| limits.set(&probabilities)),
+            levels: promised
+                .zip(limits)
+                .map(|(promised, limits)| limits.set(&probabilities, promised.alpha)),
             probabilities,
             confidence,
         })

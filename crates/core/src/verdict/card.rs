@@ -122,14 +122,23 @@ impl Conformal {
 }
 
 impl Limits {
-    /// The levels of the set, ascending.
-    pub fn set(self, probabilities: &[f32]) -> Vec<u8> {
-        let (best, _) = argmax(probabilities);
-        let levels = (1..).zip(probabilities.iter().enumerate());
+    /// The levels of the set, ascending. Of many levels none may reach the threshold: without one that is likelier than all
+    /// others together, the set then holds the likeliest ones, up to a probability of 1 - `alpha`.
+    pub fn set(self, probabilities: &[f32], alpha: f32) -> Vec<u8> {
+        let (_, best) = argmax(probabilities);
+        let mut falling: Vec<(u8, f32)> = (1..).zip(probabilities.iter().copied()).collect();
+        falling.sort_by(|one, other| other.1.total_cmp(&one.1));
+        let is_unclear = best < self.threshold.min(0.5);
+        let mut before = 0.0;
+        falling.retain(|&(_, p)| {
+            let is_first = before == 0.0;
+            let is_needed = is_unclear && before < 1.0 - alpha;
+            before += p;
+            is_first || is_needed || p >= self.threshold
+        });
+        let mut levels: Vec<u8> = falling.into_iter().map(|(level, _)| level).collect();
+        levels.sort_unstable();
         levels
-            .filter(|&(_, (place, &p))| place == best || p >= self.threshold)
-            .map(|(level, _)| level)
-            .collect()
     }
 }
 
