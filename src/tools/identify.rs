@@ -310,6 +310,20 @@ fn account(out: &str, references: &[ReferencePress], tried: Tried) -> String {
         text +=
             &format!("judged rightly  {with} of {presses} with the others, {without} with none\n");
     }
+    if tried.right[0] * 2 < tried.presses {
+        text += "what is known of the pieces and the verdicts differ for most: check the hardness that you gave, and newtons \
+                 with `calibrate force`\n";
+    }
+    if tried.left_out > 0 {
+        text += &format!(
+            "unknown presses left out {}: the daemon uses six or more, whose estimated hardness differs by a standard \
+             deviation of 12 OO or more: press other objects\n",
+            tried.left_out
+        );
+    }
+    if references.len() == tried.left_out as usize {
+        return text;
+    }
     if tried.are_worse() {
         text += "these references make verdicts worse, so the daemon will not use them: check newtons with \
                  `calibrate force`, press from 5 N on, add other pieces, or leave `references` out\n";

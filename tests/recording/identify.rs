@@ -30,6 +30,11 @@ fn has_note(event: &Value, note: &str) -> bool {
 #[test]
 fn references_of_raw_bytes_are_judged_with_and_change_verdicts() {
     let bench = bench();
+    let text = bench.succeeds(&format!("{IDENTIFY} --as unknown wood.bin"));
+    assert!(text.contains("unknown presses left out 2"), "{text}");
+    let alike = &bench.finals("wood.bin --config hardnessd.toml")[0];
+    assert!(alike["references"] == "none" && has_note(alike, "references_ignored"));
+    fs::remove_file(bench.path("r.npz")).unwrap();
     let text = bench.succeeds(&format!("{IDENTIFY} --as level:1 wood.bin"));
     for part in ["known hardness 2", "references = \"r.npz\""] {
         assert!(text.contains(part), "{text}");

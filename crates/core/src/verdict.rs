@@ -43,6 +43,7 @@ pub use self::references::{Knowledge, MOST_REFERENCES, PIECE, Piece, ReferencePr
 pub use self::settings::{BuiltIn, Settings};
 pub use self::shore::{Borders, Distribution, Level, LevelTable, MOST_LEVELS, Shore, are_levels};
 pub use self::tried::Tried;
+pub(crate) use self::tried::are_unlike;
 
 /// No number that a model keeps of a press is so large.
 const MOST_FEATURE: f32 = 1e6;

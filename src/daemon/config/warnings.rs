@@ -115,7 +115,8 @@ impl Setup {
 
     /// The references are not used.
     fn ignored(&self, sensor: &str) -> Option<Warning> {
-        let problem = "not used, because its presses make verdicts on each other worse: make others with `identify`";
+        let problem =
+            "not used, because its presses would make verdicts worse: make others with `identify`";
         let is_ignored = self.hrn_of(sensor).known_references().are_ignored();
         is_ignored.then(|| ("references", problem.to_owned()))
     }

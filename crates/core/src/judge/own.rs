@@ -12,13 +12,8 @@ use sha2::{Digest, Sha256};
 use super::approach::PressWithApproach;
 use crate::press::ContactFrame;
 use crate::sensor::Sensor;
-use crate::verdict::{Model, ModelError, Piece, Reference, References, TimeSeries};
+use crate::verdict::{Model, ModelError, Piece, Reference, References, TimeSeries, are_unlike};
 
-/// The fewest presses that are used.
-const LEAST: usize = 6;
-/// The least standard deviation of their estimated Shore hardness with which they are used. Presses of
-/// objects that are all alike make verdicts worse.
-const LEAST_SPREAD: f32 = 12.0;
 /// At most so many presses in a row are kept of one object.
 const MOST_IN_A_ROW: u32 = 2;
 /// Without names, presses are of one object if they follow each other within this time and lie no
@@ -146,22 +141,12 @@ impl OwnPresses {
 
     /// The presses as references, if they may be used.
     pub(super) fn references(&self) -> References {
-        if self.presses.len() < LEAST || self.spread() < LEAST_SPREAD {
+        let shores: Vec<f32> = self.presses.iter().map(|press| press.shore).collect();
+        if !are_unlike(&shores) {
             return References::NONE;
         }
         let presses = self.presses.iter().map(|press| press.reference.clone());
         References::of(presses.collect())
-    }
-
-    /// The standard deviation of the estimated Shore hardness.
-    fn spread(&self) -> f32 {
-        let count = self.presses.len() as f32;
-        let mean = self.presses.iter().map(|press| press.shore).sum::<f32>() / count;
-        let squares = self
-            .presses
-            .iter()
-            .map(|press| (press.shore - mean).powi(2));
-        (squares.sum::<f32>() / count).sqrt()
     }
 
     /// The number of presses.
