@@ -285,13 +285,19 @@ impl Judge {
         let verdict = verdict?;
         let is_unknown = hrn.most_references() > 0 && references.knowledge() == Knowledge::None;
         let notes = self.notes(peak, &resampling, is_unknown);
-        let object = name.map(|name| {
-            let mut object = self.kept.objects.with(&name, &verdict);
-            if phase == Phase::Final {
-                self.kept.objects.add(&name, &verdict);
+        let is_light = !is_felt || (is_unknown && peak.force_n < LEAST_UNKNOWN_N);
+        let objects = &mut self.kept.objects;
+        let object = name.and_then(|name| {
+            // A press that names no level because it was light says nothing of its object either.
+            let mut object = match is_light {
+                true => objects.without(&name, &verdict)?,
+                false => objects.with(&name, &verdict),
+            };
+            if phase == Phase::Final && !is_light {
+                objects.add(&name, &verdict);
             }
             object.shore = object.shore.map(|shore| hrn.within(shore, object.level));
-            object
+            Some(object)
         });
         let presses = object
             .as_ref()

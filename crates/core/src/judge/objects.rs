@@ -55,6 +55,11 @@ impl Objects {
         self.after(name, verdict).verdict()
     }
 
+    /// The verdict on the object `name` without this press. `None` before its first one.
+    pub(super) fn without(&self, name: &str, verdict: &Verdict) -> Option<ObjectVerdict> {
+        Some(self.find(name, verdict)?.clone().verdict())
+    }
+
     /// Adds the press to the object `name`.
     pub(super) fn add(&mut self, name: &str, verdict: &Verdict) {
         let object = self.after(name, verdict);
@@ -64,16 +69,21 @@ impl Objects {
         self.known.drain(..many);
     }
 
-    /// The object after another press. After a change of the model, it may be known with other
-    /// levels, and then begins anew.
-    fn after(&self, name: &str, verdict: &Verdict) -> Object {
+    /// The object, if it was pressed. After a change of the model, it may be known with other levels, and then begins
+    /// anew.
+    fn find(&self, name: &str, verdict: &Verdict) -> Option<&Object> {
         let levels = verdict.probabilities.len();
         let is_same = |known: &&Object| known.name == name && known.log_sums.len() == levels;
-        let known = self.known.iter().find(is_same).cloned();
+        self.known.iter().find(is_same)
+    }
+
+    /// The object after another press.
+    fn after(&self, name: &str, verdict: &Verdict) -> Object {
+        let known = self.find(name, verdict).cloned();
         let mut object = known.unwrap_or_else(|| Object {
             name: name.to_owned(),
             presses: 0,
-            log_sums: vec![0.0; levels],
+            log_sums: vec![0.0; verdict.probabilities.len()],
             shore_sums: [0.0; 4],
         });
         object.add(verdict);
@@ -144,10 +154,12 @@ mod tests {
     fn presses_that_agree_make_the_object_surer_and_others_do_not_count() {
         let mut objects = Objects::default();
         let press = verdict(&[0.6, 0.3, 0.1], Some([60.0, 50.0, 70.0]));
+        assert!(objects.without("cup", &press).is_none());
         let first = objects.with("cup", &press);
         assert_eq!((first.presses, first.level), (1, 1));
         assert!((first.probabilities[0] - 0.6).abs() < 1e-6);
         objects.add("cup", &press);
+        assert_eq!(objects.without("cup", &press).as_ref(), Some(&first));
         objects.add("can", &verdict(&[0.0, 0.0, 1.0], None));
         let wide = verdict(&[0.6, 0.3, 0.1], Some([80.0, 50.0, 90.0]));
         let second = objects.with("cup", &wide);
