@@ -195,7 +195,10 @@ fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<Strin
         let [newtons, read] = [newtons, read].map(|n| format!("{n:.3} N"));
         text += &format!("{newtons:<13} {read:<13} {error:+.1} %\n");
     }
-    let (newtons_per_count, [least, most]) = (fit.newtons_per_count, fit.alone);
+    // A fine count may have a ten-thousandth of the newtons of a coarse one.
+    let digits = (4.0 - fit.newtons_per_count.log10().floor()).clamp(0.0, 20.0) as usize;
+    let [least, most] = fit.alone.map(|newtons| format!("{newtons:.digits$}"));
+    let newtons_per_count = format!("{:.digits$}", fit.newtons_per_count);
     let power = match fit.power {
         Some((exponent, error)) => {
             format!("exponent {exponent:.2}, error {:.1} %", 100.0 * error)
@@ -204,12 +207,12 @@ fn of_force(newtons: &[f64], presses: &[Press], sensor: &Sensor) -> Result<Strin
     };
     Ok(text
         + &format!(
-            "\nnewtons_per_count  {newtons_per_count:.5} (weight by weight {least:.5} to {most:.5})\n\
+            "\nnewtons_per_count  {newtons_per_count} (weight by weight {least} to {most})\n\
              line               error {:.1} %\n\
              power law          {power}\n\
              \n\
              [sensor.calibration]\n\
-             newtons_per_count = {newtons_per_count:.5}\n\
+             newtons_per_count = {newtons_per_count}\n\
              exponent = {:.2}\n",
             100.0 * fit.line_error,
             fit.exponent

@@ -43,7 +43,8 @@ const RESTING_SHARE: f64 = 0.8;
 /// being put on or taken off.
 const LEFT_OUT: f64 = 0.25;
 /// The weight is on the taxels with at least this share of the greatest force on one, and on those
-/// around them. The present scale may be far off, so no threshold in newtons can say it.
+/// around them. The present scale may be far off, so no threshold in newtons can say it. Nor is it on taxels that read no
+/// more above 0 than others read below: that is noise.
 const ON_SHARE: f32 = 0.05;
 /// An exponent needs at least this number of different weights.
 const LEAST_WEIGHTS: usize = 4;
@@ -184,10 +185,14 @@ impl Weight {
             array,
             newtons: newtons_of_counts,
         };
-        let greatest = means.newtons.iter().copied().fold(0.0, f32::max);
+        let means_of = means.newtons.iter().copied();
+        let (greatest, noise) = (
+            means_of.clone().fold(0.0, f32::max),
+            -means_of.fold(0.0, f32::min),
+        );
         let counts = RawFrame {
             array,
-            counts: means.felt(ON_SHARE * greatest).newtons,
+            counts: means.felt(noise.max(ON_SHARE * greatest)).newtons,
         };
         Self {
             newtons,
