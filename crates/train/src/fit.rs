@@ -23,6 +23,7 @@ use crate::data::collect::{self, Collection, Settings};
 use crate::data::findings;
 use crate::data::presses::{Layout, Presses, read_one};
 use crate::data::source::{Source, papers_levels};
+use crate::exit::unreadable;
 use crate::model::export::{Learnt, validation};
 use crate::progress;
 use hardnessd_core::references;
@@ -178,6 +179,10 @@ fn read(
     sensor: &Sensor,
     levels: Option<Vec<Level>>,
 ) -> anyhow::Result<(Presses, Vec<String>)> {
+    // What cannot be used is left out, but not a name that is misspelt.
+    for path in data {
+        std::fs::metadata(path).map_err(|error| unreadable(path, &error))?;
+    }
     let paths = collect::captures(data)?;
     let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths
         .into_iter()

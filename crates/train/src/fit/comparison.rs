@@ -360,7 +360,8 @@ impl Comparison<'_> {
         let is_no_better = |other: &Row| lead(other).is_some_and(|lead| lead.worth <= 0.0);
         let control = self.control.estimate(division);
         let tells = |control: Estimate| control.worth > self.guessing(division);
-        if control.is_some_and(tells) && is_no_better(&self.control) {
+        let are_sessions = control.is_some_and(tells) && is_no_better(&self.control);
+        if are_sessions {
             remarks.push(format!(
                 "the unloaded sensor alone tells the levels as well as {name}: the sessions tell them apart, and not the \
                  hardness. Record each object in several sessions, all objects in turn, with a new zero before each"
@@ -377,11 +378,12 @@ impl Comparison<'_> {
                  shapes"
             ));
         }
-        if best > 0 && !is_no_better(built_in) {
+        if best > 0 && !are_sessions && !is_no_better(built_in) {
             return best;
         }
         let why = match best {
             0 => "the built-in model is the best one".to_owned(),
+            _ if are_sessions => format!("{name} may know the sessions alone"),
             _ => format!("{name} is not better than the built-in model by more than chance"),
         };
         let then = match self.has_references {

@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::ensure;
+use anyhow::{bail, ensure};
 
 use crate::data::source::papers_levels;
 use hardnessd_core::recording::Labels;
 use hardnessd_core::verdict::{Level, MOST_LEVELS};
+use hardnessd_core::wording::is_misspelt;
 
 /// The levels that the labels of recordings name. Numbers alone are those of the paper's levels, or of as
 /// many as there are. Two names that differ in case alone are one. Names are put in the order of the Shore hardness that
@@ -40,6 +41,17 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
     };
     if named.keys().all(is_papers) && most <= papers.len() {
         return Ok(papers);
+    }
+    if named.keys().any(is_papers)
+        && let Some(name) = named.keys().find(|name| !is_papers(name))
+        && let Some(meant) = papers
+            .iter()
+            .find(|level| is_misspelt(&name.to_ascii_lowercase(), &level.label))
+    {
+        bail!(
+            "label level: found {name:?} beside names of the usual levels: did you mean {:?}?",
+            meant.label
+        );
     }
     let count = named.len().max(most);
     ensure!(
@@ -97,6 +109,8 @@ mod tests {
     fn levels_are_those_of_the_labels() {
         let papers = "hard >70, firm 61-70, soft 51-60, very-soft <=50";
         // The labels `level` and `shore` of each recording, and the levels that follow.
+        let misspelt = ["hrad", "soft"].map(|name| Labels::from([("level".into(), name.into())]));
+        assert!(of_labels(misspelt.iter()).is_err());
         for (given, expected) in [
             ("1, 3 55", papers),
             ("Soft, hard", papers),

@@ -8,7 +8,9 @@ use crate::data::presses::Presses;
 use crate::judge::evaluated::{Case, cases};
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
-use hardnessd_core::verdict::{Card, Format, Model, Piece, ReferencePress, References, TimeSeries};
+use hardnessd_core::verdict::{
+    Card, Format, Model, Piece, ReferencePress, References, TimeSeries, Verdict,
+};
 use hardnessd_simulator::random::Stream;
 
 /// The references of its sensor that a model is given beside a press.
@@ -178,7 +180,9 @@ pub fn of(
                 hrn.judge_beside(&presses.course_for(place, hrn.card()), references)?
             }
         };
-        verdicts.push((place, verdict));
+        // As the daemon publishes it.
+        let shore = verdict.shore.map(|shore| hrn.within(shore, verdict.level));
+        verdicts.push((place, Verdict { shore, ..verdict }));
     }
     Ok(cases(presses, &verdicts))
 }

@@ -296,6 +296,11 @@ fn what_cannot_be_fitted_is_said_in_one_line() {
     refused("d.npz", "found 10 labelled presses of 2 objects");
     let expected = "d.npz and d.npz are the same file: name it once";
     refused("d.npz d.npz", expected);
+    desk.fails(
+        "fit d.npz missing.npz --out m.onnx",
+        66,
+        "missing.npz: No such file",
+    );
     fs::copy(desk.path("d.npz"), desk.path("copy.npz")).unwrap();
     refused("d.npz copy.npz", "copy.npz and d.npz are the same file");
     write(&desk, "d.npz", &[(1, 0), (1, 2), (1, 3)], &five);

@@ -1,9 +1,10 @@
 //! Ends the trainer at a signal, and says how to continue.
 
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGINT, SIGTERM, SIGXFSZ};
 use signal_hook::iterator::Signals;
 
-/// Ends the process at SIGINT and SIGTERM, with 130 and 143, and prints the command that continues.
+/// Ends the process at SIGINT and SIGTERM, with 130 and 143, and prints the command that continues. At the limit of a
+/// file's size, writing fails as on a full disk, and SIGXFSZ does not end the process.
 ///
 /// Every file on the disk is whole at any moment, and a run continues from its last checkpoint. So
 /// there is nothing to wait for.
@@ -12,9 +13,9 @@ use signal_hook::iterator::Signals;
 ///
 /// Fails if the system refuses a handler, or has no thread to wait on.
 pub(super) fn end_at_signals(how_to_continue: Option<String>) -> std::io::Result<()> {
-    let mut signals = Signals::new([SIGINT, SIGTERM])?;
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGXFSZ])?;
     std::thread::Builder::new().spawn(move || {
-        if let Some(signal) = signals.forever().next() {
+        if let Some(signal) = signals.forever().find(|&signal| signal != SIGXFSZ) {
             let hint = how_to_continue
                 .map_or_else(String::new, |command| format!("; to continue: {command}"));
             hrn_train::exit::remove_at_once();
