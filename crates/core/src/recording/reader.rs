@@ -122,15 +122,45 @@ impl<R: Read> Iterator for Records<R> {
 }
 
 /// Parses a record. An attachment is passed over, because the crate panics on one whose lengths do not
-/// fit. No recording of ours has any.
+/// fit. No recording of ours has any. Nor is a header read.
 pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, mcap::McapError> {
-    match opcode {
-        op::ATTACHMENT => Ok(Record::Unknown {
-            opcode,
-            data: body.into(),
-        }),
-        _ => mcap::parse_record(opcode, body),
+    let (texts, are_more) = match opcode {
+        op::ATTACHMENT | op::HEADER => {
+            let data = body.into();
+            return Ok(Record::Unknown { opcode, data });
+        }
+        op::SCHEMA => (texts(body, 2, 2), false),
+        op::CHANNEL => (texts(body, 4, 2), true),
+        op::CHUNK => (texts(body, 28, 1), false),
+        op::METADATA => (texts(body, 0, 1), true),
+        _ => return mcap::parse_record(opcode, body),
+    };
+    // After the texts comes the length of a list of further ones.
+    let are_whole = texts.is_some_and(|rest| !are_more || texts_to_end(rest).is_some());
+    match are_whole {
+        true => mcap::parse_record(opcode, body),
+        false => Err(mcap::McapError::UnexpectedEoc),
     }
+}
+
+/// What follows so many texts, which begin at `start`. `None` if one is longer than the record: the crate takes as much
+/// memory as the length says before it looks.
+fn texts(body: &[u8], start: usize, count: usize) -> Option<&[u8]> {
+    let mut rest = body.get(start..)?;
+    for _ in 0..count {
+        let (length, text) = rest.split_first_chunk::<4>()?;
+        rest = text.get(u32::from_le_bytes(*length) as usize..)?;
+    }
+    Some(rest)
+}
+
+/// The same for a list of texts, which has its own length before it.
+fn texts_to_end(list: &[u8]) -> Option<()> {
+    let mut rest = list.get(4..)?;
+    while !rest.is_empty() {
+        rest = texts(rest, 0, 1)?;
+    }
+    Some(())
 }
 
 /// The decoder of the messages of a schema, if they are read.
