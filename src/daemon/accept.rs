@@ -66,7 +66,10 @@ pub(crate) async fn accept<L: Listener>(
             }
             // The system is out of descriptors or memory. Try again later.
             Err(error) => {
-                log::limited("accept", || warn!(%error, "connections cannot be accepted"));
+                log::limited(
+                    "new connections",
+                    || warn!(%error, "connections cannot be accepted"),
+                );
                 tokio::time::sleep(PAUSE).await;
             }
         }

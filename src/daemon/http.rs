@@ -18,11 +18,12 @@ use std::pin::pin;
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::Bytes;
-use axum::extract::{DefaultBodyLimit, State};
+use axum::body::Body;
+use axum::extract::State;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{get, post};
 use base64::prelude::{BASE64_STANDARD, Engine};
+use futures_util::StreamExt as _;
 use hyper::body::Incoming;
 use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
 use hyper::server::conn::http1;
@@ -47,7 +48,7 @@ use hardnessd_core::wording::cut_found;
 /// The live page: one file, which loads nothing from elsewhere.
 const PAGE: &str = include_str!("page.html");
 
-/// How long the head of a request may take, and how long a connection may idle between two
+/// How long the head of a request may take, and its body, and how long a connection may idle between two
 /// requests.
 const HEAD_PATIENCE: Duration = Duration::from_secs(15);
 
@@ -110,7 +111,7 @@ impl Http {
             });
         if let Some(sensors) = sensors {
             let set = post(async move |headers, body| context(&sensors, headers, body).await);
-            routes = routes.route("/api/context", set.layer(DefaultBodyLimit::max(BODY_BYTES)));
+            routes = routes.route("/api/context", set);
         }
         let routes = routes.method_not_allowed_fallback(async move || {
             let message = match sets_context {
@@ -160,7 +161,7 @@ struct Pressed {
 
 /// Sets what is being pressed. A page from elsewhere cannot send this type of content without a question first, and
 /// gets no answer to that.
-async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response {
+async fn context(sensors: &Sensors, headers: HeaderMap, body: Body) -> Response {
     let kind = headers.get(header::CONTENT_TYPE);
     let kind = kind.and_then(|kind| kind.to_str().ok()).unwrap_or_default();
     let (kind, _parameters) = kind.split_once(';').unwrap_or((kind, ""));
@@ -168,6 +169,20 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
         let why = "Content-Type: expected application/json";
         return refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, why);
     }
+    let body = match tokio::time::timeout(HEAD_PATIENCE, read_body(body)).await {
+        Ok(Some(body)) => body,
+        read => {
+            let (code, why) = match read {
+                Ok(_) => (
+                    StatusCode::PAYLOAD_TOO_LARGE,
+                    "the body is too long or cut off",
+                ),
+                Err(_) => (StatusCode::REQUEST_TIMEOUT, "the body did not come in time"),
+            };
+            let closes = [(header::CONNECTION, "close")];
+            return (closes, refusal(code, why)).into_response();
+        }
+    };
     let read = serde_json::from_slice(&body).map_err(|error| cut_found(&error.to_string()));
     let done = async {
         let Pressed {
@@ -185,6 +200,20 @@ async fn context(sensors: &Sensors, headers: HeaderMap, body: Bytes) -> Response
         Ok(_) => text("application/json", "{}".to_owned()),
         Err(why) => refusal(StatusCode::BAD_REQUEST, why),
     }
+}
+
+/// The body of a request. `None` if it is too long or cut off. Each piece is copied: alone it would keep the buffer into
+/// which it was read.
+async fn read_body(body: Body) -> Option<Vec<u8>> {
+    let mut pieces = body.into_data_stream();
+    let mut bytes = Vec::new();
+    while let Some(piece) = pieces.next().await {
+        bytes.extend_from_slice(&piece.ok()?);
+        if bytes.len() > BODY_BYTES {
+            return None;
+        }
+    }
+    Some(bytes)
 }
 
 /// An answer with an error code and one line with the reason.

@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tracing::{Level, Subscriber, info, warn};
-use tracing_subscriber::filter::Targets;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::layer::{Layer, SubscriberExt};
@@ -112,8 +112,13 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     if parts.is_empty() {
         return Ok(unasked.parse().expect("these are directives"));
     }
+    // A word that is no level would count as a target, and leave out all others.
+    let are_known = parts
+        .iter()
+        .all(|part| part.contains('=') || part.parse::<LevelFilter>().is_ok());
     let directives = parts.join(",");
-    directives.parse().map_err(|_| {
+    let filter = directives.parse().ok().filter(|_| are_known);
+    filter.ok_or_else(|| {
         Error::Config(format!(
             "RUST_LOG: found {directives:?}, expected off, error, warn, info, debug or trace, or \
              TARGET=LEVEL, as in \"warn,hardnessd=debug\""

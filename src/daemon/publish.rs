@@ -48,7 +48,7 @@ fn control_group(unix: &Unix) -> Result<Option<Gid>, Error> {
         return Ok(None);
     };
     let found = socket::group(name);
-    let expected = "expected a group of /etc/group, such as \"hardnessd-control\" of the package";
+    let expected = "expected a group of /etc/group; the package makes \"hardnessd-control\"";
     found
         .map(Some)
         .ok_or_else(|| Error::Config(format!("{GROUP_KEY}: found {name:?}, {expected}")))

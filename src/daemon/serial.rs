@@ -309,7 +309,7 @@ impl Task {
                 Err(error) => return error.to_string(),
             };
             if std::mem::take(&mut is_new) && is_telnet(&self.buffer[..bytes]) {
-                log::limited("tcp", || warn!(port = %self.port, "{TELNET}"));
+                log::limited("TCP peers", || warn!(port = %self.port, "{TELNET}"));
             }
             self.pass_on(bytes).await;
         }

@@ -177,6 +177,12 @@ fn bytes_hold_no_place_and_requests_go_to_a_sender_of_frames() {
     assert!(requests() > 20);
     std::thread::sleep(Duration::from_millis(300));
     assert_eq!(requests(), 0);
+    // Then it has no more sent than it sends.
+    for _ in 0..4 {
+        noise.send_to(b"7", address).unwrap();
+        std::thread::sleep(10 * PERIOD);
+    }
+    assert!((1..=4).contains(&requests()));
     // One byte every 20 ms holds the place for half a second at a time.
     let mut place = Vec::new();
     wait_for("the sensor", || {

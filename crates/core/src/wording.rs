@@ -136,7 +136,7 @@ pub fn of_toml(text: &str, error: &toml::de::Error) -> String {
 /// The parser's message in words: the name of a type becomes what it holds, and the list of all names
 /// becomes the most similar one, if one is similar.
 fn in_words(message: &str) -> String {
-    const TYPES: [(&str, &str); 11] = [
+    const TYPES: [(&str, &str); 13] = [
         ("u8", "a whole number from 0 to 255"),
         ("u16", "a whole number from 0 to 65535"),
         ("u32", "a whole number from 0 to 4294967295"),
@@ -148,6 +148,8 @@ fn in_words(message: &str) -> String {
         ("f64", "a number"),
         ("a string", "a text in quotes"),
         ("a boolean", "true or false"),
+        ("a sequence", "a list in brackets"),
+        ("socket address", "ADDRESS:PORT in quotes"),
     ];
     if message == "invalid socket address syntax" {
         return "expected ADDRESS:PORT, such as \"127.0.0.1:8256\"".to_owned();
@@ -158,6 +160,9 @@ fn in_words(message: &str) -> String {
     if let Some((_, words)) = TYPES.iter().find(|(name, _)| *name == expected) {
         return format!("{found}, expected {words}");
     }
+    if expected.starts_with("struct ") {
+        return format!("{found}, expected a table");
+    }
     let names = |text: &str| -> Vec<String> {
         let names = text.split('`').skip(1).step_by(2);
         names.map(str::to_owned).collect()
@@ -165,7 +170,10 @@ fn in_words(message: &str) -> String {
     let Some(unknown) = names(found).pop() else {
         return message.to_owned();
     };
-    let likeness = |name: &String| strsim::jaro_winkler(&unknown, name);
+    let likeness = |name: &String| match is_misspelt(&unknown, name) {
+        true => 1.0,
+        false => strsim::jaro_winkler(&unknown, name),
+    };
     let mut known = names(expected);
     known.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)));
     let is_as_near = |other: &String| likeness(&known[0]) - likeness(other) < AS_SIMILAR;
@@ -175,6 +183,11 @@ fn in_words(message: &str) -> String {
         }
         _ => message.to_owned(),
     }
+}
+
+/// Whether a name is one typing error away from another: a letter, or two that are swapped.
+pub fn is_misspelt(name: &str, other: &str) -> bool {
+    strsim::osa_distance(name, other) == 1
 }
 
 /// Names with at least this Jaro-Winkler similarity count as similar.

@@ -129,8 +129,11 @@ fn resolve(given: Option<&mut PathBuf>, directory: &Path, key: &str) -> Result<(
 fn syntax(text: &str, error: &toml::de::Error) -> Problem {
     let table = text.parse::<toml::Table>().unwrap_or_default();
     if table.get("sensor").is_some_and(toml::Value::is_table) {
-        let problem = "write [[sensor]], not [sensor]: there may be several";
-        return Problem::of_file(problem);
+        let line = text.lines().position(|line| line.trim() == "[sensor]");
+        let line = line.map_or_else(String::new, |line| format!("line {}: ", line + 1));
+        return Problem::of_file(format!(
+            "{line}write [[sensor]], not [sensor]: there may be several"
+        ));
     }
     Problem::of_file(wording::of_toml(text, error))
 }

@@ -62,7 +62,7 @@ fn an_error_is_one_line_that_names_file_place_key_found_and_expected() {
         ),
         (
             "[sensor]\nport = \"p\"\n".to_owned(),
-            "hardnessd.toml: write [[sensor]], not [sensor]: there may be several",
+            "hardnessd.toml: line 1: write [[sensor]], not [sensor]: there may be several",
         ),
         (
             format!("{LEAST}name = \"{long}\""),

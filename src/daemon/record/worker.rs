@@ -148,7 +148,7 @@ impl Worker {
     /// Pauses the recording, and logs the reason once.
     fn pause(&mut self, reason: &recording::Error) {
         if self.paused.is_none() {
-            warn!(%reason, "recording stopped; it goes on when there is room");
+            warn!(%reason, "recording stopped; it is tried again");
         }
         self.paused = Some(Instant::now() + RETRY_AFTER);
     }

@@ -88,7 +88,7 @@ struct Sender {
     /// When its last frame came, or its first bytes.
     last: Instant,
     sends_frames: bool,
-    /// The number of requests to it since then.
+    /// The number of requests to it, less that of its datagrams while it has sent no frame.
     requests: u32,
     /// Whether another one was reported.
     reported: bool,
@@ -121,10 +121,9 @@ impl Udp {
         let (bytes, address) = self.socket.recv_from(buffer).await?;
         Ok(match &mut self.sender {
             Some(sender) if sender.address == address => {
-                if !sender.sends_frames && !sender.is_new(stale_after) {
-                    // Nobody else came since its time was over.
-                    sender.last = Instant::now();
-                    sender.requests = 0;
+                // It may be ready for requests only now. But no stranger may have more sent than it sends.
+                if !sender.sends_frames {
+                    sender.requests = sender.requests.saturating_sub(1);
                 }
                 // An empty datagram is no end.
                 match bytes {
@@ -135,7 +134,7 @@ impl Udp {
             Some(sender) if sender.is_new(stale_after) => {
                 if !std::mem::replace(&mut sender.reported, true) {
                     let sender = sender.address;
-                    log::limited("udp", || {
+                    log::limited("UDP senders", || {
                         warn!(%sender, other = %address, "ignored: another sender sends for this sensor, and one at a time may");
                     });
                 }
