@@ -373,6 +373,11 @@ fn curve(sensor: &Sensor, now: Duration, width: usize, height: usize) -> Vec<Lin
     lines
 }
 
+/// The least columns of an answer with its Shore hardness.
+const LEAST_ANSWER: usize = 27;
+/// The columns of a verdict up to its force, which the shares of the levels follow.
+const VERDICT_COLUMNS: usize = 48;
+
 fn verdicts(
     view: &View,
     sensor: &Sensor,
@@ -380,29 +385,43 @@ fn verdicts(
     now: Duration,
     width: usize,
 ) -> Vec<Line<'static>> {
-    let of = format!("Shore OO, level, age; % of {}", view.labels.join(", "));
+    let room_for_shares = VERDICT_COLUMNS + 4 * view.labels.len();
+    let of = match width >= room_for_shares {
+        true => format!("Shore OO, level, age; % of {}", view.labels.join(", ")),
+        false => "Shore OO, level, age".to_owned(),
+    };
     let mut lines = vec![headed("verdicts", &of, ASIDE)];
     if sensor.verdicts.is_empty() {
         lines.push(span("none yet", ASIDE).into());
     }
-    for (index, (at, verdict)) in sensor.verdicts.iter().enumerate() {
+    let answers = sensor.verdicts.iter().map(|(_, verdict)| {
         let (answer, is_weak) = answer(verdict, &view.labels);
-        let style = match is_weak {
+        (with_shore(&answer, verdict), is_weak)
+    });
+    let answers: Vec<(String, bool)> = answers.collect();
+    let longest = answers
+        .iter()
+        .map(|(answer, _)| answer.chars().count())
+        .max();
+    let longest = longest.unwrap_or(0).max(LEAST_ANSWER);
+    for (index, ((at, verdict), (answer, is_weak))) in
+        sensor.verdicts.iter().zip(&answers).enumerate()
+    {
+        let style = match *is_weak {
             true => ASIDE,
             false if index == 0 && link == Link::Live => STRONG,
             false => Style::new(),
         };
         let old = age(now.saturating_sub(*at));
-        let line = verdict_line(verdict, &answer, &old, width);
+        let line = verdict_line(verdict, &format!("{answer:<longest$} {old:>6}"), width);
         lines.push(span(&line, style).into());
     }
     lines
 }
 
-/// Press, answer with its Shore hardness, and age. What else is known follows as far as there is room.
-fn verdict_line(verdict: &Value, answer: &str, old: &str, width: usize) -> String {
-    let (press, answer) = (number(verdict, "press"), with_shore(answer, verdict));
-    let mut line = format!("{press:>3} {answer:<27} {old:>6}");
+/// Press, and answer with its age. What else is known follows as far as there is room.
+fn verdict_line(verdict: &Value, answer: &str, width: usize) -> String {
+    let mut line = format!("{:>3} {answer}", number(verdict, "press"));
     let early = (verdict["phase"] == "early").then(|| "  early".to_owned());
     let force_n = verdict["force_n"].as_f64().unwrap_or_default();
     let shares = items(verdict, "probabilities").filter_map(Value::as_f64);

@@ -232,7 +232,7 @@ fn verdicts_stand_with_their_probabilities_newest_first() {
         .skip_while(|line| !line.starts_with("verdicts"))
         .collect();
     let expected = [
-        "verdicts Shore OO, level, age; % of hard, firm",
+        "verdicts Shore OO, level, age",
         "  4 65 +- 6 OO, low force        1.2 s   12.3 N",
         "  3 65 +- 6 OO, firm              10 s   12.3 N",
         "",
