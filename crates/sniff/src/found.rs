@@ -206,7 +206,7 @@ impl Ranked {
             ));
         }
         if is_given {
-            return None;
+            return self.own_doubt.clone();
         }
         let other = next.filter(|next| self.may_be(next));
         if other.is_some_and(|other| other.array == self.array && other.cell == self.cell) {

@@ -179,7 +179,12 @@ impl Parts<'_> {
         let mark = match check.map(|check| check.places().end) {
             Some(end) => match covered.filter(|&begin| self.place.constant(begin).is_none()) {
                 Some(begin) => end..begin,
-                None => end..self.place.constant_end(begin.unwrap_or(end).max(end)),
+                None => {
+                    let begin = begin.unwrap_or(end).max(end);
+                    let whole = end..self.place.constant_end(begin);
+                    let shorter = self.place.without_high_bytes(whole.clone()).end;
+                    end..shorter.max(begin + 1).min(whole.end)
+                }
             },
             None => match self.place.mark() {
                 Some(mark) => mark,

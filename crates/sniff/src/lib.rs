@@ -23,7 +23,7 @@ mod text;
 mod search;
 mod packed;
 
-use hardnessd_core::wire::{Cell, Layout, Preset, Settings};
+use hardnessd_core::wire::{Cell, Layout, Preset, Settings, TELNET};
 
 use coding::Coding;
 pub use found::{Failure, Found, Known, Ranked};
@@ -90,8 +90,12 @@ pub fn sniff(capture: &Capture, known: Known) -> Result<Found, Failure> {
         Some(Coding::Unreadable(words)) => return Err(Failure::sure(words)),
         Some(Coding::Maybe(words)) => {
             let mut found = in_periods(capture, known).or(Err(Failure::sure(words)))?;
-            if let Some(doubt) = &mut found.doubt {
-                *doubt += &format!("; or {words}");
+            match &mut found.doubt {
+                Some(doubt) => *doubt += &format!("; or {words}"),
+                None if found.best.proposal.is_checked() || found.best.proposal.is_board => {}
+                // A mark may be FF FF.
+                None if words == TELNET => {}
+                none => *none = Some(words.to_owned()),
             }
             return Ok(found);
         }

@@ -11,7 +11,7 @@ use crate::text::most_frequent;
 use crate::{Capture, in_periods};
 
 /// What no sensor sends.
-const MARK: [u8; 8] = [0xA5, 0xC3, 0x96, 0x3C, 0xD2, 0xE1, 0x69, 0xB4];
+pub(crate) const MARK: [u8; 8] = [0xA5, 0xC3, 0x96, 0x3C, 0xD2, 0xE1, 0x69, 0xB4];
 
 /// The layout of packed frames.
 pub(crate) fn find(framing: Framing, bytes: &[u8], known: Known) -> Result<Found, Failure> {

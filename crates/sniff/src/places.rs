@@ -10,6 +10,7 @@ use hardnessd_core::wire::Checksum;
 use crate::checks::Check;
 use crate::columns::{Columns, Kind};
 use crate::model::{CONSTANT_BITS, EXPECTED_BITS, UNKNOWN_BITS, UNKNOWN_TAXEL_BITS, ZERO_BITS};
+use crate::packed;
 
 /// A stretch of each frame that may be the cells.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +61,10 @@ const MOST_BESIDE: usize = 40;
 /// The most places with as many bytes beside the cells. Constant cells all over a frame look like a mark, such
 /// as the high halves of numbers below 0: the places beside them would crowd out the right one.
 const MOST_OF_LENGTH: usize = 8;
+/// The most bytes of a number that may look constant.
+const MOST_HIGH_BYTES: usize = 3;
+/// The least mark that is left without them.
+const LEAST_MARK: usize = 2;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;
 
@@ -192,13 +197,51 @@ impl Place {
         let begins = (0..self.beside.len()).filter(|&at| {
             self.constant(at).is_some() && (at == 0 || self.constant(at - 1).is_none())
         });
-        let runs = begins.map(|start| start..self.constant_end(start));
-        let weight = |run: &Range<usize>| {
-            run.clone()
-                .filter(|&at| self.constant(at) != Some(0))
-                .count()
+        let runs = begins.map(|start| {
+            let run = start..self.constant_end(start);
+            let mark = self.without_high_bytes(run.clone());
+            (self.weight(&run), mark == run, mark)
+        });
+        let best = runs
+            .rev()
+            .max_by_key(|&(weight, is_whole, _)| (weight, is_whole));
+        best.and_then(|(weight, _, mark)| (weight > 0).then_some(mark))
+    }
+
+    /// How many of these constant bytes are not 0.
+    fn weight(&self, run: &Range<usize>) -> usize {
+        run.clone()
+            .filter(|&at| self.constant(at) != Some(0))
+            .count()
+    }
+
+    /// Constant bytes without those that may be high ones of what changes beside them, such as a clock, as long as a mark
+    /// is left.
+    pub(crate) fn without_high_bytes(&self, mut run: Range<usize>) -> Range<usize> {
+        let checked = self.check.map_or(0..0, |check| check.places());
+        // The highest byte that changes is seldom restless.
+        let changes = |at: usize| {
+            let kind = self.beside.get(at).map(|beside| beside.kind);
+            matches!(kind, Some(Kind::Number | Kind::Active)) && !checked.contains(&at)
         };
-        runs.rev().max_by_key(weight).filter(|run| weight(run) > 0)
+        let [before, after] = [run.start.wrapping_sub(1), run.end].map(changes);
+        let has_own_mark = |run: &Range<usize>| {
+            let bytes: Vec<u8> = run.clone().filter_map(|at| self.constant(at)).collect();
+            bytes
+                .windows(packed::MARK.len())
+                .any(|part| part == packed::MARK)
+        };
+        let is_packed = has_own_mark(&run);
+        for _ in 0..MOST_HIGH_BYTES {
+            for (may_be_high, [from_start, from_end]) in [(after, [0, 1]), (before, [1, 0])] {
+                let shorter = run.start + from_start..run.end - from_end;
+                let is_mark = self.weight(&shorter) > 0 && (!is_packed || has_own_mark(&shorter));
+                if may_be_high && run.len() > LEAST_MARK && is_mark {
+                    run = shorter;
+                }
+            }
+        }
+        run
     }
 
     /// The bytes that change in an unknown way.

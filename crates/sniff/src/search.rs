@@ -525,15 +525,21 @@ impl Search<'_> {
             let is_best = ranked
                 .iter()
                 .all(|ranked| score.bits() < ranked.score.bits());
-            let mut own_doubt = doubt_of_cells(array.taxels(), &score, &alone);
+            let mut own_doubt = (!known.is_complete())
+                .then(|| doubt_of_cells(array.taxels(), &score, &alone))
+                .flatten();
             let of_place = || {
                 self.stuck_mark(candidate, candidates)
                     .or_else(|| other_cells(candidate, candidates))
                     .or_else(|| self.shifted(candidate, &pictures))
             };
             if is_best && !proposal.is_board && known.is_complete() {
-                // No more can be said of the array, and the cells may still begin elsewhere.
-                proposal.remarks.extend(of_place());
+                // No more can be said of the array, and beside other bytes the cells may still begin elsewhere.
+                let mark = candidate.place.mark().map_or(0, |mark| mark.len());
+                match candidate.place.beside.len() > mark {
+                    true => own_doubt = of_place(),
+                    false => proposal.remarks.extend(of_place()),
+                }
             } else if is_best && !proposal.is_board {
                 let half = "they look like floats of 16 bits, which the daemon does not read: say --cell if they are \
                             not, or let a bridge send them as text";

@@ -88,7 +88,15 @@ pub(crate) fn find(bytes: &[u8], known: Known) -> Result<Found, Failure> {
         .take(MOST_FRAMES)
         .collect();
     if let Some((rows, _)) = rows {
-        return in_rows(Array { rows, cols: count }, bytes, known);
+        let mut found = in_rows(Array { rows, cols: count }, bytes, known)?;
+        if is_growing(&frames, 0) || is_numbered(&frames, rows) {
+            found.doubt = Some(
+                "the first number of each row grows, as a time or the row's number does: print a colon after it, or \
+                 leave it out"
+                    .to_owned(),
+            );
+        }
+        return Ok(found);
     }
     if let Some(rows) = rows_of_a_frame(&frames) {
         return no_array(&format!(
@@ -171,6 +179,13 @@ fn rows_of_a_frame(lines: &[&Vec<f32>]) -> Option<usize> {
         .min_by(|a, b| of[a - 1].total_cmp(&of[b - 1]))
 }
 
+/// Whether the first numbers of the rows of a frame count them, in each frame.
+fn is_numbered(lines: &[&Vec<f32>], rows: usize) -> bool {
+    let last = rows as f32 - 1.0;
+    let mut steps = lines.windows(2).map(|pair| pair[1][0] - pair[0][0]);
+    steps.all(|step| [1.0, -last].contains(&step))
+}
+
 fn is_growing(frames: &[&Vec<f32>], at: usize) -> bool {
     let steps: Vec<f32> = frames
         .windows(2)
@@ -202,6 +217,7 @@ fn in_order(
     };
     let alone = model::alone(&pictures);
     let alone: Vec<f64> = alone.iter().map(|press| press.iter().sum()).collect();
+    let is_given = known.rows.is_some() && known.cols.is_some();
     let arrays: Vec<Array> = known.arrays(cells, cells).collect();
     let readable = arrays.iter().filter(|&&array| !is_too_large(array));
     let ranked = readable.filter_map(|&array| {
@@ -213,12 +229,15 @@ fn in_order(
             cell: None,
             picture: pictures.strongest().to_vec(),
             proposal,
-            own_doubt: doubt_of_cells(cells, &own, &score(array, alone.clone()))
-                .or_else(|| doubt_of_rows(&pictures, array, 1)),
+            own_doubt: (!is_given)
+                .then(|| {
+                    doubt_of_cells(cells, &own, &score(array, alone.clone()))
+                        .or_else(|| doubt_of_rows(&pictures, array, 1))
+                })
+                .flatten(),
             score: own,
         })
     });
-    let is_given = known.rows.is_some() && known.cols.is_some();
     Found::among(ranked.collect(), is_given).ok_or_else(|| {
         match arrays.into_iter().find(|&array| is_too_large(array)) {
             Some(array) => Failure::TooLarge(array),
