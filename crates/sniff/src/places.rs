@@ -217,26 +217,32 @@ impl Place {
 
     /// Constant bytes without those that may be high ones of what changes beside them, such as a clock, as long as a mark
     /// is left.
-    pub(crate) fn without_high_bytes(&self, mut run: Range<usize>) -> Range<usize> {
+    pub(crate) fn without_high_bytes(&self, whole: Range<usize>) -> Range<usize> {
         let checked = self.check.map_or(0..0, |check| check.places());
         // The highest byte that changes is seldom restless.
         let changes = |at: usize| {
             let kind = self.beside.get(at).map(|beside| beside.kind);
             matches!(kind, Some(Kind::Number | Kind::Active)) && !checked.contains(&at)
         };
-        let [before, after] = [run.start.wrapping_sub(1), run.end].map(changes);
-        let has_own_mark = |run: &Range<usize>| {
-            let bytes: Vec<u8> = run.clone().filter_map(|at| self.constant(at)).collect();
-            bytes
-                .windows(packed::MARK.len())
-                .any(|part| part == packed::MARK)
+        let [before, after] = [whole.start.wrapping_sub(1), whole.end].map(changes);
+        let bytes = |run: &Range<usize>| -> Vec<u8> {
+            run.clone().filter_map(|at| self.constant(at)).collect()
         };
-        let is_packed = has_own_mark(&run);
+        let times =
+            |part: &[u8], of: &[u8]| of.windows(part.len()).filter(|&at| at == part).count();
+        let all = bytes(&whole);
+        let own_marks = times(&packed::MARK, &all);
+        let is_mark = |run: &Range<usize>| {
+            let bytes = bytes(run);
+            self.weight(run) > 0
+                && times(&bytes, &all) == 1
+                && times(&packed::MARK, &bytes) == own_marks
+        };
+        let mut run = whole;
         for _ in 0..MOST_HIGH_BYTES {
             for (may_be_high, [from_start, from_end]) in [(after, [0, 1]), (before, [1, 0])] {
                 let shorter = run.start + from_start..run.end - from_end;
-                let is_mark = self.weight(&shorter) > 0 && (!is_packed || has_own_mark(&shorter));
-                if may_be_high && run.len() > LEAST_MARK && is_mark {
+                if may_be_high && run.len() > LEAST_MARK && is_mark(&shorter) {
                     run = shorter;
                 }
             }
