@@ -233,28 +233,13 @@ mod tests {
 
     #[test]
     fn each_kind_does_to_the_line_what_it_says() {
-        let script = r#"
-            [[fault]]
-            at_s = 1.0
-            kind = "unplug"
-            for_s = 0.5
-            [[fault]]
-            at_s = 2.0
-            kind = "silence"
-            for_s = 0.5
-            [[fault]]
-            at_s = 3.0
-            kind = "noise"
-            bytes = 7
-            [[fault]]
-            at_s = 4.0
-            kind = "drop-bytes"
-            bytes = 3
-            frames = 2
-            [[fault]]
-            at_s = 5.0
-            kind = "flip"
-        "#;
+        let script = "fault = [
+            { at_s = 1.0, kind = 'unplug', for_s = 0.5 },
+            { at_s = 2.0, kind = 'silence', for_s = 0.5 },
+            { at_s = 3.0, kind = 'noise', bytes = 7 },
+            { at_s = 4.0, kind = 'drop-bytes', bytes = 3, frames = 2 },
+            { at_s = 5.0, kind = 'flip' },
+        ]";
         let mut faults = Faults::new(parse(script).unwrap(), 1);
         let layout = Layout::new(&Settings::default()).unwrap();
         let (raw, mut whole) = (RawFrame::default(), Vec::new());

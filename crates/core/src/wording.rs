@@ -95,6 +95,15 @@ pub fn lines(text: &str) -> String {
 }
 
 /// The same JSON without hidden characters, for a terminal. They are inside strings only.
+///
+/// # Example
+///
+/// ```
+/// use hardnessd_core::wording::json_escaped;
+///
+/// let safe = json_escaped("{\"label\":\"a\u{202e}b\u{9b}é\"}");
+/// assert_eq!(safe, r#"{"label":"a\u202eb\u009bé"}"#);
+/// ```
 pub fn json_escaped(json: &str) -> String {
     let mut escaped = String::with_capacity(json.len());
     for c in json.chars() {

@@ -5,6 +5,7 @@
 
 use hardnessd_core::frame::{Array, MOST_SIDE};
 use hardnessd_core::wire::{Cell, Order};
+use hardnessd_core::wording::name;
 
 use crate::Capture;
 use crate::cells::Cells;
@@ -52,6 +53,8 @@ const MAYBE_INTERLEAVED: f64 = 0.9;
 const UNLIKE: f64 = 1.1;
 /// The full scale of a converter of 10 bits. Those of fewer are one byte.
 const LEAST_FULL_SCALE: f32 = 1023.0;
+/// A number of 16 bits that changes by so much in a frame went through 0.
+const TURN: f32 = 64_900.0;
 /// One in so many frames may be damaged.
 const DAMAGED: usize = 10;
 /// The number of frames that a checksum is tried on.
@@ -406,6 +409,29 @@ impl Search<'_> {
         })
     }
 
+    /// The doubt that cells without a sign have one: one near 0 is near full scale in the next frame.
+    fn may_have_sign(&self, best: &Candidate, known: Known) -> Option<String> {
+        let Candidate { format, place, .. } = best;
+        let signed = numbers::signed(format.cell).filter(|&signed| signed != format.cell)?;
+        if known.cell.is_some() || signed.bytes() != 2 {
+            return None;
+        }
+        let cells = |index| {
+            let bytes = self.frames.from(index, place.start, place.bytes);
+            numbers::numbers(format.cell, bytes)
+        };
+        let turns = |&(before, after): &(usize, usize)| {
+            let mut both = cells(before).into_iter().zip(cells(after));
+            both.any(|(before, after)| (before - after).abs() >= TURN)
+        };
+        // Damage does it once.
+        let are_turned = self.frames.pairs().filter(turns).nth(1).is_some();
+        are_turned.then(|| {
+            let option = format!("--cell {}", name(&signed));
+            format!("numbers near 0 are near full scale in the next frame: say `{option}` if they fell below 0")
+        })
+    }
+
     /// The doubt that the first cell is none, where there may be one more behind the last, and the other way around.
     fn shifted(&self, best: &Candidate, pictures: &Pictures) -> Option<String> {
         let Candidate {
@@ -558,6 +584,14 @@ impl Search<'_> {
                         (!is_given).then(doubt).flatten()
                     })
                     .or_else(|| several_numbers(&channels[channel], array, format))
+                    .or_else(|| self.may_have_sign(candidate, known))
+                    .or_else(|| {
+                        // Other numbers beside the cells fill up a rare array.
+                        let is_odd = array.rows % 2 + array.cols % 2 > 0;
+                        (order == Order::Serpentine && is_odd).then(|| {
+                            "other numbers may be taken for taxels: say --rows, --cols and --cell".to_owned()
+                        })
+                    })
                     .or_else(of_place);
             }
             tried.push((array, order, format));

@@ -50,7 +50,7 @@ fn hello(run: &str, sensors: &[&str]) -> Value {
         .iter()
         .map(|name| json!({"name": name, "rows": 28, "cols": 28, "pitch_mm": 3.5}))
         .collect();
-    json!({"type": "hello", "protocol": 1, "robot": "arm-7", "version": "0.1.0", "run": run,
+    json!({"type": "hello", "protocol": 1, "robot": "arm\u{202e}-7", "version": "0.1.0", "run": run,
         "sensors": sensors, "model": {"name": "built in", "validation": "simulated data only",
         "needs": "judges single frames, needs no arm",
         "levels": [{"level": 1, "label": "hard"}, {"level": 2, "label": "firm"}]}})
@@ -158,6 +158,8 @@ fn a_soft_touch_is_seen_after_a_hard_one() {
 #[test]
 fn what_is_not_live_is_not_shown_as_present() {
     let live = [
+        // Without what turns the line.
+        " arm-7 ",
         "LIVE",
         "force 12.00 N on 8 taxels",
         "model built in (simulated data only)",
@@ -277,14 +279,6 @@ fn each_connection_begins_anew_and_shows_the_chosen_sensor() {
     assert_eq!(sensor.name, "forearm");
     assert!(sensor.verdicts.is_empty() && sensor.frame.is_none());
     assert_eq!(view.link(Some(sensor), at(700).mono).0, Link::Connecting);
-}
-
-#[test]
-fn no_name_turns_the_line() {
-    let mut turned = hello("a", &["forearm"]);
-    turned["robot"] = json!("b\u{202e}\u{e4}r-7");
-    let turned = view_of(&[(0, turned)]);
-    assert!(shown(&turned, 0, (80, 24)).starts_with(" b\u{e4}r-7 "));
 }
 
 #[test]

@@ -124,6 +124,18 @@ impl Conformal {
 impl Limits {
     /// The levels of the set, ascending. Of many levels none may reach the threshold: without one that is likelier than all
     /// others together, the set then holds the likeliest ones, up to a probability of 1 - `alpha`.
+    ///
+    /// # Example
+    ///
+    /// ```
+    /// use hardnessd_core::verdict::Limits;
+    ///
+    /// let set = |threshold, shares: &[f32]| Limits { threshold, tail: 0.05 }.set(shares, 0.1);
+    /// assert_eq!(set(0.2, &[0.5, 0.2, 0.1, 0.2]), [1, 2, 4]);
+    /// assert_eq!(set(0.9, &[0.3, 0.6, 0.1]), [2]);
+    /// assert_eq!(set(0.9, &[0.25, 0.45, 0.25, 0.05]), [1, 2, 3]);
+    /// assert_eq!(set(0.0, &[1.0, 0.0]), [1, 2]);
+    /// ```
     pub fn set(self, probabilities: &[f32], alpha: f32) -> Vec<u8> {
         let (_, best) = argmax(probabilities);
         let mut falling: Vec<(u8, f32)> = (1..).zip(probabilities.iter().copied()).collect();

@@ -284,13 +284,3 @@ fn a_model_of_courses_that_is_not_as_agreed_is_refused() {
     let expected = "expected `alpha` between 0 and 1, `threshold`, 0 to 1";
     refused_by(&course_model(8, &[("hrn.conformal", conformal)]), expected);
 }
-
-#[test]
-fn a_conformal_set_holds_what_is_likely_enough_and_the_likeliest() {
-    let tail = TAIL;
-    let set = |threshold, shares: &[f32]| Limits { threshold, tail }.set(shares, 0.1);
-    assert_eq!(set(0.2, &[0.5, 0.2, 0.1, 0.2]), [1, 2, 4]);
-    assert_eq!(set(0.9, &[0.3, 0.6, 0.1]), [2]);
-    assert_eq!(set(0.9, &[0.25, 0.45, 0.25, 0.05]), [1, 2, 3]);
-    assert_eq!(set(0.0, &[1.0, 0.0]), [1, 2]);
-}

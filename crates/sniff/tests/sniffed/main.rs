@@ -421,6 +421,27 @@ fn a_taxel_that_is_stuck_at_full_scale_is_no_mark() {
 }
 
 #[test]
+fn the_high_bytes_of_a_clock_are_no_part_of_the_mark() {
+    let mark = |seed| {
+        let mut clock = 0x05F0_0000_u32;
+        let found = sure(
+            Stream::new(seed, "packets"),
+            Array { rows: 8, cols: 9 },
+            |frame, _| {
+                clock += 2000;
+                [&MARK[..], &clock.to_be_bytes(), &cells(frame)].concat()
+            },
+        )?;
+        Some(found.proposal.settings.sync?.0)
+    };
+    let marks: Vec<Vec<u8>> = (0..8).filter_map(mark).collect();
+    assert!(
+        marks.len() >= 4 && marks.iter().all(|mark| !mark.contains(&5)),
+        "{marks:?}"
+    );
+}
+
+#[test]
 fn a_status_is_no_part_of_the_mark() {
     let array = Array { rows: 8, cols: 9 };
     let found = |seed| {

@@ -489,21 +489,4 @@ mod tests {
         let found = Estimate::of(&presses, &values.collect::<Vec<_>>(), Division::NewObjects);
         assert!(found.worth < 0.5 + LEAST_GAIN, "{found:?}");
     }
-
-    #[test]
-    fn a_candidate_that_is_judged_on_some_presses_is_named() {
-        let row = |name: &str, presses: usize| Row {
-            name: name.to_owned(),
-            judged: [Some(vec![(0, Vec::new()); presses]), None],
-            ..Row::default()
-        };
-        let all = [row("built-in", 5), row("taxels", 0), row("features", 5)];
-        assert_eq!(partly_judged(&all), None);
-        let [first, _, last] = all;
-        let found = partly_judged(&[first, last, row("hrn", 1)]).unwrap();
-        assert!(
-            found.starts_with("hrn is judged on 1 of the 5 presses"),
-            "{found}"
-        );
-    }
 }
