@@ -5,6 +5,7 @@
 
 use std::fmt::Display;
 use std::io::{self, Cursor, Seek, Write};
+use std::mem::ManuallyDrop;
 use std::ops::RangeInclusive;
 
 use zip::result::ZipResult;
@@ -22,7 +23,8 @@ const CHUNK_BYTES: usize = 1 << 16;
 /// An `.npz` file being written. Its arrays are compressed. It holds no date, so the same arrays give the
 /// same bytes.
 pub struct Writer<W: Write + Seek> {
-    zip: ZipWriter<W>,
+    /// Dropped unfinished, it would write on stderr that it cannot end, after the error that is returned.
+    zip: ManuallyDrop<ZipWriter<W>>,
     chunk_bytes: usize,
 }
 
@@ -30,7 +32,7 @@ impl<W: Write + Seek> Writer<W> {
     /// Begins a file.
     pub fn new(out: W) -> Self {
         Self {
-            zip: ZipWriter::new(out),
+            zip: ManuallyDrop::new(ZipWriter::new(out)),
             chunk_bytes: usize::MAX,
         }
     }
@@ -117,7 +119,7 @@ impl<W: Write + Seek> Writer<W> {
     ///
     /// Returns the errors of writing.
     pub fn finish(self) -> io::Result<W> {
-        let mut out = self.zip.finish()?;
+        let mut out = ManuallyDrop::into_inner(self.zip).finish()?;
         out.flush()?;
         Ok(out)
     }
