@@ -88,7 +88,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration) {
     let sensor = view.sensor();
     let (link, reason) = view.link(sensor, now);
     let mut head = wrapped(&title(view), width, ASIDE);
-    // The state of the link is more worth.
+    // What follows matters more.
     head.truncate(if area.height < 20 { 1 } else { 2 });
     if view.sensors.len() > 1 {
         head.push(tabs(view, now, width));

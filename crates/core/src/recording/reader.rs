@@ -136,7 +136,7 @@ pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, mcap::McapErr
         _ => return mcap::parse_record(opcode, body),
     };
     // After the texts comes the length of a list of further ones.
-    let are_whole = texts.is_some_and(|rest| !are_more || texts_to_end(rest).is_some());
+    let are_whole = texts.is_some_and(|rest| !are_more || list_of_texts(rest).is_some());
     match are_whole {
         true => mcap::parse_record(opcode, body),
         false => Err(mcap::McapError::UnexpectedEoc),
@@ -155,8 +155,9 @@ fn texts(body: &[u8], start: usize, count: usize) -> Option<&[u8]> {
 }
 
 /// The same for a list of texts, which has its own length before it.
-fn texts_to_end(list: &[u8]) -> Option<()> {
-    let mut rest = list.get(4..)?;
+fn list_of_texts(list: &[u8]) -> Option<()> {
+    let (length, rest) = list.split_first_chunk::<4>()?;
+    let mut rest = rest.get(..u32::from_le_bytes(*length) as usize)?;
     while !rest.is_empty() {
         rest = texts(rest, 0, 1)?;
     }
