@@ -221,7 +221,11 @@ fn on_line(
         return Err(wrong_numbers(numbers, cells));
     }
     let held = lines.held.len();
-    if numbers > 0 || has_damaged(line) {
+    let damaged = damaged_word(line);
+    if numbers > 0 || damaged.is_some() {
+        if let Some(word) = damaged.filter(|_| numbers == 0) {
+            lines.refused.get_or_insert_with(|| wrong_word(word));
+        }
         // Of more lines than a frame has, the first ones are in none.
         if held >= 2 * rows {
             lines.refused.get_or_insert(wrong_rows(held, cells));
@@ -351,9 +355,9 @@ fn numbers_in(text: &[u8]) -> usize {
     tokens(text).filter(|word| number(word).is_some()).count()
 }
 
-/// Whether something in a line is neither a number nor a word.
-fn has_damaged(line: &[u8]) -> bool {
-    tokens(line).any(|word| number(word).is_none() && !is_word(word))
+/// The first part of a line that is neither a number nor a word.
+fn damaged_word(line: &[u8]) -> Option<&[u8]> {
+    tokens(line).find(|word| number(word).is_none() && !is_word(word))
 }
 
 /// Whether a byte separates the cells of a text.
