@@ -89,7 +89,7 @@ pub(super) fn draw(frame: &mut Frame, view: &View, now: Duration) {
     let (link, reason) = view.link(sensor, now);
     let mut head = wrapped(&title(view), width, ASIDE);
     // What follows matters more.
-    head.truncate(if area.height < 20 { 1 } else { 2 });
+    head.truncate(if area.height < 20 { 1 } else { 3 });
     if view.sensors.len() > 1 {
         head.push(tabs(view, now, width));
     }
@@ -403,7 +403,9 @@ fn verdicts(
         .iter()
         .map(|(answer, _)| answer.chars().count())
         .max();
-    let longest = longest.unwrap_or(0).max(LEAST_ANSWER);
+    // The force of most presses should find room.
+    let room = LEAST_ANSWER + width.saturating_sub(VERDICT_COLUMNS);
+    let longest = longest.unwrap_or(0).clamp(LEAST_ANSWER, room);
     for (index, ((at, verdict), (answer, is_weak))) in
         sensor.verdicts.iter().zip(&answers).enumerate()
     {
