@@ -22,9 +22,7 @@ use crate::event::{Advice, Hardness, LinkState, Note, Phase, Rejection};
 use crate::motion::Track;
 use crate::press::{ContactFrame, FrameAt, SoFar};
 use crate::sensor::Sensor;
-use crate::verdict::{
-    COURSE_FRAMES, Format, Knowledge, Model, ModelError, References, Resampling, Verdict,
-};
+use crate::verdict::{COURSE_FRAMES, Format, Knowledge, Model, ModelError, References, Resampling};
 
 /// The number of frames in contact that an early verdict on the course needs.
 const FIRST_LOOK: u64 = 3;
@@ -285,7 +283,8 @@ impl Judge {
         let verdict = verdict?;
         let is_unknown = hrn.most_references() > 0 && references.knowledge() == Knowledge::None;
         let notes = self.notes(peak, &resampling, is_unknown);
-        let is_light = !is_felt || (is_unknown && peak.force_n < LEAST_UNKNOWN_N);
+        let needs_force = is_unknown && peak.force_n < LEAST_UNKNOWN_N;
+        let is_light = !is_felt || needs_force;
         let objects = &mut self.kept.objects;
         let object = name.and_then(|name| {
             // A press that names no level because it was light says nothing of its object either.
@@ -303,8 +302,8 @@ impl Judge {
             .as_ref()
             .map_or(in_a_row.into(), |object| object.presses);
 
-        let advice = advice(peak, &verdict, is_unknown, presses);
-        let rejected = if !is_felt || advice == Some(Advice::PressHarder) {
+        let advice = advice(needs_force, verdict.confidence, presses);
+        let rejected = if is_light {
             Some(Rejection::LowForce)
         } else if verdict.confidence < described.model.min_confidence {
             Some(Rejection::LowConfidence)
@@ -386,17 +385,12 @@ impl Judge {
     }
 }
 
-/// What the robot may do to know more. `is_unknown`: whether the model could know the sensor, and does not.
-/// `presses` is how often the robot has pressed this object.
-fn advice(
-    peak: &ContactFrame,
-    verdict: &Verdict,
-    is_unknown: bool,
-    presses: u64,
-) -> Option<Advice> {
-    if is_unknown && peak.force_n < LEAST_UNKNOWN_N {
+/// What the robot may do to know more. `needs_force`: whether the press is too light for a sensor that the model does not
+/// know. `presses` is how often the robot has pressed this object.
+fn advice(needs_force: bool, confidence: f32, presses: u64) -> Option<Advice> {
+    if needs_force {
         Some(Advice::PressHarder)
-    } else if verdict.confidence < ENOUGH && presses < MOST_PRESSES {
+    } else if confidence < ENOUGH && presses < MOST_PRESSES {
         Some(Advice::PressAgain)
     } else {
         None
