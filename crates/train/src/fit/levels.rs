@@ -42,11 +42,13 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
     if named.keys().all(is_papers) && most <= papers.len() {
         return Ok(papers);
     }
+    let meant = |name: &&str| {
+        let name = name.to_ascii_lowercase();
+        papers.iter().find(|level| is_misspelt(&name, &level.label))
+    };
+    let mut own = named.keys().filter(|name| !is_papers(name));
     if named.keys().any(is_papers)
-        && let Some(name) = named.keys().find(|name| !is_papers(name))
-        && let Some(meant) = papers
-            .iter()
-            .find(|level| is_misspelt(&name.to_ascii_lowercase(), &level.label))
+        && let Some((name, meant)) = own.find_map(|name| Some((name, meant(name)?)))
     {
         bail!(
             "label level: found {name:?} beside names of the usual levels: did you mean {:?}?",
@@ -109,7 +111,7 @@ mod tests {
     fn levels_are_those_of_the_labels() {
         let papers = "hard >70, firm 61-70, soft 51-60, very-soft <=50";
         // The labels `level` and `shore` of each recording, and the levels that follow.
-        let misspelt = ["hrad", "soft"].map(|name| Labels::from([("level".into(), name.into())]));
+        let misspelt = ["b", "hrad", "soft"].map(|of| Labels::from([("level".into(), of.into())]));
         assert!(of_labels(misspelt.iter()).is_err());
         for (given, expected) in [
             ("1, 3 55", papers),
