@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use crate::data::presses::Presses;
-use crate::data::source::Source;
+use crate::data::source::{Source, papers_levels};
 use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
@@ -31,6 +31,7 @@ use crate::run::Run;
 use crate::run::disk::{lock, refuse_foreign, write_whole};
 use crate::settings::Profile;
 use hardnessd_core::trial;
+use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 use sets::{FRESH_OBJECTS, TestSet};
 
@@ -148,7 +149,7 @@ impl Plan {
 ///
 /// # Errors
 ///
-/// Fails if the data cannot be read, the directory cannot be written or is in use by another process, or at the
+/// Fails if the data cannot be read or have other levels than the paper's, the directory cannot be written or is in use by another process, or at the
 /// end if a run failed.
 pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     if plan.data.is_empty() {
@@ -156,6 +157,17 @@ pub fn compare(plan: &Plan) -> anyhow::Result<String> {
     }
     refuse_foreign(&plan.out, "results.json", &["objects.csv", "tables.md"])?;
     let presses = Presses::read(&plan.data)?;
+    let names = |levels: Vec<Level>| -> Vec<String> {
+        levels.into_iter().map(|level| level.label).collect()
+    };
+    let (found, expected) = (names(presses.levels()), names(papers_levels()));
+    ensure!(
+        found == expected,
+        "{}: found the levels {}, expected {}, as the fresh objects have",
+        presses.shown_paths(),
+        found.join(", "),
+        expected.join(", ")
+    );
     let mut open = plan.runs(presses.are_over_time());
     for run in &open {
         plan.check_before(&run.name, &presses)?;
