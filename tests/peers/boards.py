@@ -51,6 +51,10 @@ def three_axes(cells):
     return b"".join(struct.pack("bbB", -5, 9, count) for count in counts(cells))
 
 
+def slip(data):
+    return b"\xc0" + data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+
+
 def xhand():
     planes = struct.pack("<240H", *[999] * 240) + struct.pack("<120H", *counts(120))
     rest = b"\x01\x02\x03" + planes + b"\x11\x22"
@@ -73,6 +77,7 @@ def text(title, cells):
 
 
 TWO = text("Sensor 1", counts(24)) + text("Sensor 2", [count + 1 for count in counts(24)]) + "END\n"
+SLIPPED = [*range(256)]
 PAXINI = b"\xaa\x55\xd7\x02\x01\x00\xfb\x0e\x04\x00\x00\xcd\x02"
 
 # The bytes of a frame, what the board waits for before each (or once, before the first), and the counts of each sensor.
@@ -95,6 +100,14 @@ BOARDS = {
     ),
     "anyskin": (anyskin(), None, [[count - 1.25 for count in counts(5)]]),
     "linkerhand": (linkerhand(), with_crc(bytes.fromhex("270400480060")), [counts(72)]),
+    "fulai": (struct.pack("<415f", *[1.0] * 10, *counts(40), *[2.0] * 365) + b"\x00\x00\x80\x7f", None, [counts(40)]),
+    "synria": (
+        with_crc(b"\x01\x42\x78\x00" + struct.pack("<60H", *counts(60))),
+        with_crc(b"\x01\x42"),
+        [counts(60)],
+    ),
+    "etextile": (slip(b"/r\0\0,b\0\0\0\0\1\0" + bytes(SLIPPED)), slip(b"/r\0\0,\0\0\0"), [SLIPPED]),
+    "fsr_array": (struct.pack("<2I256H", 7, 9, *counts(256)), b"\x10", [counts(256)]),
     "twelve": (b"\xa5\x5a" + struct.pack("<64H", *[0xF000 | count for count in counts(64)]), None, [counts(64)]),
     "left": (TWO.encode(), None, [counts(24), [count + 1 for count in counts(24)]]),
     "round": (b"\xaa\x55" + bytes(counts(16)), None, [None]),
