@@ -146,10 +146,10 @@ def the_bridge(binary, directory):
 
 
 def a_picture(rrd, out):
-    """What the viewer draws."""
+    """What the viewer draws. The pointer is in the middle of the screen, which is beside the window."""
     out.unlink(missing_ok=True)
     command = [shutil.which("rerun", path=os.path.dirname(sys.executable)), str(rrd), "--renderer", "vulkan"]
-    shown = ["xvfb-run", "-a", "-s", "-screen 0 1400x900x24", *command, "--window-size", "1400x900", "--screenshot-to", str(out)]
+    shown = ["xvfb-run", "-a", "-s", "-screen 0 5800x1900x24", *command, "--window-size", "1400x900", "--screenshot-to", str(out)]
     done = subprocess.run(shown, capture_output=True, text=True, timeout=240)
     assert out.exists(), re.sub(r"\x1b\[[0-9;]*m", "", done.stderr)[-600:]
 

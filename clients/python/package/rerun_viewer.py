@@ -33,6 +33,9 @@ BRIGHTEST_N = 0.5
 COLOURS = [[74, 139, 203], [83, 184, 123], [224, 160, 60], [217, 83, 79]]
 """Red, green and blue of four levels, from hard to very soft. Rerun chooses those of other models."""
 
+USUAL = {1: "hard", 2: "firm", 3: "soft", 4: "very-soft"}
+"""The levels of the built-in model."""
+
 SECONDS_SHOWN = 30.0
 """How much of the past the plots show."""
 
@@ -153,10 +156,12 @@ class Log:
 
 def log_recording(take: recording.Recording, log: Log) -> None:
     """Logs a recording."""
-    # A recording names the levels only where it has a verdict of each.
-    labels = {event["level"]: event["label"] for event in take.events(["hardness"]) if event["type"] == "hardness"}
-    known = range(1, max((level or 0 for level in labels), default=0) + 1)
-    levels = [{"level": level, "label": labels.get(level) or f"level {level}"} for level in known]
+    # A recording names the levels only where it has a verdict of each. Where these are the usual ones, so are the others.
+    verdicts = (event for event in take.events(["hardness"]) if event["type"] == "hardness")
+    labels = {event["level"]: event["label"] for event in verdicts if event["level"] is not None}
+    if labels.items() <= USUAL.items():
+        labels = dict(USUAL)
+    levels = [{"level": level, "label": labels.get(level) or f"level {level}"} for level in range(1, max(labels) + 1)]
     log.begin(list(take.sensors), levels, live=False)
     for lack in take.lacks:
         print(f"{take.path}: another program has changed this recording. It lacks {lack}", file=sys.stderr)
