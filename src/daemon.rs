@@ -66,7 +66,7 @@ use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
 use crate::maybe;
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
-use hardnessd_core::exit::{CONFIG, Coded, IO, UNAVAILABLE};
+use hardnessd_core::exit::{CONFIG, Coded, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
@@ -78,56 +78,37 @@ const FAREWELL: Duration = Duration::from_millis(300);
 /// The most commands that wait for a sensor.
 const QUESTIONS: usize = 64;
 
-/// The reason the daemon cannot start, or has stopped by itself.
+/// The reason the daemon cannot start, or has stopped by itself. Nobody tells reasons apart but by the exit code.
 #[derive(Debug, thiserror::Error)]
-pub enum Error {
+#[error("{message}")]
+pub struct Error {
+    message: String,
+    code: u8,
+}
+
+impl Error {
     /// The configuration names what the daemon cannot use.
-    #[error("{0}")]
-    Config(String),
+    fn config(message: String) -> Self {
+        let code = CONFIG;
+        Self { message, code }
+    }
+
     /// The system or a library refused. A later try may succeed.
-    #[error("{0}")]
-    Io(String),
-    /// A sensor to record is missing at the start.
-    #[error("sensor {sensor:?}: cannot record: {reason}")]
-    Unavailable {
-        /// The sensor's name.
-        sensor: String,
-        /// The reason its port cannot be opened.
-        reason: String,
-    },
-    /// All sensors to record are lost. What they sent is recorded.
-    #[error("sensor {sensor:?} lost: {reason}; the recording ends there")]
-    Lost {
-        /// The name of the sensor that was lost last.
-        sensor: String,
-        /// The reason its port was lost.
-        reason: String,
-    },
+    pub(crate) fn io(message: String) -> Self {
+        Self { message, code: IO }
+    }
 }
 
 impl From<NoThread> for Error {
     fn from(error: NoThread) -> Self {
-        Self::Io(error.to_string())
+        Self::io(error.to_string())
     }
 }
 
 impl Coded for Error {
     fn exit_code(&self) -> u8 {
-        match self {
-            Error::Config(_) => CONFIG,
-            Error::Io(_) => IO,
-            Error::Unavailable { .. } | Error::Lost { .. } => UNAVAILABLE,
-        }
+        self.code
     }
-}
-
-/// The sockets of a daemon that records into one file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Sockets {
-    /// No sockets, because one person uses the daemon as a tool.
-    None,
-    /// The sockets of `[publish.unix]`, on which a robot reports the positions of its arm.
-    Configured,
 }
 
 /// A daemon that has started: its sockets answer, and its ports are being opened.
@@ -170,20 +151,14 @@ impl Daemon {
         Self::start_with(setup, target)
     }
 
-    /// A daemon with `sockets` that records into the file of `target`.
+    /// A daemon that records into the file of `target`. Of all publishers it has `[publish.unix]` alone.
     ///
     /// # Errors
     ///
     /// Fails if the system gives no random numbers, or a socket cannot be bound.
-    pub(crate) fn recording(
-        mut setup: Setup,
-        sockets: Sockets,
-        target: Target,
-    ) -> Result<Self, Error> {
-        let mut unix = setup.config.publish.unix;
-        unix.enabled &= sockets == Sockets::Configured;
+    pub(crate) fn recording(mut setup: Setup, target: Target) -> Result<Self, Error> {
         setup.config.publish = Publish {
-            unix,
+            unix: setup.config.publish.unix,
             ..Publish::default()
         };
         setup.config.http = None;
@@ -192,7 +167,7 @@ impl Daemon {
     }
 
     fn start_with(setup: Setup, target: Option<Target>) -> Result<Self, Error> {
-        let run = run_token().map_err(|error| Error::Io(format!("/dev/urandom: {error}")))?;
+        let run = run_token().map_err(|error| Error::io(format!("/dev/urandom: {error}")))?;
         let hello = hello(&setup, run);
         raise_descriptors();
         realtime::lock_memory();
@@ -292,7 +267,7 @@ impl Daemon {
         self.finish().await
     }
 
-    /// Serves until `shutdown` is ready, or there is no more to record.
+    /// Serves until `shutdown` is ready.
     async fn serve(&mut self, shutdown: impl Future<Output = ()>, mut reload: Option<&mut Reload>) {
         let mut heartbeat = tokio::time::interval(systemd::heartbeat());
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -300,7 +275,6 @@ impl Daemon {
         loop {
             tokio::select! {
                 () = &mut shutdown => return,
-                () = maybe::wait(self.recorder.as_mut().map(Recorder::stopped)) => return,
                 _ = heartbeat.tick() => {
                     // This is the sensors' thread, so it works.
                     systemd::alive(self.hub.log().live());

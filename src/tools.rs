@@ -16,7 +16,6 @@ pub mod identify;
 pub mod live;
 mod played;
 mod player;
-mod prompts;
 pub(crate) mod pty;
 pub mod record;
 pub mod recover;

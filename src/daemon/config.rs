@@ -22,11 +22,12 @@ use anyhow::Context as _;
 use serde_json::Value;
 
 use self::error::Problem;
-pub use self::error::{Error, Text};
+pub use self::error::Text;
 pub(crate) use self::parse::read_at_most;
 pub use self::publish::{
     Foxglove, Http, Mode, Publish, RmwZenoh, Ros2, Tcp, Unix, Zenoh, domain_id,
 };
+pub use super::Error;
 use super::log;
 use hardnessd_core::range::from_to;
 use hardnessd_core::sensor::{self, Description, Sensor};

@@ -97,7 +97,7 @@ impl Foxglove {
         let server = runtime
             .block_on(server.start())
             .map_err(|error| match error {
-                FoxgloveError::Bind(error) => Error::Io(format!(
+                FoxgloveError::Bind(error) => Error::io(format!(
                     "publish.foxglove.listen: cannot listen on {address}: {error}"
                 )),
                 other => failed(other),
@@ -139,7 +139,7 @@ impl Foxglove {
 }
 
 fn failed(error: impl Display) -> Error {
-    Error::Io(format!("publish.foxglove: {error}"))
+    Error::io(format!("publish.foxglove: {error}"))
 }
 
 fn topics(

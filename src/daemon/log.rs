@@ -22,7 +22,7 @@ use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Registry, reload};
 
-use self::lines::Lines;
+pub(crate) use self::lines::Lines;
 use super::Error;
 use hardnessd_core::allowance::Allowance;
 use hardnessd_core::event::{Event, LinkState, Phase, PressState, Status, Tared, name, round_3};
@@ -84,13 +84,13 @@ impl Log {
             .with(layer)
             .with(filter)
             .try_init()
-            .map_err(|_| Error::Config("the log was started twice".to_owned()))?;
+            .map_err(|_| Error::config("the log was started twice".to_owned()))?;
         Ok(Self { output, lines })
     }
 
-    /// Waits until all lines so far are written, but not longer than `LAST_LINES`.
-    pub fn flush(&self) {
-        self.lines.flush(LAST_LINES);
+    /// Where lines are written.
+    pub(crate) fn lines(&self) -> &Lines {
+        &self.lines
     }
 
     /// Writes in the format of `settings` from now on.
@@ -119,7 +119,7 @@ fn filter(directives: &str, level: &str) -> Result<Targets, Error> {
     let directives = parts.join(",");
     let filter = directives.parse().ok().filter(|_| are_known);
     filter.ok_or_else(|| {
-        Error::Config(format!(
+        Error::config(format!(
             "RUST_LOG: found {directives:?}, expected off, error, warn, info, debug or trace, or \
              TARGET=LEVEL, as in \"warn,hardnessd=debug\""
         ))

@@ -51,7 +51,7 @@ fn control_group(unix: &Unix) -> Result<Option<Gid>, Error> {
     let expected = "expected a group of /etc/group; the package makes \"hardnessd-control\"";
     found
         .map(Some)
-        .ok_or_else(|| Error::Config(format!("{GROUP_KEY}: found {name:?}, {expected}")))
+        .ok_or_else(|| Error::config(format!("{GROUP_KEY}: found {name:?}, {expected}")))
 }
 
 /// What serves a publisher until the order to stop.

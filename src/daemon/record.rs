@@ -38,30 +38,29 @@ const STATE_EVERY_BYTES: usize = 4 << 20;
 /// The target of a recording.
 #[derive(Debug)]
 pub(crate) enum Target {
-    /// One file, which the caller has made, and which is empty. `progress` gets what it holds so far. The
-    /// recording ends when the file cannot be written, and `without_sensor` as it says.
+    /// One file, which the caller has made, and which is empty. `progress` gets what it holds so far, until
+    /// the file is complete or cannot be written.
     File {
         path: PathBuf,
         file: File,
         labels: Labels,
         progress: watch::Sender<Progress>,
-        without_sensor: WithoutSensor,
     },
     /// Files in the directory of the configuration.
     Directory(config::Record),
 }
 
-/// What a recording into one file does if a sensor is missing at the start, or all are lost.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WithoutSensor {
-    /// It ends.
-    End,
-    /// It waits, as a daemon does.
-    Wait,
+/// A recording that has no sensor to record.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Gone {
+    /// A sensor was missing at the start: its name, and why its port cannot be opened.
+    Unavailable(String, String),
+    /// All sensors are lost: the name of the last one, and why its port was lost.
+    Lost(String, String),
 }
 
 /// The content of one file so far.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Progress {
     /// The number of whole frames of all sensors.
     pub frames: u64,
@@ -73,6 +72,8 @@ pub struct Progress {
     pub lost: u64,
     /// The number of sensors that are missing now.
     pub missing: usize,
+    /// Why there was no sensor to record, once that was so.
+    pub gone: Option<Gone>,
     /// The final verdicts beside the level of the label `level`.
     pub(crate) score: Score,
     /// The level of the last verdict. `None` if it was rejected.
@@ -158,8 +159,6 @@ impl Jobs {
 pub(crate) struct Recorder {
     jobs: Jobs,
     labels: Labels,
-    /// Ready when there is no more to record.
-    stop: oneshot::Receiver<()>,
     ended: oneshot::Receiver<Result<(), Error>>,
 }
 
@@ -172,13 +171,11 @@ impl Recorder {
         let labels = about.labels.clone();
         let (sender, inbox) = channel();
         let jobs = Jobs::new(sender, QUEUED_BYTES);
-        let (stopping, stop) = oneshot::channel();
-        let worker = Worker::new(target, about, jobs.dropped.clone(), stopping);
+        let worker = Worker::new(target, about, jobs.dropped.clone());
         let ended = spawn_thread("recorder", move || worker.run(&inbox))?;
         Ok(Self {
             jobs,
             labels,
-            stop,
             ended,
         })
     }
@@ -199,12 +196,6 @@ impl Recorder {
     /// The recorder for the hub.
     pub(crate) fn of_hub(&self) -> Jobs {
         self.jobs.clone()
-    }
-
-    /// Waits until there is no more to record, or the thread has ended.
-    pub(crate) async fn stopped(&mut self) {
-        // An error means that the thread has ended.
-        let _ = (&mut self.stop).await;
     }
 
     /// Waits until the file is complete. The caller must have dropped every [`SensorRecorder`] and

@@ -73,7 +73,7 @@ impl Worker {
         open: impl FnOnce() -> Result<O, E> + Send + 'static,
         mut publish: impl FnMut(&mut O, &Event, &Line) + Send + 'static,
     ) -> Result<Self, Error> {
-        let open = move || open().map_err(|error| Error::Io(format!("publish.{way}: {error}")));
+        let open = move || open().map_err(|error| Error::io(format!("publish.{way}: {error}")));
         Self::start(way, open, move |mut session, mut lines| {
             let mut each = |event: &Event, line: &Line| publish(&mut session, event, line);
             while let Some(lines) = lines.blocking_recv() {

@@ -80,7 +80,7 @@ const TOPICS: [Known; 5] = [
 /// error, because the library tries again.
 pub(super) fn open(settings: &config::RmwZenoh, sensors: &Sensors) -> Result<Worker, Error> {
     check_listen("publish.rmw_zenoh.listen", &settings.listen)?;
-    let domain = config::domain_id(settings.domain_id).map_err(Error::Config)?;
+    let domain = config::domain_id(settings.domain_id).map_err(Error::config)?;
     let (namespace, connect) = (&settings.namespace, &settings.connect);
     info!(way = "rmw_zenoh", domain, namespace, ?connect, "publishing");
     let (settings, sensors) = (settings.clone(), sensors.clone());

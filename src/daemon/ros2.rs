@@ -36,7 +36,7 @@ const CONTACTS_KEPT: usize = 5;
 ///
 /// Fails if the domain cannot be joined, for example because no port is free.
 pub(super) fn open(settings: &config::Ros2, sensors: &Sensors) -> Result<Worker, Error> {
-    let domain = config::domain_id(settings.domain_id).map_err(Error::Config)?;
+    let domain = config::domain_id(settings.domain_id).map_err(Error::config)?;
     let namespace = &settings.namespace;
     info!(way = "ros2", domain, namespace, "publishing");
     let (settings, sensors) = (settings.clone(), sensors.clone());

@@ -90,7 +90,7 @@ impl Drop for Socket {
 pub(crate) fn check(key: &str, path: &Path) -> Result<bool, Error> {
     let (bytes, shown) = (path.as_os_str().len(), path.display());
     if bytes > LONGEST_PATH_BYTES {
-        return Err(Error::Config(format!(
+        return Err(Error::config(format!(
             "{key}: found {shown}, {bytes} bytes, expected a path of at most {LONGEST_PATH_BYTES}"
         )));
     }
@@ -101,7 +101,7 @@ pub(crate) fn check(key: &str, path: &Path) -> Result<bool, Error> {
         return Err(failed(key, path, "find its directory", &error));
     }
     if !directory.is_dir() && (directory.exists() || !directory_of(directory).is_dir()) {
-        return Err(Error::Config(format!(
+        return Err(Error::config(format!(
             "{key}: {shown} is in no directory: make the directory, or set another path"
         )));
     }
@@ -109,7 +109,7 @@ pub(crate) fn check(key: &str, path: &Path) -> Result<bool, Error> {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
         Err(error) => Err(failed(key, path, "look at it", &error)),
         Ok(file) if file.file_type().is_socket() => Ok(true),
-        Ok(_) => Err(Error::Config(format!(
+        Ok(_) => Err(Error::config(format!(
             "{key}: {shown} is no socket: remove it, or set another path"
         ))),
     }
@@ -125,7 +125,7 @@ fn refuse_living(key: &str, path: &Path) -> Result<(), Error> {
         Err(error @ (Errno::ACCESS | Errno::PERM)) => {
             Err(failed(key, path, "try it", &error.into()))
         }
-        _ => Err(Error::Io(format!(
+        _ => Err(Error::io(format!(
             "the daemon runs and serves {}: stop it (the package's with `sudo systemctl stop hardnessd`), or \
              give a second one another {key} or another XDG_RUNTIME_DIR",
             path.display()
@@ -142,7 +142,7 @@ fn failed(key: &str, path: &Path, what: &str, error: &io::Error) -> Error {
         _ => "",
     };
     let path = path.display();
-    Error::Io(format!("{key}: {path}: cannot {what}: {error}{remedy}"))
+    Error::io(format!("{key}: {path}: cannot {what}: {error}{remedy}"))
 }
 
 /// Listens at a new socket of this mode and group. Its calls do not block.

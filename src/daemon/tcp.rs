@@ -43,7 +43,7 @@ impl Tcp {
             Ok(Self { listener, address })
         };
         let failed = |error| format!("{key}: cannot listen on {address}: {error}");
-        bound().map_err(|error: io::Error| Error::Io(failed(error)))
+        bound().map_err(|error: io::Error| Error::io(failed(error)))
     }
 }
 

@@ -142,7 +142,7 @@ pub(super) fn check_listen(key: &str, endpoints: &[String]) -> Result<(), Error>
     for endpoint in endpoints {
         let tried = TcpListener::bind(config::Zenoh::address(endpoint).unwrap_or_default());
         tried
-            .map_err(|error| Error::Io(format!("{key}: cannot listen on {endpoint:?}: {error}")))?;
+            .map_err(|error| Error::io(format!("{key}: cannot listen on {endpoint:?}: {error}")))?;
     }
     Ok(())
 }

@@ -13,11 +13,10 @@ use rustix::process::Signal;
 use tokio::sync::watch;
 
 use super::exit::{Fail, Failure};
-use super::prompts::Prompts;
 use super::record;
-use crate::daemon::Sockets;
 use crate::daemon::config::Setup;
-use crate::daemon::record::{Progress, WithoutSensor};
+use crate::daemon::log::Lines;
+use crate::daemon::record::Progress;
 use crate::thread;
 use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::recording::Labels;
@@ -25,6 +24,8 @@ use hardnessd_core::sensor::Sensor;
 
 /// How long to wait for positions after the last press.
 const LAST_POSITIONS: Duration = Duration::from_secs(1);
+/// How long the last prompts may take at the end.
+const LAST_PROMPTS: Duration = Duration::from_secs(1);
 
 /// What `read` makes of recordings, or of `wanted` presses of `sensor` that are made now. `next` is that of
 /// [`record`].
@@ -85,17 +86,17 @@ async fn record(
     // Nobody else needs the file. Without a name, it vanishes when this process ends.
     let mut file = tempfile::tempfile().of(path.display(), IO)?;
     let mut stopped = None;
-    let prompts = Prompts::start()?;
+    let prompts = Lines::start()?;
     let enough = async |mut counted: watch::Receiver<Progress>| {
         let made = async {
-            prompts.say("leave the sensor free until its zero is taken\n");
+            prompts.say(b"leave the sensor free until its zero is taken\n");
             // The presses at the last prompt.
             let mut shown = None;
             while shown < Some(wanted) && counted.changed().await.is_ok() {
                 let Progress { tared, presses, .. } = *counted.borrow_and_update();
                 if tared > 0 && shown != Some(presses) {
                     shown = Some(presses);
-                    prompts.say(&format!("{}\n", next(presses)));
+                    prompts.say(format!("{}\n", next(presses)).as_bytes());
                 }
             }
             tokio::time::sleep(LAST_POSITIONS).await;
@@ -105,10 +106,8 @@ async fn record(
             signal = end => stopped = Some(signal),
         }
     };
-    let (sockets, labels) = (Sockets::Configured, Labels::new());
-    let without = WithoutSensor::End;
-    let (recorded, _) = record::record(setup, sockets, &path, &file, labels, without, enough).await;
-    prompts.end().await;
+    let (recorded, _) = record::record(setup, &path, &file, Labels::new(), enough).await;
+    prompts.flush(LAST_PROMPTS);
     recorded?;
     if let Some(signal) = stopped {
         return Err(Failure::interrupted(signal));

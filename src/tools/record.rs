@@ -17,10 +17,10 @@ use tokio::sync::watch;
 use super::configuration::Configuration;
 use super::doctor;
 use super::exit::{Fail as _, Failure};
+use crate::daemon::Daemon;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::{Progress, Target, WithoutSensor};
-use crate::daemon::{self, Daemon, Sockets};
+use crate::daemon::record::{Gone, Progress, Target};
 use crate::maybe;
 use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
@@ -76,7 +76,7 @@ impl Args {
 /// file cannot be made or written, a sensor is missing at the start, or the last sensor is lost.
 pub async fn run(
     args: Args,
-    setup: Setup,
+    mut setup: Setup,
     log: &Log,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
@@ -91,18 +91,14 @@ pub async fn run(
         }
     }
     check_level(&labels, &setup)?;
-    let sockets = if args.sockets {
-        Sockets::Configured
-    } else {
-        Sockets::None
-    };
+    setup.config.publish.unix.enabled &= args.sockets;
     if let Some(directory) = &args.session {
         let asked = ["level", "object", "name", "shore"];
         if let Some(key) = asked.into_iter().find(|&key| labels.contains_key(key)) {
             let asked = format!("--label {key}: --session asks for it: leave it out");
             return Err(Failure::new(USAGE, asked));
         }
-        return session::run(directory, &labels, &setup, sockets, log, pin!(shutdown)).await;
+        return session::run(directory, &labels, &setup, log, pin!(shutdown)).await;
     }
     let path = args
         .out
@@ -114,8 +110,7 @@ pub async fn run(
             () = maybe::until(maybe::after(args.seconds)) => {}
         }
     };
-    let without = WithoutSensor::End;
-    let (recorded, progress) = record(setup, sockets, &path, &file, labels, without, end).await;
+    let (recorded, progress) = record(setup, &path, &file, labels, end).await;
     let (frames, presses) = (progress.frames, progress.presses);
     if recorded.is_err() && frames == 0 {
         // The path must be free for the next try.
@@ -143,44 +138,70 @@ fn create(path: &Path) -> Result<File, Failure> {
     File::create_new(path).of(format!("{}: name a new file", path.display()), IO)
 }
 
-/// Records into `file`, which is at `path`, until `end` is over, or until no sensor is left if it does not wait for them.
-/// Returns what the file holds too. Where a sensor is missing at the start, nothing is worth keeping: the file holds
-/// nothing then.
+/// Records into `file`, which is at `path`, until `end` is over, or until no sensor is left. Returns what the file holds
+/// too. Where a sensor is missing at the start, nothing is worth keeping: the file holds nothing then.
 pub(super) async fn record(
     setup: Setup,
-    sockets: Sockets,
     path: &Path,
     file: &File,
     labels: Labels,
-    without_sensor: WithoutSensor,
+    end: impl AsyncFnOnce(watch::Receiver<Progress>),
+) -> (Result<(), Failure>, Progress) {
+    let sensors = setup.config.sensors.clone();
+    let end = async |counted: watch::Receiver<Progress>| {
+        let mut left = counted.clone();
+        tokio::select! {
+            () = end(counted) => {}
+            _ = left.wait_for(|progress| progress.gone.is_some()) => {}
+        }
+    };
+    let (recorded, progress) = record_waiting(setup, path, file, labels, end).await;
+    match (&recorded, &progress.gone) {
+        (Ok(()), Some(Gone::Unavailable(sensor, reason))) => {
+            let mut sensors = sensors.iter();
+            let known = sensors.find(|known| known.name == *sensor);
+            let known = known.expect("a missing sensor is one of the configuration");
+            let failure = unavailable(known, reason.clone());
+            (Err(failure), Progress::default())
+        }
+        (Ok(()), Some(Gone::Lost(sensor, reason))) => {
+            let lost = format!("sensor {sensor:?} lost: {reason}; the recording ends there");
+            (Err(Failure::new(UNAVAILABLE, lost)), progress)
+        }
+        _ => (recorded, progress),
+    }
+}
+
+/// The same, but it waits for sensors that are missing.
+async fn record_waiting(
+    setup: Setup,
+    path: &Path,
+    file: &File,
+    labels: Labels,
     end: impl AsyncFnOnce(watch::Receiver<Progress>),
 ) -> (Result<(), Failure>, Progress) {
     let (progress, counted) = watch::channel(Progress::default());
-    let sensors = setup.config.sensors.clone();
     let recorded = async {
-        let file = file.try_clone();
-        let file =
-            file.map_err(|error| daemon::Error::Io(format!("{}: {error}", path.display())))?;
         let target = Target::File {
             path: path.to_owned(),
-            file,
+            file: file.try_clone().of(path.display(), IO)?,
             labels,
             progress,
-            without_sensor,
         };
-        let daemon = Daemon::recording(setup, sockets, target)?;
-        daemon.run(end(counted.clone()), None).await
+        let daemon = Daemon::recording(setup, target)?;
+        let mut written = counted.clone();
+        let end = async {
+            tokio::select! {
+                () = end(counted.clone()) => {}
+                // The file cannot be written.
+                _ = written.wait_for(|_| false) => {}
+            }
+        };
+        Ok(daemon.run(end, None).await?)
     };
     let recorded = recorded.await;
-    let progress = *counted.borrow();
-    match recorded {
-        Err(daemon::Error::Unavailable { sensor, reason }) => {
-            let known = sensors.into_iter().find(|known| known.name == sensor);
-            let known = known.expect("a missing sensor is one of the configuration");
-            (Err(unavailable(&known, reason)), Progress::default())
-        }
-        recorded => (recorded.map_err(Failure::from), progress),
-    }
+    let progress = counted.borrow().clone();
+    (recorded, progress)
 }
 
 /// The failure of a sensor whose port cannot be opened for this reason.

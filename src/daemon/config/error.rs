@@ -5,22 +5,14 @@ use std::path::Path;
 
 use toml::de::{DeTable, DeValue};
 
-use hardnessd_core::exit::{CONFIG, Coded, NO_INPUT};
+use crate::daemon::Error;
+use hardnessd_core::exit::{CONFIG, NO_INPUT};
 use hardnessd_core::range::OutOfRange;
 use hardnessd_core::sensor;
 
 /// The most bytes of a configuration file. They are enough for a hundred sensors with every taxel
 /// dead.
 pub(super) const MAX_BYTES: usize = 1 << 20;
-
-/// The reason a configuration cannot be used. The message names the file, the line and the key, what was
-/// found and what was expected.
-#[derive(Debug, thiserror::Error)]
-#[error("{message}")]
-pub struct Error {
-    message: String,
-    code: u8,
-}
 
 impl Error {
     /// Makes the error of a problem in the configuration at `path`, which has this text.
@@ -103,12 +95,6 @@ impl Problem {
             self.sensor = Some((index, sensor.name.clone()));
         }
         self
-    }
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        self.code
     }
 }
 

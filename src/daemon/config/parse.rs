@@ -6,8 +6,8 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::Config;
-use super::error::{Error, MAX_BYTES, Problem, Text};
+use super::error::{MAX_BYTES, Problem, Text};
+use super::{Config, Error};
 use hardnessd_core::port::Port;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, LevelTable, Model};

@@ -1,6 +1,6 @@
-//! Passes log lines to a thread that writes them to stderr.
+//! Passes log lines to a thread that writes them to stderr, and what a command says to the person who presses.
 //!
-//! The program that reads the log may stop reading, and the sensor must not wait for that program.
+//! The program or the terminal that shows them may stop reading, and the sensor must not wait for it.
 //! So when [`WAITING`] lines wait, further lines are dropped. After the next line that is written,
 //! another line gives the number of dropped lines. (`tracing-appender` does not fit: where the
 //! system has no thread for it, it panics, and at the end it may wait longer than a second and print
@@ -21,7 +21,7 @@ const WAITING: usize = 1024;
 
 /// The queue to the thread. Clones share it.
 #[derive(Clone)]
-pub(super) struct Lines {
+pub(crate) struct Lines {
     thread: SyncSender<Vec<u8>>,
     counts: Arc<Counts>,
 }
@@ -40,7 +40,7 @@ impl Lines {
     /// # Errors
     ///
     /// Fails if the system cannot make the thread.
-    pub(super) fn start() -> Result<Self, NoThread> {
+    pub(crate) fn start() -> Result<Self, NoThread> {
         let (thread, lines) = sync_channel(WAITING);
         let counts = Arc::new(Counts::default());
         let of_thread = Arc::clone(&counts);
@@ -48,8 +48,17 @@ impl Lines {
         Ok(Self { thread, counts })
     }
 
+    /// Writes a text, soon.
+    pub(crate) fn say(&self, text: &[u8]) {
+        self.counts.waiting.fetch_add(1, Ordering::Relaxed);
+        if self.thread.try_send(text.to_vec()).is_err() {
+            self.counts.waiting.fetch_sub(1, Ordering::Relaxed);
+            self.counts.lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
     /// Waits until all lines are written, but not longer than `patience`.
-    pub(super) fn flush(&self, patience: Duration) {
+    pub(crate) fn flush(&self, patience: Duration) {
         let end = Instant::now() + patience;
         while self.counts.waiting.load(Ordering::Acquire) > 0 && Instant::now() < end {
             std::thread::sleep(Duration::from_millis(1));
@@ -80,11 +89,7 @@ impl<'a> MakeWriter<'a> for Lines {
 /// The formatter writes each line in one call.
 impl Write for &Lines {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        self.counts.waiting.fetch_add(1, Ordering::Relaxed);
-        if self.thread.try_send(line.to_vec()).is_err() {
-            self.counts.waiting.fetch_sub(1, Ordering::Relaxed);
-            self.counts.lost.fetch_add(1, Ordering::Relaxed);
-        }
+        self.say(line);
         Ok(line.len())
     }
 

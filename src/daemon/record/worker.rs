@@ -9,10 +9,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::{Job, Progress, Queued, Target, WithoutSensor};
+use super::{Gone, Job, Progress, Queued, Target};
 use crate::daemon::sensor::Done;
 use crate::daemon::{Error, config, log};
 use hardnessd_core::event::{Event, Phase, PressState};
@@ -49,9 +48,6 @@ pub(super) struct Worker {
     open: Option<Open>,
     /// Until when the recording is paused, because the disk failed or is full.
     paused: Option<Instant>,
-    /// Dropped when there is no more to record.
-    stop: Option<oneshot::Sender<()>>,
-    gone: Option<Error>,
     progress: Progress,
 }
 
@@ -66,12 +62,7 @@ struct Watched {
 }
 
 impl Worker {
-    pub(super) fn new(
-        target: Target,
-        about: About,
-        dropped: Arc<AtomicU64>,
-        stop: oneshot::Sender<()>,
-    ) -> Self {
+    pub(super) fn new(target: Target, about: About, dropped: Arc<AtomicU64>) -> Self {
         Self {
             sensors: about.sensors.iter().map(|_| Watched::default()).collect(),
             target,
@@ -80,8 +71,6 @@ impl Worker {
             report_at: Instant::now(),
             open: None,
             paused: None,
-            stop: Some(stop),
-            gone: None,
             progress: Progress::default(),
         }
     }
@@ -104,6 +93,9 @@ impl Worker {
                     unchecked += room.num_permits();
                     drop(room);
                     let done = self.take(job);
+                    if let Target::File { progress, .. } = &self.target {
+                        progress.send_replace(self.progress.clone());
+                    }
                     self.settle(done)?;
                 }
                 Err(RecvTimeoutError::Timeout) => {}
@@ -132,19 +124,6 @@ impl Worker {
         }
     }
 
-    /// Ends a recording into one file, because there is no sensor to record, unless it waits.
-    fn end_because(&mut self, gone: Error) {
-        let Target::File {
-            without_sensor: WithoutSensor::End,
-            ..
-        } = self.target
-        else {
-            return;
-        };
-        self.gone.get_or_insert(gone);
-        self.stop = None;
-    }
-
     /// Pauses the recording, and logs the reason once.
     fn pause(&mut self, reason: &recording::Error) {
         if self.paused.is_none() {
@@ -155,18 +134,17 @@ impl Worker {
 
     fn end(mut self) -> Result<(), Error> {
         self.report_dropped();
-        let gone = self.gone.take().map_or(Ok(()), Err);
         let Some(Open {
             path, file, writer, ..
         }) = self.open.take()
         else {
-            return gone;
+            return Ok(());
         };
         let mut finished = writer.finish().map(drop);
         if self.directory().is_none() {
             finished = finished.and_then(|()| Ok(file.sync_all()?));
             // If a sensor was missing at the start, the file is not kept, so do not report it.
-            if !matches!(gone, Err(Error::Unavailable { .. })) {
+            if !matches!(self.progress.gone, Some(Gone::Unavailable(..))) {
                 info!(
                     path = %escaped(&path.display().to_string()),
                     frames = self.progress.frames,
@@ -175,7 +153,7 @@ impl Worker {
                 );
             }
         }
-        self.settle(finished).and(gone)
+        self.settle(finished)
     }
 
     fn take(&mut self, job: Job) -> Result<(), recording::Error> {
@@ -197,28 +175,27 @@ impl Worker {
     fn entry(&mut self, sensor: usize, at: Stamp, entry: Entry) -> Result<(), recording::Error> {
         let watched = &mut self.sensors[sensor];
         let name = || self.about.sensors[sensor].name().to_owned();
-        let mut gone = None;
         match &entry {
             Entry::State(_) => watched.is_begun = true,
             Entry::Input(Input::Opened) => watched.is_open = Some(true),
             Entry::Input(Input::Lost(reason)) => {
                 watched.is_open = Some(false);
                 let (sensor, reason) = (name(), reason.clone());
-                let is_gone = |one: &Watched| one.is_open == Some(false);
-                gone = (self.sensors.iter().all(is_gone)).then_some(Error::Lost { sensor, reason });
+                if self.sensors.iter().all(|one| one.is_open == Some(false)) {
+                    let gone = &mut self.progress.gone;
+                    gone.get_or_insert(Gone::Lost(sensor, reason));
+                }
             }
             Entry::Input(Input::Unavailable(reason)) if watched.is_open.is_none() => {
                 watched.is_open = Some(false);
                 let (sensor, reason) = (name(), reason.clone());
-                gone = Some(Error::Unavailable { sensor, reason });
+                let gone = &mut self.progress.gone;
+                gone.get_or_insert(Gone::Unavailable(sensor, reason));
             }
             Entry::Input(_) => {}
         }
         let missing = self.sensors.iter().filter(|one| one.is_open == Some(false));
         self.progress.missing = missing.count();
-        if let Some(gone) = gone {
-            self.end_because(gone);
-        }
         if let Entry::State(state) = &entry {
             self.about.sensors[sensor].clone_from(&state.sensor);
         }
@@ -252,9 +229,6 @@ impl Worker {
                 self.progress.said = verdict.level;
             }
             _ => {}
-        }
-        if let Target::File { progress, .. } = &self.target {
-            progress.send_replace(self.progress);
         }
         match &mut self.open {
             Some(open) => open.writer.event(event),
@@ -381,7 +355,7 @@ impl Worker {
 }
 
 fn cannot_write(path: &Path, error: &recording::Error) -> Error {
-    Error::Io(format!("{}: {error}", path.display()))
+    Error::io(format!("{}: {error}", path.display()))
 }
 
 /// A file that is being written.

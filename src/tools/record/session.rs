@@ -12,16 +12,14 @@ use std::pin::Pin;
 
 use tokio::sync::{mpsc, watch};
 
-use super::{counted_in_words, create, record, unavailable};
-use crate::daemon::Sockets;
+use super::{counted_in_words, create, record_waiting, unavailable};
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
-use crate::daemon::record::{Progress, WithoutSensor};
+use crate::daemon::record::Progress;
 use crate::daemon::serial;
 use crate::score::Score;
 use crate::thread::start;
 use crate::tools::exit::{Fail as _, Failure, IO, USAGE};
-use crate::tools::prompts::Prompts;
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, object_of};
 use hardnessd_core::verdict::{Borders, Level};
@@ -29,13 +27,14 @@ use hardnessd_core::verdict::{Borders, Level};
 /// The user at the terminal.
 struct User<'a> {
     lines: mpsc::Receiver<String>,
-    prompts: Prompts,
+    log: &'a Log,
     shutdown: Pin<&'a mut dyn Future<Output = ()>>,
 }
 
 impl User<'_> {
     /// Reads stdin on a thread of its own, which ends with the process.
     fn at_terminal<'a>(
+        log: &'a Log,
         shutdown: Pin<&'a mut dyn Future<Output = ()>>,
     ) -> Result<User<'a>, Failure> {
         let (sender, lines) = mpsc::channel(1);
@@ -50,13 +49,14 @@ impl User<'_> {
         })?;
         Ok(User {
             lines,
-            prompts: Prompts::start()?,
+            log,
             shutdown,
         })
     }
 
+    /// Writes a text, between the lines of the log.
     fn say(&self, text: &str) {
-        self.prompts.say(text);
+        self.log.lines().say(text.as_bytes());
     }
 
     /// The next line. `None` if no more lines come: do not ask again then.
@@ -147,7 +147,6 @@ pub(super) async fn run(
     directory: &Path,
     labels: &Labels,
     setup: &Setup,
-    sockets: Sockets,
     log: &Log,
     mut shutdown: Pin<&mut dyn Future<Output = ()>>,
 ) -> Result<(), Failure> {
@@ -166,7 +165,7 @@ pub(super) async fn run(
         };
         opened.map_err(|reason| unavailable(sensor, reason))?;
     }
-    let mut user = User::at_terminal(shutdown)?;
+    let mut user = User::at_terminal(log, shutdown)?;
     user.say("One recording for each object. `q` ends the session.\n");
     let levels = &setup.hrn.card().levels;
     // The verdicts on objects whose level the user named.
@@ -174,12 +173,10 @@ pub(super) async fn run(
     let (mut number, mut goes_on, mut ended) = (first, true, Ok(()));
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
-        let recorded = record_object(&mut user, &object, setup, sockets, &mut score).await;
+        let recorded = record_object(&mut user, &object, setup, &mut score).await;
         goes_on = recorded.as_ref().is_ok_and(|goes_on| *goes_on);
         ended = recorded.map(drop);
         number += u32::from(object.path.exists());
-        // A late line would cut through the next question.
-        log.flush();
     }
     let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
@@ -195,7 +192,6 @@ pub(super) async fn run(
             "to make a model of them: hrn-train fit {directory} --out own.onnx\n"
         ));
     }
-    user.prompts.end().await;
     ended
 }
 
@@ -230,7 +226,6 @@ async fn record_object(
     user: &mut User<'_>,
     object: &Object,
     setup: &Setup,
-    sockets: Sockets,
     score: &mut Score,
 ) -> Result<bool, Failure> {
     let path = &object.path;
@@ -239,9 +234,8 @@ async fn record_object(
     let mut goes_on = false;
     let levels = &setup.hrn.card().levels;
     let end = async |counted| goes_on = wait_for_user(user, counted, object, levels).await;
-    let labels = object.labels.clone();
-    let (setup, without) = (setup.clone(), WithoutSensor::Wait);
-    let (recorded, progress) = record(setup, sockets, path, &file, labels, without, end).await;
+    let (setup, labels) = (setup.clone(), object.labels.clone());
+    let (recorded, progress) = record_waiting(setup, path, &file, labels, end).await;
     if progress.presses == 0 {
         // It would stop `hrn-train collect`.
         part::remove(path, &file);
