@@ -158,7 +158,7 @@ impl Model {
         let mut optimized = typed.map_err(ModelError::of(RUNNING))?;
         guard::check_values(&optimized)?;
         optimized.optimize().map_err(ModelError::of(RUNNING))?;
-        forest::quicken(&mut optimized).map_err(ModelError::of(RUNNING))?;
+        forest::quicken(&mut optimized);
         for (place, output) in file.outputs.iter().enumerate() {
             let Some(lengths) = file.lengths_of(output) else {
                 continue;

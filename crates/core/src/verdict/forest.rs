@@ -5,101 +5,47 @@
 //! default forest of scikit-learn took 20 to 40 ms. The votes are added in the same order: the numbers are the same.
 
 use tract_onnx::tract_core::internal::*;
-use tract_onnx_opl::ml::tree_ensemble_classifier::{TreeEnsembleClassifier, TreeEnsembleData};
+use tract_onnx_opl::ml::tree_ensemble_classifier::{TreeEnsemble, TreeEnsembleClassifier};
 
 /// A forest that votes for classes.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-struct Forest {
-    /// The first node of each tree.
-    roots: Vec<u32>,
-    nodes: Vec<Node>,
-    /// The class and the bits of the weight of each vote.
-    votes: Vec<[u32; 2]>,
-    classes: usize,
-    /// The number of features that it needs.
-    features: usize,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-enum Node {
-    /// A feature is compared with a number, whose bits these are.
-    Branch {
-        feature: u32,
-        number: u32,
-        comparison: u8,
-        is_true_for_nan: bool,
-        yes: u32,
-        no: u32,
-    },
-    /// The votes of a leaf.
-    Leaf { from: u32, to: u32 },
-}
+struct Forest(TreeEnsemble);
 
 /// Puts a [`Forest`] in the place of each of the library's own.
-pub(super) fn quicken(model: &mut TypedModel) -> TractResult<()> {
+pub(super) fn quicken(model: &mut TypedModel) {
     for node in &mut model.nodes {
         if let Some(TreeEnsembleClassifier { ensemble }) = node.op_as() {
-            let (classes, features) = (ensemble.n_classes, ensemble.max_used_feature + 1);
-            node.op = Box::new(Forest::new(&ensemble.data, classes, features)?);
+            node.op = Box::new(Forest(ensemble.clone()));
         }
     }
-    Ok(())
 }
 
-impl Forest {
-    fn new(data: &TreeEnsembleData, classes: usize, features: usize) -> TractResult<Self> {
-        let nodes = data.nodes.try_as_plain_ram()?.as_slice::<u32>()?;
-        let votes = data.leaves.try_as_plain_ram()?.as_slice::<u32>()?;
-        let nodes = nodes.as_chunks::<5>().0.iter();
-        let node = |&[a, b, c, number, kind]: &[u32; 5]| match kind as u8 {
-            0 => Node::Leaf { from: a, to: b },
-            comparison => Node::Branch {
-                feature: a,
-                number,
-                comparison,
-                is_true_for_nan: kind & 0x100 != 0,
-                yes: b,
-                no: c,
-            },
-        };
-        Ok(Self {
-            roots: data.trees.try_as_plain_ram()?.as_slice::<u32>()?.to_vec(),
-            nodes: nodes.map(node).collect(),
-            votes: votes.as_chunks::<2>().0.to_vec(),
-            classes,
-            features,
-        })
-    }
+fn numbers(tensor: &Tensor) -> TractResult<&[u32]> {
+    tensor.try_as_plain_ram()?.as_slice()
+}
 
-    /// The votes of the leaf that a tree comes to.
-    fn votes(&self, root: u32, features: &[f32]) -> &[[u32; 2]] {
-        let mut at = root;
-        loop {
-            match self.nodes[at as usize] {
-                Node::Leaf { from, to } => return &self.votes[from as usize..to as usize],
-                Node::Branch {
-                    feature,
-                    number,
-                    comparison,
-                    is_true_for_nan,
-                    yes,
-                    no,
-                } => {
-                    let (found, number) = (features[feature as usize], f32::from_bits(number));
-                    // The numbers of tract's `Cmp`.
-                    let is_true = match comparison {
-                        _ if found.is_nan() => is_true_for_nan,
-                        1 => found == number,
-                        2 => found != number,
-                        3 => found < number,
-                        4 => found > number,
-                        5 => found <= number,
-                        _ => found >= number,
-                    };
-                    at = if is_true { yes } else { no };
-                }
-            }
+/// The votes of the leaf that a tree comes to: the first one, and the one after the last.
+fn votes(nodes: &[[u32; 5]], root: u32, features: &[f32]) -> [usize; 2] {
+    let mut at = root;
+    loop {
+        // In a leaf, the first two numbers are its votes. In a branch, a feature is compared with a number, whose bits
+        // are there, and the next node is another one for each outcome.
+        let [feature, yes, no, number, kind] = nodes[at as usize];
+        if kind as u8 == 0 {
+            return [feature, yes].map(|vote| vote as usize);
         }
+        let (found, number) = (features[feature as usize], f32::from_bits(number));
+        // The numbers of tract's `Cmp`.
+        let is_true = match kind as u8 {
+            _ if found.is_nan() => kind & 0x100 != 0,
+            1 => found == number,
+            2 => found != number,
+            3 => found < number,
+            4 => found > number,
+            5 => found <= number,
+            _ => found >= number,
+        };
+        at = if is_true { yes } else { no };
     }
 }
 
@@ -115,30 +61,31 @@ impl EvalOp for Forest {
     op_out_of_plan!();
 
     fn eval(&self, _: &EvalContext, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
+        let Self(forest) = self;
         let input = args_1!(inputs);
         let input = input.cast_to::<f32>()?;
         let features = input.try_as_plain_ram()?.as_slice::<f32>()?;
-        if input.shape() != [1, features.len()] || features.len() < self.features {
-            bail!(
-                "found features {:?}, expected [1, {}]",
-                input.shape(),
-                self.features
-            );
+        if input.shape() != [1, features.len()] || features.len() <= forest.max_used_feature {
+            let (found, most) = (input.shape(), forest.max_used_feature + 1);
+            bail!("found features {found:?}, expected [1, {most}]");
         }
-        let mut sums = vec![0.0_f32; self.classes];
-        for &root in &self.roots {
-            for &[class, weight] in self.votes(root, features) {
+        let (nodes, _) = numbers(&forest.data.nodes)?.as_chunks();
+        let (all, _) = numbers(&forest.data.leaves)?.as_chunks();
+        let mut sums = vec![0.0_f32; forest.n_classes];
+        for &root in numbers(&forest.data.trees)? {
+            let [from, to] = votes(nodes, root, features);
+            for &[class, weight] in &all[from..to] {
                 sums[class as usize] += f32::from_bits(weight);
             }
         }
-        let sums = tensor1(&sums).into_shape(&[1, self.classes])?;
+        let sums = tensor1(&sums).into_shape(&[1, forest.n_classes])?;
         Ok(tvec!(sums.into_tvalue()))
     }
 }
 
 impl TypedOp for Forest {
     fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(f32::fact([1, self.classes])))
+        Ok(tvec!(f32::fact([1, self.0.n_classes])))
     }
 
     as_op!();
