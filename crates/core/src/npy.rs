@@ -80,6 +80,15 @@ fn fill(reader: &mut impl Read, bytes: &mut [u8]) -> io::Result<()> {
 }
 
 impl Header {
+    /// The header of an array of this shape, whose elements are row by row.
+    pub(crate) fn of<T: Element>(shape: &[usize]) -> Self {
+        Self {
+            descr: T::DESCR.to_owned(),
+            fortran_order: false,
+            shape: shape.to_vec(),
+        }
+    }
+
     /// Reads the header at the beginning of an array.
     ///
     /// # Errors
@@ -279,11 +288,7 @@ pub fn table(reader: &mut impl Read) -> io::Result<Vec<Vec<f32>>> {
 ///
 /// Panics if the shape has another number of elements.
 pub fn to_bytes<T: Element>(shape: &[usize], elements: &[T]) -> Vec<u8> {
-    let header = Header {
-        descr: T::DESCR.to_owned(),
-        fortran_order: false,
-        shape: shape.to_vec(),
-    };
+    let header = Header::of::<T>(shape);
     assert_eq!(header.count(), Some(elements.len()), "{shape:?}");
     let mut bytes = header.to_bytes();
     bytes.reserve_exact(size_of_val(elements));

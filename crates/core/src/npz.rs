@@ -75,11 +75,7 @@ impl<W: Write + Seek> Writer<W> {
         shape: &[usize],
         elements: impl Iterator<Item = T>,
     ) -> io::Result<()> {
-        let header = Header {
-            descr: T::DESCR.to_owned(),
-            fortran_order: false,
-            shape: shape.to_vec(),
-        };
+        let header = Header::of::<T>(shape);
         let mut bytes = header.to_bytes();
         let expected = header.count().unwrap_or(usize::MAX);
         let all_bytes = expected.saturating_mul(size_of::<T>());

@@ -18,7 +18,7 @@ use std::io::{self, Read};
 
 use serde::{Deserialize, Serialize};
 
-pub use self::labels::{Labels, check_label, is_named, misspelt, object_of};
+pub use self::labels::{Labels, check_label, misspelt, object_of};
 pub use self::message::MOTION;
 pub use self::playback::{Playback, PlaybackError};
 pub use self::reader::{Found, Reader};

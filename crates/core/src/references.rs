@@ -40,20 +40,20 @@ pub enum Error {
 /// [`MOST_REFERENCES`].
 pub fn read(bytes: &[u8]) -> Result<Vec<ReferencePress>, Error> {
     let mut file = Reader::new(bytes, MOST_REFERENCES * MOST_PRESS_BYTES)?;
-    if !file.has("0") {
-        let expected = "a press: make the file with `hardnessd identify`";
-        return Err(Unexpected::new("0", "none", expected).into());
-    }
-    let mut presses = vec![read_press(&mut file, "0")?];
+    let mut presses = Vec::new();
     loop {
         let array = presses.len().to_string();
-        match file.has(&array) {
-            false => return Ok(presses),
-            true if presses.len() < MOST_REFERENCES => presses.push(read_press(&mut file, &array)?),
-            true => {
+        match (presses.len(), file.has(&array)) {
+            (0, false) => {
+                let expected = "a press: make the file with `hardnessd identify`";
+                return Err(Unexpected::new(&array, "none", expected).into());
+            }
+            (MOST_REFERENCES, true) => {
                 let expected = format!("at most {MOST_REFERENCES} presses");
                 return Err(Unexpected::new(&array, "one more", expected).into());
             }
+            (_, true) => presses.push(read_press(&mut file, &array)?),
+            (_, false) => return Ok(presses),
         }
     }
 }

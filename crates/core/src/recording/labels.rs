@@ -76,11 +76,6 @@ pub fn object_of(name: &str) -> u32 {
     number | NAMED
 }
 
-/// Whether the number of an object is that of a name.
-pub fn is_named(object: u32) -> bool {
-    object >= NAMED
-}
-
 /// The keys of labels that mean something to `hrn-train` and `identify`.
 const KEYS: [&str; 6] = ["level", "object", "shore", "material", "reference", "name"];
 

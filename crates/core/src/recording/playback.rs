@@ -10,7 +10,7 @@ use crate::judge::{EndedPress, Unjudged};
 use crate::pipeline::{Clock, Pipeline};
 use crate::press::End;
 use crate::sensor::Sensor;
-use crate::verdict::{Model, ModelError, References};
+use crate::verdict::{Model, ModelError};
 
 /// The pipelines of a recording's sensors. They get the same inputs as the recorded ones.
 ///
@@ -49,15 +49,13 @@ struct Player {
     /// The moment of the last entry. `None` for raw bytes, whose times come from the frame rate.
     last: Option<Stamp>,
     labels: Labels,
-    /// The SHA-256 of the model during recording, and the sensor's references.
-    model: (String, References),
+    /// The sensor as it was recorded. Raw bytes have none.
+    recorded: Option<RecordedSensor>,
 }
 
 impl Player {
     fn has(&self, state: &State) -> bool {
-        let recorded = &state.sensor;
-        (&self.model.0, &self.model.1) == (&recorded.model_sha256, &recorded.references)
-            && self.pipeline.sensor().for_recording() == recorded.description
+        self.recorded.as_ref() == Some(&state.sensor)
             && self.pipeline.at_rest().as_ref() == Some(&state.at_rest)
     }
 }
@@ -92,7 +90,7 @@ impl Playback {
     pub fn of_bytes(sensor: Sensor, hrn: Arc<Model>) -> Self {
         let mut playback = Self::new(hrn.clone());
         playback.players.push(Player {
-            model: (hrn.sha256().to_owned(), References::NONE),
+            recorded: None,
             pipeline: Pipeline::new(sensor, hrn, Clock::FrameRate),
             last: None,
             labels: Labels::new(),
@@ -155,10 +153,6 @@ impl Playback {
             // If no entry is missing, the pipeline already has this state.
             (Entry::State(state), Some(known)) if known.has(&state) => Vec::new(),
             (Entry::State(state), known) => {
-                let model = (
-                    state.sensor.model_sha256.clone(),
-                    state.sensor.references.clone(),
-                );
                 let described = state.sensor.check()?;
                 hrn.card().check_array(described.layout().array())?;
                 if !state.at_rest.is_usable(described.layout().array()) {
@@ -173,7 +167,7 @@ impl Playback {
                     pipeline,
                     last: Some(at),
                     labels: state.labels,
-                    model,
+                    recorded: Some(state.sensor),
                 };
                 match known {
                     Some(known) => {
@@ -263,8 +257,9 @@ impl Playback {
 
     /// The SHA-256 of a model during recording, if it differs from the current model.
     pub fn other_model(&self) -> Option<&str> {
-        let models = self.players.iter().map(|player| player.model.0.as_str());
-        models.into_iter().find(|model| *model != self.hrn.sha256())
+        let recorded = self.players.iter().flat_map(|player| &player.recorded);
+        let mut models = recorded.map(|recorded| recorded.model_sha256.as_str());
+        models.find(|model| *model != self.hrn.sha256())
     }
 }
 
