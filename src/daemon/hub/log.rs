@@ -169,7 +169,7 @@ pub(crate) struct SensorSnapshot {
 }
 
 /// The whole state of the hub. It belongs to the sensors' thread.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Log {
     hello: Hello,
     recorder: Option<Jobs>,
@@ -192,16 +192,7 @@ impl Log {
     pub(super) fn new(hello: Hello) -> Self {
         Self {
             hello,
-            recorder: None,
-            events: VecDeque::new(),
-            frames: VecDeque::new(),
-            end: Place::default(),
-            sensors: BTreeMap::new(),
-            subscribers: BTreeMap::new(),
-            joined: 0,
-            gaps: 0,
-            dropped: 0,
-            is_closed: false,
+            ..Self::default()
         }
     }
 

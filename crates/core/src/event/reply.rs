@@ -94,7 +94,7 @@ impl Reply {
 /// let line = Reply::Hello(hello).to_line();
 /// assert!(line.starts_with(r#"{"type":"hello","protocol":1,"server":"hardnessd","#));
 /// ```
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Hello {
     /// [`PROTOCOL`](super::PROTOCOL).
     pub protocol: u32,
@@ -130,7 +130,7 @@ pub struct SensorCard {
 }
 
 /// The model, as announced in `hello`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct ModelCard {
     /// The SHA-256 of the model's file.
     pub sha256: String,
