@@ -66,7 +66,7 @@ use self::sensor::{Command, SensorCore, SensorHandle, Sensors};
 use crate::maybe;
 use crate::thread::NoThread;
 use hardnessd_core::event::{Hello, ModelCard, PROTOCOL, SensorCard};
-use hardnessd_core::exit::{CONFIG, Coded, IO};
+use hardnessd_core::exit::{CONFIG, IO};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::pipeline::{Clock, Pipeline};
 use hardnessd_core::recording::{About, Labels, RecordedSensor};
@@ -97,17 +97,16 @@ impl Error {
     pub(crate) fn io(message: String) -> Self {
         Self { message, code: IO }
     }
+
+    /// The exit code of a program that ends with it.
+    pub fn exit_code(&self) -> u8 {
+        self.code
+    }
 }
 
 impl From<NoThread> for Error {
     fn from(error: NoThread) -> Self {
         Self::io(error.to_string())
-    }
-}
-
-impl Coded for Error {
-    fn exit_code(&self) -> u8 {
-        self.code
     }
 }
 

@@ -11,18 +11,10 @@ use std::time::Duration;
 
 use tokio::sync::oneshot;
 
-use hardnessd_core::exit::{Coded, IO};
-
 /// The error of work that the system has no thread for.
 #[derive(Debug, thiserror::Error)]
 #[error("no thread to spare: {0}")]
 pub struct NoThread(#[from] pub io::Error);
-
-impl Coded for NoThread {
-    fn exit_code(&self) -> u8 {
-        IO
-    }
-}
 
 /// Starts a thread that does `work`, and ends with the process.
 ///

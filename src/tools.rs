@@ -35,9 +35,8 @@ use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 
-use self::exit::{Fail, Failure};
+use self::exit::{FAILED, Fail, Failure, IO, NO_INPUT};
 use crate::thread;
-use hardnessd_core::exit::{FAILED, IO, NO_INPUT};
 use hardnessd_core::recording;
 use hardnessd_core::wording;
 

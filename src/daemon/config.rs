@@ -21,7 +21,6 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use serde_json::Value;
 
-use self::error::Problem;
 pub use self::error::Text;
 pub(crate) use self::parse::read_at_most;
 pub use self::publish::{
@@ -29,7 +28,7 @@ pub use self::publish::{
 };
 pub use super::Error;
 use super::log;
-use hardnessd_core::range::from_to;
+use hardnessd_core::range::{OutOfRange, from_to};
 use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::settings;
 use hardnessd_core::verdict::{self, BuiltIn, Format, LevelTable, Model};
@@ -258,7 +257,7 @@ impl Setup {
             let checked = self.hrn.card().check_array(sensor.layout().array());
             checked.map_err(|error| {
                 let problem = format!("sensor {:?}: {error}", sensor.name());
-                Error::at(path, &self.text)(Problem::because("model.path", problem))
+                Error::at(path, &self.text)(OutOfRange::because("model.path", problem).into())
             })?;
         }
         Ok(self)

@@ -20,10 +20,9 @@ use rustix::process::Signal;
 
 use self::gather::Press;
 use super::configuration::Configuration;
-use super::exit::{Fail, Failure};
+use super::exit::{FAILED, Fail, Failure, IO, USAGE};
 use super::live;
 use crate::daemon::config::Setup;
-use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::line::extent;
 use hardnessd_core::npy;
 use hardnessd_core::part::Part;

@@ -3,7 +3,7 @@
 use clap::Args as ClapArgs;
 
 use super::configuration::Configuration;
-use super::exit::{Coded, Failure};
+use super::exit::Failure;
 use crate::daemon::config::Setup;
 use crate::daemon::publish;
 use hardnessd_core::sensor::Settings;

@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args as ClapArgs;
 
-use super::exit::{Fail, Failure};
-use hardnessd_core::exit::NO_INPUT;
+use super::exit::{Fail, Failure, NO_INPUT};
 use hardnessd_core::stderr_line;
 
 /// The argument `--config`.

@@ -18,12 +18,11 @@ use clap::Args as ClapArgs;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use serde_json::Value;
 
-use super::exit::Failure;
+use super::exit::{Failure, UNAVAILABLE};
 use super::{demo, doctor};
 use crate::daemon::config::Unix;
 use crate::daemon::tcp;
 use hardnessd_core::event::PROTOCOL;
-use hardnessd_core::exit::UNAVAILABLE;
 
 /// How long a daemon may take to send `hello`: a hundred times the 50 ms that a running one takes
 /// at most, because a service manager may have to start it first.

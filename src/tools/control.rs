@@ -9,8 +9,7 @@ use serde_json::{Map, Value, json};
 
 use super::answer::{labels, level_of};
 use super::connect::{self, Connection};
-use super::exit::Failure;
-use hardnessd_core::exit::{FAILED, USAGE};
+use super::exit::{FAILED, Failure, USAGE};
 use hardnessd_core::wording;
 
 /// The sensor and the socket of a command.

@@ -15,10 +15,9 @@ use clap::Args as ClapArgs;
 use rustix::fs::{AtFlags, CWD, accessat};
 
 use super::absolute;
-use super::exit::Failure;
+use super::exit::{FAILED, Failure, USAGE};
 use crate::daemon::serial;
 use crate::holders::{holders, processes, under};
-use hardnessd_core::exit::{FAILED, USAGE};
 use hardnessd_core::port::Port;
 use hardnessd_core::wording::escaped;
 

@@ -4,7 +4,9 @@ use std::fmt::{Debug, Display};
 
 use rustix::process::Signal;
 
-pub use hardnessd_core::exit::{Coded, IO, USAGE};
+use crate::daemon;
+use crate::thread::NoThread;
+pub use hardnessd_core::exit::{FAILED, IO, NO_INPUT, UNAVAILABLE, USAGE};
 use hardnessd_core::wording;
 
 /// The error of a command, and the exit code of the program that ends with it.
@@ -41,11 +43,17 @@ impl Failure {
     }
 }
 
-impl<E: Coded + Send + Sync + 'static> From<E> for Failure {
-    fn from(error: E) -> Self {
+impl From<daemon::Error> for Failure {
+    fn from(error: daemon::Error) -> Self {
         let code = error.exit_code();
         let error = error.into();
         Self { error, code }
+    }
+}
+
+impl From<NoThread> for Failure {
+    fn from(error: NoThread) -> Self {
+        daemon::Error::from(error).into()
     }
 }
 

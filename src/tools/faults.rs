@@ -10,9 +10,8 @@ use std::path::Path;
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::exit::Failure;
+use super::exit::{FAILED, Failure};
 use super::read_text;
-use hardnessd_core::exit::FAILED;
 use hardnessd_core::frame::{Array, RawFrame};
 use hardnessd_core::wire::Layout;
 use hardnessd_core::wording;

@@ -16,11 +16,10 @@ use clap::Args as ClapArgs;
 use rustix::process::Signal;
 
 use super::configuration::Configuration;
-use super::exit::{Fail, Failure};
+use super::exit::{FAILED, Fail, Failure, IO, USAGE};
 use super::played::Played;
 use super::{cannot_read, live, print_apart};
 use crate::daemon::config::{self, Config, Setup};
-use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::line::extent;
 use hardnessd_core::part::Part;
 use hardnessd_core::recording::Labels;

@@ -12,13 +12,12 @@ use std::time::Duration;
 use rustix::process::Signal;
 use tokio::sync::watch;
 
-use super::exit::{Fail, Failure};
+use super::exit::{FAILED, Fail, Failure, IO};
 use super::record;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Lines;
 use crate::daemon::record::Progress;
 use crate::thread;
-use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::recording::Labels;
 use hardnessd_core::sensor::Sensor;
 

@@ -11,12 +11,11 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::exit::Failure;
+use super::exit::{FAILED, Failure, USAGE};
 use super::replay::motion;
 use super::unplayable;
 use crate::daemon::config::Setup;
 use hardnessd_core::event::{self, Event, Status};
-use hardnessd_core::exit::{FAILED, USAGE};
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::judge::Unjudged;
 use hardnessd_core::motion::Point;

@@ -16,13 +16,12 @@ use tokio::sync::watch;
 
 use super::configuration::Configuration;
 use super::doctor;
-use super::exit::{Fail as _, Failure};
+use super::exit::{Fail as _, Failure, IO, UNAVAILABLE, USAGE};
 use crate::daemon::Daemon;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Log;
 use crate::daemon::record::{Gone, Progress, Target};
 use crate::maybe;
-use hardnessd_core::exit::{IO, UNAVAILABLE, USAGE};
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, misspelt};
 use hardnessd_core::sensor;

@@ -7,9 +7,8 @@ use std::path::PathBuf;
 use clap::Args as ClapArgs;
 use jiff::Timestamp;
 
-use super::exit::Failure;
+use super::exit::{FAILED, Failure, IO};
 use super::{cannot_read, unplayable};
-use hardnessd_core::exit::{FAILED, IO};
 use hardnessd_core::part::Part;
 use hardnessd_core::recording::{self, RecoverError, Recovered};
 use hardnessd_core::stderr_line;

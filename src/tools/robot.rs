@@ -13,10 +13,9 @@ use serde_json::{Value, json};
 use tokio::time::Instant;
 
 use super::connect;
-use super::exit::Failure;
+use super::exit::{FAILED, Failure};
 use crate::daemon::now;
 use crate::thread::NoThread;
-use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
 
 /// The time between two positions.

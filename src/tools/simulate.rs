@@ -8,14 +8,13 @@ use std::path::{Path, PathBuf};
 use clap::Args as ClapArgs;
 use tokio::time::Instant;
 
-use super::exit::{Fail, Failure};
+use super::exit::{Fail, Failure, IO, USAGE};
 use super::faults::{self, Faults, Line};
 use super::player::{self, Player};
 use super::robot;
 use crate::daemon::config::Unix;
 use crate::daemon::port::BITS_A_BYTE;
 use crate::thread;
-use hardnessd_core::exit::{IO, USAGE};
 use hardnessd_core::part::Part;
 use hardnessd_core::sensor::DEFAULT_FRAME_RATE_HZ;
 use hardnessd_core::verdict::Piece;

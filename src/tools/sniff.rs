@@ -17,11 +17,10 @@ use std::time::{Duration, Instant};
 use clap::{ArgGroup, Args as ClapArgs};
 use hardnessd_sniff::{Capture, Found, Known, Proposal, Ranked, Scale, sniff};
 
-use super::exit::{Fail, Failure};
+use super::exit::{FAILED, Fail, Failure, IO, UNAVAILABLE};
 use super::{absolute, cannot_read, doctor};
 use crate::daemon::serial;
 use crate::thread::spawn_thread;
-use hardnessd_core::exit::{FAILED, IO, UNAVAILABLE};
 use hardnessd_core::frame::MOST_SIDE;
 use hardnessd_core::part::Part;
 use hardnessd_core::pipeline::Input;

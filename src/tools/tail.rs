@@ -13,12 +13,11 @@ use serde_json::{Value, json};
 
 use super::answer;
 use super::connect::Source;
-use super::exit::Failure;
+use super::exit::{FAILED, Failure};
 use super::readable::printed;
 use crate::maybe;
 use crate::thread::spawn_thread;
 use hardnessd_core::event::Kind;
-use hardnessd_core::exit::FAILED;
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::{escaped, named, positive};
 

@@ -33,10 +33,9 @@ use self::screen::Screen;
 use self::view::{Order, View};
 use super::connect::{self, Address, Connection, Source};
 use super::control;
-use super::exit::{Fail, Failure};
+use super::exit::{FAILED, Fail, Failure, IO, USAGE};
 use crate::daemon::now;
 use crate::thread::{spawn_thread, start};
-use hardnessd_core::exit::{FAILED, IO, USAGE};
 use hardnessd_core::stderr_line;
 use hardnessd_core::wording::escaped;
 

@@ -12,9 +12,3 @@ pub const UNAVAILABLE: u8 = 69;
 pub const IO: u8 = 74;
 /// Bad configuration or model, or a file that the configuration names.
 pub const CONFIG: u8 = 78;
-
-/// An error that knows the exit code of a program that ends with it.
-pub trait Coded: std::error::Error {
-    /// One of the codes of this module, or 128 and a signal's number.
-    fn exit_code(&self) -> u8;
-}

@@ -3,6 +3,7 @@
 use super::error::Problem;
 use super::{Config, Publish, Unix, Zenoh, domain_id};
 use crate::daemon::port;
+use hardnessd_core::range::OutOfRange;
 use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::{range, verdict, wording};
 
@@ -35,7 +36,7 @@ pub(super) fn check(config: &Config) -> Result<Vec<Sensor>, Problem> {
 }
 
 /// Checks that this program was built with the features that the tables need.
-fn check_built(publish: &Publish) -> Result<(), Problem> {
+fn check_built(publish: &Publish) -> Result<(), OutOfRange> {
     let (has_zenoh, has_ros2) = (cfg!(feature = "zenoh"), cfg!(feature = "ros2"));
     let has_foxglove = cfg!(feature = "foxglove");
     for (table, feature, is_built, is_given) in [
@@ -54,21 +55,21 @@ fn check_built(publish: &Publish) -> Result<(), Problem> {
                 "this hardnessd was built without {feature}: build it with --features {feature}, or \
                  remove the table"
             );
-            return Err(Problem::because(&format!("publish.{table}"), problem));
+            return Err(OutOfRange::because(&format!("publish.{table}"), problem));
         }
     }
     Ok(())
 }
 
-fn check_robot(robot: &str) -> Result<(), Problem> {
+fn check_robot(robot: &str) -> Result<(), OutOfRange> {
     let chars = robot.chars().count();
     if chars > MOST_ROBOT_CHARS {
-        let found = format!("{chars} characters");
-        return Err(Problem::found("robot", found, "a name of at most 255"));
+        let found = format_args!("{chars} characters");
+        return Err(OutOfRange::new("robot", found, "a name of at most 255"));
     }
     let expected = "a name without control or bidirectional characters";
     let fits = !robot.is_empty() && wording::is_plain(robot);
-    Ok(range::check("robot", robot, fits, expected)?)
+    range::check("robot", robot, fits, expected)
 }
 
 /// Twice as many sensors as a core can read at 100 frames/s.
@@ -81,15 +82,15 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     }
     let count = config.sensors.len();
     if count > MOST_SENSORS {
-        let found = format!("{count} tables");
-        return Err(Problem::found("sensor", found, "at most 1000"));
+        let found = format_args!("{count} tables");
+        return Err(OutOfRange::new("sensor", found, "at most 1000").into());
     }
     let checked = |(index, given): (usize, &sensor::Settings)| {
         let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
         let sensor = sensor.and_then(|sensor| {
             check_beside(given, &config.sensors[..index])?;
             let carried = port::check_baud(given, sensor.layout());
-            carried.map_err(|problem| Problem::because("sensor.frame_rate_hz", problem))?;
+            carried.map_err(|problem| OutOfRange::because("sensor.frame_rate_hz", problem))?;
             Ok(sensor)
         });
         sensor.map_err(|problem| problem.of((index, given)))
@@ -97,7 +98,7 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
     config.sensors.iter().enumerate().map(checked).collect()
 }
 
-fn check_unix(unix: &Unix) -> Result<(), Problem> {
+fn check_unix(unix: &Unix) -> Result<(), OutOfRange> {
     let ranges = unix.check_ranges();
     ranges.map_err(|error| error.within("publish.unix"))?;
     if unix.enabled && unix.control_path() == unix.path() {
@@ -105,12 +106,12 @@ fn check_unix(unix: &Unix) -> Result<(), Problem> {
             "{} is the socket of events too: set another path",
             unix.control_path().display()
         );
-        return Err(Problem::because("publish.unix.control_path", problem));
+        return Err(OutOfRange::because("publish.unix.control_path", problem));
     }
     Ok(())
 }
 
-fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
+fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), OutOfRange> {
     check_endpoints("publish.zenoh.listen", &zenoh.listen)?;
     check_endpoints("publish.zenoh.connect", &zenoh.connect)?;
     let site = zenoh.site(robot);
@@ -120,10 +121,10 @@ fn check_zenoh(zenoh: &Zenoh, robot: &str) -> Result<(), Problem> {
         && wording::is_plain(site);
     let expected = "parts of a key (by default the robot's name), without * $ ? #, control or \
                     bidirectional characters";
-    Ok(range::check("publish.zenoh.site", site, is_key, expected)?)
+    range::check("publish.zenoh.site", site, is_key, expected)
 }
 
-fn check_endpoints(key: &str, endpoints: &[String]) -> Result<(), Problem> {
+fn check_endpoints(key: &str, endpoints: &[String]) -> Result<(), OutOfRange> {
     for endpoint in endpoints {
         let expected = "an endpoint such as \"tcp/127.0.0.1:7447\"";
         let fits = Zenoh::address(endpoint).is_some();
@@ -138,12 +139,14 @@ fn check_ros(
     domain: Option<u16>,
     namespace: &str,
     sensors: &[sensor::Settings],
-) -> Result<(), Problem> {
+) -> Result<(), OutOfRange> {
     let key = format!("{table}.domain_id");
     let expected = "0 to 232 (by default $ROS_DOMAIN_ID)";
     match domain_id(domain) {
         Ok(id) => range::check(&key, id, id <= LAST_DOMAIN_ID, expected)?,
-        Err(found) => return Err(Problem::found(&key, found, expected)),
+        Err(found) => {
+            return Err(OutOfRange::new(&key, format_args!("{found}"), expected));
+        }
     }
     let token = |token: &str| {
         token.starts_with(|first: char| first.is_ascii_alphabetic())
@@ -156,9 +159,9 @@ fn check_ros(
     range::check(&format!("{table}.namespace"), namespace, fits, expected)?;
     let fits = |sensor: &&sensor::Settings| token(&sensor.name);
     match sensors.iter().find(|sensor| !fits(sensor)) {
-        Some(sensor) => Err(Problem::found(
+        Some(sensor) => Err(OutOfRange::new(
             "sensor.name",
-            &sensor.name,
+            format_args!("{}", sensor.name),
             format_args!("a name without two _ in a row, for {table}"),
         )),
         None => Ok(()),
@@ -172,10 +175,10 @@ const MOST_ROBOT_CHARS: usize = 255;
 const LAST_DOMAIN_ID: u16 = 232;
 
 /// Checks that a sensor has a name of its own, and agrees with those before it on the port that they share.
-fn check_beside(sensor: &sensor::Settings, before: &[sensor::Settings]) -> Result<(), Problem> {
+fn check_beside(sensor: &sensor::Settings, before: &[sensor::Settings]) -> Result<(), OutOfRange> {
     if before.iter().any(|other| other.name == sensor.name) {
         let problem = "two sensors have this name: give each a name of its own";
-        return Err(Problem::because("sensor.name", problem));
+        return Err(OutOfRange::because("sensor.name", problem));
     }
     let mut at_its_port = before.iter().filter(|other| other.port == sensor.port);
     let Some(first) = at_its_port.find(|first| first.baud != sensor.baud) else {
@@ -185,13 +188,13 @@ fn check_beside(sensor: &sensor::Settings, before: &[sensor::Settings]) -> Resul
         "{} as for {:?}, which has the same port",
         first.baud, first.name
     );
-    Err(Problem::found("sensor.baud", sensor.baud, expected))
+    Err(OutOfRange::new("sensor.baud", sensor.baud, expected))
 }
 
-fn check_model(model: &verdict::Settings) -> Result<(), Problem> {
+fn check_model(model: &verdict::Settings) -> Result<(), OutOfRange> {
     let Some(hash) = &model.sha256 else {
         return Ok(());
     };
     let fits = hash.len() == 64 && hash.chars().all(|c| c.is_ascii_hexdigit());
-    Ok(range::check("model.sha256", hash, fits, "64 hex digits")?)
+    range::check("model.sha256", hash, fits, "64 hex digits")
 }

@@ -1,6 +1,5 @@
 //! The errors of a configuration. Each error names the file, the line and the key.
 
-use std::fmt;
 use std::path::Path;
 
 use toml::de::{DeTable, DeValue};
@@ -76,16 +75,6 @@ impl Problem {
             code: NO_INPUT,
             ..Self::of_file(format!("cannot read: {error}"))
         }
-    }
-
-    /// The problem of a value. `found` is shown as it is.
-    pub(super) fn found(key: &str, found: impl fmt::Display, expected: impl fmt::Display) -> Self {
-        OutOfRange::new(key, format_args!("{found}"), expected).into()
-    }
-
-    /// A problem and its remedy.
-    pub(super) fn because(key: &str, problem: impl fmt::Display) -> Self {
-        OutOfRange::because(key, problem).into()
     }
 
     /// The same problem in the table of a sensor, if its key is there.

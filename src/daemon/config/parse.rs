@@ -9,6 +9,7 @@ use std::time::Duration;
 use super::error::{MAX_BYTES, Problem, Text};
 use super::{Config, Error};
 use hardnessd_core::port::Port;
+use hardnessd_core::range::OutOfRange;
 use hardnessd_core::tare::Gains;
 use hardnessd_core::verdict::{self, LevelTable, Model};
 use hardnessd_core::{npy, range, references, sensor, trial, wording};
@@ -60,7 +61,7 @@ fn resolve_of(sensor: &mut sensor::Settings, directory: &Path) -> Result<(), Pro
     if let Port::Device(device) = &mut sensor.port {
         if device.as_os_str().is_empty() {
             let expected = "a path under /dev/serial/by-id/";
-            return Err(Problem::found("sensor.port", "none", expected));
+            return Err(OutOfRange::new("sensor.port", format_args!("none"), expected).into());
         }
         resolve(Some(device), directory, "sensor.port")?;
     }
@@ -75,7 +76,8 @@ fn resolve_of(sensor: &mut sensor::Settings, directory: &Path) -> Result<(), Pro
 fn gains(given: &Gains, directory: &Path) -> Result<Gains, Problem> {
     let key = "sensor.calibration.gains";
     let Gains::File(file) = given else {
-        return Err(Problem::found(key, "a list", "the path of an .npy file"));
+        let found = format_args!("a list");
+        return Err(OutOfRange::new(key, found, "the path of an .npy file").into());
     };
     let mut file = file.clone();
     resolve(Some(&mut file), directory, key)?;
@@ -103,7 +105,7 @@ fn read_named(key: &str, file: &Path, most: usize) -> Result<Vec<u8>, Problem> {
 
 /// The problem of the file that the configuration names at `key`.
 fn unusable(key: &str, file: &Path, problem: impl Display) -> Problem {
-    Problem::because(key, format_args!("{}: {problem}", file.display()))
+    OutOfRange::because(key, format_args!("{}: {problem}", file.display())).into()
 }
 
 /// Resolves a path of the configuration, if it is given, against its directory. An empty path is refused,
@@ -157,14 +159,15 @@ pub(super) fn model(config: &Config, most: Duration) -> Result<Model, Problem> {
         && !expected.eq_ignore_ascii_case(hrn.sha256())
     {
         let found = format_args!("a model of {}", hrn.sha256());
-        return Err(Problem::found("model.sha256", found, expected));
+        let expected = expected.as_str();
+        return Err(OutOfRange::new("model.sha256", found, expected).into());
     }
     if config.levels.is_empty() {
         return Ok(hrn);
     }
     let levels = LevelTable::levels(&config.levels);
     let levelled = levels.and_then(|levels| hrn.with_levels(levels));
-    levelled.map_err(|error| Problem::because("level", error))
+    levelled.map_err(|error| OutOfRange::because("level", error).into())
 }
 
 /// The model with the references in `file`, which are those of `sensor`.

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use super::*;
-use hardnessd_core::exit::{CONFIG, Coded};
+use hardnessd_core::exit::CONFIG;
 use hardnessd_core::{npy, tare};
 
 fn load(text: &str) -> Result<Config, String> {

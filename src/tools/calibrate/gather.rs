@@ -6,10 +6,9 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::tools::exit::Failure;
+use crate::tools::exit::{FAILED, Failure};
 use crate::tools::played::Played;
 use hardnessd_core::event::{Event, FrameEvent, Note, Phase, PressState};
-use hardnessd_core::exit::FAILED;
 use hardnessd_core::frame::Stamp;
 use hardnessd_core::motion::Track;
 use hardnessd_core::pipeline::Pipeline;

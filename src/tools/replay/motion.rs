@@ -2,9 +2,8 @@
 
 use std::path::Path;
 
-use crate::tools::exit::Failure;
+use crate::tools::exit::{FAILED, Failure};
 use crate::tools::read_text;
-use hardnessd_core::exit::FAILED;
 use hardnessd_core::motion::{FURTHEST_MM, Point};
 
 /// The most bytes of a file: more than a day of positions, 100 a second.
