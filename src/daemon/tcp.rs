@@ -1,7 +1,9 @@
 //! TCP listeners and the options of their connections.
 
 use std::io;
-use std::net::{SocketAddr, TcpListener as StdListener};
+use std::net::{
+    SocketAddr, TcpListener as StdListener, TcpStream as StdStream, ToSocketAddrs as _,
+};
 use std::os::fd::AsFd;
 use std::time::Duration;
 
@@ -56,6 +58,19 @@ impl Listener for Tcp {
         let _ = behave(&stream);
         Ok(stream)
     }
+}
+
+/// Connects to a host and a port, each of whose addresses may take the time `patience`. A peer that has gone without a
+/// word is noticed after the time `gone`.
+pub(crate) fn connect(address: &str, patience: Duration, gone: Duration) -> io::Result<StdStream> {
+    let mut last = io::Error::other("the name has no address");
+    for address in address.to_socket_addrs()? {
+        match StdStream::connect_timeout(&address, patience) {
+            Ok(stream) => return keep_alive(&stream, gone).map(|()| stream),
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
 }
 
 fn behave(stream: &TcpStream) -> io::Result<()> {

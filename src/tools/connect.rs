@@ -7,7 +7,6 @@
 use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, ErrorKind, Write as _};
-use std::net::{TcpStream, ToSocketAddrs as _};
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
@@ -150,17 +149,7 @@ impl Connection {
     fn try_open(address: &Address) -> io::Result<Self> {
         let stream: OwnedFd = match address {
             Address::Unix(path) => UnixStream::connect(path)?.into(),
-            Address::Tcp(name) => {
-                let mut last = io::Error::from(ErrorKind::AddrNotAvailable);
-                let mut addresses = name.to_socket_addrs()?;
-                let stream = addresses.find_map(|address| {
-                    let stream = TcpStream::connect_timeout(&address, HELLO);
-                    stream.map_err(|error| last = error).ok()
-                });
-                let stream = stream.ok_or(last)?;
-                tcp::keep_alive(&stream, tcp::PATIENCE)?;
-                stream.into()
-            }
+            Address::Tcp(name) => tcp::connect(name, HELLO, tcp::PATIENCE)?.into(),
         };
         Ok(Self {
             address: address.clone(),

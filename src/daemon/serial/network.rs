@@ -1,7 +1,7 @@
 //! Bytes of a sensor over TCP or UDP.
 
 use std::io::{self, Read};
-use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::net::{SocketAddr, TcpStream};
 use std::time::Duration;
 
 use rustix::io::Errno;
@@ -9,8 +9,7 @@ use tokio::net::UdpSocket;
 use tokio::time::Instant;
 use tracing::warn;
 
-use crate::daemon::log;
-use crate::daemon::tcp::keep_alive;
+use crate::daemon::{log, tcp};
 use hardnessd_core::wire;
 
 /// How long a connection may take.
@@ -29,20 +28,11 @@ const UNPROVEN_REQUESTS: u32 = 32;
 
 /// Connects to `address`, a host and a port.
 pub(super) fn connect(address: &str) -> io::Result<TcpStream> {
-    let mut last = None;
-    for address in address.to_socket_addrs()? {
-        match TcpStream::connect_timeout(&address, CONNECTING) {
-            Ok(stream) => {
-                refuse_self(&stream)?;
-                stream.set_nodelay(true)?;
-                stream.set_nonblocking(true)?;
-                keep_alive(&stream, GONE)?;
-                return Ok(stream);
-            }
-            Err(error) => last = Some(error),
-        }
-    }
-    Err(last.unwrap_or_else(|| io::Error::other("the name has no address")))
+    let stream = tcp::connect(address, CONNECTING, GONE)?;
+    refuse_self(&stream)?;
+    stream.set_nodelay(true)?;
+    stream.set_nonblocking(true)?;
+    Ok(stream)
 }
 
 /// Fails for a connection to itself. The system makes one where nothing listens and it happens to choose
