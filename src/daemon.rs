@@ -185,17 +185,17 @@ impl Daemon {
         let recorder = target.map(|target| Recorder::start(target, about(&setup, &hello)));
         let recorder = recorder.transpose()?;
         if let Some(recorder) = &recorder {
-            hub.log().record(recorder.of_hub());
+            hub.log().record(recorder.jobs.clone());
         }
         let parts = setup.sensors.iter().zip(inboxes).enumerate();
         let core = |(index, (sensor, commands)): (usize, (&Sensor, _))| {
-            let recorder = recorder.as_ref().map(|recorder| recorder.of_sensor(index));
+            let recorder = recorder.as_ref();
             let hrn = setup.hrn_of(sensor.name()).clone();
             let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
             store.load(&mut pipeline);
             SensorCore {
                 pipeline,
-                recorder: recorder.unwrap_or_default(),
+                recorder: recorder.map(|recorder| recorder.of_sensor(index)),
                 unjudged: 0,
                 commands,
             }
@@ -322,7 +322,7 @@ impl Daemon {
             let port = &self.setup.config.sensors[index].port;
             info!(sensor = sensor.name(), %port, "sensor");
             core.pipeline = core.pipeline.restarted(sensor.clone(), hrn);
-            core.recorder.begin_anew(&core.pipeline, now());
+            core.begin_recording_anew();
             anew.push(core);
         }
         self.start_sensors(anew);

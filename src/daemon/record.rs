@@ -157,7 +157,8 @@ impl Jobs {
 /// The daemon's handle to the thread.
 #[derive(Debug)]
 pub(crate) struct Recorder {
-    jobs: Jobs,
+    /// What the hub passes events to.
+    pub(crate) jobs: Jobs,
     labels: Labels,
     ended: oneshot::Receiver<Result<(), Error>>,
 }
@@ -182,20 +183,14 @@ impl Recorder {
 
     /// The recorder for the task of the sensor with this `index`.
     pub(crate) fn of_sensor(&self, index: usize) -> SensorRecorder {
-        let active = Active {
+        SensorRecorder {
             jobs: self.jobs.clone(),
             index,
             labels: self.labels.clone(),
             noted: None,
             was_busy: false,
             bytes: 0,
-        };
-        SensorRecorder(Some(Box::new(active)))
-    }
-
-    /// The recorder for the hub.
-    pub(crate) fn of_hub(&self) -> Jobs {
-        self.jobs.clone()
+        }
     }
 
     /// Waits until the file is complete. The caller must have dropped every [`SensorRecorder`] and
@@ -207,12 +202,9 @@ impl Recorder {
     }
 }
 
-/// Records the inputs of one sensor. Without a recorder, it records nothing.
-#[derive(Debug, Default)]
-pub(crate) struct SensorRecorder(Option<Box<Active>>);
-
+/// Records the inputs of one sensor.
 #[derive(Debug)]
-struct Active {
+pub(crate) struct SensorRecorder {
     jobs: Jobs,
     index: usize,
     labels: Labels,
@@ -228,41 +220,28 @@ struct Active {
 impl SensorRecorder {
     /// Records `input`, which `pipeline` is about to take.
     pub(crate) fn note(&mut self, pipeline: &Pipeline, input: &Input, at: Stamp) {
-        let Some(active) = &mut self.0 else { return };
-        active.begin(pipeline, at);
+        self.begin(pipeline, at);
         // Before the first state, entries are left out: a replay could not use them.
-        if active.noted.is_some() {
+        if self.noted.is_some() {
             let entry = Entry::Input(input.clone());
-            active.bytes += entry.weight();
-            active.queue(at, entry);
+            self.bytes += entry.weight();
+            self.queue(at, entry);
         }
     }
 
     /// Records that `pipeline`, which is at rest, begins anew or has another model.
     pub(crate) fn begin_anew(&mut self, pipeline: &Pipeline, at: Stamp) {
-        if let Some(active) = &mut self.0 {
-            active.noted = None;
-            active.begin(pipeline, at);
-        }
+        self.noted = None;
+        self.begin(pipeline, at);
     }
 
     /// Requests the last minute as a file. The answer comes when the file is written.
     pub(crate) fn blackbox(&self, reply: Answer) {
+        let sensor = self.index;
         // If there is no room for the job, `reply` is dropped with the job, which the caller sees.
-        match &self.0 {
-            Some(active) => {
-                let sensor = active.index;
-                active.jobs.send(Job::Blackbox { sensor, reply });
-            }
-            None => {
-                let none = "blackbox: nothing is kept: the configuration has no [record]";
-                let _ = reply.send(Err(none.to_owned()));
-            }
-        }
+        self.jobs.send(Job::Blackbox { sensor, reply });
     }
-}
 
-impl Active {
     /// Sends a state if one is due.
     fn begin(&mut self, pipeline: &Pipeline, at: Stamp) {
         self.was_busy |= !pipeline.is_at_rest();

@@ -59,7 +59,7 @@ pub(crate) enum Command {
 #[derive(Debug)]
 pub(crate) struct SensorCore {
     pub(crate) pipeline: Pipeline,
-    pub(crate) recorder: SensorRecorder,
+    pub(crate) recorder: Option<SensorRecorder>,
     /// The number of verdicts since the start that are missing because the model failed.
     pub(crate) unjudged: u64,
     pub(crate) commands: mpsc::Receiver<Command>,
@@ -107,7 +107,7 @@ pub(crate) async fn serve(
             && let Some(judging) = core.pipeline.with_model(sensor, hrn)
         {
             core.pipeline = judging;
-            core.recorder.begin_anew(&core.pipeline, super::now());
+            core.begin_recording_anew();
         }
         hub.log().report(core.state());
         // A sensor that never pauses leaves the others their turns.
@@ -138,7 +138,13 @@ pub(crate) async fn serve(
                     continue;
                 }
                 Some(Command::Blackbox(reply)) => {
-                    core.recorder.blackbox(reply);
+                    match &core.recorder {
+                        Some(recorder) => recorder.blackbox(reply),
+                        None => {
+                            let none = "blackbox: nothing is kept: the configuration has no [record]";
+                            let _ = reply.send(Err(none.to_owned()));
+                        }
+                    }
                     continue;
                 }
                 Some(Command::Model(sensor, hrn)) => {
@@ -194,8 +200,17 @@ impl SensorCore {
     /// Records an input, then passes it on to the pipeline.
     fn take(&mut self, input: Input) -> Result<Vec<Event>, Refused> {
         let now = super::now();
-        self.recorder.note(&self.pipeline, &input, now);
+        if let Some(recorder) = &mut self.recorder {
+            recorder.note(&self.pipeline, &input, now);
+        }
         self.pipeline.take(input, now)
+    }
+
+    /// The pipeline begins anew, or has another model.
+    pub(super) fn begin_recording_anew(&mut self) {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.begin_anew(&self.pipeline, super::now());
+        }
     }
 
     /// The same for an input that is never refused.

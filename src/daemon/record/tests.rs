@@ -9,7 +9,7 @@ use hardnessd_core::tests::support::{self, at};
 /// A recorder with room for so many bytes.
 fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) {
     let pipeline = Pipeline::new(support::sensor(), support::hrn(), Clock::Arrival);
-    let active = Active {
+    let recorder = SensorRecorder {
         jobs: Jobs::new(sender, bytes),
         index: 0,
         labels: Labels::new(),
@@ -17,7 +17,7 @@ fn recorder(sender: Sender<Queued>, bytes: usize) -> (SensorRecorder, Pipeline) 
         was_busy: false,
         bytes: 0,
     };
-    (SensorRecorder(Some(Box::new(active))), pipeline)
+    (recorder, pipeline)
 }
 
 /// The count of the recorded inputs, and the numbers of those that follow a gap without a state
