@@ -26,7 +26,7 @@ use super::hub::{Hub, Line, Subscriber};
 use super::lines::{LineError, Lines, lines};
 use super::request::motion::{self, Positions};
 use super::request::{self, Context, Merge, Query, Request, Subscription};
-use super::sensor::{Answer, Command, Done, SensorHandle, Sensors};
+use super::sensor::{Answer, Command, Done, Sensors};
 use super::{now, realtime};
 use hardnessd_core::event::Reply;
 use hardnessd_core::pipeline::Input;
@@ -286,7 +286,11 @@ async fn ask(
     name: &str,
     command: impl FnOnce(Answer) -> Command,
 ) -> Result<Done, String> {
-    let sensor = find(sensors, key, name)?;
+    let sensor = sensors.iter().find(|sensor| sensor.name == name);
+    let sensor = sensor.ok_or_else(|| {
+        let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+        request::unusable(key, name, &format!("one of {}", names.join(", ")))
+    })?;
     let (reply, answer) = oneshot::channel();
     // An answer that does not come is dropped by a sensor's task that ends, or by a recorder whose
     // queue is full.
@@ -297,14 +301,6 @@ async fn ask(
         ))
     };
     answer.await.unwrap_or_else(none)
-}
-
-fn find<'a>(sensors: &'a Sensors, key: &str, name: &str) -> Result<&'a SensorHandle, String> {
-    let found = sensors.iter().find(|sensor| sensor.name == name);
-    found.ok_or_else(|| {
-        let names: Vec<&str> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
-        request::unusable(key, name, &format!("one of {}", names.join(", ")))
-    })
 }
 
 #[cfg(test)]

@@ -29,7 +29,7 @@ pub use self::publish::{
 pub use super::Error;
 use super::log;
 use hardnessd_core::range::{OutOfRange, from_to};
-use hardnessd_core::sensor::{self, Description, Sensor};
+use hardnessd_core::sensor::{self, Sensor};
 use hardnessd_core::settings;
 use hardnessd_core::verdict::{self, BuiltIn, Format, LevelTable, Model};
 use hardnessd_core::{press, trial};
@@ -132,15 +132,6 @@ impl Config {
         let (config, text) = parse::load(path)?;
         let checked = check::check(&config);
         checked.map(|_| config).map_err(Error::at(path, &text))
-    }
-
-    /// The description of `sensor`, composed from all tables of the file.
-    fn describe(&self, sensor: &sensor::Settings) -> Description {
-        Description {
-            sensor: sensor.clone(),
-            press: self.press.clone(),
-            model: self.model.clone(),
-        }
     }
 
     /// The first key that differs between `self` and `other` and that only a restart can change. This

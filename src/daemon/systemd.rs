@@ -11,10 +11,9 @@ pub(crate) fn ready() {
 
 /// Notifies systemd that the configuration is being read again, until [`ready`] is called.
 pub(crate) fn reloading() {
-    match NotifyState::monotonic_usec_now() {
-        Ok(now) => notify(&[NotifyState::Reloading, now]),
-        Err(_) => notify(&[NotifyState::Reloading]),
-    }
+    let now = NotifyState::monotonic_usec_now().ok();
+    let state = [NotifyState::Reloading].into_iter().chain(now);
+    notify(&state.collect::<Vec<_>>());
 }
 
 /// Notifies systemd that the daemon is about to end.

@@ -318,7 +318,9 @@ impl Pipeline {
             match found {
                 Ok(Decoded { frame, end }) => {
                     let stamp = self.stamp_of(end);
-                    if self.is_within_pace(stamp) {
+                    let period = self.sensor.period();
+                    // Without times of their own, frames come at the configured rate.
+                    if self.clock == Clock::FrameRate || self.pace.takes(stamp.mono, period) {
                         self.take_frame(&frame, stamp, events);
                     } else {
                         self.link.came(stamp);
@@ -338,12 +340,6 @@ impl Pipeline {
         while self.chunks.front().is_some_and(|&(end, _)| end <= decoded) {
             self.chunks.pop_front();
         }
-    }
-
-    /// Whether the sensor may send a frame at this moment.
-    fn is_within_pace(&mut self, at: Stamp) -> bool {
-        // Without times of their own, frames come at the configured rate.
-        self.clock == Clock::FrameRate || self.pace.takes(at.mono, self.sensor.period())
     }
 
     /// The arrival time of the byte before `end`.

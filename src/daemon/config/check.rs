@@ -4,7 +4,7 @@ use super::error::Problem;
 use super::{Config, Publish, Unix, Zenoh, domain_id};
 use crate::daemon::port;
 use hardnessd_core::range::OutOfRange;
-use hardnessd_core::sensor::{self, Sensor};
+use hardnessd_core::sensor::{self, Description, Sensor};
 use hardnessd_core::{range, verdict, wording};
 
 /// Checks a configuration whose paths are already resolved, and returns its sensors.
@@ -86,7 +86,12 @@ fn check_sensors(config: &Config) -> Result<Vec<Sensor>, Problem> {
         return Err(OutOfRange::new("sensor", found, "at most 1000").into());
     }
     let checked = |(index, given): (usize, &sensor::Settings)| {
-        let sensor = Sensor::new(config.describe(given)).map_err(Problem::from);
+        let described = Description {
+            sensor: given.clone(),
+            press: config.press.clone(),
+            model: config.model.clone(),
+        };
+        let sensor = Sensor::new(described).map_err(Problem::from);
         let sensor = sensor.and_then(|sensor| {
             check_beside(given, &config.sensors[..index])?;
             let carried = port::check_baud(given, sensor.layout());

@@ -48,7 +48,7 @@ pub(super) struct Cursor {
     /// Of each kind, the number of the first event that the subscriber has not passed.
     next: Place,
     /// The numbers of the events that it had and that are still held. A `since` does not give them again.
-    had: BTreeSet<u64>,
+    pub(super) had: BTreeSet<u64>,
     /// How many events the subscriber may be behind.
     allowed: u64,
     /// The events that it has missed since its last line. `None`: an unknown number.
@@ -177,12 +177,6 @@ impl Cursor {
             let place = |seq| held.binary_search_by_key(&Some(seq), |entry| entry.line.seq());
             self.had.retain(|&seq| place(seq).is_ok());
         }
-    }
-
-    /// How many events it remembers that it had.
-    #[cfg(test)]
-    pub(super) fn remembered(&self) -> usize {
-        self.had.len()
     }
 
     /// Goes back to `place`, for numbered events. Frames go on where they are.

@@ -7,12 +7,13 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use super::approach::PressWithApproach;
 use crate::press::ContactFrame;
 use crate::sensor::Sensor;
-use crate::verdict::{Model, ModelError, Piece, Reference, References, TimeSeries, are_unlike};
+use crate::verdict::{
+    Model, ModelError, Piece, Reference, References, TimeSeries, are_unlike, sha256_hex,
+};
 
 /// At most so many presses in a row are kept of one object.
 const MOST_IN_A_ROW: u32 = 2;
@@ -186,5 +187,5 @@ pub fn owner(sensor: &Sensor, hrn: &Model) -> String {
         &described.sensor.arm,
     );
     let text = serde_json::to_vec(&of).expect("numbers and strings always serialise");
-    hex::encode(Sha256::digest(text))
+    sha256_hex(&text)
 }

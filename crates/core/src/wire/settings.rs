@@ -170,12 +170,8 @@ impl TryFrom<String> for HexBytes {
 
 impl From<HexBytes> for String {
     fn from(bytes: HexBytes) -> Self {
-        bytes
-            .0
-            .iter()
-            .map(|b| format!("{b:02X}"))
-            .collect::<Vec<_>>()
-            .join(" ")
+        let pairs = bytes.0.iter().map(|byte| format!("{byte:02X}"));
+        pairs.collect::<Vec<_>>().join(" ")
     }
 }
 
