@@ -120,7 +120,8 @@ pub struct Daemon {
     publishers: Publishers,
     /// The thread of the clients.
     clients: Clients,
-    store: Store,
+    /// Where own presses are written, if anywhere.
+    store: Option<Store>,
     /// When own presses are written.
     stored: Option<Written>,
     recorder: Option<Recorder>,
@@ -172,7 +173,7 @@ impl Daemon {
         realtime::lock_memory();
         let hub = Hub::new(hello.clone());
         let clients = Clients::start().map_err(NoThread)?;
-        let (store, stored) = Store::of_environment()?;
+        let (store, stored) = Store::of_environment()?.unzip();
         let names = setup.sensors.iter().map(|sensor| sensor.name().to_owned());
         let handles = names.map(|name| {
             let (commands, inbox) = mpsc::channel(QUESTIONS);
@@ -192,7 +193,9 @@ impl Daemon {
             let recorder = recorder.as_ref();
             let hrn = setup.hrn_of(sensor.name()).clone();
             let mut pipeline = Pipeline::new(sensor.clone(), hrn, Clock::Arrival);
-            store.load(&mut pipeline);
+            if let Some(store) = &store {
+                store.load(&mut pipeline);
+            }
             SensorCore {
                 pipeline,
                 recorder: recorder.map(|recorder| recorder.of_sensor(index)),

@@ -41,12 +41,9 @@ struct Kept {
 /// Comes when the thread has written all.
 pub(super) type Written = oneshot::Receiver<()>;
 
-/// The files of own presses. Without a directory, own presses last as long as the daemon.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Store(Option<Directory>);
-
+/// The files of own presses, in a directory.
 #[derive(Debug, Clone)]
-struct Directory {
+pub(super) struct Store {
     path: PathBuf,
     changed: Sender<(PathBuf, Kept)>,
     /// Whether it is the user's. It has no presses of simulated sensors, such as those of a demo.
@@ -55,44 +52,39 @@ struct Directory {
 
 impl Store {
     /// The store in the directory that systemd or the user's environment names, and its end: all that was saved is
-    /// written some time after the last store was dropped.
-    pub(super) fn of_environment() -> Result<(Self, Option<Written>), NoThread> {
+    /// written some time after the last store was dropped. Without a directory, own presses last as long as the daemon.
+    pub(super) fn of_environment() -> Result<Option<(Self, Written)>, NoThread> {
         let service = directory_of_service("STATE_DIRECTORY").map(|path| (path, false));
         let user = || Some((of_user(|variable| env::var_os(variable))?, true));
-        match service.or_else(user) {
-            Some((path, is_of_user)) => {
-                let (store, written) = Self::in_directory(path, is_of_user)?;
-                Ok((store, Some(written)))
-            }
-            None => Ok((Self::default(), None)),
-        }
+        let directory = service.or_else(user);
+        let store = directory.map(|(path, is_of_user)| Self::in_directory(path, is_of_user));
+        store.transpose()
     }
 
     fn in_directory(path: PathBuf, is_of_user: bool) -> Result<(Self, Written), NoThread> {
         let (changed, inbox) = channel();
         let written = spawn_thread("own presses", move || write_all(&inbox))?;
-        let directory = Directory {
+        let store = Self {
             path,
             changed,
             is_of_user,
         };
-        Ok((Self(Some(directory)), written))
+        Ok((store, written))
     }
 
     /// Where the presses of a sensor are, if any are kept. Of a simulated one a user keeps none: it may have the name of
     /// a real one.
-    fn directory_for(&self, sensor: &Sensor) -> Option<&Directory> {
+    fn file_of(&self, sensor: &Sensor) -> Option<PathBuf> {
         let sensor = &sensor.description().sensor;
-        let directory = self.0.as_ref().filter(|_| sensor.own_presses > 0);
-        directory.filter(|directory| !(directory.is_of_user && is_simulated(&sensor.port)))
+        let is_kept = sensor.own_presses > 0 && !(self.is_of_user && is_simulated(&sensor.port));
+        is_kept.then(|| self.path.join(format!("own-{}.json", sensor.name)))
     }
 
     /// Gives a pipeline the own presses of its sensor, if they are of its calibration and model.
     pub(super) fn load(&self, pipeline: &mut Pipeline) {
-        let Some(directory) = self.directory_for(pipeline.sensor()) else {
+        let Some(path) = self.file_of(pipeline.sensor()) else {
             return;
         };
-        let path = directory.file_of(pipeline.sensor().name());
         match read(&path) {
             Ok(Some(kept)) if kept.owner == owner(pipeline.sensor(), pipeline.hrn()) => {
                 pipeline.take_own_presses(kept.presses);
@@ -105,7 +97,7 @@ impl Store {
     /// Writes the own presses of a pipeline, soon.
     pub(super) fn save(&self, pipeline: &Pipeline) {
         let sensor = pipeline.sensor();
-        let Some(directory) = self.directory_for(sensor) else {
+        let Some(path) = self.file_of(sensor) else {
             return;
         };
         let kept = Kept {
@@ -113,14 +105,7 @@ impl Store {
             presses: pipeline.own_presses().clone().for_another_start(),
         };
         // The thread ends only after all senders.
-        let path = directory.file_of(sensor.name());
-        let _ = directory.changed.send((path, kept));
-    }
-}
-
-impl Directory {
-    fn file_of(&self, sensor: &str) -> PathBuf {
-        self.path.join(format!("own-{sensor}.json"))
+        let _ = self.changed.send((path, kept));
     }
 }
 

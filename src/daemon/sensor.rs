@@ -94,7 +94,7 @@ pub(crate) async fn serve(
     mut core: SensorCore,
     mut source: Source,
     hub: Hub,
-    store: Store,
+    store: Option<Store>,
 ) -> SensorCore {
     // The client that waits for the outcome of a tare.
     let mut taring: Option<Answer> = None;
@@ -186,7 +186,7 @@ pub(crate) async fn serve(
             |event: &Event| matches!(event, Event::Hardness(one) if one.phase == Phase::Final);
         let is_judged = events.iter().any(is_final);
         hub.publish(events);
-        if is_judged {
+        if let Some(store) = store.as_ref().filter(|_| is_judged) {
             store.save(&core.pipeline);
         }
     }
