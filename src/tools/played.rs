@@ -9,8 +9,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
-
 use super::exit::{FAILED, Failure, USAGE};
 use super::replay::motion;
 use super::unplayable;
@@ -46,12 +44,6 @@ enum Source<'a> {
 
 /// Positions are given to the pipeline this long before the frame of their moment.
 const AHEAD: Duration = Duration::from_secs(2);
-
-/// Where the times of raw bytes begin, which come from the frame rate.
-const START: Stamp = Stamp {
-    mono: Duration::ZERO,
-    wall: Timestamp::UNIX_EPOCH,
-};
 
 impl<'a> Played<'a> {
     /// Begins to play the file at `path`, judged by `hrn`. Raw bytes are those of `sensor`, whose arm moves as
@@ -143,10 +135,13 @@ impl<'a> Played<'a> {
                 let points = Input::Motion(motion.drain(..count).collect());
                 let part = |input| Found {
                     sensor: sensor.name().to_owned(),
-                    at: START,
+                    at: Stamp::EPOCH,
                     entry: Entry::Input(input),
                 };
-                let wall = START.wall.checked_add(mono).unwrap_or(START.wall);
+                let wall = Stamp::EPOCH
+                    .wall
+                    .checked_add(mono)
+                    .unwrap_or(Stamp::EPOCH.wall);
                 let parts = [points, Input::Bytes(bytes)].map(part);
                 (parts.into(), Stamp { mono, wall })
             }
@@ -201,7 +196,7 @@ impl<'a> Played<'a> {
         &mut self,
         mut each: impl FnMut(&mut Self, Vec<Event>, Stamp) -> Result<bool, Failure>,
     ) -> Result<(), Failure> {
-        let mut last = START;
+        let mut last = Stamp::EPOCH;
         let played = loop {
             match self.next() {
                 Ok(Some((events, at))) => {

@@ -338,6 +338,12 @@ pub struct Stamp {
 }
 
 impl Stamp {
+    /// The moment before the first frame of bytes without times.
+    pub const EPOCH: Self = Self {
+        mono: Duration::ZERO,
+        wall: jiff::Timestamp::UNIX_EPOCH,
+    };
+
     /// The time by CLOCK_MONOTONIC of an event at `time`, if UTC was not set between both.
     pub fn mono_of(self, time: jiff::Timestamp) -> Duration {
         let ago = self.wall.as_nanosecond() - time.as_nanosecond();

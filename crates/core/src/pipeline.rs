@@ -293,10 +293,10 @@ impl Pipeline {
     /// totals. `at` is the recording's last moment. Without it, the last frame's moment is used.
     pub fn end_of_recording(&mut self, at: Option<Stamp>) -> Vec<Event> {
         let mut events = Vec::new();
-        self.settle(at.unwrap_or(EPOCH), &mut events);
+        self.settle(at.unwrap_or(Stamp::EPOCH), &mut events);
         self.abort(End::EndOfRecording, &mut events);
         self.link.ended("end of recording".to_owned());
-        let at = at.or(self.link.last_frame).unwrap_or(EPOCH);
+        let at = at.or(self.link.last_frame).unwrap_or(Stamp::EPOCH);
         // The rest of the bytes never became a frame, so count them as skipped.
         self.decoder.restart();
         events.push(Event::Status(self.status(at)));
@@ -349,13 +349,16 @@ impl Pipeline {
                 .chunks
                 .iter()
                 .find(|&&(chunk_end, _)| chunk_end >= end)
-                .map_or(EPOCH, |&(_, stamp)| stamp),
+                .map_or(Stamp::EPOCH, |&(_, stamp)| stamp),
             Clock::FrameRate => {
                 let frame_rate_hz = self.sensor.frame_rate_hz();
                 let mono = Duration::from_secs_f64(self.frames as f64 / frame_rate_hz);
                 Stamp {
                     mono,
-                    wall: EPOCH.wall.checked_add(mono).unwrap_or(Timestamp::MAX),
+                    wall: Stamp::EPOCH
+                        .wall
+                        .checked_add(mono)
+                        .unwrap_or(Timestamp::MAX),
                 }
             }
         }
@@ -480,12 +483,6 @@ impl Pipeline {
         })
     }
 }
-
-/// The moment before the first frame of a recording without times.
-const EPOCH: Stamp = Stamp {
-    mono: Duration::ZERO,
-    wall: Timestamp::UNIX_EPOCH,
-};
 
 fn contact(press: &Thresholds) -> Contact {
     Contact {

@@ -39,7 +39,7 @@ fn at(millis: u64) -> Stamp {
     let mono = Duration::from_millis(1000 + millis);
     Stamp {
         mono,
-        wall: EPOCH.wall.checked_add(mono).unwrap(),
+        wall: Stamp::EPOCH.wall.checked_add(mono).unwrap(),
     }
 }
 
