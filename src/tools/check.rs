@@ -44,7 +44,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for warning in setup.warnings() {
         stderr_line!("warning: {}: {warning}", path.display());
     }
-    lines += &format!("\n{}", setup.in_force());
+    match setup.in_force() {
+        Ok(keys) => lines += &format!("\n{keys}"),
+        Err(error) => stderr_line!("the keys in force cannot be shown: {error}"),
+    }
     super::print(lines.as_bytes())?;
     Ok(())
 }

@@ -9,7 +9,11 @@ use hardnessd_core::wire::Preset;
 impl Setup {
     /// Every key in force as a line of TOML, with a comment that says where the key comes from: `written`,
     /// `default`, or a preset.
-    pub fn in_force(&self) -> String {
+    ///
+    /// # Errors
+    ///
+    /// Fails for a path that is not UTF-8, which TOML cannot hold.
+    pub fn in_force(&self) -> Result<String, toml::ser::Error> {
         let mut config = self.config.clone();
         for (table, sensor) in config.sensors.iter_mut().zip(&self.sensors) {
             table.stale_after_ms = Some(sensor.stale_after().as_secs_f64() * 1e3);
@@ -29,7 +33,7 @@ impl Setup {
         if let Some(record) = &mut config.record {
             record.dir = Some(record.dir());
         }
-        let text = toml::to_string(&config).expect("a configuration is TOML");
+        let text = toml::to_string(&config)?;
         let (mut table, mut sensors) = (String::new(), 0);
         let mut lines = String::new();
         for line in text.lines() {
@@ -46,7 +50,7 @@ impl Setup {
                 lines.extend(self.sensors.iter().map(of_sensor));
             }
         }
-        lines
+        Ok(lines)
     }
 
     /// The `[press]` table, if it is that of all sensors: thresholds depend on the taxels.
@@ -105,7 +109,7 @@ mod tests {
                     [press]\nmax_seconds = 5.0\n";
         std::fs::write(&path, text).unwrap();
         let setup = Setup::load(&path, None).unwrap();
-        let lines = setup.in_force();
+        let lines = setup.in_force().unwrap();
         let (first, rest) = lines.split_once("name = \"own\"").unwrap();
         let (own, film) = rest.split_once("name = \"film\"").unwrap();
         for (part, line) in [
@@ -130,7 +134,7 @@ mod tests {
         }
         let unlike = text.replace("[press]", "[sensor.calibration]\npitch_mm = 7.0\n[press]");
         std::fs::write(&path, unlike).unwrap();
-        let unlike = Setup::load(&path, None).unwrap().in_force();
+        let unlike = Setup::load(&path, None).unwrap().in_force().unwrap();
         for thresholds in [
             "own: contact_threshold_n = 0.07, begin_area_taxels = 3, end_area_taxels = 1",
             "film: contact_threshold_n = 0.28, begin_area_taxels = 3, end_area_taxels = 1",
