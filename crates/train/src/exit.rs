@@ -2,8 +2,7 @@
 
 use std::fmt::Display;
 use std::io;
-use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::path::Path;
 
 use hardnessd_core::exit::NO_INPUT;
 
@@ -20,28 +19,6 @@ pub struct Coded {
 pub fn coded(code: u8, text: impl Display) -> anyhow::Error {
     let text = text.to_string();
     Coded { code, text }.into()
-}
-
-/// The directories that are removed when a signal ends the program.
-static PASSING: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
-
-/// Has this directory removed if a signal ends the program.
-pub fn remove_at_signal(directory: &Path) {
-    PASSING
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .push(directory.to_owned());
-}
-
-/// Removes the directories that [`remove_at_signal`] has. Call it at a signal.
-pub fn remove_at_once() {
-    for directory in PASSING
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .iter()
-    {
-        let _ = std::fs::remove_dir_all(directory);
-    }
 }
 
 /// The error of a file named on the command line that cannot be read.

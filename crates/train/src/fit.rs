@@ -160,8 +160,6 @@ pub fn fit(
             learning,
             weights,
             calibration,
-            presses: &presses,
-            train: &places,
         };
         let mut card = learnt.card(name, &presses.sources)?;
         let kinds = presses.of(&places).map(|press| press.kind).collect();

@@ -11,7 +11,10 @@ pub mod calibration;
 use std::time::{Duration, Instant};
 
 use anyhow::ensure;
+use burn::tensor::Device;
 
+use crate::data::presses::Presses;
+use crate::data::split::Parts;
 use crate::net::graph::Graph;
 pub use crate::net::graph::Inputs;
 use crate::net::network::Weights;
@@ -20,7 +23,7 @@ use crate::run::Run;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::history::Metrics;
 pub use crate::run::history::Taken;
-use crate::settings::Training;
+use crate::settings::{Settings, Training};
 use hardnessd_core::verdict::{Borders, Distribution, Knowledge, Piece, Shore, argmax};
 use hardnessd_simulator::random::Stream;
 use learner::Learner;
@@ -30,26 +33,63 @@ const CHECKPOINT_EVERY: Duration = Duration::from_secs(10);
 /// The number of epochs between two judgements of the held-out objects.
 const VALIDATED_EVERY_EPOCHS: u32 = 5;
 
+/// A stage of a run: what whatever learns in it has.
+#[derive(Debug, Clone)]
+pub struct Stage<'a> {
+    /// The name in checkpoints and in `metrics.csv`.
+    pub name: &'static str,
+    /// The presses that indices refer to.
+    pub presses: &'a Presses,
+    /// Which presses are learnt from, and how.
+    pub parts: Parts,
+    /// The settings of the run.
+    pub settings: Settings,
+    /// Those of this stage's training.
+    pub training: Training,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// The device that computes.
+    pub device: &'a Device,
+}
+
+impl Stage<'_> {
+    /// The stream of random numbers of this name.
+    pub fn stream(&self, name: &str) -> Stream {
+        Stream::new(self.seed, &format!("{} {name}", self.name))
+    }
+
+    /// The number of hardness levels.
+    pub fn levels(&self) -> usize {
+        self.presses.levels().len()
+    }
+}
+
 /// What learns. A GAN has two sides, everything else one.
 pub trait Learning {
-    /// The name of the stage in its checkpoints and in `metrics.csv`.
-    fn stage(&self) -> &'static str;
+    /// The stage.
+    fn on(&self) -> &Stage<'_>;
 
-    /// Where the stage begins, and how it goes on.
-    fn plan(&self) -> Plan;
+    /// The sides before the first step.
+    fn sides(&self) -> Vec<Learner>;
+
+    /// What an epoch passes over, in an order that is drawn anew for each.
+    fn samples(&self) -> Vec<usize> {
+        self.on().parts.train.clone()
+    }
+
+    /// The number of samples of a step.
+    fn batch(&self) -> usize {
+        self.on().training.batch
+    }
 
     /// Takes a step of each side on these samples, at this learning rate. `step` counts from 0.
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken;
 
     /// The questions that presses of held-out objects ask where so much is known of their sensors.
     /// `None` if it never is.
-    fn questions(
-        &self,
-        presses: &[usize],
-        knowledge: Knowledge,
-        _stream: &mut Stream,
-    ) -> Option<Vec<Question>> {
-        (knowledge == Knowledge::None).then(|| vec![Question::alone(presses)])
+    fn questions(&self, knowledge: Knowledge, _stream: &mut Stream) -> Option<Vec<Question>> {
+        let held_out = &self.on().parts.held_out;
+        (knowledge == Knowledge::None).then(|| vec![Question::alone(held_out)])
     }
 
     /// What the network says of each press of the questions, one question after the other: logits, before
@@ -68,23 +108,6 @@ pub trait Learning {
 
     /// The graph of the exported file, up to the logits.
     fn graph(&self, weights: &[Weights]) -> Graph;
-}
-
-/// A stage before its first step, and how it goes on.
-#[derive(Debug)]
-pub struct Plan {
-    /// The sides.
-    pub sides: Vec<Learner>,
-    /// What an epoch passes over, in an order that is drawn anew for each.
-    pub samples: Vec<usize>,
-    /// Presses of held-out objects with their levels; may be empty.
-    pub held_out: Vec<(usize, u8)>,
-    /// Samples of a step.
-    pub batch: usize,
-    /// The rest of its settings.
-    pub training: Training,
-    /// Seed of everything random.
-    pub seed: u64,
 }
 
 /// Presses of one sensor, and presses that serve as its references, as indices.
@@ -168,31 +191,36 @@ impl Outputs {
 }
 
 /// Trains from the beginning, or continues from the stage's last checkpoint in `run`. Returns the weights of
-/// each side. An interrupted run resumes with bit-identical results.
+/// each side. An interrupted run resumes with bit-identical results. Without a run, nothing is written.
 ///
 /// # Errors
 ///
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another run, or a loss or
 /// a weight is no longer finite.
-pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
-    let stage = learning.stage();
-    let mut plan = learning.plan();
-    let mut done = begin(stage, &mut plan.sides, run)?;
-    let (sides, training) = (&mut plan.sides, plan.training);
-    let epochs = training.epochs;
-    let steps = u64::from(epochs) * plan.samples.len().div_ceil(plan.batch) as u64;
-    let mut metrics = Metrics::open(&run.path("metrics.csv"), stage, done.step)?;
+pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Weights>> {
+    let on = learning.on();
+    let (stage, epochs) = (on.name, on.training.epochs);
+    let (mut sides, batch) = (learning.sides(), learning.batch());
+    let mut done = match run {
+        Some(run) => begin(stage, &mut sides, run)?,
+        None => Checkpoint::default(),
+    };
+    // A GAN names no levels.
+    let is_judged = sides.len() == 1 && !on.parts.held_out.is_empty();
+    let samples = learning.samples();
+    let steps = u64::from(epochs) * samples.len().div_ceil(batch) as u64;
+    let open = |run: &Run| Metrics::open(&run.path("metrics.csv"), stage, done.step);
+    let mut metrics = run.map(open).transpose()?;
     let bar = progress_bar(stage, steps, done.step);
     let (begun, seconds_before) = (Instant::now(), done.seconds);
     let mut kept = begun;
     while done.epoch < epochs {
-        let mut order = plan.samples.clone();
-        let stream = Stream::new(plan.seed, &format!("{stage} order"));
-        { stream.child(done.epoch.into()) }.shuffle(&mut order);
+        let mut order = samples.clone();
+        { on.stream("order").child(done.epoch.into()) }.shuffle(&mut order);
         let (mut mean, mut rate) = (Taken::default(), 0.0);
-        for samples in order.chunks(plan.batch) {
-            rate = training.rate_at(done.step, steps);
-            let taken = learning.step(sides, samples, done.step, rate);
+        for samples in order.chunks(batch) {
+            rate = on.training.rate_at(done.step, steps);
+            let taken = learning.step(&mut sides, samples, done.step, rate);
             mean.add(&taken, samples.len() as f64 / order.len() as f64);
             done.step += 1;
             bar.inc(1);
@@ -203,15 +231,17 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
         }
         let is_last = done.epoch == epochs;
         let is_validated = is_last || done.epoch.is_multiple_of(VALIDATED_EVERY_EPOCHS);
-        let validation = (is_validated && !plan.held_out.is_empty()).then(|| {
+        let validation = (is_validated && is_judged).then(|| {
             let weights: Vec<Weights> = sides.iter().map(Learner::evaluated).collect();
-            validated(learning, &weights, &plan.held_out)
+            validated(learning, &weights)
         });
         if let Some((loss, _)) = validation {
             ensure_learning(stage, done.epoch, "validation loss", loss)?;
         }
         done.seconds = seconds_before + begun.elapsed().as_secs_f64();
-        metrics.add(&done, rate, &mean, validation)?;
+        if let Some(metrics) = &mut metrics {
+            metrics.add(&done, rate, &mean, validation)?;
+        }
         report(&bar, stage, done.epoch, epochs, message(&mean, validation));
         if is_last || kept.elapsed() > CHECKPOINT_EVERY {
             kept = Instant::now();
@@ -220,7 +250,9 @@ pub fn run(learning: &dyn Learning, run: &Run) -> anyhow::Result<Vec<Weights>> {
             for &number in &done.numbers {
                 ensure_learning(stage, done.epoch, "weights", number.into())?;
             }
-            done.write(&run.checkpoint(stage))?;
+            if let Some(run) = run {
+                done.write(&run.checkpoint(stage))?;
+            }
         }
     }
     bar.finish_and_clear();
@@ -248,18 +280,18 @@ fn begin(stage: &str, sides: &mut [Learner], run: &Run) -> anyhow::Result<Checkp
 }
 
 /// Mean loss and accuracy on presses of held-out objects, as they are and without references.
-fn validated(learning: &dyn Learning, weights: &[Weights], held_out: &[(usize, u8)]) -> (f64, f64) {
-    let presses: Vec<usize> = held_out.iter().map(|&(press, _)| press).collect();
+fn validated(learning: &dyn Learning, weights: &[Weights]) -> (f64, f64) {
+    let Stage { presses, parts, .. } = learning.on();
     let outputs = learning.outputs();
     let (mut loss, mut right) = (0.0, 0.0);
-    let rows = learning.judge(weights, &[Question::alone(&presses)], None);
-    for (&(_, level), row) in held_out.iter().zip(rows) {
+    let rows = learning.judge(weights, &[Question::alone(&parts.held_out)], None);
+    for (press, row) in presses.of(&parts.held_out).zip(rows) {
         let probabilities = outputs.probabilities(&row, 1.0);
-        let level = usize::from(level) - 1;
+        let level = usize::from(press.level) - 1;
         loss -= f64::from(probabilities[level].max(f32::MIN_POSITIVE)).ln();
         right += f64::from(u8::from(argmax(&probabilities).0 == level));
     }
-    let count = held_out.len() as f64;
+    let count = parts.held_out.len() as f64;
     (loss / count, right / count)
 }
 

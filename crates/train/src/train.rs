@@ -10,8 +10,8 @@ use crate::data::presses::Presses;
 use crate::data::split::Parts;
 use crate::exit::coded;
 use crate::judge::evaluated::Evaluated;
-use crate::learn;
 use crate::learn::calibration::Calibration;
+use crate::learn::{self, Stage};
 use crate::methods::{Stages, last_stage};
 use crate::model::export::{self, Learnt};
 use crate::progress::ensure_learning;
@@ -21,7 +21,6 @@ use crate::run::{Description, Run, disk};
 use crate::settings::{self, Profile};
 use hardnessd_core::exit::{UNAVAILABLE, USAGE};
 use hardnessd_simulator::Split;
-use hardnessd_simulator::random::Stream;
 
 /// What to train, on what, and where to.
 #[derive(Debug, clap::Args)]
@@ -146,29 +145,27 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     }
 
     let stages = Stages {
-        presses: &presses,
-        parts: &parts,
-        settings: &settings,
-        seed,
+        on: Stage {
+            name: &recipe.name,
+            presses: &presses,
+            parts,
+            settings,
+            training: settings.training,
+            seed,
+            device,
+        },
         start: start.as_ref(),
-        run: &run,
-        device,
+        run: Some(&run),
     };
     let learning = &*last_stage(recipe, &stages)?;
-    let weights = learn::run(learning, &run)?;
+    let weights = learn::run(learning, Some(&run))?;
+    let on = learning.on();
     // Finite weights can still give a logit that is not. One press is enough for this check.
-    let first = learn::Question::alone(&parts.train[..1]);
+    let first = learn::Question::alone(&on.parts.train[..1]);
     for logit in learning.judge(&weights, &[first], None).concat() {
-        ensure_learning(
-            learning.stage(),
-            settings.training.epochs,
-            "logit",
-            logit.into(),
-        )?;
+        ensure_learning(on.name, settings.training.epochs, "logit", logit.into())?;
     }
-    let mut stream = Stream::new(seed, &format!("{} calibration", learning.stage()));
-    let held_out = &parts.held_out;
-    let calibration = Calibration::of(learning, &presses, held_out, &weights, &mut stream);
+    let calibration = Calibration::of(learning, &weights, &mut on.stream("calibration"));
     if let Some(missing) = calibration
         .missing()
         .filter(|_| recipe.learning == Kind::Course)
@@ -179,8 +176,6 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         learning,
         weights: &weights,
         calibration,
-        presses: &presses,
-        train: &parts.train,
     };
     export::finish(&learnt, &run, &description)
 }

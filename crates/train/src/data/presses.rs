@@ -491,12 +491,6 @@ impl Presses {
         places.iter().map(|&place| &self.all[place])
     }
 
-    /// Some presses with their levels.
-    pub fn with_levels(&self, places: &[usize]) -> Vec<(usize, u8)> {
-        let level = |&place: &usize| (place, self.all[place].level);
-        places.iter().map(level).collect()
-    }
-
     /// For each press the unit that an interval draws: the cover whose sensors read the same presses, where a
     /// file has several sensors, else the object. `None` if a press has no object.
     pub fn units(&self, presses: &[usize]) -> Option<(Unit, Vec<u32>)> {

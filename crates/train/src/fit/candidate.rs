@@ -8,15 +8,13 @@ use burn::tensor::Device;
 use super::folds::Fold;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
-use crate::exit::remove_at_signal;
 use crate::learn::regression::{Regression, Seen};
-use crate::learn::{self, Learning, Question};
+use crate::learn::{self, Learning, Question, Stage};
 use crate::methods::{Stages, last_stage};
 use crate::model::verdicts;
 use crate::net::network::Weights;
 use crate::recipe;
-use crate::run::{Description, Run};
-use crate::settings::Profile;
+use crate::settings::{Profile, Settings};
 use hardnessd_core::frame::{Array, Frame};
 use hardnessd_core::verdict::{BUILT_IN, Borders, Level, Model, Piece, ReferencePress};
 
@@ -164,58 +162,49 @@ impl Candidate {
             Self::BuiltIn(_) => anyhow::bail!("the built-in model learns nothing"),
             Self::Regression(seen) => {
                 let device = Device::flex();
-                let parts = parts(train);
-                let regression = Regression::new(presses, *seen, &parts, &device);
+                let on = stage(presses, train, Settings::default(), seed, &device);
+                let regression = Regression::new(on, *seen);
                 take(&regression, &[regression.fitted()])
             }
-            Self::Hrn => with_hrn(presses, train, seed, take),
+            Self::Hrn => {
+                let recipe = recipe::named(HRN).context("no recipe of the paper's network")?;
+                let none = toml::Table::new();
+                let mut settings = recipe.settings(Profile::Quick, train.len(), &none)?;
+                settings.held_out = 0.0;
+                let device = Device::flex();
+                let stages = Stages {
+                    on: stage(presses, train, settings, seed, &device),
+                    start: None,
+                    run: None,
+                };
+                let learning = &*last_stage(recipe, &stages)?;
+                take(learning, &learn::run(learning, None)?)
+            }
         }
     }
 }
 
-/// Labelled presses to learn from, and no others.
-fn parts(train: &[usize]) -> Parts {
-    Parts {
+/// A stage that learns from these labelled presses, and from no others.
+fn stage<'a>(
+    presses: &'a Presses,
+    train: &[usize],
+    settings: Settings,
+    seed: u64,
+    device: &'a Device,
+) -> Stage<'a> {
+    let parts = Parts {
         train: train.to_vec(),
         ..Parts::default()
-    }
-}
-
-/// Trains the paper's network, in a directory that is removed.
-fn with_hrn<T>(
-    presses: &Presses,
-    train: &[usize],
-    seed: u64,
-    take: impl FnOnce(&dyn Learning, &[Weights]) -> anyhow::Result<T>,
-) -> anyhow::Result<T> {
-    let recipe = recipe::named(HRN).context("no recipe of the paper's network")?;
-    let mut settings = recipe.settings(Profile::Quick, train.len(), &toml::Table::new())?;
-    settings.held_out = 0.0;
-    let directory = tempfile::tempdir()?;
-    remove_at_signal(directory.path());
-    let run = Run::open(
-        directory.path(),
-        &Description {
-            method: recipe.name.clone(),
-            profile: Profile::Quick,
-            seed,
-            labels: train.len(),
-            settings,
-            data: presses.sources.clone(),
-        },
-        false,
-    )?;
-    let stages = Stages {
-        presses,
-        parts: &parts(train),
-        settings: &settings,
-        seed,
-        start: None,
-        run: &run,
-        device: &Device::flex(),
     };
-    let learning = &*last_stage(recipe, &stages)?;
-    take(learning, &learn::run(learning, &run)?)
+    Stage {
+        name: "fit",
+        presses,
+        parts,
+        settings,
+        training: settings.training,
+        seed,
+        device,
+    }
 }
 
 /// As many presses as the model takes as references, of all objects in turn, light and hard ones.

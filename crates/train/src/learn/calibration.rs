@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Learning, Outputs};
+use super::{Learning, Outputs, Stage};
 use crate::data::presses::{Presses, Unit};
 use crate::net::network::Weights;
 use hardnessd_core::verdict::{Conformal, Knowledge, Limits, TAIL, argmax};
@@ -65,19 +65,14 @@ impl Judged {
 }
 
 impl Calibration {
-    /// Calibrates on the presses `held_out`, varied and with references like the training presses. Without
+    /// Calibrates on the held-out presses, varied and with references like the training presses. Without
     /// any, it changes nothing and promises nothing.
-    pub fn of(
-        learning: &dyn Learning,
-        presses: &Presses,
-        held_out: &[usize],
-        weights: &[Weights],
-        stream: &mut Stream,
-    ) -> Self {
+    pub fn of(learning: &dyn Learning, weights: &[Weights], stream: &mut Stream) -> Self {
+        let Stage { presses, parts, .. } = learning.on();
         let mut judged = BTreeMap::new();
         for knowledge in Knowledge::ALL {
-            let questions = learning.questions(held_out, knowledge, stream);
-            let Some(questions) = questions.filter(|_| !held_out.is_empty()) else {
+            let questions = learning.questions(knowledge, stream);
+            let Some(questions) = questions.filter(|_| !parts.held_out.is_empty()) else {
                 continue;
             };
             let rows = learning.judge(weights, &questions, Some(stream));
@@ -91,7 +86,7 @@ impl Calibration {
             let of_knowledge = asked.iter().zip(rows).enumerate().map(one).collect();
             judged.insert(knowledge, of_knowledge);
         }
-        let unit = presses.units(held_out).map(|(unit, _)| unit);
+        let unit = presses.units(&parts.held_out).map(|(unit, _)| unit);
         let unit = unit.unwrap_or(Unit::Object);
         Self::on(&judged, unit, &learning.outputs(), stream)
     }

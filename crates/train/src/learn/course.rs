@@ -3,20 +3,18 @@
 //! In: presses over time, with the arm's reported motion, and presses that serve as references of
 //! their sensors. Out: weights, and logits of the bins of Shore hardness.
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 
 use self::lots::Lots;
 use super::learner::Learner;
-use super::{Inputs, Learning, Outputs, Plan, Question, Taken, share_right};
-use crate::data::presses::Presses;
-use crate::data::split::Parts;
+use super::{Inputs, Learning, Outputs, Question, Stage, Taken, share_right};
 use crate::net::bins::{self, BINS};
 use crate::net::course;
 use crate::net::graph::Graph;
 use crate::net::network::{Weights, numbers};
 use crate::net::standard::Standard;
 use crate::run::start::Start;
-use crate::settings::{ArmReports, Settings, Training};
+use crate::settings::ArmReports;
 use hardnessd_core::verdict::features::{self, FEATURES, FrameFeatures};
 use hardnessd_core::verdict::{Borders, Knowledge, ModelError, Moment, TimeSeries};
 use hardnessd_simulator::random::Stream;
@@ -26,8 +24,6 @@ mod varied;
 
 /// Questions per pass without gradients.
 const JUDGED_AT_ONCE: usize = 16;
-/// The name of the stage.
-const STAGE: &str = "course";
 
 /// What a press felt like.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,38 +61,25 @@ impl Felt {
 /// The network, and what it learns from.
 #[derive(Debug)]
 pub struct Course<'a> {
-    presses: &'a Presses,
-    /// What each of them felt like.
+    on: Stage<'a>,
+    /// What each press felt like.
     felt: Vec<Felt>,
-    held_out: &'a [usize],
     lots: Lots<'a>,
     standard: Standard,
     /// The share of each bin that lies in each level.
     parts: Tensor<2>,
     outputs: Outputs,
     initial: Weights,
-    reports: ArmReports,
-    training: Training,
-    seed: u64,
-    device: &'a Device,
 }
 
 impl<'a> Course<'a> {
-    /// A network that learns from the presses `train`. It starts from random weights, or from those of `start`.
+    /// A network that starts from random weights, or from those of `start`.
     ///
     /// # Errors
     ///
     /// Fails if the levels are no parts of the scale of Shore hardness.
-    pub fn new(
-        presses: &'a Presses,
-        Parts {
-            train, held_out, ..
-        }: &'a Parts,
-        settings: &Settings,
-        seed: u64,
-        start: Option<&Start>,
-        device: &'a Device,
-    ) -> Result<Self, ModelError> {
+    pub fn new(on: Stage<'a>, start: Option<&Start>) -> Result<Self, ModelError> {
+        let (presses, train) = (on.presses, &on.parts.train);
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
         let felt = (0..presses.all.len()).map(|place| Felt::of(&presses.course(place)));
@@ -107,7 +90,8 @@ impl<'a> Course<'a> {
                 let rows = train.iter().map(|&place| felt[place].features());
                 let rows: Vec<[f32; FEATURES]> = rows.collect();
                 let rows = rows.iter().map(<[f32; FEATURES]>::as_slice);
-                (course::initial(seed, device), Standard::of(FEATURES, rows))
+                let standard = Standard::of(FEATURES, rows);
+                (course::initial(on.seed, on.device), standard)
             }
         };
         let mut counts = vec![0; levels];
@@ -115,33 +99,25 @@ impl<'a> Course<'a> {
             counts[usize::from(press.level) - 1] += 1;
         }
         Ok(Self {
-            presses,
             felt,
-            held_out,
             lots: Lots::of(presses, borders.clone(), train),
             standard,
-            parts: bins::parts(&borders, levels, device),
+            parts: bins::parts(&borders, levels, on.device),
             outputs: Outputs::Bins {
                 lifts: bins::lifts(&borders, &counts),
                 borders,
             },
             initial,
-            reports: settings.reports,
-            training: settings.training,
-            seed,
-            device,
+            on,
         })
-    }
-
-    fn stream(&self, name: &str) -> Stream {
-        Stream::new(self.seed, &format!("{STAGE} {name}"))
     }
 
     /// The network's inputs for a question.
     fn group(&self, question: &Question, mut vary: Option<&mut Stream>) -> course::Group {
+        let reports = self.on.settings.reports;
         let whole = ArmReports {
             early: 0.0,
-            ..self.reports
+            ..reports
         };
         // With a stream, presses have the robot's errors, as training presses have them. References are
         // whole presses.
@@ -156,7 +132,7 @@ impl<'a> Course<'a> {
         let presses = question.presses.iter();
         let references = question.references.iter();
         course::Group {
-            presses: presses.map(|&place| inputs(place, &self.reports)).collect(),
+            presses: presses.map(|&place| inputs(place, &reports)).collect(),
             references: references
                 .map(|&(place, piece)| (inputs(place, &whole), piece))
                 .collect(),
@@ -165,32 +141,33 @@ impl<'a> Course<'a> {
 }
 
 impl Learning for Course<'_> {
-    fn stage(&self) -> &'static str {
-        STAGE
+    fn on(&self) -> &Stage<'_> {
+        &self.on
     }
 
-    fn plan(&self) -> Plan {
-        Plan {
-            sides: vec![Learner::fresh(self.initial.clone(), self.training)],
-            // A sample of an epoch is a group of presses.
-            samples: self.lots.tickets(),
-            held_out: self.presses.with_levels(self.held_out),
-            batch: (self.training.batch / lots::GROUP).max(1),
-            training: self.training,
-            seed: self.seed,
-        }
+    fn sides(&self) -> Vec<Learner> {
+        vec![Learner::fresh(self.initial.clone(), self.on.training)]
+    }
+
+    /// A sample of an epoch is a group of presses.
+    fn samples(&self) -> Vec<usize> {
+        self.lots.tickets()
+    }
+
+    fn batch(&self) -> usize {
+        (self.on.training.batch / lots::GROUP).max(1)
     }
 
     /// Takes a step on groups of presses.
     fn step(&self, sides: &mut [Learner], tickets: &[usize], step: u64, rate: f64) -> Taken {
         let learner = &mut sides[0];
-        let mut stream = self.stream("variation").child(step);
+        let mut stream = self.on.stream("variation").child(step);
         let mut labels: Vec<bins::Label> = Vec::new();
         let mut groups = Vec::with_capacity(tickets.len());
         for &ticket in tickets {
             let question = self.lots.draw(ticket, &mut stream);
             groups.push(self.group(&question, Some(&mut stream)));
-            let presses = self.presses.of(&question.presses);
+            let presses = self.on.presses.of(&question.presses);
             labels.extend(presses.map(|press| match press.reference {
                 // A rigid piece is harder than any object.
                 Some(_) => (1, None),
@@ -198,7 +175,7 @@ impl Learning for Course<'_> {
             }));
         }
         let tracked = learner.weights.tracked();
-        let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.device);
+        let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.on.device);
         let (loss, judged) = bins::loss(outputs, &labels, &self.parts);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
@@ -211,13 +188,8 @@ impl Learning for Course<'_> {
         }
     }
 
-    fn questions(
-        &self,
-        presses: &[usize],
-        knowledge: Knowledge,
-        stream: &mut Stream,
-    ) -> Option<Vec<Question>> {
-        let lots = self.lots.with(presses);
+    fn questions(&self, knowledge: Knowledge, stream: &mut Stream) -> Option<Vec<Question>> {
+        let lots = self.lots.with(&self.on.parts.held_out);
         let is_askable = knowledge == Knowledge::None || lots.have_references();
         is_askable.then(|| lots.all(knowledge, stream))
     }
@@ -232,7 +204,7 @@ impl Learning for Course<'_> {
         let groups: Vec<course::Group> = questions.iter().map(group).collect();
         let mut rows = Vec::new();
         for part in groups.chunks(JUDGED_AT_ONCE) {
-            let outputs = course::outputs(&weights[0], part, None, self.device);
+            let outputs = course::outputs(&weights[0], part, None, self.on.device);
             rows.extend(numbers(&outputs).chunks(BINS).map(<[f32]>::to_vec));
         }
         rows

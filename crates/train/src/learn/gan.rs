@@ -5,12 +5,14 @@
 //! starting weights. SGAN and IGAN also use labelled frames, and their discriminator becomes the
 //! recogniser.
 
+use std::slice;
+
 use burn::tensor::{Device, Tensor};
 
-use super::hrn::{Frames, Hrn};
+use super::hrn::Hrn;
 use super::learner::Learner;
-use super::{Learning, Plan, Question, Taken};
-use crate::data::presses::Presses;
+use super::{Learning, Question, Stage, Taken};
+use crate::data::split::Parts;
 use crate::net::generator;
 use crate::net::graph::Graph;
 use crate::net::hrn;
@@ -18,7 +20,7 @@ use crate::net::image::PixelScale;
 use crate::net::losses::{self, Game, Judged};
 use crate::net::network::{self, FEATURES, Normalisation, Weights, numbers};
 use crate::net::sensed::Sensor;
-use crate::settings::{Augmentation, Training};
+use crate::settings::{Augmentation, Settings, Training};
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
@@ -36,17 +38,14 @@ pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> [Weight
     [generator::initial(seed, device), discriminator]
 }
 
-/// A GAN, and what it learns from.
+/// A GAN. Its real samples are the stage's unlabelled presses. The labelled ones, whose levels the discriminator learns,
+/// are none where the game has no levels.
 #[derive(Debug)]
 pub struct Gan<'a> {
     /// The stage.
-    pub on: Frames<'a>,
+    pub on: Stage<'a>,
     /// The classes that the discriminator distinguishes, and the losses.
     pub game: Game,
-    /// Real samples, used without their levels.
-    pub real: &'a [usize],
-    /// Samples whose levels the discriminator learns; empty where the game has no levels.
-    pub labelled: &'a [usize],
     /// The first weights of generator and discriminator.
     pub initial: [Weights; 2],
     /// The sensor that measured the real frames.
@@ -107,20 +106,27 @@ fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
     }
 }
 
-/// The sensor that measured the frames of these presses.
-pub fn sensor(presses: &Presses, places: &[usize]) -> Sensor {
-    let frames: Vec<ModelFrame> = places.iter().map(|&press| presses.frame(press)).collect();
-    Sensor::of(&frames.iter().collect::<Vec<_>>())
-}
+impl<'a> Gan<'a> {
+    /// A GAN that begins with these weights.
+    pub fn new(on: Stage<'a>, game: Game, initial: [Weights; 2]) -> Self {
+        let real = on.parts.unlabelled.iter();
+        let frames: Vec<ModelFrame> = real.map(|&press| on.presses.frame(press)).collect();
+        Self {
+            sensor: Sensor::of(&frames.iter().collect::<Vec<_>>()),
+            on,
+            game,
+            initial,
+        }
+    }
 
-impl Gan<'_> {
     /// The labelled samples of step `step`. They are fewer than the real ones, so they repeat in passes of
     /// their own.
     fn labelled(&self, step: u64) -> Option<(Tensor<4>, Tensor<2>)> {
         let batch = self.on.training.batch;
-        let batches = self.labelled.len().div_ceil(batch) as u64;
+        let labelled = &self.on.parts.train;
+        let batches = labelled.len().div_ceil(batch) as u64;
         let pass = step.checked_div(batches)?;
-        let mut order = self.labelled.to_vec();
+        let mut order = labelled.clone();
         { self.on.stream("labelled order").child(pass) }.shuffle(&mut order);
         let places = order.chunks(batch).nth((step % batches) as usize)?;
         Some((self.on.images(places), self.on.targets(places)))
@@ -128,43 +134,48 @@ impl Gan<'_> {
 
     /// The discriminator as a recogniser of the levels. The statistics of its layers are those of all real
     /// frames that it has seen, in batches of the same size and without augmentation, as in its training.
-    fn recogniser(&self, weights: &[Weights]) -> (Hrn<'_>, [Weights; 1]) {
-        let hrn = Hrn {
-            on: self.on,
-            augmentation: Augmentation::default(),
-            train: [self.real, self.labelled].concat(),
-            held_out: &[],
-            initial: Weights::default(),
+    fn recogniser(&self, weights: &[Weights]) -> Hrn<'_> {
+        let Parts {
+            unlabelled, train, ..
+        } = &self.on.parts;
+        let on = Stage {
+            parts: Parts {
+                train: [&unlabelled[..], train].concat(),
+                ..Parts::default()
+            },
+            settings: Settings {
+                augmentation: Augmentation::default(),
+                ..self.on.settings
+            },
+            ..self.on.clone()
         };
-        let levels = hrn::of_levels(&weights[1], self.on.levels, self.on.device);
-        (hrn, [levels])
+        Hrn {
+            initial: hrn::of_levels(&weights[1], on.levels(), on.device),
+            on,
+        }
     }
 }
 
 impl Learning for Gan<'_> {
-    fn stage(&self) -> &'static str {
-        self.on.stage
+    fn on(&self) -> &Stage<'_> {
+        &self.on
     }
 
-    fn plan(&self) -> Plan {
+    fn sides(&self) -> Vec<Learner> {
         let [generator, discriminator] = self.initial.clone();
-        let training = self.on.training;
         // The average is of the discriminator alone.
         let of_generator = Training {
             averaging: 0.0,
-            ..training
+            ..self.on.training
         };
-        Plan {
-            sides: vec![
-                Learner::fresh(generator, of_generator),
-                Learner::fresh(discriminator, training),
-            ],
-            samples: self.real.to_vec(),
-            held_out: Vec::new(),
-            batch: training.batch,
-            training,
-            seed: self.on.seed,
-        }
+        vec![
+            Learner::fresh(generator, of_generator),
+            Learner::fresh(discriminator, self.on.training),
+        ]
+    }
+
+    fn samples(&self) -> Vec<usize> {
+        self.on.parts.unlabelled.clone()
     }
 
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
@@ -173,7 +184,7 @@ impl Learning for Gan<'_> {
             real: self.on.images(samples),
             labelled: self.labelled(step),
             eta: generator::noise(generator::SAMPLES_A_COMPONENT, &mut stream, self.on.device),
-            sensing: Some((self.sensor, self.on.scale)),
+            sensing: Some((self.sensor, self.on.scale())),
         };
         let [loss, of_generator] = self::step(sides, self.game, &batch, rate);
         Taken {
@@ -189,12 +200,12 @@ impl Learning for Gan<'_> {
         questions: &[Question],
         vary: Option<&mut Stream>,
     ) -> Vec<Vec<f32>> {
-        let (hrn, weights) = self.recogniser(weights);
-        hrn.judge(&weights, questions, vary)
+        let hrn = self.recogniser(weights);
+        hrn.judge(slice::from_ref(&hrn.initial), questions, vary)
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {
-        let (hrn, weights) = self.recogniser(weights);
-        hrn.graph(&weights)
+        let hrn = self.recogniser(weights);
+        hrn.graph(slice::from_ref(&hrn.initial))
     }
 }

@@ -1,45 +1,27 @@
 //! The paper's recogniser: Eq. (9) minimised over labelled frames.
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 
 use super::learner::Learner;
-use super::{Learning, Plan, Question, Taken, share_right};
+use super::{Learning, Question, Stage, Taken, share_right};
 use crate::data::augment;
-use crate::data::presses::Presses;
 use crate::net::graph::Graph;
 use crate::net::hrn;
 use crate::net::image::PixelScale;
 use crate::net::network::{Normalisation, Statistics, Weights, numbers, targets};
-use crate::settings::{Augmentation, Training};
 use hardnessd_core::verdict::ModelFrame;
 use hardnessd_simulator::random::Stream;
 
 /// Frames per pass without gradients.
 const JUDGED_AT_ONCE: usize = 250;
 
-/// What a stage on frames has, whatever learns.
-#[derive(Debug, Clone, Copy)]
-pub struct Frames<'a> {
-    /// The name of the stage.
-    pub stage: &'static str,
-    /// The presses that indices refer to.
-    pub presses: &'a Presses,
-    /// The number of hardness levels.
-    pub levels: usize,
+impl Stage<'_> {
     /// The scale from newtons to images.
-    pub scale: PixelScale,
-    /// Settings of the training.
-    pub training: Training,
-    /// Seed of everything random.
-    pub seed: u64,
-    /// The device that computes.
-    pub device: &'a Device,
-}
-
-impl Frames<'_> {
-    /// The stream of random numbers of this name.
-    pub fn stream(&self, name: &str) -> Stream {
-        Stream::new(self.seed, &format!("{} {name}", self.stage))
+    pub fn scale(&self) -> PixelScale {
+        PixelScale {
+            full_scale_n: self.settings.full_scale_n,
+            log_above_n: self.settings.log_above_n,
+        }
     }
 
     /// The frames of presses as images `[batch, 1, 28, 28]`.
@@ -56,27 +38,21 @@ impl Frames<'_> {
             .iter()
             .map(|&press| change(self.presses.frame(press)));
         let frames: Vec<ModelFrame> = frames.collect();
-        self.scale.images(frames.iter(), self.device)
+        self.scale().images(frames.iter(), self.device)
     }
 
     /// The levels of labelled presses as targets `[batch, L]`.
     pub fn targets(&self, presses: &[usize]) -> Tensor<2> {
         let levels = self.presses.of(presses).map(|press| press.level);
-        targets(levels, self.levels, self.device)
+        targets(levels, self.levels(), self.device)
     }
 }
 
-/// HRN, and what it learns from.
+/// HRN, which learns from labelled presses.
 #[derive(Debug)]
 pub struct Hrn<'a> {
     /// The stage.
-    pub on: Frames<'a>,
-    /// The changes made to a frame before each use.
-    pub augmentation: Augmentation,
-    /// Labelled presses to learn from.
-    pub train: Vec<usize>,
-    /// Labelled presses of held-out objects; may be empty.
-    pub held_out: &'a [usize],
+    pub on: Stage<'a>,
     /// The first weights.
     pub initial: Weights,
 }
@@ -101,7 +77,7 @@ pub fn step(
 impl Hrn<'_> {
     /// Images of presses, each augmented.
     fn varied(&self, presses: &[usize], stream: &mut Stream) -> Tensor<4> {
-        let vary = |frame: ModelFrame| augment::vary(&frame, self.augmentation, stream);
+        let vary = |frame: ModelFrame| augment::vary(&frame, self.on.settings.augmentation, stream);
         self.on.changed(presses, vary)
     }
 
@@ -109,7 +85,7 @@ impl Hrn<'_> {
     /// say, in batches of their size. A smaller remainder is left out.
     fn statistics(&self, weights: &Weights) -> Statistics {
         let mut statistics = Statistics::default();
-        let mut order = self.train.clone();
+        let mut order = self.on.parts.train.clone();
         self.on.stream("statistics").shuffle(&mut order);
         let batch = self.on.training.batch.min(order.len());
         for (presses, number) in order.chunks_exact(batch).zip(0..) {
@@ -125,19 +101,12 @@ impl Hrn<'_> {
 }
 
 impl Learning for Hrn<'_> {
-    fn stage(&self) -> &'static str {
-        self.on.stage
+    fn on(&self) -> &Stage<'_> {
+        &self.on
     }
 
-    fn plan(&self) -> Plan {
-        Plan {
-            sides: vec![Learner::fresh(self.initial.clone(), self.on.training)],
-            samples: self.train.clone(),
-            held_out: self.on.presses.with_levels(self.held_out),
-            batch: self.on.training.batch,
-            training: self.on.training,
-            seed: self.on.seed,
-        }
+    fn sides(&self) -> Vec<Learner> {
+        vec![Learner::fresh(self.initial.clone(), self.on.training)]
     }
 
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
@@ -148,7 +117,7 @@ impl Learning for Hrn<'_> {
         let levels = self.on.presses.of(samples).map(|press| press.level);
         Taken {
             loss,
-            accuracy: Some(share_right(levels, judged.chunks(self.on.levels))),
+            accuracy: Some(share_right(levels, judged.chunks(self.on.levels()))),
             ..Taken::default()
         }
     }
@@ -169,12 +138,16 @@ impl Learning for Hrn<'_> {
             };
             let mut normalisation = Normalisation::Fixed(&statistics);
             let logits = hrn::logits(&weights[0], images, &mut normalisation);
-            rows.extend(numbers(&logits).chunks(self.on.levels).map(<[f32]>::to_vec));
+            rows.extend(
+                numbers(&logits)
+                    .chunks(self.on.levels())
+                    .map(<[f32]>::to_vec),
+            );
         }
         rows
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {
-        hrn::graph(&weights[0], &self.statistics(&weights[0]), self.on.scale)
+        hrn::graph(&weights[0], &self.statistics(&weights[0]), self.on.scale())
     }
 }

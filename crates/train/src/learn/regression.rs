@@ -7,12 +7,11 @@
 use std::collections::BTreeMap;
 use std::slice;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 
 use super::learner::Learner;
-use super::{Inputs, Learning, Plan, Question, Taken, share_right};
+use super::{Inputs, Learning, Question, Stage, Taken, share_right};
 use crate::data::presses::Presses;
-use crate::data::split::Parts;
 use crate::net::graph::{Graph, RAW};
 use crate::net::network::{Weights, dense, numbers};
 use crate::net::standard::Standard;
@@ -75,29 +74,23 @@ impl Seen {
     }
 }
 
-/// The regression, and what it learns from.
+/// The regression, which learns from labelled presses.
 #[derive(Debug)]
 pub struct Regression<'a> {
-    presses: &'a Presses,
+    on: Stage<'a>,
     seen: Seen,
-    train: &'a [usize],
-    held_out: &'a [usize],
-    levels: usize,
     standard: Standard,
-    device: &'a Device,
 }
 
 impl<'a> Regression<'a> {
-    /// A regression that learns from the presses `train`.
-    pub fn new(
-        presses: &'a Presses,
-        seen: Seen,
-        Parts {
-            train, held_out, ..
-        }: &'a Parts,
-        device: &'a Device,
-    ) -> Self {
-        let rows = train.iter().map(|&press| seen.of(presses, press));
+    /// A regression in a stage, which gets its name and its settings.
+    pub fn new(stage: Stage<'a>, seen: Seen) -> Self {
+        let presses = stage.presses;
+        let rows = stage
+            .parts
+            .train
+            .iter()
+            .map(|&press| seen.of(presses, press));
         let rows: Vec<Vec<f32>> = rows.collect();
         let mut standard = Standard::of(seen.columns(), rows.iter().map(Vec::as_slice));
         // A frame alone says nothing of time. What the features of time are then, a whole press does not repeat.
@@ -111,15 +104,21 @@ impl<'a> Regression<'a> {
                 standard.deviation[column] = f32::MAX;
             }
         }
-        Self {
-            presses,
-            train,
-            held_out,
-            levels: presses.levels().len(),
-            standard,
-            seen,
-            device,
-        }
+        let on = Stage {
+            name: match seen {
+                Seen::Features => "features",
+                Seen::Parts(..) => "taxels",
+                Seen::Unloaded(_) => "unloaded",
+            },
+            // The fit takes all presses at once, and ends by itself.
+            training: Training {
+                batch: rows.len(),
+                epochs: 1,
+                ..Training::default()
+            },
+            ..stage
+        };
+        Self { on, seen, standard }
     }
 
     /// The weights of least loss.
@@ -130,11 +129,11 @@ impl<'a> Regression<'a> {
     fn samples(&self) -> Samples {
         // Each level counts the same, and within it each object, whatever the number of its presses.
         let unit = |place: &usize| {
-            let press = &self.presses.all[*place];
+            let press = &self.on.presses.all[*place];
             (press.level, press.object)
         };
         let mut counts = BTreeMap::new();
-        for place in self.train {
+        for place in &self.on.parts.train {
             *counts.entry(unit(place)).or_insert(0.0) += 1.0;
         }
         let objects = |level: u8| counts.keys().filter(|unit| unit.0 == level).count() as f64;
@@ -147,28 +146,28 @@ impl<'a> Regression<'a> {
             let columns = self.row(press).into_iter().chain([1.0]);
             columns.map(f64::from).collect()
         };
-        let presses = self.presses.of(self.train);
+        let presses = self.on.presses.of(&self.on.parts.train);
         Samples {
-            rows: self.train.iter().map(row).collect(),
-            shares: self.train.iter().map(share).collect(),
+            rows: self.on.parts.train.iter().map(row).collect(),
+            shares: self.on.parts.train.iter().map(share).collect(),
             of_level: presses.map(|press| usize::from(press.level) - 1).collect(),
-            levels: self.levels,
+            levels: self.on.levels(),
             ridge: match self.seen {
                 Seen::Features => RIDGE,
                 // With as many taxels as this, the presses are what limits the fit.
-                Seen::Parts(..) | Seen::Unloaded(_) => 1.0 / self.train.len() as f64,
+                Seen::Parts(..) | Seen::Unloaded(_) => 1.0 / self.on.parts.train.len() as f64,
             },
         }
     }
 
     /// The standardised columns of a press.
     fn row(&self, press: usize) -> Vec<f32> {
-        self.standard.row(&self.seen.of(self.presses, press))
+        self.standard.row(&self.seen.of(self.on.presses, press))
     }
 
     /// The coefficients of each level, those of the columns and the bias, as a layer.
     fn weights(&self, coefficients: &[f64]) -> Weights {
-        let (columns, levels, device) = (self.seen.columns(), self.levels, self.device);
+        let (columns, levels, device) = (self.seen.columns(), self.on.levels(), self.on.device);
         let of = |column: usize| {
             let levels = coefficients.chunks_exact(columns + 1);
             levels.map(move |of_level| of_level[column] as f32)
@@ -182,30 +181,13 @@ impl<'a> Regression<'a> {
 }
 
 impl Learning for Regression<'_> {
-    fn stage(&self) -> &'static str {
-        match self.seen {
-            Seen::Features => "features",
-            Seen::Parts(..) => "taxels",
-            Seen::Unloaded(_) => "unloaded",
-        }
+    fn on(&self) -> &Stage<'_> {
+        &self.on
     }
 
-    fn plan(&self) -> Plan {
-        let nothing = vec![0.0; (self.seen.columns() + 1) * self.levels];
-        // The fit takes all presses at once, and ends by itself.
-        let training = Training {
-            batch: self.train.len(),
-            epochs: 1,
-            ..Training::default()
-        };
-        Plan {
-            sides: vec![Learner::fresh(self.weights(&nothing), training)],
-            samples: self.train.to_vec(),
-            held_out: self.presses.with_levels(self.held_out),
-            batch: training.batch,
-            training,
-            seed: 0,
-        }
+    fn sides(&self) -> Vec<Learner> {
+        let nothing = vec![0.0; (self.seen.columns() + 1) * self.on.levels()];
+        vec![Learner::fresh(self.weights(&nothing), self.on.training)]
     }
 
     /// Fits the coefficients.
@@ -213,9 +195,13 @@ impl Learning for Regression<'_> {
         let samples = self.samples();
         let fitted = samples.fit();
         let weights = self.weights(&fitted);
-        let question = Question::alone(self.train);
+        let question = Question::alone(&self.on.parts.train);
         let judged = self.judge(slice::from_ref(&weights), &[question], None);
-        let levels = self.presses.of(self.train).map(|press| press.level);
+        let levels = self
+            .on
+            .presses
+            .of(&self.on.parts.train)
+            .map(|press| press.level);
         sides[0].weights = weights;
         Taken {
             loss: samples.loss(&fitted).0,
@@ -234,9 +220,12 @@ impl Learning for Regression<'_> {
         let rows: Vec<f32> = presses.flat_map(|&press| self.row(press)).collect();
         let columns = self.seen.columns();
         let shape = [rows.len() / columns, columns];
-        let rows = Tensor::from_data(TensorData::new(rows, shape), self.device);
+        let rows = Tensor::from_data(TensorData::new(rows, shape), self.on.device);
         let logits = numbers(&dense(&weights[0], "levels", rows));
-        logits.chunks(self.levels).map(<[f32]>::to_vec).collect()
+        logits
+            .chunks(self.on.levels())
+            .map(<[f32]>::to_vec)
+            .collect()
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {

@@ -11,11 +11,11 @@ use serde_json::json;
 
 use super::file;
 use super::verdicts::{self, Given, rigid};
-use crate::data::presses::{Press, Presses};
+use crate::data::presses::Press;
 use crate::data::source::{Kind, Source};
 use crate::judge::evaluated::Evaluated;
 use crate::learn::calibration::Calibration;
-use crate::learn::{Inputs, Learning, Outputs, Question};
+use crate::learn::{Inputs, Learning, Outputs, Question, Stage};
 use crate::net::graph::Graph;
 use crate::net::network::Weights;
 use crate::run::{Description, Run};
@@ -37,10 +37,6 @@ pub struct Learnt<'a> {
     pub weights: &'a [Weights],
     /// The calibration of its verdicts.
     pub calibration: Calibration,
-    /// The data.
-    pub presses: &'a Presses,
-    /// The presses that it learnt from.
-    pub train: &'a [usize],
 }
 
 /// Writes the model and its evaluation on the test split to the run's directory. The file is loaded once, as
@@ -56,8 +52,9 @@ pub fn finish(
 ) -> anyhow::Result<Option<Evaluated>> {
     let mut card = learnt.card(&description.method, &description.data)?;
     let hrn = Model::load(&learnt.bytes(&card)?)?;
-    let test: Vec<usize> = learnt.presses.labelled(Split::Test).collect();
-    let cases = verdicts::of(&hrn, learnt.presses, &test, Given::USUAL)?;
+    let presses = learnt.learning.on().presses;
+    let test: Vec<usize> = presses.labelled(Split::Test).collect();
+    let cases = verdicts::of(&hrn, presses, &test, Given::USUAL)?;
     let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &card.levels));
     if let Some(evaluation) = &evaluation {
         card.metrics["test"] = json!(evaluation);
@@ -88,6 +85,7 @@ impl Learnt<'_> {
     ///
     /// Fails if the names of the files cannot be written as JSON.
     pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
+        let Stage { presses, parts, .. } = self.learning.on();
         let graph = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
         let (format, conformal) = match graph.inputs {
@@ -99,18 +97,18 @@ impl Learnt<'_> {
                 ("3", self.calibration.conformal())
             }
         };
-        let pitches = self.presses.pitches_mm(self.train);
+        let pitches = presses.pitches_mm(&parts.train);
         let grid = match graph.inputs {
-            Inputs::Parts(_) => self.presses.grid(),
+            Inputs::Parts(_) => presses.grid(),
             _ => None,
         };
         let range = match grid.filter(|grid| !grid.is_kept()) {
-            Some(_) => range(self.presses.of(self.train).filter_map(felt)),
+            Some(_) => range(presses.of(&parts.train).filter_map(felt)),
             None => {
-                let pitch = Pitch::square(self.presses.pitch_mm());
+                let pitch = Pitch::square(presses.pitch_mm());
                 let threshold_n = pitch.contact_threshold_n();
-                range(self.train.iter().map(|&press| {
-                    let best = self.presses.frame(press);
+                range(parts.train.iter().map(|&press| {
+                    let best = presses.frame(press);
                     let force_n = best.force_n() as f32;
                     ([force_n; 2], best.contact_area_taxels(threshold_n))
                 }))
@@ -118,12 +116,12 @@ impl Learnt<'_> {
         };
         Ok(Card {
             format: format.to_owned(),
-            levels: self.presses.levels(),
-            pitch_mm: grid.map_or(self.presses.pitch_mm(), |grid| grid.pitch_mm) as f32,
+            levels: presses.levels(),
+            pitch_mm: grid.map_or(presses.pitch_mm(), |grid| grid.pitch_mm) as f32,
             method: method.to_owned(),
             data: data(sources)?,
             metrics,
-            validation: validation(&self.presses.validated()).to_owned(),
+            validation: validation(&presses.validated()).to_owned(),
             range: Range {
                 pitch_mm: pitches.map(|pitches| pitches.map(|mm| mm as f32)),
                 ..range
@@ -136,6 +134,7 @@ impl Learnt<'_> {
     /// Two presses of each level, and what the trainer's network says of them. Of a model that takes
     /// references, every second press has some.
     fn checks(&self, graph: &Graph, outputs: &Outputs) -> Checks {
+        let presses = self.learning.on().presses;
         let places = self.checked();
         let references = match graph.inputs {
             Inputs::References => self.check_references(),
@@ -155,8 +154,8 @@ impl Learnt<'_> {
         let probabilities = |row: &Vec<f32>| outputs.probabilities(row, temperature);
         if let Inputs::Frame | Inputs::Parts(_) = graph.inputs {
             let newtons = |&press: &usize| match graph.inputs {
-                Inputs::Parts(array) => self.presses.parts(press, array),
-                _ => self.presses.frame(press).newtons.to_vec(),
+                Inputs::Parts(array) => presses.parts(press, array),
+                _ => presses.frame(press).newtons.to_vec(),
             };
             return Checks::Frames(Check {
                 frames: places.iter().map(newtons).collect(),
@@ -174,7 +173,7 @@ impl Learnt<'_> {
         };
         let checked = places.iter().zip(&rows).enumerate();
         let checked = checked.map(|(number, (&press, row))| CheckedCourse {
-            course: self.presses.course(press),
+            course: presses.course(press),
             probabilities: probabilities(row),
             shore: outputs.shore(row, temperature, tail(is_identified(number))),
             identified: is_identified(number),
@@ -184,7 +183,7 @@ impl Learnt<'_> {
             presses: checked.collect(),
             references: references
                 .map(|&(place, piece)| ReferencePress {
-                    course: self.presses.course(place),
+                    course: presses.course(place),
                     piece,
                 })
                 .collect(),
@@ -193,10 +192,11 @@ impl Learnt<'_> {
 
     /// The references of the first sensor that has some.
     fn check_references(&self) -> Vec<(usize, Piece)> {
-        let sensors = self.presses.of(self.train).map(|press| press.sensor);
+        let Stage { presses, parts, .. } = self.learning.on();
+        let sensors = presses.of(&parts.train).map(|press| press.sensor);
         let mut seen = BTreeSet::new();
         let new = sensors.filter(|&sensor| seen.insert(sensor));
-        let mut of_sensors = new.map(|sensor| rigid(self.presses, sensor, Given::USUAL));
+        let mut of_sensors = new.map(|sensor| rigid(presses, sensor, Given::USUAL));
         of_sensors
             .find(|references| !references.is_empty())
             .unwrap_or_default()
@@ -204,12 +204,13 @@ impl Learnt<'_> {
 
     /// Two training presses of each level: those one third and two thirds through its presses.
     fn checked(&self) -> Vec<usize> {
+        let Stage { presses, parts, .. } = self.learning.on();
         let mut checked = Vec::new();
-        for level in self.presses.levels() {
-            let of_level = |&press: &usize| self.presses.all[press].level == level.level;
-            let own: Vec<usize> = self.train.iter().copied().filter(of_level).collect();
+        for level in presses.levels() {
+            let of_level = |&press: &usize| presses.all[press].level == level.level;
+            let own: Vec<usize> = parts.train.iter().copied().filter(of_level).collect();
             // A level without its own is checked on those of other levels.
-            let own = if own.is_empty() { self.train } else { &own };
+            let own = if own.is_empty() { &parts.train } else { &own };
             for part in 1..=CHECKS_A_LEVEL {
                 checked.push(own[own.len() * part / (CHECKS_A_LEVEL + 1)]);
             }
@@ -279,6 +280,7 @@ fn range(presses: impl Iterator<Item = ([f32; 2], u32)>) -> Range {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::presses::Presses;
 
     #[test]
     fn a_model_is_validated_by_what_judged_it_and_it_did_not_learn() {

@@ -18,7 +18,6 @@ pub(super) fn end_at_signals(how_to_continue: Option<String>) -> std::io::Result
         if let Some(signal) = signals.forever().find(|&signal| signal != SIGXFSZ) {
             let hint = how_to_continue
                 .map_or_else(String::new, |command| format!("; to continue: {command}"));
-            hrn_train::exit::remove_at_once();
             hardnessd_core::stderr_line!("hrn-train: interrupted{hint}");
             std::process::exit(128 + signal);
         }
