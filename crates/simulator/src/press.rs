@@ -85,7 +85,6 @@ pub(super) struct Window {
 pub(super) struct Bench {
     pub(super) cover: Cover,
     solvers: BTreeMap<usize, Solver>,
-    layers: Vec<((f64, Base), Layer)>,
     spectra: Vec<(Influence, Arc<[f32]>)>,
 }
 
@@ -109,8 +108,6 @@ struct Influence {
 
 /// The number of spectra held: those of the cover, and of an object's up to three heights, for some widths.
 const SPECTRA: usize = 24;
-/// The number of kinds of layers held, including the cover.
-const LAYERS: usize = 8;
 
 impl Specimen {
     pub(super) fn new(
@@ -414,37 +411,21 @@ impl Bench {
             return Arc::clone(held);
         }
         let Influence { width, layer, unit } = of;
-        let solvers = self.solvers.entry(width);
-        let convolver = &mut solvers.or_insert_with(|| Solver::new(width)).convolver;
+        let convolver = &mut self.solver(width).convolver;
         let made = match layer {
             None => convolver.spectrum(|i, j| unit * kernel::half_space(i as f64, j as f64)),
             Some(LayerKey { nu, base, height }) => {
-                let layer = layer_of(&mut self.layers, nu, base);
+                let layer = Layer::new(nu, base);
                 convolver.spectrum(|i, j| unit * layer.influence(i as f64, j as f64, height))
             }
         };
         let made: Arc<[f32]> = made.into();
-        keep(&mut self.spectra, (of, Arc::clone(&made)), SPECTRA);
+        if self.spectra.len() == SPECTRA {
+            self.spectra.remove(0);
+        }
+        self.spectra.push((of, Arc::clone(&made)));
         made
     }
-}
-
-/// The layer of this kind, which is made if it is missing.
-fn layer_of(layers: &mut Vec<((f64, Base), Layer)>, nu: f64, base: Base) -> &Layer {
-    let held = layers.iter().position(|(held, _)| *held == (nu, base));
-    let at = held.unwrap_or_else(|| {
-        keep(layers, ((nu, base), Layer::new(nu, base)), LAYERS);
-        layers.len() - 1
-    });
-    &layers[at].1
-}
-
-/// Adds to a list of the last `most` items.
-fn keep<T>(list: &mut Vec<T>, item: T, most: usize) {
-    if list.len() == most {
-        list.remove(0);
-    }
-    list.push(item);
 }
 
 pub(super) fn touches_border(pressure_mpa: &[f32], width: usize) -> bool {
