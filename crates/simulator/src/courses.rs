@@ -13,7 +13,7 @@ use super::press::{Bench, Specimen};
 use super::sensor::{Film, Sensor};
 use super::settings::{CourseSettings, SensorDesigns};
 use super::solved::SolvedPress;
-use super::subject::{Labels, Subject, harder_and_harder, shared_out, units};
+use super::subject::{Labels, Subject, harder_and_harder, units};
 use super::tracked::{Seen, begins_press, one_press};
 use crate::random::{Stream, log_even};
 use hardnessd_core::frame::{Frame, Pitch};
@@ -162,37 +162,37 @@ impl Plan {
     }
 }
 
-/// Simulates the presses on `threads` threads, and calls `progress` with the number of objects done and of all, or
-/// of covers if each sensor is another one. The presses are in the order of [`super::dataset`], and the result is
-/// the same for any number of threads. A press is `None` if no sensor sees it, however hard it is made, or if it
-/// lasts too long.
-pub fn courses(
-    settings: &CourseSettings,
-    threads: usize,
-    progress: impl Fn(usize, usize) + Sync,
-) -> Vec<Option<LabelledCourse>> {
+/// What makes presses, on whatever thread: those of an object, or of a cover if each sensor is another one. A press
+/// is `None` if no sensor sees it, however hard it is made, or if it lasts too long.
+type Work<'a> = Box<dyn FnOnce() -> Vec<Option<LabelledCourse>> + Send + 'a>;
+
+/// The data set, as what makes its presses, in the order of [`super::dataset`].
+pub fn courses(settings: &CourseSettings) -> Vec<Work<'_>> {
     if let Some(sensors) = &settings.sensors {
-        return world::courses(settings, sensors, threads, progress);
+        return world::courses(settings, sensors);
     }
     let of = &settings.objects;
-    shared_out(&units(of), threads, progress, |&unit| {
-        let mut bench = Bench::default();
-        let subject = Subject::draw(of, unit, settings.flat_share());
-        let pressed = |press| {
-            let mut paired = subject.geometry.child(3).child(press);
-            let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
-            subject.pressed(&mut bench, &plan, press, |solved, noise| {
-                plan.read(
-                    &subject.sensor,
-                    solved,
-                    plan.reading,
-                    noise,
-                    subject.labels(),
-                )
-            })
-        };
-        (0..u64::from(of.presses)).map(pressed).collect()
-    })
+    let object = |unit| -> Work {
+        Box::new(move || {
+            let mut bench = Bench::default();
+            let subject = Subject::draw(of, unit, settings.flat_share());
+            let pressed = |press| {
+                let mut paired = subject.geometry.child(3).child(press);
+                let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
+                subject.pressed(&mut bench, &plan, press, |solved, noise| {
+                    plan.read(
+                        &subject.sensor,
+                        solved,
+                        plan.reading,
+                        noise,
+                        subject.labels(),
+                    )
+                })
+            };
+            (0..u64::from(of.presses)).map(pressed).collect()
+        })
+    };
+    units(of).into_iter().map(object).collect()
 }
 
 impl Subject {

@@ -1,6 +1,6 @@
 //! The whole simulated data set: objects, postures, forces, labels.
 //!
-//! The objects are distributed over threads. Every number depends on the seed and on the object,
+//! The objects may be distributed over threads. Every number depends on the seed and on the object,
 //! never on the thread.
 
 use super::motion::Arm;
@@ -8,7 +8,7 @@ use super::object::{POSTURES, Pose};
 use super::press::{Bench, Specimen};
 use super::sensor::Film;
 use super::settings::DatasetSettings;
-use super::subject::{Labels, Subject, harder_and_harder, shared_out, units};
+use super::subject::{Labels, Subject, harder_and_harder, units};
 use super::tracked::begins_press;
 use crate::random::Stream;
 use hardnessd_core::frame::Frame;
@@ -30,17 +30,14 @@ const FORCES: usize = 8;
 const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
 
-/// Simulates the data set on `threads` threads, and calls `progress` with the number of objects
-/// done and of all. Samples are in the order of materials (as in [`super::Material::ALL`]) or of split and
-/// group, then of object, posture and press. The result is the same for any number of threads.
+/// The data set, as what makes the samples of each object, on whatever thread. The objects are in the order of
+/// materials (as in [`super::Material::ALL`]) or of split and group, and their samples in that of posture and
+/// press.
 pub fn dataset(
     settings: &DatasetSettings,
-    threads: usize,
-    progress: impl Fn(usize, usize) + Sync,
-) -> Vec<LabelledSample> {
-    shared_out(&units(settings), threads, progress, |&unit| {
-        Subject::draw(settings, unit, 0.0).press_all(settings)
-    })
+) -> Vec<impl FnOnce() -> Vec<LabelledSample> + Send + '_> {
+    let object = |unit| move || Subject::draw(settings, unit, 0.0).press_all(settings);
+    units(settings).into_iter().map(object).collect()
 }
 
 impl Subject {
@@ -169,7 +166,9 @@ mod tests {
     fn samples_are_labelled_as_their_material_and_others_are_another_version() {
         // The sums are the newtons of all frames of each material. If they change on purpose,
         // change them and raise VERSION. Differences of a few counts may come from another machine.
-        let samples = dataset(&small(Shapes::Matched), 2, |_, _| ());
+        let settings = small(Shapes::Matched);
+        let objects = dataset(&settings).into_iter();
+        let samples: Vec<LabelledSample> = objects.flat_map(|make| make()).collect();
         let newtons = Material::ALL.map(|material| {
             let own = samples
                 .iter()

@@ -4,10 +4,6 @@
 //! An object's draws follow from the seed, its kind and its number. So all data sets of a seed
 //! contain the same objects, whatever the number of objects.
 
-use std::collections::BTreeMap;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
-
 use super::broad;
 use super::level::LEVELS;
 use super::material::{Body, Material, Split};
@@ -96,32 +92,6 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
     units
 }
 
-/// Runs `work` on each unit, on `threads` threads, and calls `progress` with the number of units done and of
-/// all. The results are in the order of the units, whichever thread makes them.
-pub(super) fn shared_out<U: Sync, T: Send>(
-    units: &[U],
-    threads: usize,
-    progress: impl Fn(usize, usize) + Sync,
-    work: impl Fn(&U) -> Vec<T> + Sync,
-) -> Vec<T> {
-    let (next, made) = (AtomicUsize::new(0), Mutex::new(BTreeMap::new()));
-    let share = || {
-        loop {
-            let place = next.fetch_add(1, Ordering::Relaxed);
-            let Some(unit) = units.get(place) else {
-                return;
-            };
-            let own = work(unit);
-            let mut made = made.lock().expect("no work panics");
-            made.insert(place, own);
-            progress(made.len(), units.len());
-        }
-    };
-    std::thread::scope(|scope| (0..threads.max(1)).for_each(|_| drop(scope.spawn(share))));
-    let made = made.into_inner().expect("no work panics");
-    made.into_values().flatten().collect()
-}
-
 /// The streams of one object: one for its geometry, poses and forces, and one for its material. The first
 /// of test objects of the same number does not depend on the material, except for the paper's shapes.
 /// This pairs the test objects.
@@ -208,15 +178,6 @@ impl Subject {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn threads_do_not_show() {
-        let units: Vec<u32> = (0..20).collect();
-        let made = |threads| shared_out(&units, threads, |_, _| (), |&unit| vec![unit, unit]);
-        let alone = made(1);
-        assert!(alone.len() == 40 && alone.is_sorted());
-        assert_eq!(made(4), alone);
-    }
 
     #[test]
     fn test_objects_are_paired_over_materials_but_for_the_papers_shapes() {

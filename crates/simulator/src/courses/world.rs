@@ -5,7 +5,7 @@
 //! drawn, objects are pressed on each, and several electronics read each of these presses: a
 //! sensor is one electronics under one cover. Train and test sensors share nothing.
 
-use super::{ARM_N_PER_MM, LabelledCourse, Plan, Reading};
+use super::{ARM_N_PER_MM, LabelledCourse, Plan, Reading, Work};
 use crate::material::Split;
 use crate::press::{Bench, Cover};
 use crate::random::{Stream, log_even};
@@ -13,7 +13,7 @@ use crate::rigid;
 use crate::sensor::{Design, Sensor};
 use crate::settings::{BroadSensors, CourseSettings, SensorDesigns};
 use crate::solved::SolvedPress;
-use crate::subject::{Labels, Subject, Unit, shared_out, units};
+use crate::subject::{Labels, Subject, Unit, units};
 use hardnessd_core::verdict::Piece;
 
 /// Presses of each rigid piece on each sensor.
@@ -41,33 +41,28 @@ impl CourseSettings {
     }
 }
 
-/// Simulates the presses; see [`super::courses()`].
-pub(super) fn courses(
-    settings: &CourseSettings,
-    sensors: &BroadSensors,
-    threads: usize,
-    progress: impl Fn(usize, usize) + Sync,
-) -> Vec<Option<LabelledCourse>> {
+/// What makes the presses on each cover; see [`super::courses()`].
+pub(super) fn courses<'a>(
+    settings: &'a CourseSettings,
+    sensors: &'a BroadSensors,
+) -> Vec<Work<'a>> {
     let of = &settings.objects;
-    let units = units(of);
     let train = (0..sensors.covers.min(of.objects)).map(|n| (Split::Train, sensors.covers, n));
     let test = 0..sensors.test_covers.min(of.test_objects);
     let test = test.map(|n| (Split::Test, sensors.test_covers, n));
-    let covers: Vec<_> = (0..).zip(train.chain(test)).collect();
-    shared_out(
-        &covers,
-        threads,
-        progress,
-        |&(index, (split, count, number))| {
+    let cover = |((split, count, number), index)| -> Work {
+        Box::new(move || {
+            let units = units(of);
             let mut station = Station::draw(settings, sensors, (split, number), index);
             let mut made = station.references(units.len() as u32);
-            let is_on = |unit: &&Unit| unit.split == split && unit.number % count == number;
-            for &unit in units.iter().filter(is_on) {
+            let is_on = |unit: &Unit| unit.split == split && unit.number % count == number;
+            for unit in units.into_iter().filter(is_on) {
                 made.extend(station.object(unit));
             }
             made
-        },
-    )
+        })
+    };
+    train.chain(test).zip(0..).map(cover).collect()
 }
 
 /// One cover on its arm, with the electronics under it.

@@ -142,7 +142,7 @@ impl Presses {
     }
 
     /// The simulator's frames.
-    pub fn of_samples(samples: Vec<LabelledSample>) -> Self {
+    pub fn of_samples(samples: impl IntoIterator<Item = LabelledSample>) -> Self {
         let mut all = Self::default();
         for sample in samples {
             let press = Press::labelled(sample.labels, sample.force_n);
@@ -152,7 +152,7 @@ impl Presses {
     }
 
     /// The simulator's presses over time.
-    pub fn of_courses<'a>(courses: impl IntoIterator<Item = &'a LabelledCourse>) -> Self {
+    pub fn of_courses(courses: impl IntoIterator<Item = LabelledCourse>) -> Self {
         let mut all = Self::default();
         for course in courses {
             let press = Press {

@@ -11,6 +11,7 @@ use hardnessd_core::npz::Writer;
 use hardnessd_core::verdict::Level;
 use hardnessd_core::wording;
 use hardnessd_simulator::{self, CourseSettings, DatasetSettings, Materials};
+use rayon::prelude::*;
 use serde_json::json;
 
 use crate::data::presses::{self, Layout, Presses};
@@ -35,26 +36,33 @@ pub fn configured(settings: &CourseSettings, text: &str) -> anyhow::Result<Cours
 /// Simulates presses, with a progress bar on a terminal. Single frames are those of `settings.objects`. Also returns
 /// the number of presses that no sensor saw, or that lasted too long.
 pub fn simulate(settings: &CourseSettings, layout: Layout) -> (Presses, usize) {
-    let jobs = std::thread::available_parallelism().map_or(1, usize::from);
-    let bar = progress::bar("{bar:30} {percent} %, {eta} left", 0);
-    let progress = |done: usize, all: usize| {
-        bar.set_length(all as u64);
-        bar.set_position(done as u64);
-    };
-    let (presses, left_out) = match layout {
+    match layout {
         Layout::Frames => {
-            let samples = hardnessd_simulator::dataset(&settings.objects, jobs, progress);
+            let samples = made(hardnessd_simulator::dataset(&settings.objects));
             (Presses::of_samples(samples), 0)
         }
         Layout::OverTime => {
-            let courses = hardnessd_simulator::courses(settings, jobs, progress);
-            let presses = Presses::of_courses(courses.iter().flatten());
-            let left_out = courses.len() - presses.all.len();
+            let courses = made(hardnessd_simulator::courses(settings));
+            let all = courses.len();
+            let presses = Presses::of_courses(courses.into_iter().flatten());
+            let left_out = all - presses.all.len();
             (presses, left_out)
         }
-    };
+    }
+}
+
+/// What all parts of some work make, in their order.
+fn made<T: Send>(work: Vec<impl FnOnce() -> Vec<T> + Send>) -> Vec<T> {
+    let bar = progress::bar("{bar:30} {percent} %, {eta} left", work.len());
+    let work = work.into_par_iter().with_max_len(1);
+    let made = work.flat_map_iter(|make| {
+        let made = make();
+        bar.inc(1);
+        made
+    });
+    let made = made.collect();
     bar.finish_and_clear();
-    (presses, left_out)
+    made
 }
 
 /// The levels with their intervals of Shore. Those of the named materials are the paper's.

@@ -132,20 +132,15 @@ mod tests {
         // Pressed taxels are a small part of the full scale and most taxels are 0, so the sums
         // before a normalised layer are tiny at the start. After normalisation they must not be
         // tiny.
-        let samples = hardnessd_simulator::dataset(
-            &DatasetSettings {
-                objects: 1,
-                test_objects: 0,
-                presses: 12,
-                ..DatasetSettings::default()
-            },
-            1,
-            |_, _| (),
-        );
-        let frames: Vec<_> = samples
-            .iter()
-            .map(|sample| resampled(&sample.frame))
-            .collect();
+        let settings = DatasetSettings {
+            objects: 1,
+            test_objects: 0,
+            presses: 12,
+            ..DatasetSettings::default()
+        };
+        let objects = hardnessd_simulator::dataset(&settings).into_iter();
+        let samples = objects.flat_map(|make| make());
+        let frames: Vec<_> = samples.map(|sample| resampled(&sample.frame)).collect();
         let device = Device::flex();
         let weights = initial(None, 4, false, 1, &device);
         for log_above_n in [0.0, 0.1] {

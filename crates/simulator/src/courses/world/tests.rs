@@ -23,7 +23,8 @@ fn sensors_have_their_references() {
         }),
         ..CourseSettings::default()
     };
-    let made = courses(&settings, 2, |_, _| ());
+    let made = courses(&settings).into_iter();
+    let made: Vec<_> = made.flat_map(|make| make()).collect();
     let wanted = made.len();
     assert_eq!(wanted, 4 * 3 * 10 + 4 * (3 + 2) * 2 * 3);
     let made: Vec<LabelledCourse> = made.into_iter().flatten().collect();

@@ -44,8 +44,9 @@ fn courses() -> Presses {
         },
         ..CourseSettings::default()
     };
-    let courses = hardnessd_simulator::courses(&settings, 2, |_, _| ());
-    let mut presses = Presses::of_courses(courses.iter().flatten());
+    let courses = hardnessd_simulator::courses(&settings).into_iter();
+    let courses = courses.flat_map(|make| make()).flatten();
+    let mut presses = Presses::of_courses(courses);
     for (place, reference) in [
         (1, Piece::Flat { width_mm: 20.0 }),
         (3, Piece::Ball { radius_mm: 7.5 }),
