@@ -147,7 +147,6 @@ impl<'a> Stages<'a> {
                 (gan.on.scale(), gan.sensor),
                 self.on.settings.generated_a_component as usize,
                 (seed, &mut stream),
-                self.on.device,
             );
             let press = Press {
                 level,

@@ -175,7 +175,7 @@ impl Learning for Course<'_> {
             }));
         }
         let tracked = learner.weights.tracked();
-        let outputs = course::outputs(&tracked, &groups, Some(&mut stream), self.on.device);
+        let outputs = course::outputs(&tracked, &groups, Some(&mut stream));
         let (loss, judged) = bins::loss(outputs, &labels, &self.parts);
         let mut gradients = loss.backward();
         learner.step(&tracked, &mut gradients, rate);
@@ -204,7 +204,7 @@ impl Learning for Course<'_> {
         let groups: Vec<course::Group> = questions.iter().map(group).collect();
         let mut rows = Vec::new();
         for part in groups.chunks(JUDGED_AT_ONCE) {
-            let outputs = course::outputs(&weights[0], part, None, self.on.device);
+            let outputs = course::outputs(&weights[0], part, None);
             rows.extend(numbers(&outputs).chunks(BINS).map(<[f32]>::to_vec));
         }
         rows

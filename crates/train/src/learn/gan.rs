@@ -31,10 +31,10 @@ const SIGMA_PENALTY: f64 = 0.1;
 /// head.
 pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> [Weights; 2] {
     let stream = Stream::new(seed, "discriminator weights");
-    let mut discriminator = Weights::default();
-    network::add_trunk(&mut discriminator, &stream, device);
+    let mut discriminator = Weights::new(device);
+    network::add_trunk(&mut discriminator, &stream);
     let dims = [FEATURES, game.outputs(levels)];
-    network::add_head(&mut discriminator, dims, &stream, device);
+    network::add_head(&mut discriminator, dims, &stream);
     [generator::initial(seed, device), discriminator]
 }
 
@@ -150,7 +150,7 @@ impl<'a> Gan<'a> {
             ..self.on.clone()
         };
         Hrn {
-            initial: hrn::of_levels(&weights[1], on.levels(), on.device),
+            initial: hrn::of_levels(&weights[1], on.levels()),
             on,
         }
     }

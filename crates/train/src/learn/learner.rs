@@ -130,9 +130,9 @@ mod tests {
             ("head.bias", &[1], 2.0),
             ("mixture.mu", &[1, 1], 2.0),
         ];
-        let mut weights = Weights::default();
+        let mut weights = Weights::new(&Device::flex());
         for (name, dims, _) in cases {
-            weights.add(name, dims, vec![2.0], &Device::flex());
+            weights.add(name, dims, vec![2.0]);
         }
         let tracked = weights.tracked();
         // Every weight has a gradient of 0, so only weight decay changes it.
@@ -158,10 +158,9 @@ mod tests {
             ..Training::default()
         };
         let fresh = || {
-            let mut weights = Weights::default();
-            let device = &Device::flex();
-            weights.add("head.matrix", &[2, 2], vec![0.3, -0.2, 0.7, 0.1], device);
-            weights.add("head.bias", &[2], vec![0.5, -0.4], device);
+            let mut weights = Weights::new(&Device::flex());
+            weights.add("head.matrix", &[2, 2], vec![0.3, -0.2, 0.7, 0.1]);
+            weights.add("head.bias", &[2], vec![0.5, -0.4]);
             Learner::fresh(weights, settings)
         };
         let take_three = |learner: &mut Learner| {

@@ -167,15 +167,15 @@ impl<'a> Regression<'a> {
 
     /// The coefficients of each level, those of the columns and the bias, as a layer.
     fn weights(&self, coefficients: &[f64]) -> Weights {
-        let (columns, levels, device) = (self.seen.columns(), self.on.levels(), self.on.device);
+        let (columns, levels) = (self.seen.columns(), self.on.levels());
         let of = |column: usize| {
             let levels = coefficients.chunks_exact(columns + 1);
             levels.map(move |of_level| of_level[column] as f32)
         };
-        let mut weights = Weights::default();
+        let mut weights = Weights::new(self.on.device);
         let matrix = (0..columns).flat_map(of).collect();
-        weights.add("levels.matrix", &[columns, levels], matrix, device);
-        weights.add("levels.bias", &[levels], of(columns).collect(), device);
+        weights.add("levels.matrix", &[columns, levels], matrix);
+        weights.add("levels.bias", &[levels], of(columns).collect());
         weights
     }
 }

@@ -58,7 +58,7 @@ const JOINT: Shapes<4> = [
 /// before the outputs, so that outputs begin near 1.
 pub fn initial(seed: u64, device: &Device) -> Weights {
     let root = Stream::new(seed, "course weights");
-    let mut weights = Weights::default();
+    let mut weights = Weights::new(device);
     for (name, [inputs, outputs]) in OF_REFERENCES.into_iter().chain(JOINT) {
         let gain = match name {
             "question" | "head" => 0.2,
@@ -67,9 +67,7 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
         let deviation = f64::sqrt(gain / inputs as f64);
         let mut stream = root.child(weights.entries.len() as u64);
         let values = (0..inputs * outputs).map(|_| (deviation * stream.normal()) as f32);
-        let (matrix, bias) = (format!("{name}.matrix"), format!("{name}.bias"));
-        weights.add(&matrix, &[inputs, outputs], values.collect(), device);
-        weights.add(&bias, &[outputs], vec![0.0; outputs], device);
+        weights.add_dense(name, [inputs, outputs], values.collect());
     }
     weights
 }
@@ -82,11 +80,11 @@ pub fn exported(graph: &pb::GraphProto, device: &Device) -> Option<(Weights, Sta
         let numbers: Vec<f32> = numbers.iter().copied().map(f32::from_le_bytes).collect();
         (numbers.len() == length && rest.is_empty()).then_some(numbers)
     };
-    let mut weights = Weights::default();
+    let mut weights = Weights::new(device);
     for weight in initial(0, device).entries {
         let length = weight.dims.iter().product();
         let values = constant(&weight.name, length)?;
-        weights.add(&weight.name, &weight.dims, values, device);
+        weights.add(&weight.name, &weight.dims, values);
     }
     let standard = Standard {
         mean: constant(standard::MEANS, FEATURES)?,
@@ -106,25 +104,20 @@ pub struct Group {
 
 /// Logits of the bins `[presses, BINS]` of the presses of all groups, one group after the other.
 /// With `dropout`, which draws the numbers to leave out, they are those of a training step.
-pub fn outputs(
-    weights: &Weights,
-    groups: &[Group],
-    mut dropout: Option<&mut Stream>,
-    device: &Device,
-) -> Tensor<2> {
+pub fn outputs(weights: &Weights, groups: &[Group], mut dropout: Option<&mut Stream>) -> Tensor<2> {
     let table = |rows: &mut dyn Iterator<Item = &Vec<f32>>| {
         let values: Vec<f32> = rows.flatten().copied().collect();
         let count = values.len() / FEATURES;
-        Tensor::<2>::from_data(TensorData::new(values, [count, FEATURES]), device)
+        Tensor::<2>::from_data(TensorData::new(values, [count, FEATURES]), &weights.device)
     };
     let beside = groups.iter().map(|group| {
         let presses = table(&mut group.presses.iter());
         let embeddings = (!group.references.is_empty()).then(|| {
             let pieces: Vec<Piece> = group.references.iter().map(|&(_, piece)| piece).collect();
             let references = table(&mut group.references.iter().map(|(inputs, _)| inputs));
-            embeddings(weights, references, &pieces, device)
+            embeddings(weights, references, &pieces)
         });
-        let beside = beside(weights, presses.clone(), embeddings, device);
+        let beside = beside(weights, presses.clone(), embeddings);
         Tensor::cat(vec![presses, beside], 1)
     });
     let mut x = Tensor::cat(beside.collect(), 0);
@@ -133,7 +126,7 @@ pub fn outputs(
         if name != "head" {
             x = activation::relu(x);
             if let Some(stream) = dropout.as_deref_mut() {
-                x = x.clone().mul(kept(x.dims(), stream, device));
+                x = x.clone().mul(kept(x.dims(), stream, &weights.device));
             }
         }
     }
@@ -166,14 +159,10 @@ fn columns(piece: Piece) -> [f32; PIECE] {
 }
 
 /// The embeddings `[presses, EMBEDDING]` of presses `[presses, FEATURES]` on these pieces.
-fn embeddings(
-    weights: &Weights,
-    features: Tensor<2>,
-    pieces: &[Piece],
-    device: &Device,
-) -> Tensor<2> {
+fn embeddings(weights: &Weights, features: Tensor<2>, pieces: &[Piece]) -> Tensor<2> {
     let columns: Vec<f32> = pieces.iter().flat_map(|&piece| columns(piece)).collect();
-    let columns = Tensor::<2>::from_data(TensorData::new(columns, [pieces.len(), PIECE]), device);
+    let columns = TensorData::new(columns, [pieces.len(), PIECE]);
+    let columns = Tensor::<2>::from_data(columns, &weights.device);
     let all = Tensor::cat(vec![features, columns], 1);
     let layer = activation::relu(dense(weights, "reference1", all));
     activation::relu(dense(weights, "reference2", layer))
@@ -181,15 +170,10 @@ fn embeddings(
 
 /// What the embeddings of one sensor say beside each of its presses: `[presses, BESIDE]`. All
 /// 0 without references.
-fn beside(
-    weights: &Weights,
-    features: Tensor<2>,
-    embeddings: Option<Tensor<2>>,
-    device: &Device,
-) -> Tensor<2> {
+fn beside(weights: &Weights, features: Tensor<2>, embeddings: Option<Tensor<2>>) -> Tensor<2> {
     let presses = features.dims()[0];
     let Some(embeddings) = embeddings else {
-        return Tensor::zeros([presses, BESIDE], device);
+        return Tensor::zeros([presses, BESIDE], &weights.device);
     };
     let count = embeddings.dims()[0] as f32;
     let questions = dense(weights, "question", features);
@@ -198,7 +182,8 @@ fn beside(
     let attended = attention.matmul(embeddings.clone());
     let mean = embeddings.mean_dim(0).repeat_dim(0, presses);
     let counts = [1.0, count.ln_1p() / COUNT].repeat(presses);
-    let counts = Tensor::<2>::from_data(TensorData::new(counts, [presses, 2]), device);
+    let counts = TensorData::new(counts, [presses, 2]);
+    let counts = Tensor::<2>::from_data(counts, &weights.device);
     Tensor::cat(vec![mean, attended, counts], 1)
 }
 
@@ -264,7 +249,7 @@ mod tests {
         let device = Device::flex();
         let weights = initial(1, &device);
         let mut stream = Stream::new(3, "columns");
-        let of = |groups: &[Group]| numbers(&outputs(&weights, groups, None, &device));
+        let of = |groups: &[Group]| numbers(&outputs(&weights, groups, None));
         let alone = Group {
             presses: vec![press(&mut stream)],
             references: Vec::new(),

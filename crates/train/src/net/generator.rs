@@ -57,23 +57,22 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
             .map(|_| stream.range(-limit, limit) as f32)
             .collect()
     };
-    let mut weights = Weights::default();
+    let mut weights = Weights::new(device);
     let width = FEATURES * FIRST_SIDE * FIRST_SIDE;
     let matrix = uniform(0, NOISE * width, INITIAL_LIMIT);
-    weights.add("linear.matrix", &[NOISE, width], matrix, device);
-    weights.add("linear.bias", &[width], vec![0.0; width], device);
-    weights.add("linear.gamma", &[width], vec![1.0; width], device);
-    weights.add("linear.beta", &[width], vec![0.0; width], device);
+    weights.add_dense("linear", [NOISE, width], matrix);
+    weights.add("linear.gamma", &[width], vec![1.0; width]);
+    weights.add("linear.beta", &[width], vec![0.0; width]);
     for ((name, layer), index) in LAYERS.into_iter().zip(1..) {
         let mut stream = stream.child(index);
-        add_convolution(&mut weights, name, layer, layer.inputs, &mut stream, device);
+        add_convolution(&mut weights, name, layer, layer.inputs, &mut stream);
     }
     let dims = [COMPONENTS, NOISE];
     let count = COMPONENTS * NOISE;
     // mu ~ U(-1, 1), sigma = 0.15.
     let mu = uniform(LAYERS.len() as u64 + 1, count, 1.0);
-    weights.add("mixture.mu", &dims, mu, device);
-    weights.add("mixture.sigma", &dims, vec![INITIAL_SIGMA; count], device);
+    weights.add("mixture.mu", &dims, mu);
+    weights.add("mixture.sigma", &dims, vec![INITIAL_SIGMA; count]);
     weights
 }
 
@@ -121,11 +120,12 @@ pub fn images(weights: &Weights, eta: Tensor<2>, normalisation: &mut Normalisati
 
 /// Mean and variance of each normalised layer over generated samples, in batches as in training.
 /// They are computed anew from the current weights (see [`crate::net::network`]).
-fn statistics(weights: &Weights, seed: u64, device: &Device) -> Statistics {
+fn statistics(weights: &Weights, seed: u64) -> Statistics {
     let stream = Stream::new(seed, "statistics of generated samples");
     let mut statistics = Statistics::default();
     for batch in 0..STATISTICS_BATCHES {
-        let eta = noise(SAMPLES_A_COMPONENT, &mut stream.child(batch), device);
+        let mut stream = stream.child(batch);
+        let eta = noise(SAMPLES_A_COMPONENT, &mut stream, &weights.device);
         let mut normalisation = Normalisation::Collect(&mut statistics);
         images(weights, eta, &mut normalisation);
     }
@@ -142,9 +142,8 @@ pub fn generate(
     (scale, sensor): (PixelScale, Sensor),
     samples_a_component: usize,
     (seed, stream): (u64, &mut Stream),
-    device: &Device,
 ) -> Vec<ModelFrame> {
-    let statistics = statistics(weights, seed, device);
+    let statistics = statistics(weights, seed);
     let mut of_component: Vec<Vec<ModelFrame>> = vec![Vec::new(); COMPONENTS];
     for round in 0..=DRAWN_AGAIN {
         let missing = of_component
@@ -153,7 +152,7 @@ pub fn generate(
         let mut left = missing.max().unwrap_or_default();
         while left > 0 {
             let samples = left.min(GENERATED_AT_ONCE);
-            let eta = noise(samples, stream, device);
+            let eta = noise(samples, stream, &weights.device);
             let images = images(weights, eta, &mut Normalisation::Fixed(&statistics));
             let frames = frames(&images, scale, sensor).into_iter().enumerate();
             for (place, frame) in frames {
@@ -201,7 +200,7 @@ mod tests {
     fn generated(weights: &Weights, samples: usize) -> Vec<ModelFrame> {
         let mut stream = Stream::new(1, "generated");
         let reading = (SCALE, Sensor::of(&[]));
-        generate(weights, reading, samples, (1, &mut stream), &Device::flex())
+        generate(weights, reading, samples, (1, &mut stream))
     }
 
     fn change(weights: &mut Weights, name: &str, with: fn(Tensor<1>) -> Tensor<1>) {
@@ -252,7 +251,7 @@ mod tests {
         change(own, "mixture.sigma", |sigma| sigma.ones_like());
         change(own, "deconv3.kernel", |kernel| kernel.mul_scalar(3.0));
         change(own, "deconv3.bias", |bias| bias.sub_scalar(3.4));
-        let statistics = statistics(&weights, 1, &device);
+        let statistics = statistics(&weights, 1);
         let eta = noise(4, &mut Stream::new(1, "drawn"), &device);
         let once = images(&weights, eta, &mut Normalisation::Fixed(&statistics));
         let once = frames(&once, SCALE, Sensor::of(&[]));

@@ -23,12 +23,12 @@ pub fn initial(
     device: &Device,
 ) -> Weights {
     let stream = Stream::new(seed, "hrn weights");
-    let mut weights = discriminator.map(without_head).unwrap_or_default();
+    let mut weights = discriminator.map_or_else(|| Weights::new(device), without_head);
     if discriminator.is_none() {
-        network::add_trunk(&mut weights, &stream, device);
+        network::add_trunk(&mut weights, &stream);
     }
     let features = if mean_pooling { 2 * FEATURES } else { FEATURES };
-    network::add_head(&mut weights, [features, levels], &stream, device);
+    network::add_head(&mut weights, [features, levels], &stream);
     weights
 }
 
@@ -40,7 +40,7 @@ fn without_head(discriminator: &Weights) -> Weights {
 }
 
 /// HRN from a discriminator whose first `levels` logits are the levels. Further logits are cut off.
-pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Weights {
+pub fn of_levels(discriminator: &Weights, levels: usize) -> Weights {
     let mut weights = without_head(discriminator);
     let outputs = discriminator.numbers("head.bias").len();
     for (name, dims) in [
@@ -49,7 +49,7 @@ pub fn of_levels(discriminator: &Weights, levels: usize, device: &Device) -> Wei
     ] {
         let rows = discriminator.numbers(name);
         let rows = rows.chunks(outputs).flat_map(|row| &row[..levels]);
-        weights.add(name, &dims, rows.copied().collect(), device);
+        weights.add(name, &dims, rows.copied().collect());
     }
     weights
 }

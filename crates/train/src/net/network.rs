@@ -70,22 +70,38 @@ pub struct Weight {
 }
 
 /// The weights of a network, in a fixed order.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Weights {
     /// The weights, in the order in which they were added.
     pub entries: Vec<Weight>,
+    /// The device that they are on.
+    pub device: Device,
 }
 
 impl Weights {
+    /// No weights on this device.
+    pub fn new(device: &Device) -> Self {
+        Self {
+            entries: Vec::new(),
+            device: device.clone(),
+        }
+    }
+
     /// Adds a weight from numbers.
-    pub fn add(&mut self, name: &str, dims: &[usize], values: Vec<f32>, device: &Device) {
+    pub fn add(&mut self, name: &str, dims: &[usize], values: Vec<f32>) {
         let length = values.len();
         debug_assert_eq!(dims.iter().product::<usize>(), length, "{name}");
         self.entries.push(Weight {
             name: name.to_owned(),
             dims: dims.to_vec(),
-            values: Tensor::from_data(TensorData::new(values, [length]), device),
+            values: Tensor::from_data(TensorData::new(values, [length]), &self.device),
         });
+    }
+
+    /// Adds a layer for [`dense`], of `[inputs, outputs]`, with a bias of 0.
+    pub fn add_dense(&mut self, name: &str, dims: [usize; 2], matrix: Vec<f32>) {
+        self.add(&format!("{name}.matrix"), &dims, matrix);
+        self.add(&format!("{name}.bias"), &dims[1..], vec![0.0; dims[1]]);
     }
 
     /// The weight called `name`, in its own shape.
@@ -130,6 +146,7 @@ impl Weights {
         };
         Self {
             entries: self.entries.iter().map(of).collect(),
+            device: self.device.clone(),
         }
     }
 
@@ -180,10 +197,9 @@ pub(super) fn add_convolution(
     layer: Convolution,
     channels: usize,
     stream: &mut Stream,
-    device: &Device,
 ) {
     let mut add = |part: &str, dims: &[usize], values: Vec<f32>| {
-        weights.add(&format!("{name}.{part}"), dims, values, device);
+        weights.add(&format!("{name}.{part}"), dims, values);
     };
     let dims = [layer.outputs, layer.inputs, layer.kernel, layer.kernel];
     let values = truncated_normal(dims.iter().product(), stream);
@@ -196,27 +212,22 @@ pub(super) fn add_convolution(
 }
 
 /// Adds the trunk's initial weights. Each layer draws from its own sub-stream.
-pub fn add_trunk(weights: &mut Weights, stream: &Stream, device: &Device) {
+pub fn add_trunk(weights: &mut Weights, stream: &Stream) {
     for (layer, index) in TRUNK.into_iter().zip(0..) {
-        let mut stream = stream.child(index);
-        add_convolution(
-            weights,
-            layer.name,
-            layer,
-            layer.outputs,
-            &mut stream,
-            device,
-        );
+        let stream = &mut stream.child(index);
+        add_convolution(weights, layer.name, layer, layer.outputs, stream);
     }
 }
 
 /// Adds the linear layer after the trunk, of `[features, outputs]`: L outputs for a recogniser, those
 /// of its game for a discriminator.
-pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream, device: &Device) {
-    let [features, outputs] = dims;
-    let values = truncated_normal(features * outputs, &mut stream.child(TRUNK.len() as u64));
-    weights.add("head.matrix", &dims, values, device);
-    weights.add("head.bias", &[outputs], vec![0.0; outputs], device);
+pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream) {
+    let mut stream = stream.child(TRUNK.len() as u64);
+    weights.add_dense(
+        "head",
+        dims,
+        truncated_normal(dims[0] * dims[1], &mut stream),
+    );
 }
 
 /// Mean and variance of every normalised layer's inputs, `[channels]` each: sums over batches, and the number of
