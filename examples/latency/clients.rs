@@ -1,6 +1,5 @@
 //! Clients: the events that they read, and how long after sending they read them.
 
-use std::fmt;
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
@@ -43,69 +42,45 @@ impl Received {
         }
     }
 
-    pub(crate) fn figures(&self, args: &Args, sent: &Sent) -> Figures {
+    /// The number of events, of lost ones, and quantiles of their delay.
+    pub(crate) fn figures(&self, args: &Args, sent: &Sent) -> String {
         let mut late = self.late.lock().unwrap_or_else(PoisonError::into_inner);
         late.sort_by(f32::total_cmp);
         let of = |share: f64| {
             let place = (share * late.len() as f64) as usize;
             late.get(place.min(late.len().saturating_sub(1))).copied()
         };
+        let [p50, p99, p999, most] =
+            [0.5, 0.99, 0.999, 1.0].map(|share| of(share).unwrap_or(f32::NAN));
         let expected = sent.count(args.event, self.since_ns.load(Relaxed)) * args.clients;
-        Figures {
-            events: late.len(),
-            lost: expected as i64 - late.len() as i64,
-            us: [0.5, 0.99, 0.999, 1.0].map(|share| of(share).unwrap_or(f32::NAN)),
-        }
-    }
-}
-
-/// The figures of a run.
-pub(crate) struct Figures {
-    events: usize,
-    lost: i64,
-    us: [f32; 4],
-}
-
-impl fmt::Display for Figures {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let [p50, p99, p999, most] = self.us;
-        let Self { events, lost, .. } = self;
-        write!(
-            out,
+        let (events, lost) = (late.len(), expected as i64 - late.len() as i64);
+        format!(
             "{events} events, {lost} lost; us p50 {p50:.0} p99 {p99:.0} p99.9 {p999:.0} max {most:.0}"
         )
     }
 }
 
 /// Reads until the server ends. Returns the problem, if there was one.
-pub(crate) fn listen(
+#[tokio::main(flavor = "current_thread")]
+pub(crate) async fn listen(
     args: &Args,
     place: &Result<u16, PathBuf>,
     sent: &Arc<Sent>,
     received: &Arc<Received>,
 ) -> Option<String> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build();
-    let runtime = match runtime {
-        Ok(runtime) => runtime,
-        Err(error) => return Some(error.to_string()),
-    };
-    runtime.block_on(async {
-        let mut clients = JoinSet::new();
-        for _ in 0..args.clients {
-            let (args, place) = (args.clone(), place.clone());
-            let (sent, received) = (Arc::clone(sent), Arc::clone(received));
-            clients.spawn(async move {
-                let stream = connect(&place).await?;
-                client(&args, stream, &sent, &received).await
-            });
-        }
-        let ends = clients.join_all().await;
-        let problems = ends.into_iter().filter_map(Result::err);
-        let mut problems = problems.filter(|end| end.kind() != io::ErrorKind::ConnectionReset);
-        problems.next().map(|problem| problem.to_string())
-    })
+    let mut clients = JoinSet::new();
+    for _ in 0..args.clients {
+        let (args, place) = (args.clone(), place.clone());
+        let (sent, received) = (Arc::clone(sent), Arc::clone(received));
+        clients.spawn(async move {
+            let stream = connect(&place).await?;
+            client(&args, stream, &sent, &received).await
+        });
+    }
+    let ends = clients.join_all().await;
+    let problems = ends.into_iter().filter_map(Result::err);
+    let mut problems = problems.filter(|end| end.kind() != io::ErrorKind::ConnectionReset);
+    problems.next().map(|problem| problem.to_string())
 }
 
 trait Duplex: AsyncRead + AsyncWrite + Send + Unpin {}

@@ -113,7 +113,10 @@ fn measure(args: &Args) -> Result<(), Failure> {
     let sensors = Sensors::plug(args, length)?;
     let devices = sensors.devices();
     let server = Server::start(args, &devices)?;
-    let (received, sent) = (Arc::new(clients::Received::default()), sensors.sent());
+    let (received, sent) = (
+        Arc::new(clients::Received::default()),
+        Arc::clone(&sensors.sent),
+    );
     let listeners = thread::spawn({
         let (args, place) = (args.clone(), server.place.clone());
         let (sent, received) = (Arc::clone(&sent), Arc::clone(&received));

@@ -69,10 +69,8 @@ pub(crate) fn now_ns() -> u64 {
 
 pub(crate) struct Sensors {
     pairs: Vec<Pair>,
-    sent: Arc<Sent>,
-    side: usize,
-    rate: f64,
-    kind: Kind,
+    pub(crate) sent: Arc<Sent>,
+    args: Args,
 }
 
 impl Sensors {
@@ -83,9 +81,7 @@ impl Sensors {
         Ok(Self {
             pairs: pairs?,
             sent: Arc::new(Sent((0..args.sensors).map(|_| list()).collect())),
-            side: args.side,
-            rate: args.rate,
-            kind: args.server,
+            args: args.clone(),
         })
     }
 
@@ -93,25 +89,22 @@ impl Sensors {
         self.pairs.iter().map(|pair| pair.path.clone()).collect()
     }
 
-    pub(crate) fn sent(&self) -> Arc<Sent> {
-        Arc::clone(&self.sent)
-    }
-
     /// Sends for `length`. Returns the largest delay of a frame.
     pub(crate) fn play(self, length: Duration) -> Result<(Self, Duration), Failure> {
+        let side = self.args.side;
         let layout = Layout::new(&Settings {
-            rows: Some(self.side),
-            cols: Some(self.side),
+            rows: Some(side),
+            cols: Some(side),
             ..Settings::default()
         })?;
         // All sensors send the same frames.
         let [mut rest, mut loaded] = [false, true].map(|is_loaded| {
             let mut bytes = Vec::new();
-            layout.encode(&frame(self.side, is_loaded), &mut bytes);
+            layout.encode(&frame(side, is_loaded), &mut bytes);
             bytes
         });
         let start = Instant::now();
-        let period = Duration::from_secs_f64(1.0 / self.rate);
+        let period = Duration::from_secs_f64(1.0 / self.args.rate);
         let count = self.pairs.len();
         let mut latest = Duration::ZERO;
         for number in 0.. {
@@ -119,7 +112,7 @@ impl Sensors {
             if due >= start + length {
                 break;
             }
-            if self.kind == Kind::Gpsd {
+            if self.args.server == Kind::Gpsd {
                 [rest, loaded] = [(); 2].map(|()| sentences(number).into_bytes());
             }
             for (sensor, pair) in self.pairs.iter().enumerate() {

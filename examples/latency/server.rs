@@ -81,9 +81,8 @@ impl Server {
 
     pub(crate) fn anonymous_kb(&self) -> Result<u64, Failure> {
         let status = fs::read_to_string(self.proc("status"))?;
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("RssAnon:"));
+        let mut lines = status.lines();
+        let line = lines.find_map(|line| line.strip_prefix("RssAnon:"));
         let number = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
         Ok(number.ok_or("no RssAnon in /proc")?)
     }
