@@ -28,9 +28,8 @@ use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
-use crate::run::disk::{lock, refuse_foreign, write_whole};
+use crate::run::disk::{load, lock, refuse_foreign, write_whole};
 use crate::settings::Profile;
-use hardnessd_core::trial;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
 use sets::{FRESH_OBJECTS, TestSet};
@@ -240,11 +239,9 @@ struct Judged {
 
 /// Judges a run that is done on every set.
 fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
-    let path = run.join("hrn.onnx");
     let description = Run::description_at(run)?;
     let description = description.with_context(|| format!("{}: no run", run.display()))?;
-    let bytes = fs::read(&path).with_context(|| path.display().to_string())?;
-    let hrn = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
+    let (hrn, _) = load(&run.join("hrn.onnx"))?;
     let (steps, seconds) = Run::cost(run)?;
     let name = run.file_name().unwrap_or_default().to_string_lossy();
     let mut entry = json!({

@@ -8,6 +8,8 @@ use std::path::Path;
 use anyhow::{Context as _, bail};
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::part::Part;
+use hardnessd_core::trial;
+use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
 use rustix::fs::FlockOperation;
 
 use crate::exit::{coded, unreadable};
@@ -37,6 +39,17 @@ pub fn read(path: &Path, most: usize) -> anyhow::Result<Vec<u8>> {
     let read = opened.and_then(|mut file| file.read_to_end(&mut bytes));
     read.map_err(|error| unreadable(path, &error))?;
     Ok(bytes)
+}
+
+/// Reads a model and the bytes of its file, once: the file may be a pipe.
+///
+/// # Errors
+///
+/// Returns an error with an exit code of its own if the file cannot be read, or is no model that the daemon takes.
+pub fn load(path: &Path) -> anyhow::Result<(Model, Vec<u8>)> {
+    let bytes = read(path, MAX_FILE_BYTES)?;
+    let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
+    Ok((model, bytes))
 }
 
 /// Reads settings or a configuration of the command line.

@@ -13,9 +13,7 @@ use crate::data::source::Source;
 use crate::net::course;
 use crate::net::network::Weights;
 use crate::net::standard::Standard;
-use crate::run::disk::read;
-use hardnessd_core::trial;
-use hardnessd_core::verdict::MAX_FILE_BYTES;
+use crate::run::disk::load;
 
 /// What a training takes of a model.
 #[derive(Debug)]
@@ -36,9 +34,8 @@ impl Start {
     /// Fails if the file cannot be read, is no model that the daemon takes, or has another network than the
     /// method `course` of this revision.
     pub fn read(path: &Path, device: &Device) -> anyhow::Result<Self> {
-        let bytes = read(path, MAX_FILE_BYTES)?;
+        let (_, bytes) = load(path)?;
         let shown = || path.display().to_string();
-        trial::load(&bytes, None).with_context(shown)?;
         let model = pb::ModelProto::decode(bytes.as_slice()).with_context(shown)?;
         let exported = model
             .graph

@@ -4,9 +4,6 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use hardnessd_core::part::Part;
-use hardnessd_core::trial;
-use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
-use hrn_train::run::disk::read;
 
 /// Refuses an output that is there already or cannot be made, before the work for it.
 pub(super) fn check_new(path: &Path) -> anyhow::Result<()> {
@@ -18,11 +15,4 @@ pub(super) fn check_new(path: &Path) -> anyhow::Result<()> {
 pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let written = Part::new(path).and_then(|part| part.write(bytes));
     written.with_context(|| path.display().to_string())
-}
-
-/// A model and the bytes of its file, read once: the file may be a pipe.
-pub(super) fn load(path: &Path) -> anyhow::Result<(Model, Vec<u8>)> {
-    let bytes = read(path, MAX_FILE_BYTES)?;
-    let model = trial::load(&bytes, None).with_context(|| path.display().to_string())?;
-    Ok((model, bytes))
 }

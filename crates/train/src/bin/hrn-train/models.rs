@@ -10,11 +10,11 @@ use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
 use hrn_train::model::verdicts;
-use hrn_train::run::disk::read;
+use hrn_train::run::disk::{load, read};
 
 use super::account;
 use super::arguments::Evaluate;
-use super::files::{check_new, load, write};
+use super::files::{check_new, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let models = arguments.model.iter().map(|path| Ok(load(path)?.0));
