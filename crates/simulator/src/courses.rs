@@ -21,11 +21,6 @@ use hardnessd_core::press::thinned;
 use hardnessd_core::verdict::{COURSE_FRAMES, Piece, Resampling};
 
 impl CourseSettings {
-    fn has_broad_sensors(&self) -> bool {
-        let designs = self.sensors.map(|sensors| sensors.designs);
-        designs == Some(SensorDesigns::Broad)
-    }
-
     /// The share of the objects that have flat faces whatever the shapes. The paper's shapes tell the
     /// level, and flat ones are flat.
     pub(super) fn flat_share(&self) -> f64 {
@@ -118,7 +113,8 @@ impl Plan {
         let posture = stream.below(POSTURES);
         let lowest = f64::from(settings.objects.lowest_force_n);
         // Many sensors meet great forces, too, but most presses are gentle.
-        let is_broad = settings.has_broad_sensors();
+        let designs = settings.sensors.map(|sensors| sensors.designs);
+        let is_broad = designs == Some(SensorDesigns::Broad);
         let highest = if is_broad {
             BROAD_FORCE_N
         } else {

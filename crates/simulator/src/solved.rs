@@ -68,7 +68,7 @@ impl SolvedPress {
         let (mut window, _, _) = bench.press(specimen, force_n, 1.0, hold_s);
         loop {
             let mut run = Run::new(bench, specimen, arm, window);
-            run.load(force_n);
+            run.step_to_forces(run.levels(force_n), 1.0);
             let motion = Motion {
                 top_mm: run.last().travel_mm,
                 load_s: run.last().time_s,
@@ -173,10 +173,6 @@ impl<'a> Run<'a> {
             false => LEVELS,
         };
         (1..=count).map(move |level| top_n * (f64::from(level) / f64::from(count)).powf(SPACING))
-    }
-
-    fn load(&mut self, force_n: f64) {
-        self.step_to_forces(self.levels(force_n), 1.0);
     }
 
     fn unload(&mut self) {

@@ -155,7 +155,8 @@ pub fn recordings(
 /// A data set under construction.
 #[derive(Debug, Default)]
 pub struct Collection {
-    presses: Presses,
+    /// The presses so far.
+    pub presses: Presses,
     /// What an earlier data set says of itself.
     meta: Map<String, Value>,
     /// The names of the materials and of the sensors, by number.
@@ -213,17 +214,6 @@ impl Collection {
             meta: meta.as_object().cloned().unwrap_or_default(),
             ..Self::default()
         })
-    }
-
-    /// The presses so far.
-    pub fn presses(&self) -> &Presses {
-        &self.presses
-    }
-
-    /// The levels that an earlier data set names.
-    pub fn stated_levels(&self) -> Option<Vec<Level>> {
-        let mut sources = self.presses.sources.iter();
-        sources.find_map(|source| source.levels.clone())
     }
 
     /// Adds the presses of a recording, or nothing.

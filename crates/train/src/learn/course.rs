@@ -47,15 +47,6 @@ impl Felt {
     pub fn features(&self) -> [f32; FEATURES] {
         features::of_press(&self.moments, self.arm_n_per_mm)
     }
-
-    /// The press as a robot gives it that reports nothing of its arm.
-    #[must_use]
-    pub fn without_arm(mut self) -> Self {
-        self.arm_n_per_mm = 0.0;
-        let moments = self.moments.iter_mut();
-        moments.for_each(|moment| moment.approach_mm = None);
-        self
-    }
 }
 
 /// The network, and what it learns from.

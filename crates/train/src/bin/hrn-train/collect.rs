@@ -27,7 +27,8 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         Some(earlier) => Collection::of(earlier, layout)?,
         None => Collection::default(),
     };
-    let stated = collection.stated_levels();
+    let mut sources = collection.presses.sources.iter();
+    let stated = sources.find_map(|source| source.levels.clone());
     if let (Some(stated), Some(levels)) = (&stated, &levels) {
         ensure!(
             stated == levels,
@@ -44,7 +45,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         is_one_object: true,
         split: arguments.split,
     };
-    let before = collection.presses().all.len();
+    let before = collection.presses.all.len();
     let skips = arguments.skip_unusable;
     let add = |recording| collection.add(recording, &settings);
     let used = collect::recordings(&captures, &sensor, layout, skips, add)?;
@@ -58,7 +59,7 @@ pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
         Ok(part.finish()?)
     };
     written().with_context(|| out.display().to_string())?;
-    let presses = collection.presses();
+    let presses = &collection.presses;
     let all = presses.all.len();
     let known = (before..all).filter(|&press| presses.is_known(press));
     Ok(format!(

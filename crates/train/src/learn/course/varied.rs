@@ -28,7 +28,10 @@ impl ArmReports {
             press.moments.truncate(frames);
         }
         if stream.uniform() < self.unknown {
-            return press.without_arm();
+            press.arm_n_per_mm = 0.0;
+            let moments = press.moments.iter_mut();
+            moments.for_each(|moment| moment.approach_mm = None);
+            return press;
         }
         if stream.uniform() < self.unknown_arm {
             press.arm_n_per_mm = 0.0;
