@@ -107,10 +107,8 @@ impl Solver {
         start(problem, total, pressure_mpa);
         // The preconditioner uses the kernel's value at a wavelength of 16 cells.
         let padded = 2 * self.convolver.width;
-        let block = problem
-            .block
-            .as_ref()
-            .map_or(0.0, |block| block.spectrum[padded / 16]);
+        let block = problem.block.as_ref();
+        let block = block.map_or(0.0, |block| block.spectrum[padded / 16]);
         let elastic = (problem.spectrum[padded / 16] + block) * (padded * padded) as f32;
         let mut contact = Contact {
             approach_mm: 0.0,

@@ -216,10 +216,8 @@ impl Specimen {
             }
         }
         let extent = (last.0 - first.0).max(last.1 - first.1) + 1 + 2 * MARGIN;
-        let width = WIDTHS
-            .into_iter()
-            .find(|&width| width >= extent.max(least_width))
-            .unwrap_or(CELLS);
+        let fits = |&width: &usize| width >= extent.max(least_width);
+        let width = WIDTHS.into_iter().find(fits).unwrap_or(CELLS);
         let corner = |first: usize, last: usize| {
             ((first + last).div_ceil(2))
                 .saturating_sub(width / 2)
@@ -319,10 +317,8 @@ impl Bench {
         let mut window = specimen.window_around(depth_mm, 0);
         loop {
             let gap = specimen.gap_on(window);
-            let mut pressure: Vec<f32> = gap
-                .iter()
-                .map(|&gap| (depth_mm as f32 - gap).max(0.0))
-                .collect();
+            let guess = |&gap: &f32| (depth_mm as f32 - gap).max(0.0);
+            let mut pressure: Vec<f32> = gap.iter().map(guess).collect();
             // Under a linear ramp, the mean age of the load is half the ramp. Flow with the fourth
             // power of the pressure counts a fifth of the ramp.
             let factor = specimen.substance.compliance_ratio(hold_s + 0.5 * ramp_s);

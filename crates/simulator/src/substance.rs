@@ -68,10 +68,8 @@ impl Substance {
     /// The creep compliance over its instantaneous value: J(t) / J0 = 1 + sum j
     /// (1 - exp(-t / tau)).
     pub(super) fn compliance_ratio(&self, time_s: f64) -> f64 {
-        1.0 + self
-            .creep()
-            .map(|c| c.j * -(-time_s / c.tau_s).exp_m1())
-            .sum::<f64>()
+        let terms = self.creep().map(|c| c.j * -(-time_s / c.tau_s).exp_m1());
+        1.0 + terms.sum::<f64>()
     }
 
     /// The base and the height in mm of the layer that bears a load, for an object `height_mm`

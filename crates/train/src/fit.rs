@@ -210,10 +210,7 @@ fn read(
             "{unlabelled} recordings are left out, because nothing says what was pressed: give them a label `level`"
         ));
     }
-    let unnumbered = played
-        .iter()
-        .filter(|recording| recording.is_unnumbered())
-        .count();
+    let unnumbered = played.iter().filter(|of| of.is_unnumbered()).count();
     if unnumbered > 0 {
         doubtful.push(format!(
             "{unnumbered} recordings have no label `object`, and each counts as an object of its own: if two are of one \
@@ -296,10 +293,8 @@ fn whole(presses: &Presses, places: &[usize]) -> Vec<usize> {
 fn check(presses: &Presses, places: &[usize]) -> anyhow::Result<()> {
     let [least_objects, least_presses] = LEAST;
     let objects = presses.by_object(places);
-    let enough = objects
-        .values()
-        .filter(|own| own.len() >= least_presses)
-        .count();
+    let enough = objects.values().filter(|own| own.len() >= least_presses);
+    let enough = enough.count();
     ensure!(
         enough >= least_objects,
         "found {} labelled presses of {} objects, {enough} of them with {least_presses} presses or more; expected \

@@ -238,17 +238,12 @@ pub fn without_copies(presses: &Presses, places: &[usize]) -> Vec<usize> {
 /// The press as its reader would find it.
 fn named(presses: &Presses, place: usize) -> String {
     let press = &presses.all[place];
+    let source = presses.sources.get(press.source);
+    let source = source.map_or("", |one| &one.name);
     let object = press.object.map(|object| format!(" of object {object}"));
     let name = press.name.as_ref().map(|name| format!(" ({name})"));
-    format!(
-        "press {place} of {}{}{}",
-        presses
-            .sources
-            .get(press.source)
-            .map_or("", |one| &one.name),
-        object.unwrap_or_default(),
-        name.unwrap_or_default()
-    )
+    let (object, name) = (object.unwrap_or_default(), name.unwrap_or_default());
+    format!("press {place} of {source}{object}{name}")
 }
 
 /// Why the forces cannot be newtons, if they cannot.

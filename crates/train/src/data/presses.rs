@@ -265,21 +265,17 @@ impl Presses {
 
     /// The files, for an error.
     pub fn shown_paths(&self) -> String {
-        let paths = self
-            .sources
-            .iter()
-            .map(|one| one.path.display().to_string());
-        paths.collect::<Vec<_>>().join(", ")
+        let paths = self.sources.iter().map(|one| one.path.display());
+        let paths: Vec<String> = paths.map(|path| path.to_string()).collect();
+        paths.join(", ")
     }
 
     /// The levels that a model of these presses states: those of the first file that states some, otherwise
     /// the paper's.
     pub fn levels(&self) -> Vec<Level> {
-        let mut stated = self
-            .sources
-            .iter()
-            .filter_map(|source| source.levels.clone());
-        stated.next().unwrap_or_else(papers_levels)
+        let mut sources = self.sources.iter();
+        let stated = sources.find_map(|source| source.levels.clone());
+        stated.unwrap_or_else(papers_levels)
     }
 
     /// Distance between the taxels of the sensors that were pressed, in mm.
@@ -290,10 +286,7 @@ impl Presses {
     /// The least and the greatest distance between the taxels of the sensors of some presses, if these
     /// differ.
     pub fn pitches_mm(&self, presses: &[usize]) -> Option<[f64; 2]> {
-        let used: BTreeSet<usize> = presses
-            .iter()
-            .map(|&press| self.all[press].source)
-            .collect();
+        let used: BTreeSet<usize> = self.of(presses).map(|press| press.source).collect();
         let used: Vec<&Source> = used.into_iter().map(|place| &self.sources[place]).collect();
         used.iter().find(|source| source.pitches_mm.is_some())?;
         let of = |source: &Source| source.pitches_mm.unwrap_or([source.pitch(); 2]);

@@ -7,11 +7,8 @@ fn total(confusion: &[Vec<u64>]) -> f64 {
 
 /// Eq. (12): `P_overall = Z / N`.
 pub fn accuracy(confusion: &[Vec<u64>]) -> f64 {
-    let right: u64 = confusion
-        .iter()
-        .enumerate()
-        .map(|(level, row)| row[level])
-        .sum();
+    let rows = confusion.iter().enumerate();
+    let right: u64 = rows.map(|(level, row)| row[level]).sum();
     right as f64 / total(confusion)
 }
 
@@ -29,13 +26,10 @@ pub fn category_accuracy(confusion: &[Vec<u64>]) -> Vec<Option<f64>> {
 fn weighted_kappa(confusion: &[Vec<u64>], weight: impl Fn(usize, usize) -> f64) -> Option<f64> {
     let n = total(confusion);
     let levels = confusion.len();
-    let rows: Vec<f64> = confusion
-        .iter()
-        .map(|row| row.iter().sum::<u64>() as f64)
-        .collect();
-    let columns: Vec<f64> = (0..levels)
-        .map(|w| confusion.iter().map(|row| row[w]).sum::<u64>() as f64)
-        .collect();
+    let of_row = |row: &Vec<u64>| row.iter().sum::<u64>() as f64;
+    let rows: Vec<f64> = confusion.iter().map(of_row).collect();
+    let of_column = |w: usize| confusion.iter().map(|row| row[w]).sum::<u64>() as f64;
+    let columns: Vec<f64> = (0..levels).map(of_column).collect();
     let (mut observed, mut expected) = (0.0, 0.0);
     for h in 0..levels {
         for w in 0..levels {

@@ -127,10 +127,8 @@ impl Calibration {
         };
         let mut of_levels = BTreeMap::<usize, BTreeSet<u64>>::new();
         for judged in all() {
-            of_levels
-                .entry(judged.level)
-                .or_default()
-                .insert(judged.unit);
+            let units = of_levels.entry(judged.level).or_default();
+            units.insert(judged.unit);
         }
         let fewest = of_levels.values().map(BTreeSet::len).min();
         let units: BTreeSet<u64> = all().map(|judged| judged.unit).collect();
@@ -255,10 +253,8 @@ fn by_unit(judged: &[Judged], value: impl Fn(&Judged) -> Option<f32>) -> Vec<Vec
     for judged in judged {
         units.entry(judged.unit).or_default().extend(value(judged));
     }
-    units
-        .into_values()
-        .filter(|values| !values.is_empty())
-        .collect()
+    units.retain(|_, values| !values.is_empty());
+    units.into_values().collect()
 }
 
 /// The split-conformal quantile of 1 - [`ALPHA`] for exchangeable units: with one press of each of n
@@ -271,10 +267,8 @@ fn quantile(units: &[Vec<f32>], stream: &mut Stream) -> Option<f32> {
     }
     let mut sum = 0.0;
     for _ in 0..DRAWS {
-        let mut drawn: Vec<f32> = units
-            .iter()
-            .map(|own| own[stream.below(own.len())])
-            .collect();
+        let drawn = units.iter().map(|own| own[stream.below(own.len())]);
+        let mut drawn: Vec<f32> = drawn.collect();
         drawn.sort_by(f32::total_cmp);
         sum += drawn[rank - 1];
     }

@@ -34,10 +34,8 @@ impl Stage<'_> {
         presses: &[usize],
         mut change: impl FnMut(ModelFrame) -> ModelFrame,
     ) -> Tensor<4> {
-        let frames = presses
-            .iter()
-            .map(|&press| change(self.presses.frame(press)));
-        let frames: Vec<ModelFrame> = frames.collect();
+        let frame = |&press: &usize| change(self.presses.frame(press));
+        let frames: Vec<ModelFrame> = presses.iter().map(frame).collect();
         self.scale().images(frames.iter(), self.device)
     }
 

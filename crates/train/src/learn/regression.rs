@@ -86,12 +86,8 @@ impl<'a> Regression<'a> {
     /// A regression in a stage, which gets its name and its settings.
     pub fn new(stage: Stage<'a>, seen: Seen) -> Self {
         let presses = stage.presses;
-        let rows = stage
-            .parts
-            .train
-            .iter()
-            .map(|&press| seen.of(presses, press));
-        let rows: Vec<Vec<f32>> = rows.collect();
+        let row = |&press: &usize| seen.of(presses, press);
+        let rows: Vec<Vec<f32>> = stage.parts.train.iter().map(row).collect();
         let mut standard = Standard::of(seen.columns(), rows.iter().map(Vec::as_slice));
         // A frame alone says nothing of time. What the features of time are then, a whole press does not repeat.
         let known = match presses.are_over_time() {
@@ -195,13 +191,10 @@ impl Learning for Regression<'_> {
         let samples = self.samples();
         let fitted = samples.fit();
         let weights = self.weights(&fitted);
-        let question = Question::alone(&self.on.parts.train);
+        let Stage { presses, parts, .. } = &self.on;
+        let question = Question::alone(&parts.train);
         let judged = self.judge(slice::from_ref(&weights), &[question], None);
-        let levels = self
-            .on
-            .presses
-            .of(&self.on.parts.train)
-            .map(|press| press.level);
+        let levels = presses.of(&parts.train).map(|press| press.level);
         sides[0].weights = weights;
         Taken {
             loss: samples.loss(&fitted).0,
@@ -222,10 +215,8 @@ impl Learning for Regression<'_> {
         let shape = [rows.len() / columns, columns];
         let rows = Tensor::from_data(TensorData::new(rows, shape), self.on.device);
         let logits = numbers(&dense(&weights[0], "levels", rows));
-        logits
-            .chunks(self.on.levels())
-            .map(<[f32]>::to_vec)
-            .collect()
+        let rows = logits.chunks(self.on.levels());
+        rows.map(<[f32]>::to_vec).collect()
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {
@@ -291,11 +282,8 @@ impl Samples {
                 1.0
             };
             let taken = (0..40).find_map(|_| {
-                let next: Vec<f64> = x
-                    .iter()
-                    .zip(&direction)
-                    .map(|(x, d)| x + share * d)
-                    .collect();
+                let next = x.iter().zip(&direction).map(|(x, d)| x + share * d);
+                let next: Vec<f64> = next.collect();
                 let (found, of_next) = self.loss(&next);
                 let is_enough = found <= loss + 1e-4 * share * slope;
                 share /= 2.0;

@@ -71,10 +71,8 @@ fn part(borders: &Borders, bin: usize, level: usize) -> f32 {
 pub fn loss(outputs: Tensor<2>, labels: &[Label], parts: &Tensor<2>) -> (Tensor<1>, Vec<f32>) {
     let (count, [_, levels]) = (labels.len(), parts.dims());
     let device = outputs.device();
-    let readings: Vec<f32> = labels
-        .iter()
-        .flat_map(|&(_, shore)| reading(shore))
-        .collect();
+    let readings = labels.iter().flat_map(|&(_, shore)| reading(shore));
+    let readings: Vec<f32> = readings.collect();
     let readings = Tensor::<2>::from_data(TensorData::new(readings, [count, BINS]), &device);
     let is_level = targets(labels.iter().map(|&(level, _)| level), levels, &device);
 

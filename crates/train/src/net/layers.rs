@@ -206,11 +206,8 @@ impl<C: CheckpointStrategy> Layers for Autodiff<Flex, C> {
         let [(x, of_x), (a, of_a), (b, of_b)] = [x, a, b].map(FloatTensor::<Self>::into_parts);
         let kept = operation.kept([x, a, b]);
         let output = operation.output(kept.clone());
-        match Step
-            .prepare::<C>([of_x, of_a, of_b])
-            .compute_bound()
-            .stateful()
-        {
+        let step = Step.prepare::<C>([of_x, of_a, of_b]);
+        match step.compute_bound().stateful() {
             OpsKind::Tracked(step) => step.finish((operation, kept), output),
             OpsKind::UnTracked(step) => step.finish(output),
         }

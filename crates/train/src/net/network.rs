@@ -112,11 +112,8 @@ impl Weights {
     /// themselves.
     pub fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
         let weight = self.entry(name);
-        let dims: [usize; D] = weight
-            .dims
-            .as_slice()
-            .try_into()
-            .expect("a network knows its weights' axes");
+        let dims = <[usize; D]>::try_from(weight.dims.as_slice());
+        let dims = dims.expect("a network knows its weights' axes");
         weight.values.clone().reshape(dims)
     }
 
@@ -131,10 +128,8 @@ impl Weights {
     }
 
     fn entry(&self, name: &str) -> &Weight {
-        self.entries
-            .iter()
-            .find(|weight| weight.name == name)
-            .expect("a network asks for weights that it made")
+        let named = self.entries.iter().find(|weight| weight.name == name);
+        named.expect("a network asks for weights that it made")
     }
 
     /// The same weights with other numbers.
@@ -159,10 +154,8 @@ impl Weights {
 
 /// A tensor as numbers, row-major.
 pub fn numbers<const D: usize>(tensor: &Tensor<D>) -> Vec<f32> {
-    tensor
-        .to_data()
-        .try_to_vec::<f32>()
-        .expect("all our tensors are of f32")
+    let numbers = tensor.to_data().try_to_vec::<f32>();
+    numbers.expect("all our tensors are of f32")
 }
 
 /// Levels 1..=L as rows with a 1 at the level: `[batch, L]`.

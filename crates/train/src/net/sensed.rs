@@ -29,8 +29,7 @@ pub struct Sensor {
 impl Sensor {
     /// Reads step, threshold and greatest force off the frames of a sensor.
     pub fn of(frames: &[&ModelFrame]) -> Self {
-        let pressed =
-            |frame: &&ModelFrame| frame.newtons.into_iter().filter(|newtons| *newtons > 0.0);
+        let pressed = |of: &&ModelFrame| of.newtons.into_iter().filter(|newtons| *newtons > 0.0);
         let all = || frames.iter().flat_map(pressed);
         let (Some(threshold_n), Some(most_n)) = (all().reduce(f32::min), all().reduce(f32::max))
         else {
@@ -41,12 +40,8 @@ impl Sensor {
             };
         };
         let every = frames.len().div_ceil(FRAMES);
-        let values: BTreeSet<u32> = frames
-            .iter()
-            .step_by(every)
-            .flat_map(pressed)
-            .map(f32::to_bits)
-            .collect();
+        let values = frames.iter().step_by(every).flat_map(pressed);
+        let values: BTreeSet<u32> = values.map(f32::to_bits).collect();
         // The bits of positive numbers have the same order as the numbers.
         let values: Vec<f32> = values.into_iter().map(f32::from_bits).collect();
         let apart = values.windows(2).map(|pair| pair[1] - pair[0]);
@@ -89,10 +84,8 @@ impl Sensor {
         let dims = images.dims();
         let device = images.device();
         let given = images.clone().inner();
-        let change: Vec<f32> = numbers(&given)
-            .into_iter()
-            .map(|pixel| scale.pixel(self.newtons(scale.newtons(pixel))) - pixel)
-            .collect();
+        let change = |pixel| scale.pixel(self.newtons(scale.newtons(pixel))) - pixel;
+        let change: Vec<f32> = numbers(&given).into_iter().map(change).collect();
         let change = Tensor::<4>::from_data(TensorData::new(change, dims), &device.inner());
         images.add(Tensor::from_inner(change))
     }

@@ -36,13 +36,11 @@ impl Standard {
                 *sum += (f64::from(x) - mean).powi(2) / count;
             }
         }
+        // The lower limit avoids a division by 0 for a column that never varies.
+        let deviation = variance.iter().map(|v| v.sqrt().max(LEAST) as f32);
         Self {
             mean: mean.iter().map(|&mean| mean as f32).collect(),
-            // The lower limit avoids a division by 0 for a column that never varies.
-            deviation: variance
-                .iter()
-                .map(|v| v.sqrt().max(LEAST) as f32)
-                .collect(),
+            deviation: deviation.collect(),
         }
     }
 

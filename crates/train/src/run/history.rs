@@ -63,17 +63,12 @@ impl Metrics {
             is_whole && (cells[0] != stage || cells[1].parse::<u64>().is_ok_and(|of| of <= step))
         };
         let rows = before.lines().skip(1).filter(is_kept);
-        let text: String = [COLUMNS]
-            .into_iter()
-            .chain(rows)
-            .flat_map(|row| [row, "\n"])
-            .collect();
+        let rows = [COLUMNS].into_iter().chain(rows);
+        let text: String = rows.flat_map(|row| [row, "\n"]).collect();
         write_whole(path, text.as_bytes())?;
+        let file = File::options().append(true).open(path);
         Ok(Self {
-            file: File::options()
-                .append(true)
-                .open(path)
-                .with_context(context)?,
+            file: file.with_context(context)?,
             stage: stage.to_owned(),
         })
     }

@@ -21,11 +21,8 @@ const LISTED: usize = 20;
 pub(super) fn fit(arguments: &Fit) -> anyhow::Result<String> {
     let (sensor, levels) = described(arguments.config.as_deref())?;
     let out = arguments.out.display();
-    if arguments
-        .out
-        .extension()
-        .is_none_or(|ending| ending != "onnx")
-    {
+    let ending = arguments.out.extension();
+    if ending.is_none_or(|ending| ending != "onnx") {
         let text = format!("--out: found {out}, expected a name that ends with .onnx");
         return Err(coded(USAGE, text));
     }
@@ -102,21 +99,21 @@ fn of_levels(levels: &[Level]) -> anyhow::Result<String> {
 fn of_report(report: &Report) -> String {
     let mut text = format!("{} presses\n", report.presses);
     for of in &report.levels {
-        let (level, objects) = (&of.level, of.objects);
-        let _ = writeln!(
-            text,
-            "  level {} {} ({}): {} presses of {objects} object{}",
-            level.level,
-            level.label,
-            level.shore,
-            of.presses,
-            if objects == 1 { "" } else { "s" }
-        );
+        let (
+            Level {
+                level,
+                label,
+                shore,
+            },
+            presses,
+        ) = (&of.level, of.presses);
+        let objects = match of.objects {
+            1 => "1 object".to_owned(),
+            count => format!("{count} objects"),
+        };
+        text += &format!("  level {level} {label} ({shore}): {presses} presses of {objects}\n");
     }
-    let _ = writeln!(
-        text,
-        "\nbalanced accuracy (95 %)      on new objects           on later presses"
-    );
+    text += "\nbalanced accuracy (95 %)      on new objects           on later presses\n";
     for row in report.candidates.iter().chain(&report.controls) {
         text += &of_row(row);
     }
@@ -131,11 +128,8 @@ fn of_report(report: &Report) -> String {
             let _ = writeln!(text, "  {:<16}{counts}", of.level.label);
         }
         for wrong in report.wrong.iter().take(LISTED) {
-            let _ = writeln!(
-                text,
-                "  wrong: {} is {}, {best} says {}",
-                wrong.press, wrong.level, wrong.said
-            );
+            let (press, level, said) = (&wrong.press, &wrong.level, &wrong.said);
+            text += &format!("  wrong: {press} is {level}, {best} says {said}\n");
         }
         if report.wrong.len() > LISTED {
             let more = report.wrong.len() - LISTED;

@@ -195,11 +195,8 @@ impl<'a> Lots<'a> {
                 if stream.uniform() < FORM {
                     let count = 1 + stream.below(MOST_RIGID);
                     for &place in shuffled(&mut form.clone(), count, stream) {
-                        references.extend(
-                            self.presses.all[place]
-                                .reference
-                                .map(|piece| (place, piece)),
-                        );
+                        let piece = self.presses.all[place].reference;
+                        references.extend(piece.map(|piece| (place, piece)));
                     }
                 }
             }
@@ -234,10 +231,9 @@ impl<'a> Lots<'a> {
             of_level.push(place);
         }
         // The cube of an exponential variate is at times far above its mean.
-        let mut weighed: Vec<(f64, Vec<usize>)> = of_level
-            .into_values()
-            .map(|places| ((-stream.uniform().max(1e-12).ln()).powi(3), places))
-            .collect();
+        let mut weight = || (-stream.uniform().max(1e-12).ln()).powi(3);
+        let weighed = of_level.into_values().map(|places| (weight(), places));
+        let mut weighed: Vec<(f64, Vec<usize>)> = weighed.collect();
         let mut chosen = Vec::new();
         while chosen.len() < count && !weighed.is_empty() {
             let mut at = stream.uniform() * weighed.iter().map(|(weight, _)| weight).sum::<f64>();

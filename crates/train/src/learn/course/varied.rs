@@ -44,11 +44,9 @@ impl ArmReports {
         let late_frames = off(self.clock_frames);
         press.arm_n_per_mm *= arm as f32;
         let late_s = (late_frames * press.period_s()) as f32;
-        let reported: Vec<(f32, f32)> = press
-            .moments
-            .iter()
-            .filter_map(|moment| Some((moment.time_s, moment.approach_mm?)))
-            .collect();
+        let reported = press.moments.iter();
+        let reported = reported.filter_map(|of| Some((of.time_s, of.approach_mm?)));
+        let reported: Vec<(f32, f32)> = reported.collect();
         let Some(begin) = reported.first().map(|_| at(&reported, late_s)) else {
             return press;
         };
@@ -92,10 +90,8 @@ impl Felt {
 
     /// The shortest time between two frames of the press, at most 1 s.
     fn period_s(&self) -> f64 {
-        let steps = self
-            .moments
-            .windows(2)
-            .map(|pair| pair[1].time_s - pair[0].time_s);
+        let pairs = self.moments.windows(2);
+        let steps = pairs.map(|pair| pair[1].time_s - pair[0].time_s);
         f64::from(steps.fold(f32::INFINITY, f32::min).min(1.0))
     }
 }
