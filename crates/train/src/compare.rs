@@ -10,7 +10,6 @@ pub mod tables;
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::num::NonZeroUsize;
@@ -273,10 +272,7 @@ fn judge(run: &Path, sets: &[TestSet]) -> anyhow::Result<Judged> {
                 "matched" => (object % FRESH_OBJECTS).to_string(),
                 _ => String::new(),
             };
-            let _ = writeln!(
-                objects,
-                "{name},{set},{level},{object},{geometry},{right},{all}"
-            );
+            objects += &format!("{name},{set},{level},{object},{geometry},{right},{all}\n");
         }
     }
     Ok(Judged { entry, objects })

@@ -38,6 +38,11 @@ pub enum Kind {
     Recorded = 2,
 }
 
+impl Kind {
+    /// All kinds, by their numbers.
+    pub const ALL: [Self; 3] = [Self::Unknown, Self::Simulated, Self::Recorded];
+}
+
 /// An array of square taxels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grid {

@@ -208,11 +208,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
         let best = best[number] as usize;
         if !rows.contains(&best) {
             let found = format!("{best} of press {number}");
-            return Err(Unexpected::new(
-                "best",
-                found,
-                format!("one of its frames, {rows:?}"),
-            ));
+            let expected = format!("one of its frames, {rows:?}");
+            return Err(Unexpected::new("best", found, expected));
         }
         let times = &time_s[rows.clone()];
         let used = times.iter().filter(|&&time_s| time_s >= 0.0).count();
@@ -224,11 +221,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
         let piece = match (reference[number].unwrap_or(0), reference_mm[number]) {
             (0, _) => None,
             (_, None) => {
-                return Err(Unexpected::new(
-                    "reference_mm",
-                    "none",
-                    "that of each reference",
-                ));
+                let expected = "that of each reference";
+                return Err(Unexpected::new("reference_mm", "none", expected));
             }
             (1, Some(width_mm)) => Some(Piece::Flat { width_mm }),
             (_, Some(radius_mm)) => Some(Piece::Ball { radius_mm }),
@@ -253,12 +247,7 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
             unloaded: unloaded.next().map(<[f32]>::to_vec),
             parts: parts.next().map(<[f32]>::to_vec),
             contact_area_taxels: areas.get(number).copied(),
-            kind: match kind[number] {
-                Some(0) => Kind::Unknown,
-                Some(1) => Kind::Simulated,
-                Some(_) => Kind::Recorded,
-                None => of_file,
-            },
+            kind: kind[number].map_or(of_file, |kind| Kind::ALL[usize::from(kind)]),
             best: best - rows.start,
             ..Press::default()
         };
@@ -271,11 +260,8 @@ fn presses(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Presses, Unex
         presses.push(press, of_press);
     }
     if presses.all.len() < count {
-        return Err(Unexpected::new(
-            "press",
-            format!("{} presses", presses.all.len()),
-            count,
-        ));
+        let found = format!("{} presses", presses.all.len());
+        return Err(Unexpected::new("press", found, count));
     }
     Ok(presses)
 }
@@ -311,12 +297,9 @@ fn source(file: &mut Reader, bytes: &[u8], path: &Path) -> Result<Source, Unexpe
     }
     let is_wrong = |of: &&Vec<Level>| !are_levels(of) || of.len() > MOST_LEVELS;
     if let Some(levels) = meta.levels.as_ref().filter(is_wrong) {
+        let found = format!("levels {}", json!(levels));
         let expected = "`level`, `label` and `shore` of each of 2 to 16 levels, from 1 on";
-        return Err(Unexpected::new(
-            "meta",
-            format!("levels {}", json!(levels)),
-            expected,
-        ));
+        return Err(Unexpected::new("meta", found, expected));
     }
     // The distances between the taxels of many simulated sensors.
     let sensors = meta.settings.get("sensors").cloned().unwrap_or_default();
