@@ -147,26 +147,25 @@ pub fn fit(
     let division = report.chosen_by.unwrap_or(Division::NewObjects);
     let judged = report.candidates[place].judged(division);
     let judged = judged.context("the best candidate was judged")?;
-    let bytes = candidate.learn(&presses, &places, SEED, |learning, weights| {
-        let mut stream = Stream::new(SEED, "calibration");
-        let calibration =
-            comparison::calibration(judged, &presses, &learning.outputs(), &mut stream);
-        let (calibration, by) = match division {
-            Division::NewObjects => (calibration, "new objects"),
-            // Presses of known objects promise nothing of others.
-            Division::LaterPresses => (calibration.without_sets(), "later presses"),
-        };
-        let learnt = Learnt {
-            learning,
-            weights,
-            calibration,
-        };
-        let mut card = learnt.card(name, &presses.sources)?;
-        let kinds = presses.of(&places).map(|press| press.kind).collect();
-        card.validation = format!("{by} of {}", validation(&kinds));
-        card.metrics["fit"] = json!(report.candidates);
-        learnt.bytes(&card)
-    })?;
+    let (learning, weights) = candidate.learnt(&presses, &places, SEED)?;
+    let mut stream = Stream::new(SEED, "calibration");
+    let outputs = learning.outputs();
+    let calibration = comparison::calibration(judged, &presses, &outputs, &mut stream);
+    let (calibration, by) = match division {
+        Division::NewObjects => (calibration, "new objects"),
+        // Presses of known objects promise nothing of others.
+        Division::LaterPresses => (calibration.without_sets(), "later presses"),
+    };
+    let learnt = Learnt {
+        learning: &*learning,
+        weights: &weights,
+        calibration,
+    };
+    let mut card = learnt.card(name, &presses.sources)?;
+    let kinds = presses.of(&places).map(|press| press.kind).collect();
+    card.validation = format!("{by} of {}", validation(&kinds));
+    card.metrics["fit"] = json!(report.candidates);
+    let bytes = learnt.bytes(&card)?;
     Ok((report, Some(Written::Model(bytes))))
 }
 

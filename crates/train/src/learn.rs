@@ -49,7 +49,7 @@ pub struct Stage<'a> {
     /// Seed of everything random.
     pub seed: u64,
     /// The device that computes.
-    pub device: &'a Device,
+    pub device: Device,
 }
 
 impl Stage<'_> {

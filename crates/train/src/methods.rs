@@ -69,7 +69,7 @@ pub fn last_stage<'a>(
             let start = ustgan.as_ref().filter(|_| recipe.from_ustgan);
             let start = start.map(|[_, discriminator]| discriminator);
             let means = on.settings.mean_pooling;
-            let mut initial = hrn::initial(start, on.levels(), means, on.seed, on.device);
+            let mut initial = hrn::initial(start, on.levels(), means, on.seed, &on.device);
             if let Some(ustgan) = ustgan.as_ref().filter(|_| recipe.pretrained) {
                 initial = stages.pretrained(ustgan, initial)?;
             }
@@ -92,7 +92,7 @@ impl<'a> Stages<'a> {
     /// A GAN whose discriminator also learns the levels and becomes the recogniser.
     fn semi_supervised(&self, stage: &'static str, game: Game) -> Gan<'a> {
         let on = self.named(stage, self.on.settings.ustgan);
-        let initial = gan::initial(game, on.levels(), on.seed, on.device);
+        let initial = gan::initial(game, on.levels(), on.seed, &on.device);
         Gan::new(on, game, initial)
     }
 

@@ -105,7 +105,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         }
         None => toml::Table::new(),
     };
-    let device = &asked.device.device()?;
+    let device = asked.device.device()?;
     let start = match &asked.start {
         Some(_) if recipe.learning != Kind::Course => {
             return Err(coded(
@@ -113,7 +113,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
                 "--start: only the method course starts from a model",
             ));
         }
-        Some(path) => Some(Start::read(path, device)?),
+        Some(path) => Some(Start::read(path, &device)?),
         None => None,
     };
     let presses = Presses::read(&asked.data)?;

@@ -11,7 +11,6 @@ use crate::data::split::Parts;
 use crate::learn::regression::{Regression, Seen};
 use crate::learn::{self, Learning, Question, Stage};
 use crate::methods::{Stages, last_stage};
-use crate::model::verdicts;
 use crate::net::network::Weights;
 use crate::recipe;
 use crate::settings::{Profile, Settings};
@@ -138,72 +137,57 @@ impl Candidate {
                 fold.test.iter().map(judge).collect()
             }
             Self::Regression(_) | Self::Hrn => {
-                let question = Question::alone(&fold.test);
-                self.learn(presses, &fold.train, seed, |learning, weights| {
-                    Ok(learning.judge(weights, &[question], None))
-                })
+                let (learning, weights) = self.learnt(presses, &fold.train, seed)?;
+                Ok(learning.judge(&weights, &[Question::alone(&fold.test)], None))
             }
         }
     }
 
-    /// Learns from the presses `train` and takes what was learnt. The built-in model learns nothing.
+    /// What is learnt from the presses `train`. The built-in model learns nothing.
     ///
     /// # Errors
     ///
-    /// Fails if a training diverges, or `take` fails.
-    pub fn learn<T>(
+    /// Fails if a training diverges.
+    pub fn learnt<'a>(
         &self,
-        presses: &Presses,
+        presses: &'a Presses,
         train: &[usize],
         seed: u64,
-        take: impl FnOnce(&dyn Learning, &[Weights]) -> anyhow::Result<T>,
-    ) -> anyhow::Result<T> {
+    ) -> anyhow::Result<(Box<dyn Learning + 'a>, Vec<Weights>)> {
+        let on = |settings: Settings| Stage {
+            name: "fit",
+            presses,
+            parts: Parts {
+                train: train.to_vec(),
+                ..Parts::default()
+            },
+            settings,
+            training: settings.training,
+            seed,
+            device: Device::flex(),
+        };
         match self {
             Self::BuiltIn(_) => anyhow::bail!("the built-in model learns nothing"),
             Self::Regression(seen) => {
-                let device = Device::flex();
-                let on = stage(presses, train, Settings::default(), seed, &device);
-                let regression = Regression::new(on, *seen);
-                take(&regression, &[regression.fitted()])
+                let regression = Regression::new(on(Settings::default()), *seen);
+                let weights = regression.fitted();
+                Ok((Box::new(regression), vec![weights]))
             }
             Self::Hrn => {
                 let recipe = recipe::named(HRN).context("no recipe of the paper's network")?;
                 let none = toml::Table::new();
                 let mut settings = recipe.settings(Profile::Quick, train.len(), &none)?;
                 settings.held_out = 0.0;
-                let device = Device::flex();
                 let stages = Stages {
-                    on: stage(presses, train, settings, seed, &device),
+                    on: on(settings),
                     start: None,
                     run: None,
                 };
-                let learning = &*last_stage(recipe, &stages)?;
-                take(learning, &learn::run(learning, None)?)
+                let learning = last_stage(recipe, &stages)?;
+                let weights = learn::run(&*learning, None)?;
+                Ok((learning, weights))
             }
         }
-    }
-}
-
-/// A stage that learns from these labelled presses, and from no others.
-fn stage<'a>(
-    presses: &'a Presses,
-    train: &[usize],
-    settings: Settings,
-    seed: u64,
-    device: &'a Device,
-) -> Stage<'a> {
-    let parts = Parts {
-        train: train.to_vec(),
-        ..Parts::default()
-    };
-    Stage {
-        name: "fit",
-        presses,
-        parts,
-        settings,
-        training: settings.training,
-        seed,
-        device,
     }
 }
 
@@ -244,8 +228,10 @@ pub fn references(
             Some(shore) => [shore; 2],
             None => borders.part(usize::from(press.level) - 1),
         };
-        let own = (place, Piece::Shore { range });
-        verdicts::reference(presses, hrn.card(), own)
+        ReferencePress {
+            course: presses.course_for(place, hrn.card()),
+            piece: Piece::Shore { range },
+        }
     };
     Ok(chosen.take(most).map(reference).collect())
 }

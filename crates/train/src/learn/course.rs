@@ -82,7 +82,7 @@ impl<'a> Course<'a> {
                 let rows: Vec<[f32; FEATURES]> = rows.collect();
                 let rows = rows.iter().map(<[f32; FEATURES]>::as_slice);
                 let standard = Standard::of(FEATURES, rows);
-                (course::initial(on.seed, on.device), standard)
+                (course::initial(on.seed, &on.device), standard)
             }
         };
         let mut counts = vec![0; levels];
@@ -93,7 +93,7 @@ impl<'a> Course<'a> {
             felt,
             lots: Lots::of(presses, borders.clone(), train),
             standard,
-            parts: bins::parts(&borders, levels, on.device),
+            parts: bins::parts(&borders, levels, &on.device),
             outputs: Outputs::Bins {
                 lifts: bins::lifts(&borders, &counts),
                 borders,

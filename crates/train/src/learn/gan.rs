@@ -183,7 +183,7 @@ impl Learning for Gan<'_> {
         let batch = Batch {
             real: self.on.images(samples),
             labelled: self.labelled(step),
-            eta: generator::noise(generator::SAMPLES_A_COMPONENT, &mut stream, self.on.device),
+            eta: generator::noise(generator::SAMPLES_A_COMPONENT, &mut stream, &self.on.device),
             sensing: Some((self.sensor, self.on.scale())),
         };
         let [loss, of_generator] = self::step(sides, self.game, &batch, rate);

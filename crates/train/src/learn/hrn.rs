@@ -36,13 +36,13 @@ impl Stage<'_> {
     ) -> Tensor<4> {
         let frame = |&press: &usize| change(self.presses.frame(press));
         let frames: Vec<ModelFrame> = presses.iter().map(frame).collect();
-        self.scale().images(frames.iter(), self.device)
+        self.scale().images(frames.iter(), &self.device)
     }
 
     /// The levels of labelled presses as targets `[batch, L]`.
     pub fn targets(&self, presses: &[usize]) -> Tensor<2> {
         let levels = self.presses.of(presses).map(|press| press.level);
-        targets(levels, self.levels(), self.device)
+        targets(levels, self.levels(), &self.device)
     }
 }
 

@@ -168,7 +168,7 @@ impl<'a> Regression<'a> {
             let levels = coefficients.chunks_exact(columns + 1);
             levels.map(move |of_level| of_level[column] as f32)
         };
-        let mut weights = Weights::new(self.on.device);
+        let mut weights = Weights::new(&self.on.device);
         let matrix = (0..columns).flat_map(of).collect();
         weights.add("levels.matrix", &[columns, levels], matrix);
         weights.add("levels.bias", &[levels], of(columns).collect());
@@ -213,7 +213,7 @@ impl Learning for Regression<'_> {
         let rows: Vec<f32> = presses.flat_map(|&press| self.row(press)).collect();
         let columns = self.seen.columns();
         let shape = [rows.len() / columns, columns];
-        let rows = Tensor::from_data(TensorData::new(rows, shape), self.on.device);
+        let rows = Tensor::from_data(TensorData::new(rows, shape), &self.on.device);
         let logits = numbers(&dense(&weights[0], "levels", rows));
         let rows = logits.chunks(self.on.levels());
         rows.map(<[f32]>::to_vec).collect()

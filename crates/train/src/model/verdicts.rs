@@ -9,7 +9,7 @@ use crate::judge::evaluated::{Case, cases};
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
 use hardnessd_core::verdict::{
-    Card, Format, Model, Piece, ReferencePress, References, TimeSeries, Verdict,
+    Format, Model, Piece, ReferencePress, References, TimeSeries, Verdict,
 };
 use hardnessd_simulator::random::Stream;
 
@@ -53,18 +53,6 @@ pub fn rigid(presses: &Presses, sensor: u32, given: Given) -> Vec<(usize, Piece)
     spread(flats).chain(spread(balls)).collect()
 }
 
-/// A press as a reference of its sensor, for this model.
-pub fn reference(
-    presses: &Presses,
-    model: &Card,
-    (place, piece): (usize, Piece),
-) -> ReferencePress {
-    ReferencePress {
-        course: presses.course_for(place, model),
-        piece,
-    }
-}
-
 /// The references for the presses of each half of a sensor's objects, by sensor, and the objects that serve as
 /// references with their hardness.
 type BySensor = (BTreeMap<u32, [References; 2]>, BTreeSet<Option<u32>>);
@@ -98,9 +86,11 @@ fn references_of_sensors(
             }
         }
         let known = known.into_iter().take(hrn.most_references());
-        let known: Vec<ReferencePress> = known
-            .map(|own| reference(presses, hrn.card(), own))
-            .collect();
+        let known = known.map(|(place, piece)| ReferencePress {
+            course: presses.course_for(place, hrn.card()),
+            piece,
+        });
+        let known: Vec<ReferencePress> = known.collect();
         // As the daemon does, which uses no references that are worse than none.
         let (identified, _) = hrn.identified_by(&known)?;
         let own = own_presses(hrn, presses, places, given.own)?;
