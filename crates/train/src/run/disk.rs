@@ -25,6 +25,26 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     written.with_context(|| path.display().to_string())
 }
 
+/// Refuses an output that is there already or cannot be made, before the work for it.
+///
+/// # Errors
+///
+/// Names the file.
+pub fn check_new(path: &Path) -> anyhow::Result<()> {
+    let begun = Part::new(path).map(drop);
+    begun.with_context(|| path.display().to_string())
+}
+
+/// Writes a new file as a whole.
+///
+/// # Errors
+///
+/// Returns the errors of writing, and an error if the file is there.
+pub fn write_new(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let written = Part::new(path).and_then(|part| part.write(bytes));
+    written.with_context(|| path.display().to_string())
+}
+
 /// The longest settings or configuration that is read, in bytes.
 const MOST_TEXT_BYTES: usize = 1 << 20;
 

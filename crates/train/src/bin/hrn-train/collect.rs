@@ -6,11 +6,10 @@ use hardnessd_core::verdict::Borders;
 use hrn_train::data::collect::{self, Collection, Settings};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::source::papers_levels;
-use hrn_train::run::disk::lock;
+use hrn_train::run::disk::{check_new, lock};
 
 use super::arguments::Collect;
 use super::configuration::described;
-use super::files::check_new;
 
 pub(super) fn collect(arguments: &Collect) -> anyhow::Result<String> {
     let (sensor, levels) = described(arguments.config.as_deref())?;

@@ -10,10 +10,10 @@ use hardnessd_core::verdict::{Borders, Level};
 use hardnessd_core::wording;
 use hrn_train::exit::coded;
 use hrn_train::fit::{self, Division, Estimate, Report, Row, Written};
+use hrn_train::run::disk::{check_new, write_new};
 
 use super::arguments::Fit;
 use super::configuration::described;
-use super::files::{check_new, write};
 
 /// The most wrongly judged presses that are listed.
 const LISTED: usize = 20;
@@ -61,14 +61,14 @@ fn save(
         Some(Written::Model(bytes)) => {
             trial::load(&bytes, Some(trial::verdict_most(rate_hz)))
                 .context("the daemon refuses the model")?;
-            write(model, &bytes)?;
+            write_new(model, &bytes)?;
             format!("[model]\npath = {}\n", shown(model))
         }
         Some(Written::References(bytes, levels)) => {
             let own = levels.as_deref().map(of_levels).transpose()?;
             let line = match bytes {
                 Some(bytes) => {
-                    write(references, &bytes)?;
+                    write_new(references, &bytes)?;
                     let path = shown(references);
                     format!("references = {path}   # in the table of the [[sensor]]\n")
                 }

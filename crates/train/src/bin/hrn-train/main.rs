@@ -4,7 +4,6 @@ mod account;
 mod arguments;
 mod collect;
 mod configuration;
-mod files;
 mod fit;
 mod models;
 mod signals;

@@ -10,11 +10,10 @@ use hrn_train::data::presses::{Presses, read_one};
 use hrn_train::exit::coded;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
 use hrn_train::model::verdicts;
-use hrn_train::run::disk::{load, read};
+use hrn_train::run::disk::{check_new, load, read, write_new};
 
 use super::account;
 use super::arguments::Evaluate;
-use super::files::{check_new, write};
 
 pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     let models = arguments.model.iter().map(|path| Ok(load(path)?.0));
@@ -38,7 +37,7 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
         .map(|(hrn, cases)| Evaluated::of(cases, &hrn.card().levels))
         .collect();
     if let Some(path) = &arguments.verdicts {
-        write(path, account::csv(&judged[0]).as_bytes())?;
+        write_new(path, account::csv(&judged[0]).as_bytes())?;
     }
     let [first, second] = &judged[..] else {
         return Ok(match arguments.json {
@@ -118,7 +117,7 @@ fn warn_of_pitch(data: &Path, presses: &Presses, hrn: &Model) {
 
 pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     let (hrn, bytes) = load(&run.join("hrn.onnx"))?;
-    write(out, &bytes)?;
+    write_new(out, &bytes)?;
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
 

@@ -8,10 +8,9 @@ use hardnessd_simulator::{BroadSensors, CourseSettings, DatasetSettings};
 use hrn_train::data::presses::Layout;
 use hrn_train::data::simulated;
 use hrn_train::exit::coded;
-use hrn_train::run::disk::read_text;
+use hrn_train::run::disk::{check_new, read_text, write_new};
 
 use super::arguments::Simulate;
-use super::files::{check_new, write};
 
 /// The settings that the options name.
 fn asked(arguments: &Simulate) -> CourseSettings {
@@ -59,7 +58,7 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let begun = Instant::now();
     let (presses, left_out) = simulated::simulate(&settings, layout);
     let seconds = begun.elapsed().as_secs_f64();
-    write(
+    write_new(
         &arguments.out,
         &simulated::to_bytes(&settings, layout, &presses)?,
     )?;
