@@ -11,7 +11,6 @@ pub mod tables;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::ErrorKind;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -27,7 +26,7 @@ use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
-use crate::run::disk::{load, lock, refuse_foreign, write_whole};
+use crate::run::disk::{load, lock, read_earlier, refuse_foreign, write_whole};
 use crate::settings::Profile;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
@@ -310,11 +309,8 @@ fn write_results(out: &Path, sets: &[TestSet]) -> anyhow::Result<()> {
 fn write_tables(out: &Path) -> anyhow::Result<String> {
     let path = out.join("results.json");
     let shown = || path.display().to_string();
-    let entries: Vec<tables::Entry> = match fs::read(&path) {
-        Ok(bytes) => serde_json::from_slice(&bytes).with_context(shown)?,
-        Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
-        Err(error) => return Err(error).with_context(shown),
-    };
+    let bytes = read_earlier(&path)?.unwrap_or(b"[]".to_vec());
+    let entries: Vec<tables::Entry> = serde_json::from_slice(&bytes).with_context(shown)?;
     ensure!(
         !entries.is_empty(),
         "{}: has no finished run: give --data, to train some",

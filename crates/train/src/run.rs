@@ -19,7 +19,7 @@ use crate::data::source::Source;
 use crate::exit::coded;
 use crate::settings::{Profile, Settings};
 use checkpoint::Checkpoint;
-use disk::{lock, refuse_foreign, write_whole};
+use disk::{lock, read_earlier, refuse_foreign, write_whole};
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
 
@@ -94,18 +94,15 @@ impl Run {
     /// Returns an error if `settings.toml` exists but cannot be read.
     pub fn description_at(directory: &Path) -> anyhow::Result<Option<Description>> {
         let path = directory.join("settings.toml");
-        match fs::read(&path) {
-            Ok(bytes) => {
-                let text = String::from_utf8_lossy(&bytes);
-                let description = toml::from_str(&text).map_err(|error| {
-                    let problem = wording::of_toml(&text, &error);
-                    coded(CONFIG, format_args!("{}: {problem}", path.display()))
-                });
-                description.map(Some)
-            }
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(error).with_context(|| path.display().to_string()),
-        }
+        let Some(bytes) = read_earlier(&path)? else {
+            return Ok(None);
+        };
+        let text = String::from_utf8_lossy(&bytes);
+        let description = toml::from_str(&text).map_err(|error| {
+            let problem = wording::of_toml(&text, &error);
+            coded(CONFIG, format_args!("{}: {problem}", path.display()))
+        });
+        description.map(Some)
     }
 
     /// Starts a run in the directory. With `resume`, continues the run that the directory has, if

@@ -4,14 +4,14 @@
 //! streams, so the number of steps done is the position of every stream. The rest of the state is
 //! numbers. The file is a line of JSON with how many they are, and the numbers after it.
 
-use std::fs;
 use std::path::Path;
 
 use anyhow::{Context as _, ensure};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-use super::disk::write_whole;
+use super::disk::{read_earlier, write_whole};
+use hardnessd_core::verdict::sha256_hex;
 
 /// How far a stage is. The default is its beginning.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -33,10 +33,9 @@ pub struct Checkpoint {
 impl Checkpoint {
     /// The beginning of a stage with these numbers, in a run with this `settings.toml`.
     pub fn first(settings: &[u8], numbers: Vec<f32>) -> Self {
-        let origin =
-            Sha256::new_with_prefix(Sha256::digest(settings)).chain_update(bytes(&numbers));
+        let origin = [&Sha256::digest(settings)[..], &bytes(&numbers)].concat();
         Self {
-            origin: hex::encode(origin.finalize()),
+            origin: sha256_hex(&origin),
             numbers,
             ..Self::default()
         }
@@ -60,9 +59,8 @@ impl Checkpoint {
     ///
     /// Returns an error if the file cannot be read, or is none of a checkpoint.
     pub fn read(path: &Path) -> anyhow::Result<Option<Self>> {
-        let file = match fs::read(path) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            file => file.with_context(|| path.display().to_string())?,
+        let Some(file) = read_earlier(path)? else {
+            return Ok(None);
         };
         let head = file.split(|&byte| byte == b'\n').next().unwrap_or_default();
         let (checkpoint, expected): (Self, usize) =

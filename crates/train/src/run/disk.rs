@@ -1,8 +1,8 @@
 //! Files that are complete at all times, files of the command line that are read up to a bound, and directories
 //! locked for one process.
 
-use std::fs::File;
-use std::io::{self, Read as _};
+use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
@@ -10,7 +10,6 @@ use hardnessd_core::exit::CONFIG;
 use hardnessd_core::part::Part;
 use hardnessd_core::trial;
 use hardnessd_core::verdict::{MAX_FILE_BYTES, Model};
-use rustix::fs::FlockOperation;
 
 use crate::exit::{coded, unreadable};
 
@@ -59,6 +58,18 @@ pub fn read(path: &Path, most: usize) -> anyhow::Result<Vec<u8>> {
     let read = opened.and_then(|mut file| file.read_to_end(&mut bytes));
     read.map_err(|error| unreadable(path, &error))?;
     Ok(bytes)
+}
+
+/// Reads a file that may be missing.
+///
+/// # Errors
+///
+/// Returns an error if the file is there and cannot be read.
+pub fn read_earlier(path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+    match fs::read(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        read => read.map(Some).with_context(|| path.display().to_string()),
+    }
 }
 
 /// Reads a model and the bytes of its file, once: the file may be a pipe.
@@ -112,11 +123,9 @@ pub fn refuse_foreign(directory: &Path, first: &str, others: &[&str]) -> anyhow:
 pub fn lock(directory: &Path) -> anyhow::Result<File> {
     let context = || directory.display().to_string();
     let file = File::open(directory).with_context(context)?;
-    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+    match file.try_lock() {
         Ok(()) => Ok(file),
-        Err(rustix::io::Errno::WOULDBLOCK) => {
-            bail!("{}: another process is at work here", context())
-        }
-        Err(error) => Err(io::Error::from(error)).with_context(context),
+        Err(TryLockError::WouldBlock) => bail!("{}: another process is at work here", context()),
+        Err(TryLockError::Error(error)) => Err(error).with_context(context),
     }
 }

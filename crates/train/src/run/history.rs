@@ -3,13 +3,13 @@
 //! All stages have the same columns. A cell is empty if the stage does not have the value.
 
 use std::fs::File;
-use std::io::{ErrorKind, Write as _};
+use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
 
 use super::checkpoint::Checkpoint;
-use super::disk::write_whole;
+use super::disk::{read_earlier, write_whole};
 
 /// The columns of the file.
 const COLUMNS: &str = "stage,step,epoch,loss,learning_rate,accuracy,validation_loss,validation_accuracy,\
@@ -53,10 +53,8 @@ impl Metrics {
     /// Returns the errors of reading and writing.
     pub fn open(path: &Path, stage: &str, step: u64) -> anyhow::Result<Self> {
         let context = || path.display().to_string();
-        let before = match std::fs::read_to_string(path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
-            before => before.with_context(context)?,
-        };
+        let before = read_earlier(path)?.unwrap_or_default();
+        let before = String::from_utf8(before).with_context(context)?;
         let is_kept = |row: &&str| {
             let cells: Vec<&str> = row.split(',').collect();
             let is_whole = cells.len() == COLUMNS.split(',').count();

@@ -29,9 +29,8 @@ fn end_with(parent: i32) -> anyhow::Result<()> {
     rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))
         .map_err(std::io::Error::from)
         .context("end with the parent process")?;
-    let actual = rustix::process::getppid().map(rustix::process::Pid::as_raw_nonzero);
     anyhow::ensure!(
-        actual.is_some_and(|actual| actual.get() == parent),
+        std::os::unix::process::parent_id().cast_signed() == parent,
         "the process that started this one, {parent}, has ended"
     );
     Ok(())
