@@ -108,10 +108,7 @@ impl<'a> Stages<'a> {
         let generated = self.generated(ustgan)?;
         let on = Stage {
             presses: &generated,
-            parts: Parts {
-                train: (0..generated.all.len()).collect(),
-                ..Parts::default()
-            },
+            parts: Parts::labelled((0..generated.all.len()).collect()),
             ..self.named("pretraining", self.on.settings.pretraining)
         };
         let hrn = Hrn { on, initial };

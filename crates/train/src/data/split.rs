@@ -27,6 +27,14 @@ pub struct Parts {
 }
 
 impl Parts {
+    /// Labelled presses to learn from, and no others.
+    pub fn labelled(train: Vec<usize>) -> Self {
+        Self {
+            train,
+            ..Self::default()
+        }
+    }
+
     /// Takes `labels` of the labelled training presses, and holds `share` of their objects out.
     pub fn of(presses: &Presses, labels: usize, share: f64, seed: u64) -> Self {
         let all: Vec<usize> = presses.labelled(Split::Train).collect();

@@ -157,10 +157,7 @@ impl Candidate {
         let on = |settings: Settings| Stage {
             name: "fit",
             presses,
-            parts: Parts {
-                train: train.to_vec(),
-                ..Parts::default()
-            },
+            parts: Parts::labelled(train.to_vec()),
             settings,
             training: settings.training,
             seed,

@@ -139,10 +139,7 @@ impl<'a> Gan<'a> {
             unlabelled, train, ..
         } = &self.on.parts;
         let on = Stage {
-            parts: Parts {
-                train: [&unlabelled[..], train].concat(),
-                ..Parts::default()
-            },
+            parts: Parts::labelled([&unlabelled[..], train].concat()),
             settings: Settings {
                 augmentation: Augmentation::default(),
                 ..self.on.settings
