@@ -115,20 +115,18 @@ impl Plan {
         // Many sensors meet great forces, too, but most presses are gentle.
         let designs = settings.sensors.map(|sensors| sensors.designs);
         let is_broad = designs == Some(SensorDesigns::Broad);
-        let highest = if is_broad {
-            BROAD_FORCE_N
-        } else {
-            HIGHEST_FORCE_N
+        let highest = match is_broad {
+            true => BROAD_FORCE_N,
+            false => HIGHEST_FORCE_N,
         };
         let force = |stream: &mut Stream| {
             let part = stream.uniform();
             lowest + (highest - lowest) * if is_broad { part * part } else { part }
         };
         let force_n = force(stream);
-        let highest_force_n = if is_broad {
-            force_n.max(force(&mut stream.child(1)))
-        } else {
-            highest
+        let highest_force_n = match is_broad {
+            true => force_n.max(force(&mut stream.child(1))),
+            false => highest,
         };
         let travel_mm = log_even(TRAVEL_MM, stream);
         let stops_by_force = stream.uniform() < 0.5;
@@ -176,13 +174,8 @@ pub fn courses(settings: &CourseSettings) -> Vec<Work<'_>> {
                 let mut paired = subject.geometry.child(3).child(press);
                 let plan = Plan::draw(settings, ARM_N_PER_MM, &mut paired);
                 subject.pressed(&mut bench, &plan, press, |solved, noise| {
-                    plan.read(
-                        &subject.sensor,
-                        solved,
-                        plan.reading,
-                        noise,
-                        subject.labels(),
-                    )
+                    let labels = subject.labels();
+                    plan.read(&subject.sensor, solved, plan.reading, noise, labels)
                 })
             };
             (0..u64::from(of.presses)).map(pressed).collect()
@@ -261,9 +254,9 @@ impl Plan {
         let of_contact = contact.binary_search(&best);
         let of_contact = of_contact.expect("the best frame is in contact");
         let thin = thinned(contact.len(), of_contact, COURSE_FRAMES.1);
-        let places: Vec<usize> = (begin.saturating_sub(BEFORE)..begin)
-            .chain(thin.iter().map(|&place| contact[place]))
-            .collect();
+        let thin = thin.into_iter().map(|place| contact[place]);
+        let places = (begin.saturating_sub(BEFORE)..begin).chain(thin);
+        let places: Vec<usize> = places.collect();
         let resampling = Resampling::new(&frames[best], sensor.grid.pitch, Pitch::JX255N.rows_mm);
         let approach_mm = |place: usize| solved.motion.approach_mm(times[place]);
         let moment = |&place: &usize| Sample {
@@ -287,10 +280,8 @@ impl Plan {
 
 /// Newtons as a data set holds them. An i16 holds up to 32 N on a taxel.
 fn millinewtons(newtons: &[f32]) -> Box<[i16]> {
-    let rounded = newtons
-        .iter()
-        .map(|newtons| (newtons / 1e-3).round() as i16);
-    rounded.collect()
+    let rounded = |newtons: &f32| (newtons / 1e-3).round() as i16;
+    newtons.iter().map(rounded).collect()
 }
 
 impl Bench {

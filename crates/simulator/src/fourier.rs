@@ -72,11 +72,8 @@ impl Convolver {
                     .copy_within(i * bins..(i + 1) * bins, (padded - i) * bins);
             }
         }
-        for bin in 0..bins {
-            for i in 0..padded {
-                self.columns[bin * padded + i] = self.rows[i * bins + bin];
-            }
-        }
+        let shape = (padded, bins);
+        transpose(&self.rows, &mut self.columns, shape, (bins, padded));
         self.column_forward
             .process_with_scratch(&mut self.columns, &mut self.scratch);
         let scale = 1.0 / (padded * padded) as f32;

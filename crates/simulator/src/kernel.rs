@@ -48,15 +48,11 @@ pub(super) struct Layer {
 impl Layer {
     /// The layer of Poisson's ratio `nu` on `base`.
     pub(super) fn new(nu: f64, base: Base) -> Self {
-        let weights: Vec<f64> = (NODES.iter())
-            .map(|&(x, weight)| weight * (1.0 - layer_ratio(x, nu, base)))
-            .collect();
-        let phi = BESSEL
-            .chunks_exact(weights.len())
-            .map(|values| weights.iter().zip(values).map(|(w, j0)| w * j0).sum())
-            .collect();
+        let weight = |&(x, weight): &(f64, f64)| weight * (1.0 - layer_ratio(x, nu, base));
+        let weights: Vec<f64> = NODES.iter().map(weight).collect();
+        let sum = |values: &[f64]| weights.iter().zip(values).map(|(w, j0)| w * j0).sum();
         Self {
-            phi,
+            phi: BESSEL.chunks_exact(weights.len()).map(sum).collect(),
             base: layer_ratio(0.0, nu, base),
         }
     }
@@ -110,12 +106,9 @@ static NODES: LazyLock<Vec<(f64, f64)>> = LazyLock::new(|| {
 /// To compute it for each took 6 to 9 % of a simulation.
 static BESSEL: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let count = (REACH / STEP) as usize + 3;
-    let of_step = |k: usize| {
-        NODES
-            .iter()
-            .map(move |&(x, _)| libm::j0(x * STEP * k as f64))
-    };
-    (0..count).flat_map(of_step).collect()
+    let steps = (0..count).map(|k| k as f64);
+    let of_step = |k: f64| NODES.iter().map(move |&(x, _)| libm::j0(x * STEP * k));
+    steps.flat_map(of_step).collect()
 });
 
 /// Distance in layer heights beyond which the layer does not move, because its Green's function has

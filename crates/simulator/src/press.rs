@@ -360,10 +360,9 @@ impl Bench {
             local,
             force_n,
             cell_mm: CELL_MM,
-            tolerance: if specimen.is_flat {
-                FLAT_TOLERANCE
-            } else {
-                TOLERANCE
+            tolerance: match specimen.is_flat {
+                true => FLAT_TOLERANCE,
+                false => TOLERANCE,
             },
         };
         self.solver(window.width).solve(&problem, pressure_mpa)

@@ -68,19 +68,17 @@ impl Sensor {
         let of_rows = lines(spread.row, 1, rows);
         let of_columns = lines(spread.column, 2, cols);
         let mut dead = stream.child(3);
-        let gain = (0..count)
-            .map(|k| {
-                let alive = dead.uniform() >= design.dead_share;
-                let gain = taxels[k] * of_rows[k / cols] * of_columns[k % cols];
-                if alive { gain.max(0.0) as f32 } else { 0.0 }
-            })
-            .collect();
+        let gain = (0..count).map(|k| {
+            let alive = dead.uniform() >= design.dead_share;
+            let gain = taxels[k] * of_rows[k / cols] * of_columns[k % cols];
+            if alive { gain.max(0.0) as f32 } else { 0.0 }
+        });
+        let gain = gain.collect();
         let mut draws = stream.child(4);
         let (median_n, bound_n) = (design.threshold_median_n, design.threshold_bound_n);
         let sigma = (bound_n / median_n).ln() / 3.0;
-        let threshold_n = (0..count)
-            .map(|_| (median_n * (sigma * draws.normal()).exp()).min(bound_n) as f32)
-            .collect();
+        let mut threshold = || (median_n * (sigma * draws.normal()).exp()).min(bound_n) as f32;
+        let threshold_n = (0..count).map(|_| threshold()).collect();
         let rest_counts = design.rest.map_or_else(Vec::new, |rest| {
             let mut draws = stream.child(5);
             let mut taxel = || rest.counts + rest.spread * draws.normal();

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use super::broad;
 use super::dataset::HIGHEST_FORCE_N;
-use super::material::{Body, Material};
+use super::material::Material;
 use super::motion::{Approach, Arm, Motion};
 use super::object::{self, POSTURES, Pose, Shapes};
 use super::press::{Bench, Specimen, draw_patch};
@@ -211,7 +211,7 @@ impl Sequence {
         let force_n = in_turn.map_or(drawn, |place| self.settings.forces_n[place].into());
         let specimen = match self.settings.piece {
             Some(piece) => rigid::specimen(&rigid::face(piece), &mut draws.child(2)),
-            None => presented(material, &mut draws).1,
+            None => presented(material, &mut draws),
         };
         let rate = self.settings.frame_rate_hz;
         let rest_s = REST.0.max(REST.1 / rate);
@@ -257,14 +257,13 @@ impl Sequence {
 }
 
 /// Draws an object of the material, or of a random one, and one of its faces in a pose.
-fn presented(material: Option<Material>, draws: &mut Stream) -> (Body, Specimen) {
+fn presented(material: Option<Material>, draws: &mut Stream) -> Specimen {
     let body = broad::body_of(material, &mut draws.child(3));
     let object = object::draw(Shapes::Matched, body.level, &mut draws.child(0));
     let face = object[draws.below(POSTURES)];
     let patch = draw_patch(&body.substance.texture, face.roughness, &mut draws.child(1));
     let pose = Pose::draw(&face, &mut draws.child(2));
-    let specimen = Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch);
-    (body, specimen)
+    Specimen::new(body.substance, body.young_mpa, &face, &pose, &patch)
 }
 
 impl Iterator for Sequence {

@@ -120,11 +120,7 @@ impl CourseSettings {
         sensors.map_err(|error| error.within("sensors"))?;
         let [least, most] = self.frame_rate_hz;
         let fits = 1.0 <= least && least <= most && most <= 200.0;
-        range::check(
-            "frame_rate_hz",
-            self.frame_rate_hz,
-            fits,
-            "1 to 200, ascending",
-        )
+        let expected = "1 to 200, ascending";
+        range::check("frame_rate_hz", self.frame_rate_hz, fits, expected)
     }
 }

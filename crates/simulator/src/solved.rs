@@ -274,9 +274,8 @@ impl<'a> Run<'a> {
         let factor = 1.0 + creep.map(|c| c.j * share(time_s, c.tau_s)).sum::<f64>();
         let (specimen, window) = (self.specimen, self.window);
         let local = specimen.local(factor, &history, time_s);
-        let contact = self
-            .bench
-            .solve(specimen, window, &gap, force_n, local, &mut pressure);
+        let bench = &mut self.bench;
+        let contact = bench.solve(specimen, window, &gap, force_n, local, &mut pressure);
         SolvedStep {
             time_s: self.last().time_s + time_s,
             force_n,
@@ -306,9 +305,8 @@ impl<'a> Run<'a> {
                 *history += kept * crept + old * pressure;
             }
         }
-        let displacement = self
-            .bench
-            .displacement(self.specimen, self.window, &history);
+        let (bench, specimen) = (&mut self.bench, self.specimen);
+        let displacement = bench.displacement(specimen, self.window, &history);
         for (gap, u) in gap.iter_mut().zip(displacement) {
             *gap += u;
         }

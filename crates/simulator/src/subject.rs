@@ -77,17 +77,14 @@ pub(super) fn units(settings: &DatasetSettings) -> Vec<Unit> {
             Split::Train => settings.objects,
             Split::Test => settings.test_objects,
         };
-        units.extend(
-            (units.len() as u32..)
-                .zip(0..count)
-                .map(|(object, number)| Unit {
-                    object,
-                    material,
-                    kind,
-                    split,
-                    number,
-                }),
-        );
+        let objects = units.len() as u32..;
+        units.extend(objects.zip(0..count).map(|(object, number)| Unit {
+            object,
+            material,
+            kind,
+            split,
+            number,
+        }));
     }
     units
 }
@@ -103,10 +100,9 @@ fn streams(settings: &DatasetSettings, unit: &Unit) -> [Stream; 2] {
         (None, Split::Test) => "broad test",
     };
     let is_paired = unit.split == Split::Test && settings.shapes != Shapes::Paper;
-    let geometry = if is_paired {
-        Material::ALL.len() as u64
-    } else {
-        unit.kind.into()
+    let geometry = match is_paired {
+        true => Material::ALL.len() as u64,
+        false => unit.kind.into(),
     };
     let root = Stream::new(settings.seed, split).child(unit.number.into());
     [

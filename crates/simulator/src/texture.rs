@@ -36,13 +36,7 @@ impl Patch {
         let mut power = 0.0;
         for i in 0..WIDTH {
             for j in 0..WIDTH {
-                let signed = |k: usize| {
-                    if k < half {
-                        k as f64
-                    } else {
-                        k as f64 - WIDTH as f64
-                    }
-                };
+                let signed = |k: usize| k as f64 - if k < half { 0.0 } else { WIDTH as f64 };
                 // Waves are longer along x, so a wave number along x counts as a higher one.
                 let q = (signed(j) * unit * stretch).hypot(signed(i) * unit / stretch);
                 if q == 0.0 || q > high {
@@ -58,17 +52,15 @@ impl Patch {
         }
         let plan = FftPlanner::new().plan_fft_inverse(WIDTH);
         plan.process(&mut spectrum);
-        let mut turned: Vec<Complex32> = (0..WIDTH * WIDTH)
-            .map(|k| spectrum[k % WIDTH * WIDTH + k / WIDTH])
-            .collect();
+        let across = |k: usize| k % WIDTH * WIDTH + k / WIDTH;
+        let cells = 0..WIDTH * WIDTH;
+        let mut turned: Vec<Complex32> = cells.clone().map(|k| spectrum[across(k)]).collect();
         plan.process(&mut turned);
         let scale = (1e-3 * texture.rms_um * rms_factor / power.sqrt()) as f32;
         // `turned` is transposed, with x as its row. Put y first again.
-        let heights_mm = (0..WIDTH * WIDTH)
-            .map(|k| scale * turned[k % WIDTH * WIDTH + k / WIDTH].re)
-            .collect();
+        let heights_mm = cells.map(|k| scale * turned[across(k)].re);
         Self {
-            heights_mm,
+            heights_mm: heights_mm.collect(),
             cell_mm,
         }
     }
@@ -87,10 +79,8 @@ impl Patch {
                 0.5 * (4.0 * p2 - 3.0 * p3 + part),
                 0.5 * (p3 - p2),
             ];
-            (
-                (below as i64 - 1).rem_euclid(WIDTH as i64) as usize,
-                weights,
-            )
+            let first = (below as i64 - 1).rem_euclid(WIDTH as i64);
+            (first as usize, weights)
         };
         let (column, across) = locate(x_mm);
         let (row, down) = locate(y_mm);

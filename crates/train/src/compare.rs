@@ -21,7 +21,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use crate::data::presses::Presses;
-use crate::data::source::{Source, papers_levels};
+use crate::data::source::papers_levels;
 use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
@@ -124,11 +124,10 @@ impl Plan {
         let Some(before) = Run::description_at(&directory)? else {
             return Ok(());
         };
-        let hashes = |sources: &[Source]| -> Vec<String> {
-            sources.iter().map(|one| one.sha256.clone()).collect()
-        };
+        let [found, expected] =
+            [&before.data, &presses.sources].map(|of| of.iter().map(|one| &one.sha256));
         ensure!(
-            before.profile == self.profile && hashes(&before.data) == hashes(&presses.sources),
+            before.profile == self.profile && found.eq(expected),
             "{}: this run has another --data or --profile: give the same ones, or choose another --out",
             directory.display()
         );

@@ -15,7 +15,7 @@ use std::path::PathBuf;
 use anyhow::{Context as _, bail, ensure};
 use serde_json::json;
 
-use self::candidate::Candidate;
+use self::candidate::{Candidate, Entry};
 use self::comparison::Comparison;
 pub use self::comparison::{Division, Estimate, OfLevel, Report, Row, Wrong};
 use self::folds::Fold;
@@ -101,10 +101,8 @@ pub fn fit(
         let judged = [judge(new)?, judge(later)?];
         Ok(Row::of(name, judged, candidate.err().cloned(), &presses))
     };
-    let compared = candidates
-        .iter()
-        .map(|(name, candidate)| compare(name, candidate.as_ref()));
-    let compared: Vec<Row> = compared.collect::<anyhow::Result<_>>()?;
+    let each = |(name, candidate): &Entry| compare(name, candidate.as_ref());
+    let compared: Vec<Row> = candidates.iter().map(each).collect::<anyhow::Result<_>>()?;
     let unloaded = control.ok_or_else(|| "only recordings have it".to_owned());
     let control = compare(UNLOADED, unloaded.as_ref())?;
     bar.finish_and_clear();
@@ -181,19 +179,16 @@ fn read(
         std::fs::metadata(path).map_err(|error| unreadable(path, &error))?;
     }
     let paths = collect::captures(data)?;
-    let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths
-        .into_iter()
-        .partition(|path| collect::is_data_set(path));
+    let is_set = |path: &PathBuf| collect::is_data_set(path);
+    let (sets, recordings): (Vec<PathBuf>, Vec<PathBuf>) = paths.into_iter().partition(is_set);
     let sets = sets.iter().map(|path| read_one(path));
     let sets: Vec<Presses> = sets.collect::<anyhow::Result<_>>()?;
     let layout = Layout::of(sets.is_empty() || sets.iter().any(Presses::are_over_time));
     let mut doubtful = Vec::new();
     if !sets.iter().all(Presses::are_over_time) {
-        doubtful.push(
-            "some presses are single frames, and the daemon judges whole presses: a model of `features` is then right less \
-             often than the figures say"
-                .to_owned(),
-        );
+        let text = "some presses are single frames, and the daemon judges whole presses: a model of `features` is then \
+                    right less often than the figures say";
+        doubtful.push(text.to_owned());
     }
     let mut played = Vec::new();
     collect::recordings(&recordings, sensor, layout, true, |recording| {
@@ -254,11 +249,9 @@ fn read(
     // One object may be of two materials where one recording does not name its own.
     all.all.iter_mut().for_each(|press| press.material = None);
     if others.len() > 1 {
-        doubtful.push(
-            "objects of different data sets count as different ones: if they are not, the figures on new objects are too \
-             good"
-                .to_owned(),
-        );
+        let text = "objects of different data sets count as different ones: if they are not, the figures on new objects \
+                    are too good";
+        doubtful.push(text.to_owned());
     }
     for set in others {
         all.join(set)?;

@@ -107,10 +107,8 @@ impl Recipe {
     ) -> anyhow::Result<Settings> {
         let mut settings = Settings::default();
         let for_all = ALL.profiles.get(&profile).into_iter();
-        let own = [&self.settings]
-            .into_iter()
-            .chain(self.profiles.get(&profile));
-        for table in for_all.chain(own) {
+        let own = self.profiles.get(&profile);
+        for table in for_all.chain([&self.settings]).chain(own) {
             settings = overridden(&settings, table)?;
         }
         if let Some(&steps) = self.steps.as_ref().and_then(|steps| steps.get(&profile)) {

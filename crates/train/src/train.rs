@@ -108,10 +108,8 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     let device = asked.device.device()?;
     let start = match &asked.start {
         Some(_) if recipe.learning != Kind::Course => {
-            return Err(coded(
-                USAGE,
-                "--start: only the method course starts from a model",
-            ));
+            let text = "--start: only the method course starts from a model";
+            return Err(coded(USAGE, text));
         }
         Some(path) => Some(Start::read(path, &device)?),
         None => None,
@@ -166,10 +164,8 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
         ensure_learning(on.name, settings.training.epochs, "logit", logit.into())?;
     }
     let calibration = Calibration::of(learning, &weights, &mut on.stream("calibration"));
-    if let Some(missing) = calibration
-        .missing()
-        .filter(|_| recipe.learning == Kind::Course)
-    {
+    let missing = calibration.missing();
+    if let Some(missing) = missing.filter(|_| recipe.learning == Kind::Course) {
         hardnessd_core::stderr_line!("{missing}");
     }
     let learnt = Learnt {
@@ -220,9 +216,8 @@ fn check(recipe: &Recipe, presses: &Presses, parts: &Parts) -> anyhow::Result<()
         parts.train.len()
     );
     for level in presses.levels() {
-        let has_own = presses
-            .of(&parts.train)
-            .any(|press| press.level == level.level);
+        let mut levels = presses.of(&parts.train).map(|press| press.level);
+        let has_own = levels.any(|own| own == level.level);
         ensure!(
             !recipe.pretrained || has_own,
             "no labelled training presses of level {} for its STGAN: label some, or choose a method \

@@ -12,10 +12,9 @@ const SYMMETRIES: usize = 8;
 
 /// Draws one variant of `frame`.
 pub fn vary(frame: &ModelFrame, settings: Augmentation, stream: &mut Stream) -> ModelFrame {
-    let symmetry = if settings.symmetries {
-        stream.below(SYMMETRIES)
-    } else {
-        0
+    let symmetry = match settings.symmetries {
+        true => stream.below(SYMMETRIES),
+        false => 0,
     };
     let reach = isize::from(settings.shift_taxels);
     let mut shift = || stream.below(2 * settings.shift_taxels as usize + 1) as isize - reach;

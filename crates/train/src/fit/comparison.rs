@@ -238,9 +238,8 @@ fn right(presses: &Presses, judged: &Judged) -> Vec<(usize, f64)> {
 fn partly_judged(candidates: &[Row]) -> Option<String> {
     let judged = |row: &Row| row.judged(Division::NewObjects).map_or(0, Vec::len);
     let most = candidates.iter().map(judged).max()?;
-    let row = candidates
-        .iter()
-        .find(|row| (1..most).contains(&judged(row)))?;
+    let is_partly = |row: &&Row| (1..most).contains(&judged(row));
+    let row = candidates.iter().find(is_partly)?;
     Some(format!(
         "{} is judged on {} of the {most} presses of new objects, because it takes minutes to learn from the others: compare \
          its figures by their intervals",
@@ -435,9 +434,8 @@ impl Comparison<'_> {
     /// The balanced accuracy of guessing.
     fn guessing(&self, division: Division) -> f64 {
         let judged = self.candidates.iter().filter_map(|of| of.judged(division));
-        let levels = judged
-            .flatten()
-            .map(|(press, _)| self.presses.all[*press].level);
+        let presses = judged.flatten().map(|(press, _)| *press);
+        let levels = presses.map(|press| self.presses.all[press].level);
         1.0 / levels.collect::<BTreeSet<u8>>().len().max(1) as f64
     }
 

@@ -35,9 +35,8 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
     }
     let papers = papers_levels();
     let is_papers = |name: &&str| {
-        papers
-            .iter()
-            .any(|level| level.label.eq_ignore_ascii_case(name))
+        let mut labels = papers.iter().map(|level| &level.label);
+        labels.any(|label| label.eq_ignore_ascii_case(name))
     };
     if named.keys().all(is_papers) && most <= papers.len() {
         return Ok(papers);
@@ -65,10 +64,8 @@ pub fn of_labels<'a>(all: impl Iterator<Item = &'a Labels>) -> anyhow::Result<Ve
         most => (1..=most).map(|number| number.to_string()).collect(),
     };
     let unmeasured = || {
-        names
-            .into_iter()
-            .map(|name| (name, "-".to_owned()))
-            .collect()
+        let names = names.into_iter();
+        names.map(|name| (name, "-".to_owned())).collect()
     };
     let measured = measured(&named).filter(|_| most == 0);
     let levels = measured.unwrap_or_else(unmeasured);

@@ -92,9 +92,8 @@ pub fn of(presses: &[Drawn], mean: Mean) -> Option<[f64; 2]> {
         let times = units.len() as f64 / (units.len() - 1) as f64;
         total(drawn).map(|sum| sum * times)
     };
-    let mut draws: Vec<f64> = (0..DRAWS)
-        .map(|_| mean.of(strata.iter().map(&mut draw)))
-        .collect();
+    let draws = (0..DRAWS).map(|_| mean.of(strata.iter().map(&mut draw)));
+    let mut draws: Vec<f64> = draws.collect();
     draws.sort_by(f64::total_cmp);
     Some([quantile(&draws, 0.025), quantile(&draws, 0.975)])
 }
@@ -119,9 +118,8 @@ pub fn of_balanced(presses: &[Drawn]) -> Option<[f64; 2]> {
     for own in each.into_values() {
         let units = strata(&own).concat();
         let share = |[sum, n]: Sum| sum / n;
-        let are_alike = units
-            .windows(2)
-            .all(|pair| share(pair[0]) == share(pair[1]));
+        let mut pairs = units.windows(2);
+        let are_alike = pairs.all(|pair| share(pair[0]) == share(pair[1]));
         if are_alike || units.len() < FEW {
             let share = share(total(units.iter().copied()));
             add(of_share(share, units.len()), share, 1);

@@ -136,11 +136,8 @@ impl Learning for Hrn<'_> {
             };
             let mut normalisation = Normalisation::Fixed(&statistics);
             let logits = hrn::logits(&weights[0], images, &mut normalisation);
-            rows.extend(
-                numbers(&logits)
-                    .chunks(self.on.levels())
-                    .map(<[f32]>::to_vec),
-            );
+            let logits = numbers(&logits);
+            rows.extend(logits.chunks(self.on.levels()).map(<[f32]>::to_vec));
         }
         rows
     }

@@ -53,9 +53,8 @@ pub fn initial(seed: u64, device: &Device) -> Weights {
     let stream = Stream::new(seed, "generator weights");
     let uniform = |index: u64, count: usize, limit: f64| -> Vec<f32> {
         let mut stream = stream.child(index);
-        (0..count)
-            .map(|_| stream.range(-limit, limit) as f32)
-            .collect()
+        let values = (0..count).map(|_| stream.range(-limit, limit) as f32);
+        values.collect()
     };
     let mut weights = Weights::new(device);
     let width = FEATURES * FIRST_SIDE * FIRST_SIDE;
@@ -146,10 +145,8 @@ pub fn generate(
     let statistics = statistics(weights, seed);
     let mut of_component: Vec<Vec<ModelFrame>> = vec![Vec::new(); COMPONENTS];
     for round in 0..=DRAWN_AGAIN {
-        let missing = of_component
-            .iter()
-            .map(|own| samples_a_component - own.len());
-        let mut left = missing.max().unwrap_or_default();
+        let fewest = of_component.iter().map(Vec::len).min();
+        let mut left = samples_a_component - fewest.unwrap_or_default();
         while left > 0 {
             let samples = left.min(GENERATED_AT_ONCE);
             let eta = noise(samples, stream, &weights.device);

@@ -216,11 +216,8 @@ pub fn add_trunk(weights: &mut Weights, stream: &Stream) {
 /// of its game for a discriminator.
 pub fn add_head(weights: &mut Weights, dims: [usize; 2], stream: &Stream) {
     let mut stream = stream.child(TRUNK.len() as u64);
-    weights.add_dense(
-        "head",
-        dims,
-        truncated_normal(dims[0] * dims[1], &mut stream),
-    );
+    let matrix = truncated_normal(dims[0] * dims[1], &mut stream);
+    weights.add_dense("head", dims, matrix);
 }
 
 /// Mean and variance of every normalised layer's inputs, `[channels]` each: sums over batches, and the number of

@@ -26,9 +26,8 @@ impl Standard {
         let count = rows.clone().count().max(1) as f64;
         let mut mean = vec![0.0; columns];
         for row in rows.clone() {
-            mean.iter_mut()
-                .zip(row)
-                .for_each(|(sum, &x)| *sum += f64::from(x) / count);
+            let sums = mean.iter_mut().zip(row);
+            sums.for_each(|(sum, &x)| *sum += f64::from(x) / count);
         }
         let mut variance = vec![0.0; columns];
         for row in rows {

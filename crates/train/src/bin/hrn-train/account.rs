@@ -3,12 +3,13 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use hardnessd_core::verdict::Model;
 use hrn_train::judge::evaluated::{Case, Difference, Evaluated};
+use hrn_train::run::disk::load;
 use serde_json::{Map, Value};
 
 /// The card of the model read from `path`, key by key.
-pub(super) fn of_model(path: &Path, hrn: &Model) -> anyhow::Result<String> {
+pub(super) fn of_model(path: &Path) -> anyhow::Result<String> {
+    let (hrn, _) = load(path)?;
     let mut text = format!("{}\nsha256        {}\n", path.display(), hrn.sha256());
     // As text first: a value made at once would give a number of 32 bits the digits of one of 64.
     let card: Map<String, Value> = serde_json::from_str(&serde_json::to_string(hrn.card())?)?;

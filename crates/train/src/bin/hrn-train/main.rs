@@ -61,7 +61,7 @@ fn main() -> ExitCode {
         Command::Evaluate(arguments) => models::evaluate(&arguments),
         Command::Export { run, out } => models::export_run(&run, &out),
         Command::CheckModel { model, fps } => models::check_model(&model, fps),
-        Command::Inspect { model } => models::inspect(&model),
+        Command::Inspect { model } => account::of_model(&model),
     };
     match done.and_then(|account| Ok(print(&account)?)) {
         Ok(_) => ExitCode::SUCCESS,

@@ -121,10 +121,6 @@ pub(super) fn export_run(run: &Path, out: &Path) -> anyhow::Result<String> {
     Ok(format!("{}: sha256 {}\n", out.display(), hrn.sha256()))
 }
 
-pub(super) fn inspect(path: &Path) -> anyhow::Result<String> {
-    account::of_model(path, &load(path)?.0)
-}
-
 /// Checks a model file. The time limit for a verdict follows from the frame rate.
 pub(super) fn check_model(path: &Path, frame_rate_hz: f64) -> anyhow::Result<String> {
     let bytes = read(path, MAX_FILE_BYTES)?;
