@@ -82,7 +82,7 @@ pub fn fit(
     let candidates = candidate::all(&presses, &places)?;
     let control = candidate::unloaded(&presses, &places);
     let divisions = [
-        folds::by_object(&presses, &places, SEED),
+        folds::by_object(&presses, &places),
         folds::by_time(&presses, &places),
     ];
     let usable = candidates.iter().filter(|(_, candidate)| candidate.is_ok());
@@ -95,7 +95,7 @@ pub fn fit(
             let (Ok(candidate), Some(folds)) = (candidate, folds) else {
                 return Ok(None);
             };
-            comparison::judge(candidate, &presses, folds, SEED, &bar).map(Some)
+            comparison::judge(candidate, &presses, folds, &bar).map(Some)
         };
         let [new, later] = &divisions;
         let judged = [judge(new)?, judge(later)?];
@@ -145,7 +145,7 @@ pub fn fit(
     let division = report.chosen_by.unwrap_or(Division::NewObjects);
     let judged = report.candidates[place].judged(division);
     let judged = judged.context("the best candidate was judged")?;
-    let (learning, weights) = candidate.learnt(&presses, &places, SEED)?;
+    let (learning, weights) = candidate.learnt(&presses, &places)?;
     let mut stream = Stream::new(SEED, "calibration");
     let outputs = learning.outputs();
     let calibration = comparison::calibration(judged, &presses, &outputs, &mut stream);

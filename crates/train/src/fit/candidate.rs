@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use anyhow::Context as _;
 use burn::tensor::Device;
 
+use super::SEED;
 use super::folds::Fold;
 use crate::data::presses::Presses;
 use crate::data::split::Parts;
@@ -119,12 +120,7 @@ impl Candidate {
     /// # Errors
     ///
     /// Fails if the built-in model does, or a training diverges.
-    pub fn judge(
-        &self,
-        presses: &Presses,
-        fold: &Fold,
-        seed: u64,
-    ) -> anyhow::Result<Vec<Vec<f32>>> {
+    pub fn judge(&self, presses: &Presses, fold: &Fold) -> anyhow::Result<Vec<Vec<f32>>> {
         match self {
             Self::BuiltIn(hrn) => {
                 let references = references(hrn, presses, &fold.train)?;
@@ -137,7 +133,7 @@ impl Candidate {
                 fold.test.iter().map(judge).collect()
             }
             Self::Regression(_) | Self::Hrn => {
-                let (learning, weights) = self.learnt(presses, &fold.train, seed)?;
+                let (learning, weights) = self.learnt(presses, &fold.train)?;
                 Ok(learning.judge(&weights, &[Question::alone(&fold.test)], None))
             }
         }
@@ -152,7 +148,6 @@ impl Candidate {
         &self,
         presses: &'a Presses,
         train: &[usize],
-        seed: u64,
     ) -> anyhow::Result<(Box<dyn Learning + 'a>, Vec<Weights>)> {
         let on = |settings: Settings| Stage {
             name: "fit",
@@ -160,7 +155,7 @@ impl Candidate {
             parts: Parts::labelled(train.to_vec()),
             settings,
             training: settings.training,
-            seed,
+            seed: SEED,
             device: Device::flex(),
         };
         match self {

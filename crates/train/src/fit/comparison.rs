@@ -204,11 +204,10 @@ pub(super) fn judge(
     candidate: &Candidate,
     presses: &Presses,
     folds: &[Fold],
-    seed: u64,
     bar: &ProgressBar,
 ) -> anyhow::Result<Judged> {
     let judge = |fold: &Fold| {
-        let rows = candidate.judge(presses, fold, seed)?;
+        let rows = candidate.judge(presses, fold)?;
         bar.inc(1);
         Ok(fold.test.iter().copied().zip(rows).collect())
     };

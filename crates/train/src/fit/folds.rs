@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::SEED;
 use crate::data::presses::Presses;
 use hardnessd_simulator::random::Stream;
 
@@ -22,7 +23,7 @@ pub struct Fold {
 
 /// Whole objects are left out and judged. An object that is alone in its level is always learnt from and
 /// never judged. `None` if that leaves fewer than two levels to tell apart.
-pub fn by_object(presses: &Presses, places: &[usize], seed: u64) -> Option<Vec<Fold>> {
+pub fn by_object(presses: &Presses, places: &[usize]) -> Option<Vec<Fold>> {
     let mut of_levels = BTreeMap::<u8, Vec<Vec<usize>>>::new();
     for ((_, level, ..), own) in presses.by_object(places) {
         of_levels.entry(level).or_default().push(own);
@@ -38,7 +39,7 @@ pub fn by_object(presses: &Presses, places: &[usize], seed: u64) -> Option<Vec<F
         GROUPS
     };
     let mut tests = vec![Vec::new(); groups];
-    let mut stream = Stream::new(seed, "groups of objects");
+    let mut stream = Stream::new(SEED, "groups of objects");
     // Dealt out level by level, so that each group has some of each level.
     let dealt = of_levels.into_values().flat_map(|mut objects| {
         stream.shuffle(&mut objects);
@@ -91,7 +92,7 @@ mod tests {
         let many: Vec<u8> = (0..40).map(|n| n % 4 + 1).collect();
         for (levels, folds) in [(&[1, 1, 2, 2, 2][..], 5), (&many, 5), (&many[..12], 12)] {
             let (presses, places) = presses(levels);
-            let found = by_object(&presses, &places, 1).unwrap();
+            let found = by_object(&presses, &places).unwrap();
             assert_eq!(found.len(), folds);
             let judged = found.iter().flat_map(|fold| fold.test.clone());
             let judged: BTreeSet<usize> = judged.collect();
@@ -108,14 +109,14 @@ mod tests {
     #[test]
     fn an_object_alone_in_its_level_is_learnt_from_only() {
         let (mut one, places) = presses(&[1, 1, 2, 2, 3]);
-        for Fold { train, test } in by_object(&one, &places, 1).unwrap() {
+        for Fold { train, test } in by_object(&one, &places).unwrap() {
             assert!(one.of(&test).all(|press| press.level < 3));
             assert!(one.of(&train).any(|press| press.level == 3));
         }
         for press in &mut one.all {
             press.level = press.level.max(2);
         }
-        assert!(by_object(&one, &places, 1).is_none());
+        assert!(by_object(&one, &places).is_none());
     }
 
     #[test]
