@@ -9,11 +9,14 @@ use tract_onnx::pb;
 use crate::learn::{Inputs, Outputs};
 use crate::net::bins::{BINS, LIFTS};
 use crate::net::course::{EMBEDDING, REFERENCES};
-use crate::net::graph::{Graph, INPUT, RAW, model, value_info};
+use crate::net::graph::{Graph, INPUT, RAW, value_info};
 use hardnessd_core::frame::Array;
 use hardnessd_core::verdict::features::FEATURES;
 use hardnessd_core::verdict::parts::PARTS;
-use hardnessd_core::verdict::{COLS, Card, Checks, PIECE, ROWS};
+use hardnessd_core::verdict::{COLS, Card, Checks, MIN_OPSET, PIECE, ROWS};
+
+/// The IR version that goes with opset 17.
+const IR_VERSION: i64 = 8;
 
 /// The file: the logits over the temperature, what follows from them, and the metadata.
 ///
@@ -59,7 +62,26 @@ pub fn bytes(
             ]
         }
     };
-    Ok(model(graph, taken, given, metadata(card, checks)?).encode_to_vec())
+    let model = pb::ModelProto {
+        ir_version: IR_VERSION,
+        opset_import: vec![pb::OperatorSetIdProto {
+            domain: String::new(),
+            version: MIN_OPSET,
+        }],
+        producer_name: "hrn-train".to_owned(),
+        producer_version: env!("CARGO_PKG_VERSION").to_owned(),
+        graph: Some(pb::GraphProto {
+            name: "hrn".to_owned(),
+            node: graph.nodes,
+            initializer: graph.constants,
+            input: taken,
+            output: given,
+            ..Default::default()
+        }),
+        metadata_props: metadata(card, checks)?,
+        ..Default::default()
+    };
+    Ok(model.encode_to_vec())
 }
 
 fn metadata(card: &Card, checks: &Checks) -> anyhow::Result<Vec<pb::StringStringEntryProto>> {

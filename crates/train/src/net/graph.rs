@@ -9,14 +9,11 @@ use tract_onnx::pb::tensor_proto::DataType;
 
 use super::network::{Weights, numbers};
 use hardnessd_core::frame::Array;
-use hardnessd_core::verdict::MIN_OPSET;
 
 /// The name of the graph's input: newtons per taxel, `[1, 1, 28, 28]`.
 pub const INPUT: &str = "frame";
 /// The name of the logits, before temperature.
 pub const RAW: &str = "raw";
-/// The IR version that goes with opset 17.
-const IR_VERSION: i64 = 8;
 
 /// What a model takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,8 +34,10 @@ pub struct Graph {
     /// What the graph takes.
     pub inputs: Inputs,
     weights: Weights,
-    nodes: Vec<pb::NodeProto>,
-    constants: Vec<pb::TensorProto>,
+    /// The nodes.
+    pub(crate) nodes: Vec<pb::NodeProto>,
+    /// The constants.
+    pub(crate) constants: Vec<pb::TensorProto>,
     /// The number of values without a name of their own.
     values: usize,
 }
@@ -172,34 +171,6 @@ fn attribute(text: &str) -> pb::AttributeProto {
         attribute.i = value.parse().expect("a whole number");
     }
     attribute
-}
-
-/// The graph as an ONNX model.
-pub(crate) fn model(
-    graph: Graph,
-    input: Vec<pb::ValueInfoProto>,
-    output: Vec<pb::ValueInfoProto>,
-    metadata_props: Vec<pb::StringStringEntryProto>,
-) -> pb::ModelProto {
-    pb::ModelProto {
-        ir_version: IR_VERSION,
-        opset_import: vec![pb::OperatorSetIdProto {
-            domain: String::new(),
-            version: MIN_OPSET,
-        }],
-        producer_name: "hrn-train".to_owned(),
-        producer_version: env!("CARGO_PKG_VERSION").to_owned(),
-        graph: Some(pb::GraphProto {
-            name: "hrn".to_owned(),
-            node: graph.nodes,
-            initializer: graph.constants,
-            input,
-            output,
-            ..Default::default()
-        }),
-        metadata_props,
-        ..Default::default()
-    }
 }
 
 /// The type of an f32 tensor in a model.
