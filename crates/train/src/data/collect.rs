@@ -222,27 +222,25 @@ impl Collection {
     ///
     /// Returns an error if its labels cannot be used, it was added before, or its taxels have another pitch.
     pub fn add(&mut self, mut recording: Recording, settings: &Settings) -> anyhow::Result<()> {
-        let sha256 = &recording.sha256;
-        let shown = recording.path.display();
+        let shown = recording.path.display().to_string();
         let mut before = self.captures.iter();
-        if let Some(same) = before.find(|before| before["sha256"] == *sha256) {
+        if let Some(same) = before.find(|before| before["sha256"] == recording.sha256) {
             let name = same["name"].as_str().unwrap_or_default();
             bail!(
                 "{shown}: the same recording as {name}, whose presses are in the data set already"
             );
         }
-        let new = object_of(sha256);
+        let new = object_of(&recording.sha256);
         let new = match settings.is_one_object {
             true => self.unnumbered.unwrap_or(new),
             false => new,
         };
-        let mut presses = std::mem::take(&mut recording.presses);
-        let labelled = recording.label_presses(&mut presses, settings, new);
-        labelled.with_context(|| shown.to_string())?;
+        let labelled = recording.label_presses(settings, new);
+        labelled.context(shown)?;
+        let (labels, mut presses) = (&recording.labels, recording.presses);
         for source in &mut presses.sources {
             source.levels = Some(settings.levels.clone());
         }
-        let labels = &recording.labels;
         let material = labels.get("material").map_or(NO_MATERIAL, String::as_str);
         // The names of a recording that is refused after all do not stay.
         let (mut materials, mut sensors) = (self.materials.clone(), self.sensors.clone());
@@ -257,7 +255,7 @@ impl Collection {
         (self.materials, self.sensors) = (materials, sensors);
         self.captures.push(json!({
             "name": name_of(&recording.path),
-            "sha256": sha256,
+            "sha256": recording.sha256,
             "split": settings.split,
             "labels": labels,
         }));

@@ -122,16 +122,11 @@ impl Recording {
 
     /// Gives its presses what options and labels say of them. What was said of a press while it was made counts more
     /// than the labels. An object without a number is `new`.
-    pub(super) fn label_presses(
-        &self,
-        presses: &mut Presses,
-        of: &Settings,
-        new: u32,
-    ) -> anyhow::Result<()> {
+    pub(super) fn label_presses(&mut self, of: &Settings, new: u32) -> anyhow::Result<()> {
         let expected = "flat:MM or ball:MM with 0.1 to 1000 mm";
         let reference = self.label("reference", expected, Piece::rigid)?;
         ensure!(
-            reference.is_none() || presses.are_over_time(),
+            reference.is_none() || self.presses.are_over_time(),
             "label reference: collect presses of rigid pieces with --sequences"
         );
         let shore = |text: &str| text.parse().ok().filter(|shore| SHORE.contains(shore));
@@ -160,7 +155,8 @@ impl Recording {
             })?,
             given => given,
         };
-        for press in &mut presses.all {
+        let presses = &mut self.presses.all;
+        for press in presses.iter_mut() {
             press.split = of.split;
             if reference.is_some() {
                 (press.level, press.object) = (0, object.or(Some(new)));
@@ -174,7 +170,7 @@ impl Recording {
             press.object = named.or(object).or(Some(new));
             press.shore = shore;
         }
-        if reference.is_none() && level.is_none() && presses.all.iter().all(|of| of.level == 0) {
+        if reference.is_none() && level.is_none() && presses.iter().all(|of| of.level == 0) {
             let text = "the recording has no label `level`: give its level with --level";
             return Err(coded(USAGE, text));
         }
@@ -426,7 +422,7 @@ mod tests {
             let (bytes, sensor) = of_a_press(|_| {}, Some(context), false);
             let path = Path::new("a.mcap");
             let recording = Recording::played(path, &bytes, &sensor, Layout::OverTime, &hrn());
-            let recording = recording.unwrap();
+            let mut recording = recording.unwrap();
             let settings = Settings {
                 levels: Vec::new(),
                 level: None,
@@ -434,9 +430,9 @@ mod tests {
                 is_one_object: true,
                 split: Split::Train,
             };
-            let mut presses = recording.presses.clone();
-            recording.label_presses(&mut presses, &settings, 5).unwrap();
-            (presses.all[0].level, presses.all[0].object)
+            recording.label_presses(&settings, 5).unwrap();
+            let press = &recording.presses.all[0];
+            (press.level, press.object)
         };
         let cup = json!({"sensor": "forearm", "level": 3, "object": "cup"});
         assert_eq!(truth(cup), (3, Some(object_of("cup"))));
