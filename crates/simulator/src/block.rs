@@ -14,6 +14,7 @@ use std::f64::consts::PI;
 use super::fourier::Convolver;
 use super::kernel::confined_compliance;
 use super::object::{Axes, FlatFace};
+use crate::CELLS;
 
 /// Poisson's ratio of the layer that carries the short waves. Short waves depend on the plane-strain
 /// modulus only, and with this ratio an even load sinks in evenly.
@@ -59,7 +60,7 @@ pub(super) struct Standing<'a> {
 }
 
 impl Block {
-    /// A block with this face on `width` x `width` cells, of Poisson's ratio `nu`, on a core with this
+    /// A block with this face on the cells of the sensor, of Poisson's ratio `nu`, on a core with this
     /// compliance. `None` for one so low that it is a layer.
     pub(super) fn new(
         face: FlatFace,
@@ -67,7 +68,6 @@ impl Block {
         nu: f64,
         core: f64,
         axes: Axes,
-        width: usize,
     ) -> Option<Self> {
         let (sides_mm, radius_mm) = match face {
             FlatFace::Rectangle { sides_mm } => (sides_mm, None),
@@ -89,8 +89,8 @@ impl Block {
             compliance: 0.0,
         };
         block.compliance = block.column(nu) + core;
-        let cells = 0..width * width;
-        let factor = cells.map(|k| block.factor_at(axes.at(k / width, k % width)));
+        let cells = 0..CELLS * CELLS;
+        let factor = cells.map(|k| block.factor_at(axes.at(k / CELLS, k % CELLS)));
         block.factor = factor.collect();
         Some(block)
     }
@@ -183,9 +183,10 @@ mod tests {
     use super::super::kernel::confined_compliance;
     use super::super::material::Material;
     use super::super::object::{Face, FlatFace, Pose};
-    use super::super::press::{Bench, CELL_MM, Cover, Specimen, Window};
+    use super::super::press::{Bench, Cover, Specimen, Window};
     use super::super::substance::{Creep, Law, Substance};
     use super::super::texture::Patch;
+    use crate::CELL_MM;
     use crate::random::Stream;
     use crate::tests::near;
 
@@ -209,12 +210,7 @@ mod tests {
             creep: [Creep::NONE; 2],
             ..Material::Rubber.properties().substance
         };
-        let patch = Patch::new(
-            &substance.texture,
-            0.0,
-            CELL_MM,
-            &mut Stream::new(1, "block"),
-        );
+        let patch = Patch::new(&substance.texture, 0.0, &mut Stream::new(1, "block"));
         let pose = Pose {
             turn_rad: 0.0,
             shift_mm: [0.0; 2],

@@ -48,6 +48,11 @@ pub use sequence::{Pressed, Sequence, SequenceFrame, SequenceSettings};
 pub use settings::{BroadSensors, CourseSettings, DatasetSettings, Materials, SensorDesigns};
 pub use subject::Labels;
 
+/// Width of a cell, mm: a quarter of a taxel of the JX255N.
+const CELL_MM: f64 = 0.875;
+/// Width of the sensor in cells.
+const CELLS: usize = 112;
+
 /// The names that a sample's `material` indexes: the eight named materials, then, for broad
 /// materials, their laws.
 pub fn material_names(materials: Materials) -> Vec<&'static str> {

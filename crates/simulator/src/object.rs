@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::texture::Patch;
 use crate::random::{Stream, log_even};
+use crate::{CELL_MM, CELLS};
 
 /// The distribution that the objects' shapes are drawn from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -112,14 +113,14 @@ impl Pose {
         }
     }
 
-    /// The axes of the face on `width` x `width` cells around the sensor's centre.
-    pub(super) fn axes(&self, width: usize, cell_mm: f64) -> Axes {
+    /// The axes of the face on the cells of the sensor.
+    pub(super) fn axes(&self) -> Axes {
         let (sin, cos) = self.turn_rad.sin_cos();
-        let first_mm = (0.5 - 0.5 * width as f64) * cell_mm;
+        let first_mm = (0.5 - 0.5 * CELLS as f64) * CELL_MM;
         let (x, y) = (first_mm - self.shift_mm[0], first_mm - self.shift_mm[1]);
         Axes {
             first: [cos * x + sin * y, cos * y - sin * x],
-            across: [cos * cell_mm, -sin * cell_mm],
+            across: [cos * CELL_MM, -sin * CELL_MM],
         }
     }
 }
@@ -388,23 +389,17 @@ impl Face {
         }
     }
 
-    /// Gap h in mm under a level sensor at `width` x `width` cells around the centre. The least gap
+    /// Gap h in mm under a level sensor at each of its cells. The least gap
     /// is 0.
-    pub(super) fn gap_mm(
-        &self,
-        pose: &Pose,
-        patch: &Patch,
-        width: usize,
-        cell_mm: f64,
-    ) -> Vec<f32> {
+    pub(super) fn gap_mm(&self, pose: &Pose, patch: &Patch) -> Vec<f32> {
         let (sin, cos) = pose.turn_rad.sin_cos();
-        let middle = 0.5 * width as f64;
-        let mut gap = vec![NOTHING_MM as f32; width * width];
+        let middle = 0.5 * CELLS as f64;
+        let mut gap = vec![NOTHING_MM as f32; CELLS * CELLS];
         for (k, gap) in gap.iter_mut().enumerate() {
-            let at = |i: usize| (i as f64 + 0.5 - middle) * cell_mm;
+            let at = |i: usize| (i as f64 + 0.5 - middle) * CELL_MM;
             let (x, y) = (
-                at(k % width) - pose.shift_mm[0],
-                at(k / width) - pose.shift_mm[1],
+                at(k % CELLS) - pose.shift_mm[0],
+                at(k / CELLS) - pose.shift_mm[1],
             );
             let (u, v) = (cos * x + sin * y, cos * y - sin * x);
             let drop = self.outline.drop_mm(u, v);

@@ -13,11 +13,8 @@ use super::object::{Face, Pose};
 use super::substance::{Law, Substance, Texture};
 use super::texture::Patch;
 use crate::random::Stream;
+use crate::{CELL_MM, CELLS};
 
-/// Width of a cell, mm: a quarter of a taxel of the JX255N.
-pub(super) const CELL_MM: f64 = 0.875;
-/// Width of the sensor in cells.
-pub(super) const CELLS: usize = 112;
 /// Window widths in cells. FFTs of twice these sizes are fast.
 const WIDTHS: [usize; 6] = [24, 32, 48, 64, 96, CELLS];
 
@@ -69,7 +66,7 @@ pub(super) struct Specimen {
 /// Draws the roughness of one posture's face.
 pub(super) fn draw_patch(texture: &Texture, roughness: f64, stream: &mut Stream) -> Patch {
     let factor = roughness * (0.35 * stream.normal()).exp();
-    Patch::new(texture, factor, CELL_MM, stream)
+    Patch::new(texture, factor, stream)
 }
 
 /// The part of the sensor on which a press is solved.
@@ -117,7 +114,7 @@ impl Specimen {
         pose: &Pose,
         patch: &Patch,
     ) -> Self {
-        let gap_mm = face.gap_mm(pose, patch, CELLS, CELL_MM);
+        let gap_mm = face.gap_mm(pose, patch);
         let (layer, block) = bearing(&substance, young_mpa, face, pose);
         Self {
             substance,
@@ -268,8 +265,7 @@ fn bearing(
         }
         _ => (face.height_mm, 0.0),
     };
-    let axes = pose.axes(CELLS, CELL_MM);
-    let block = Block::new(flat, yields_mm, substance.nu, core, axes, CELLS);
+    let block = Block::new(flat, yields_mm, substance.nu, core, pose.axes());
     match block.filter(|_| young_mpa < STIFF_MPA) {
         Some(block) => {
             let layer = key(LOCAL_NU, Base::RIGID, block.local_mm());
@@ -446,7 +442,7 @@ pub(super) mod tests {
         let face = Face::ball(27.0);
         let mut stream = Stream::new(2, "ball");
         let pose = Pose::draw(&face, &mut stream);
-        let patch = Patch::new(&substance.texture, roughness, CELL_MM, &mut stream);
+        let patch = Patch::new(&substance.texture, roughness, &mut stream);
         Specimen::new(
             substance,
             properties.young_mpa(properties.shore.mean),
@@ -476,7 +472,7 @@ pub(super) mod tests {
             let face = Face::ball(radius);
             let mut stream = Stream::new(4, "hertz");
             let pose = Pose::draw(&face, &mut stream);
-            let patch = Patch::new(&rubber.texture, 0.0, CELL_MM, &mut stream);
+            let patch = Patch::new(&rubber.texture, 0.0, &mut stream);
             let specimen = Specimen::new(rubber, young_mpa, &face, &pose, &patch);
             let (_, _, contact) = bench.press(&specimen, force_n, 0.0, 1.0);
             let softened = rubber.plane_strain(young_mpa) / rubber.compliance_ratio(1.0);

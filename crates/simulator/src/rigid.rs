@@ -2,7 +2,7 @@
 //! which show what it reads of a known form.
 
 use super::object::{Face, Pose};
-use super::press::{Bench, CELL_MM, Specimen, Window};
+use super::press::{Bench, Specimen, Window};
 use super::sensor::{Film, Sensor};
 use super::substance::{Creep, Law, Substance, Texture};
 use super::texture::Patch;
@@ -51,7 +51,7 @@ pub(super) fn specimen(face: &Face, stream: &mut Stream) -> Specimen {
         texture,
     };
     let pose = Pose::draw(face, stream);
-    let patch = Patch::new(&texture, 1.0, CELL_MM, stream);
+    let patch = Patch::new(&texture, 1.0, stream);
     Specimen::new(substance, YOUNG_MPA, face, &pose, &patch)
 }
 

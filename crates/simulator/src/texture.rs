@@ -4,6 +4,7 @@ use realfft::num_complex::Complex32;
 use rustfft::FftPlanner;
 
 use super::substance::Texture;
+use crate::CELL_MM;
 use crate::random::Stream;
 
 /// Width of a patch in cells. A patch is periodic, and wider than the sensor (98 mm), so that a
@@ -14,7 +15,6 @@ const WIDTH: usize = 128;
 #[derive(Debug, Clone)]
 pub(super) struct Patch {
     heights_mm: Vec<f32>,
-    cell_mm: f64,
 }
 
 impl Patch {
@@ -22,14 +22,9 @@ impl Patch {
     ///
     /// The power spectrum falls as `q^-2(1+H)` between the longest and the shortest wavelength. It
     /// is constant above the longest wavelength and 0 below the shortest.
-    pub(super) fn new(
-        texture: &Texture,
-        rms_factor: f64,
-        cell_mm: f64,
-        stream: &mut Stream,
-    ) -> Self {
+    pub(super) fn new(texture: &Texture, rms_factor: f64, stream: &mut Stream) -> Self {
         let half = WIDTH / 2;
-        let unit = 1.0 / (WIDTH as f64 * cell_mm);
+        let unit = 1.0 / (WIDTH as f64 * CELL_MM);
         let (low, high) = (1.0 / texture.longest_mm, 1.0 / texture.shortest_mm);
         let stretch = texture.anisotropy.sqrt();
         let mut spectrum = vec![Complex32::new(0.0, 0.0); WIDTH * WIDTH];
@@ -61,7 +56,6 @@ impl Patch {
         let heights_mm = cells.map(|k| scale * turned[across(k)].re);
         Self {
             heights_mm: heights_mm.collect(),
-            cell_mm,
         }
     }
 
@@ -69,7 +63,7 @@ impl Patch {
     /// third of the shortest waves.
     pub(super) fn height_mm(&self, x_mm: f64, y_mm: f64) -> f32 {
         let locate = |at: f64| {
-            let cell = at / self.cell_mm;
+            let cell = at / CELL_MM;
             let below = cell.floor();
             let part = (cell - below) as f32;
             let (p2, p3) = (part * part, part * part * part);
@@ -109,7 +103,7 @@ mod tests {
             let texture = material.properties().substance.texture;
             let (mut square, mut along, mut across) = (0.0, 0.0, 0.0);
             for seed in 0..seeds {
-                let patch = Patch::new(&texture, 1.0, 0.875, &mut Stream::new(seed, "texture"));
+                let patch = Patch::new(&texture, 1.0, &mut Stream::new(seed, "texture"));
                 for k in 0..4000 {
                     let (x, y) = (f64::from(k % 80) * 1.31, f64::from(k / 80) * 1.77);
                     let h = f64::from(patch.height_mm(x, y));

@@ -1,8 +1,8 @@
 use std::f64::consts::PI;
 
 use super::*;
+use crate::CELL_MM;
 use crate::kernel;
-use crate::press::CELL_MM;
 use crate::tests::near;
 
 const ELASTIC: Local = Local {
@@ -137,7 +137,7 @@ fn rough_contact_area_is_linear_in_the_load() {
         anisotropy: 1.0,
     };
     let (width, modulus) = (112, 0.8);
-    let patch = Patch::new(&texture, 1.0, CELL_MM, &mut Stream::new(8, "rough"));
+    let patch = Patch::new(&texture, 1.0, &mut Stream::new(8, "rough"));
     let height = |i: usize, j: usize| patch.height_mm(i as f64 * CELL_MM, j as f64 * CELL_MM);
     let gap: Vec<f32> = (0..width * width)
         .map(|k| 1.0 - height(k % width, k / width))

@@ -3,8 +3,8 @@
 //! [`Design::jx255n`] is the array of the paper. [`Design::broad`] draws one of many.
 
 use super::SensorProfile;
-use crate::press::{CELL_MM, CELLS};
 use crate::random::{Stream, log_even};
+use crate::{CELL_MM, CELLS};
 use hardnessd_core::frame::{Array, MOST_SIDE, Pitch};
 use hardnessd_core::tare::NEWTONS_PER_COUNT;
 

@@ -2,7 +2,8 @@
 //! taxel feels.
 
 use super::design::Design;
-use crate::press::{CELL_MM, CELLS, Window};
+use crate::press::Window;
+use crate::{CELL_MM, CELLS};
 use hardnessd_core::frame::{Array, Pitch};
 
 /// The film's taxels lie this deep, in depths, before what they feel of a load is left out. At this

@@ -1,5 +1,6 @@
 use super::*;
-use crate::press::{CELL_MM, Window};
+use crate::CELL_MM;
+use crate::press::Window;
 
 const TAXELS: usize = ARRAY.taxels();
 
