@@ -77,11 +77,6 @@ pub trait Learning {
         self.on().parts.train.clone()
     }
 
-    /// The number of samples of a step.
-    fn batch(&self) -> usize {
-        self.on().training.batch
-    }
-
     /// Takes a step of each side on these samples, at this learning rate. `step` counts from 0.
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken;
 
@@ -200,7 +195,7 @@ impl Outputs {
 pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Weights>> {
     let on = learning.on();
     let (stage, epochs) = (on.name, on.training.epochs);
-    let (mut sides, batch) = (learning.sides(), learning.batch());
+    let (mut sides, batch) = (learning.sides(), on.training.batch);
     let mut done = match run {
         Some(run) => begin(stage, &mut sides, run)?,
         None => Checkpoint::default(),

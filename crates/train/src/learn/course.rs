@@ -69,7 +69,9 @@ impl<'a> Course<'a> {
     /// # Errors
     ///
     /// Fails if the levels are no parts of the scale of Shore hardness.
-    pub fn new(on: Stage<'a>, start: Option<&Start>) -> Result<Self, ModelError> {
+    pub fn new(mut on: Stage<'a>, start: Option<&Start>) -> Result<Self, ModelError> {
+        // A sample of an epoch is a group of presses.
+        on.training.batch = (on.training.batch / lots::GROUP).max(1);
         let (presses, train) = (on.presses, &on.parts.train);
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
@@ -140,13 +142,8 @@ impl Learning for Course<'_> {
         vec![Learner::fresh(self.initial.clone(), self.on.training)]
     }
 
-    /// A sample of an epoch is a group of presses.
     fn samples(&self) -> Vec<usize> {
         self.lots.tickets()
-    }
-
-    fn batch(&self) -> usize {
-        (self.on.training.batch / lots::GROUP).max(1)
     }
 
     /// Takes a step on groups of presses.
