@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::interval::{self, Drawn, Mean};
 use super::metrics::{accuracy, category_accuracy, kappa, kappa_quadratic};
-use crate::data::presses::{Presses, Unit};
+use crate::data::presses::Unit;
 use hardnessd_core::verdict::{Level, Shore, Verdict, argmax};
 
 /// Number of equal bins of the largest probability in the expected calibration error.
@@ -30,26 +30,6 @@ pub struct Case {
     pub unit: Option<(Unit, u32)>,
     /// The verdict.
     pub verdict: Verdict,
-}
-
-/// Verdicts on presses in the form that is evaluated.
-pub fn cases(presses: &Presses, verdicts: &[(usize, Verdict)]) -> Vec<Case> {
-    let places: Vec<usize> = verdicts.iter().map(|&(place, _)| place).collect();
-    let units = presses.units(&places);
-    let case = |(number, (place, verdict)): (usize, &(usize, Verdict))| {
-        let press = &presses.all[*place];
-        Case {
-            press: *place,
-            level: press.level,
-            shore: press.shore,
-            object: press.object,
-            unit: units
-                .as_ref()
-                .map(|(unit, numbers)| (*unit, numbers[number])),
-            verdict: verdict.clone(),
-        }
-    };
-    verdicts.iter().enumerate().map(case).collect()
 }
 
 impl Case {

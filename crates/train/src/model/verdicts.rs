@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use anyhow::ensure;
 
 use crate::data::presses::Presses;
-use crate::judge::evaluated::{Case, cases};
+use crate::judge::evaluated::Case;
 use hardnessd_core::frame::Array;
 use hardnessd_core::judge::OwnPresses;
 use hardnessd_core::verdict::{
@@ -174,5 +174,19 @@ pub fn of(
         let shore = verdict.shore.map(|shore| hrn.within(shore, verdict.level));
         verdicts.push((place, Verdict { shore, ..verdict }));
     }
-    Ok(cases(presses, &verdicts))
+    let judged: Vec<usize> = verdicts.iter().map(|&(place, _)| place).collect();
+    let units = presses.units(&judged);
+    let case = |(number, (place, verdict)): (usize, (usize, Verdict))| {
+        let press = &presses.all[place];
+        let unit = units.as_ref();
+        Case {
+            press: place,
+            level: press.level,
+            shore: press.shore,
+            object: press.object,
+            unit: unit.map(|(unit, numbers)| (*unit, numbers[number])),
+            verdict,
+        }
+    };
+    Ok(verdicts.into_iter().enumerate().map(case).collect())
 }
