@@ -150,10 +150,8 @@ impl Solver {
             let (mut error, mut work, mut rz, mut cross) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
             let mut penetration_mm = 0.0_f32;
             for i in 0..pressure_mpa.len() {
-                let (r, p) = (
-                    self.residual[i] - contact.approach_mm as f32,
-                    pressure_mpa[i],
-                );
+                let r = self.residual[i] - contact.approach_mm as f32;
+                let p = pressure_mpa[i];
                 if p > 0.0 {
                     let z = r * self.inverse[i];
                     error += f64::from(p * r.abs());

@@ -43,9 +43,8 @@ impl Durometer {
         let mut solver = Solver::new(WIDTH);
         let compliance = substance.compliance_ratio(READ_S);
         let unit = CELL_MM / substance.plane_strain(1.0) * compliance;
-        let layer = substance
-            .layer(PIECE_MM)
-            .map(|(base, height_mm)| (Layer::new(substance.nu, base), height_mm / CELL_MM));
+        let layer = substance.layer(PIECE_MM);
+        let layer = layer.map(|(base, mm)| (Layer::new(substance.nu, base), mm / CELL_MM));
         let spectrum = solver.convolver.spectrum(|i, j| {
             let (x, y) = (i as f64, j as f64);
             unit * match &layer {
@@ -59,10 +58,9 @@ impl Durometer {
                 let at = |i: usize| (i as f64 + 0.5 - 0.5 * WIDTH as f64) * CELL_MM;
                 let square = at(k / WIDTH).powi(2) + at(k % WIDTH).powi(2);
                 let rest = RADIUS_MM * RADIUS_MM - square;
-                if rest > 0.0 {
-                    (RADIUS_MM - rest.sqrt()) as f32
-                } else {
-                    1e3
+                match rest > 0.0 {
+                    true => (RADIUS_MM - rest.sqrt()) as f32,
+                    false => 1e3,
                 }
             })
             .collect();

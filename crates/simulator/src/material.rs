@@ -65,10 +65,9 @@ impl Material {
 
     /// The material's split in the paper: training and test use different materials.
     pub fn split(self) -> Split {
-        if self.index() < 4 {
-            Split::Train
-        } else {
-            Split::Test
+        match self.index() {
+            0..4 => Split::Train,
+            _ => Split::Test,
         }
     }
 

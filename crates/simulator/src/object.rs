@@ -139,10 +139,9 @@ impl Axes {
     pub(super) fn at(&self, row: usize, column: usize) -> [f64; 2] {
         let (row, column) = (row as f64, column as f64);
         let [cos, sin] = [self.across[0], -self.across[1]];
-        [
-            self.first[0] + column * cos + row * sin,
-            self.first[1] + row * cos - column * sin,
-        ]
+        let u = self.first[0] + column * cos + row * sin;
+        let v = self.first[1] + row * cos - column * sin;
+        [u, v]
     }
 
     /// The axes on the cells from this one on.
@@ -397,10 +396,8 @@ impl Face {
         let mut gap = vec![NOTHING_MM as f32; CELLS * CELLS];
         for (k, gap) in gap.iter_mut().enumerate() {
             let at = |i: usize| (i as f64 + 0.5 - middle) * CELL_MM;
-            let (x, y) = (
-                at(k % CELLS) - pose.shift_mm[0],
-                at(k / CELLS) - pose.shift_mm[1],
-            );
+            let x = at(k % CELLS) - pose.shift_mm[0];
+            let y = at(k / CELLS) - pose.shift_mm[1];
             let (u, v) = (cos * x + sin * y, cos * y - sin * x);
             let drop = self.outline.drop_mm(u, v);
             if drop < NOTHING_MM {

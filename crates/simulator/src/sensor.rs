@@ -175,16 +175,14 @@ impl Sensor {
             *counts = if let Some(&resting) = resting.get(k) {
                 design.counts(resting + read / design.count_n)
             } else {
-                let noise_n = if self.gain[k] > 0.0 {
-                    (design.noise_n * noise.normal()) as f32
-                } else {
-                    0.0
+                let noise_n = match self.gain[k] > 0.0 {
+                    true => (design.noise_n * noise.normal()) as f32,
+                    false => 0.0,
                 };
                 let counts = design.counts((read + noise_n) / design.count_n);
-                if counts < design.least_counts {
-                    0.0
-                } else {
-                    counts
+                match counts < design.least_counts {
+                    true => 0.0,
+                    false => counts,
                 }
             };
         }

@@ -297,10 +297,8 @@ fn write_results(out: &Path, sets: &[TestSet]) -> anyhow::Result<()> {
     let objects = all.iter().map(|judged| judged.objects.as_str());
     let csv: String = [head].into_iter().chain(objects).collect();
     let entries: Vec<&Value> = all.iter().map(|judged| &judged.entry).collect();
-    write_whole(
-        &out.join("results.json"),
-        &serde_json::to_vec_pretty(&entries)?,
-    )?;
+    let json = serde_json::to_vec_pretty(&entries)?;
+    write_whole(&out.join("results.json"), &json)?;
     write_whole(&out.join("objects.csv"), csv.as_bytes())
 }
 

@@ -210,9 +210,8 @@ pub(crate) fn overridden<T: Serialize + DeserializeOwned>(
     given: &toml::Table,
 ) -> anyhow::Result<T> {
     let own = toml::Table::try_from(settings).expect("settings are plain tables");
-    merged(own, given.clone())
-        .try_into()
-        .map_err(|error| coded(CONFIG, error.message()))
+    let merged = merged(own, given.clone()).try_into();
+    merged.map_err(|error| coded(CONFIG, error.message()))
 }
 
 /// Reads a file of settings, whose values take the place of others.

@@ -28,11 +28,9 @@ fn moved(frame: &ModelFrame, symmetry: usize, rows: isize, columns: isize) -> Mo
     const { assert!(ROWS == COLS, "a transposed frame must fit") };
     let mut image = ModelFrame::default();
     for (place, newtons) in image.newtons.iter_mut().enumerate() {
-        let from = (
-            (place / COLS).checked_add_signed(-rows),
-            (place % COLS).checked_add_signed(-columns),
-        );
-        let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = from else {
+        let row = (place / COLS).checked_add_signed(-rows);
+        let column = (place % COLS).checked_add_signed(-columns);
+        let (Some(r @ 0..ROWS), Some(c @ 0..COLS)) = (row, column) else {
             continue;
         };
         let (r, c) = if symmetry & 4 == 0 { (r, c) } else { (c, r) };

@@ -270,13 +270,11 @@ impl Collection {
     /// Returns an error if it was added before, its taxels have another pitch, or all presses are too many.
     pub fn add_set(&mut self, set: Presses) -> anyhow::Result<()> {
         for Source { name, sha256, .. } in &set.sources {
-            let is_same = self
-                .captures
-                .iter()
-                .any(|before| before["sha256"] == *sha256);
+            let mut before = self.captures.iter();
+            let is_same = before.any(|before| before["sha256"] == *sha256);
             ensure!(!is_same, "{name}: is named twice");
-            self.captures
-                .push(json!({ "name": name, "sha256": sha256 }));
+            let capture = json!({ "name": name, "sha256": sha256 });
+            self.captures.push(capture);
         }
         self.presses.append(set)
     }
@@ -344,9 +342,8 @@ impl Collection {
         if usize::from(most) <= stated.len() {
             return Ok(stated);
         }
-        let are_numbers = stated
-            .iter()
-            .all(|level| level.label == level.level.to_string());
+        let is_number = |level: &Level| level.label == level.level.to_string();
+        let are_numbers = stated.iter().all(is_number);
         ensure!(
             are_numbers || stated == papers_levels(),
             "level: found {most}, expected at most {}, as many as the data set has names for",

@@ -33,10 +33,9 @@ pub fn by_object(presses: &Presses, places: &[usize]) -> Option<Vec<Fold>> {
         return None;
     }
     let count = of_levels.values().map(Vec::len).sum();
-    let groups = if count <= LEFT_OUT_ALONE {
-        count
-    } else {
-        GROUPS
+    let groups = match count {
+        0..=LEFT_OUT_ALONE => count,
+        _ => GROUPS,
     };
     let mut tests = vec![Vec::new(); groups];
     let mut stream = Stream::new(SEED, "groups of objects");

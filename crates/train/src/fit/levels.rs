@@ -84,11 +84,11 @@ fn measured(named: &BTreeMap<&str, Vec<Option<f32>>>) -> Option<Vec<(String, Str
         ranges.push((*name, least, most));
     }
     ranges.sort_by(|one, other| other.2.total_cmp(&one.2));
-    let borders: Option<Vec<f32>> = ranges
-        .windows(2)
-        .map(|pair| (pair[0].1 > pair[1].2).then_some(0.5 * (pair[0].1 + pair[1].2)))
-        .collect();
-    let borders = borders?;
+    let border = |pair: &[(&str, f32, f32)]| {
+        let (above, below) = (pair[0].1, pair[1].2);
+        (above > below).then_some(0.5 * (above + below))
+    };
+    let borders: Vec<f32> = ranges.windows(2).map(border).collect::<Option<_>>()?;
     let shore = |place: usize| match (place.checked_sub(1), borders.get(place)) {
         (None, Some(low)) => format!(">{low}"),
         (Some(above), Some(low)) => format!("{low}-{}", borders[above]),

@@ -88,11 +88,9 @@ pub fn images(weights: &Weights, eta: Tensor<2>, normalisation: &mut Normalisati
     let [batch, _] = eta.dims();
     // Eq. (2): z^k = mu^k + sigma^k eta
     let of_component = |name| {
-        weights
-            .tensor::<2>(name)
-            .reshape([1, COMPONENTS, NOISE])
-            .expand([batch / COMPONENTS, COMPONENTS, NOISE])
-            .reshape([batch, NOISE])
+        let one = weights.tensor::<2>(name).reshape([1, COMPONENTS, NOISE]);
+        let each = one.expand([batch / COMPONENTS, COMPONENTS, NOISE]);
+        each.reshape([batch, NOISE])
     };
     let z = of_component("mixture.mu").add(of_component("mixture.sigma").mul(eta));
 

@@ -69,11 +69,8 @@ pub fn logits(
 /// `targets` is `[batch, L]` with a 1 at each sample's level.
 pub fn cross_entropy(logits: Tensor<2>, targets: Tensor<2>) -> Tensor<1> {
     let batch = logits.dims()[0] as f32;
-    activation::log_softmax(logits, 1)
-        .mul(targets)
-        .sum()
-        .neg()
-        .div_scalar(batch)
+    let of_levels = activation::log_softmax(logits, 1).mul(targets);
+    of_levels.sum().neg().div_scalar(batch)
 }
 
 /// The graph from newtons to logits. The inference library fuses batch normalisation with the convolution

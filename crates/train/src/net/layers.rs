@@ -127,9 +127,8 @@ pub fn transposed_convolution(
     let images = module::conv_transpose2d(x.permute([3, 0, 1, 2]), kernels, None, options);
     let images = images.slice([0..batch, 0..layer.inputs, 0..size, 0..size]);
     let images = images.permute([1, 2, 3, 0]);
-    images
-        .reshape([layer.inputs, size * size * batch])
-        .add(bias)
+    let images = images.reshape([layer.inputs, size * size * batch]);
+    images.add(bias)
 }
 
 /// Batch normalisation of the rows of `x` `[channels, numbers]`, then LeakyReLU; ReLU with
@@ -345,18 +344,17 @@ fn from_patches(patches: FlexTensor, layer: Convolution) -> FlexTensor {
     let batch = of_channel / (taps * layer.small() * layer.small());
     let image = layer.size * layer.size * batch;
     let mut values = vec![0.0; layer.inputs * image];
-    values
-        .par_chunks_exact_mut(image)
-        .zip(numbers(&patches).par_chunks_exact(of_channel))
-        .for_each(|(image, patches)| {
-            let runs = (0..taps).flat_map(|tap| layer.runs(tap, batch));
-            for (run, patch) in runs.zip(patches.chunks_exact(batch)) {
-                let Some(run) = run else { continue };
-                for (sum, value) in image[run..run + batch].iter_mut().zip(patch) {
-                    *sum += value;
-                }
+    let patches = numbers(&patches).par_chunks_exact(of_channel);
+    let channels = values.par_chunks_exact_mut(image).zip(patches);
+    channels.for_each(|(image, patches)| {
+        let runs = (0..taps).flat_map(|tap| layer.runs(tap, batch));
+        for (run, patch) in runs.zip(patches.chunks_exact(batch)) {
+            let Some(run) = run else { continue };
+            for (sum, value) in image[run..run + batch].iter_mut().zip(patch) {
+                *sum += value;
             }
-        });
+        }
+    });
     tensor(values, layer.inputs)
 }
 

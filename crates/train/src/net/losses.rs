@@ -80,10 +80,8 @@ pub fn discriminator(
         // A real frame is not generated. A generated frame is of the last level.
         Game::FakeLevel => {
             let [batch, outputs] = generated.dims();
-            let last = generated
-                .clone()
-                .slice([0..batch, outputs - 1..outputs])
-                .sub(log_sum_exp(generated));
+            let last = generated.clone().slice([0..batch, outputs - 1..outputs]);
+            let last = last.sub(log_sum_exp(generated));
             not_generated(real).mean().sub(last.mean())
         }
         // p(real) = sigmoid(LSE(l)), so -log p(real) = sp(LSE) - LSE and -log p(fake) = sp(LSE).
@@ -97,9 +95,8 @@ pub fn discriminator(
         None => loss,
         // Eq. (9) over all logits, because a labelled frame is not a generated one either.
         Some((logits, targets)) => {
-            let of_level = first(logits.clone(), targets.dims()[1])
-                .mul(targets)
-                .sum_dim(1);
+            let levels = first(logits.clone(), targets.dims()[1]);
+            let of_level = levels.mul(targets).sum_dim(1);
             loss.add(log_sum_exp(logits).sub(of_level).mean())
         }
     }

@@ -53,10 +53,9 @@ impl Sensor {
             (counts - counts.round()).abs() < 0.02
         };
         Self {
-            step_n: if values.iter().all(is_multiple) {
-                step_n
-            } else {
-                0.0
+            step_n: match values.iter().all(is_multiple) {
+                true => step_n,
+                false => 0.0,
             },
             threshold_n,
             most_n,
@@ -65,10 +64,9 @@ impl Sensor {
 
     /// The sensor's reading of a force.
     pub fn newtons(self, newtons: f32) -> f32 {
-        let counted = if self.step_n > 0.0 {
-            (newtons / self.step_n).round() * self.step_n
-        } else {
-            newtons
+        let counted = match self.step_n {
+            0.0 => newtons,
+            step_n => (newtons / step_n).round() * step_n,
         };
         // Half a step is tolerated, because multiples are not exact.
         if counted < self.threshold_n - 0.5 * self.step_n {

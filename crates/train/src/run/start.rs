@@ -37,9 +37,8 @@ impl Start {
         let (_, bytes) = load(path)?;
         let shown = || path.display().to_string();
         let model = pb::ModelProto::decode(bytes.as_slice()).with_context(shown)?;
-        let exported = model
-            .graph
-            .and_then(|graph| course::exported(&graph, device));
+        let exported = |graph| course::exported(&graph, device);
+        let exported = model.graph.and_then(exported);
         let (weights, standard) = exported
             .ok_or_else(|| anyhow!("not a model of the method course, or of another revision"))
             .with_context(shown)?;

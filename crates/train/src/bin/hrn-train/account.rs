@@ -104,9 +104,8 @@ pub(super) fn of_difference(difference: &Difference) -> String {
 /// Verdicts as CSV, one line each after the header: object, true level, verdict's level,
 /// probabilities, Shore OO with its interval, and the true Shore OO. Unknown values are empty.
 pub(super) fn csv(cases: &[Case]) -> String {
-    let levels = cases
-        .first()
-        .map_or(0, |case| case.verdict.probabilities.len());
+    let first = cases.first().map(|case| &case.verdict.probabilities);
+    let levels = first.map_or(0, Vec::len);
     let probabilities = (1..=levels).map(|level| format!("probability_{level},"));
     let probabilities: String = probabilities.collect();
     let mut text =

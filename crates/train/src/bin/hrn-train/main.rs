@@ -74,10 +74,8 @@ fn main() -> ExitCode {
 
 /// The exit code of an error: its own, 78 bad model, 74 other I/O error, 1 any other error.
 fn exit_code(error: &anyhow::Error) -> u8 {
-    let own = error
-        .chain()
-        .find_map(|error| error.downcast_ref::<Coded>());
-    if let Some(own) = own {
+    let mut chain = error.chain();
+    if let Some(own) = chain.find_map(|error| error.downcast_ref::<Coded>()) {
         own.code
     } else if error.chain().any(<dyn Error>::is::<ModelError>) {
         exit::CONFIG

@@ -32,10 +32,8 @@ pub(super) fn evaluate(arguments: &Evaluate) -> anyhow::Result<String> {
     }
     let judged = models.iter().map(|hrn| judge(arguments, &presses, hrn));
     let judged: Vec<Vec<Case>> = judged.collect::<anyhow::Result<_>>()?;
-    let of_models = models.iter().zip(&judged);
-    let evaluations: Vec<Evaluated> = of_models
-        .map(|(hrn, cases)| Evaluated::of(cases, &hrn.card().levels))
-        .collect();
+    let evaluated = |(hrn, cases): (&Model, &Vec<Case>)| Evaluated::of(cases, &hrn.card().levels);
+    let evaluations: Vec<Evaluated> = models.iter().zip(&judged).map(evaluated).collect();
     if let Some(path) = &arguments.verdicts {
         write_new(path, account::csv(&judged[0]).as_bytes())?;
     }

@@ -58,10 +58,8 @@ pub(super) fn simulate(arguments: &Simulate) -> anyhow::Result<String> {
     let begun = Instant::now();
     let (presses, left_out) = simulated::simulate(&settings, layout);
     let seconds = begun.elapsed().as_secs_f64();
-    write_new(
-        &arguments.out,
-        &simulated::to_bytes(&settings, layout, &presses)?,
-    )?;
+    let bytes = simulated::to_bytes(&settings, layout, &presses)?;
+    write_new(&arguments.out, &bytes)?;
     let count = presses.all.len();
     let left_out = match layout {
         Layout::Frames => String::new(),

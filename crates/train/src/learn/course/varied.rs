@@ -106,9 +106,8 @@ fn at(reported: &[(f32, f32)], time_s: f32) -> f32 {
         return last.1;
     }
     // Before the begin, the arm moved at the speed between the first two moments.
-    let next = reported
-        .partition_point(|&(moment_s, _)| moment_s <= time_s)
-        .clamp(1, reported.len() - 1);
+    let next = reported.partition_point(|&(moment_s, _)| moment_s <= time_s);
+    let next = next.clamp(1, reported.len() - 1);
     let (before, after) = (reported[next - 1], reported[next]);
     before.1 + (after.1 - before.1) * (time_s - before.0) / (after.0 - before.0)
 }
