@@ -13,7 +13,8 @@ use crate::columns::Kind;
 /// A checksum that each frame has. Places are counted from the end of the cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Check {
-    pub(crate) checksum: Checksum,
+    /// `None` for Adler-32, which the daemon does not read: its bytes are skipped.
+    pub(crate) checksum: Option<Checksum>,
     /// The place of its first byte.
     pub(crate) at: usize,
     /// The place from which on it covers everything: the beginning of a frame, or the end of its mark. It is
@@ -24,8 +25,21 @@ pub(crate) struct Check {
 impl Check {
     /// The places of its bytes.
     pub(crate) fn places(&self) -> Range<usize> {
-        self.at..self.at + self.checksum.bytes()
+        self.at..self.at + self.bytes()
     }
+
+    pub(crate) fn bytes(&self) -> usize {
+        self.checksum.map_or(4, Checksum::bytes)
+    }
+}
+
+/// The Adler-32 of `bytes` (RFC 1950), as it is sent.
+fn adler32(bytes: &[u8]) -> [u8; 4] {
+    let (sum, sums) = bytes.iter().fold((1, 0), |(sum, sums), &byte| {
+        let sum = (sum + u32::from(byte)) % 65_521;
+        (sum, (sums + sum) % 65_521)
+    });
+    (sums << 16 | sum).to_be_bytes()
 }
 
 /// The checksums, the most certain first: the lowest byte of a `sum16` is a `sum8`.
@@ -59,14 +73,16 @@ pub(crate) fn find(
     tried: &mut Tried,
 ) -> Option<Check> {
     let length = beside.len();
-    for (index, checksum) in CHECKSUMS.into_iter().enumerate() {
-        for at in (0..(length + 1).saturating_sub(checksum.bytes())).rev() {
-            let check = |begin| Check {
-                checksum,
-                at,
-                begin,
-            };
-            let places = check(None).places();
+    let checksums = [None].into_iter().chain(CHECKSUMS.map(Some));
+    for (index, checksum) in checksums.enumerate() {
+        let check = |at, begin| Check {
+            checksum,
+            at,
+            begin,
+        };
+        let bytes = check(0, None).bytes();
+        for at in (0..(length + 1).saturating_sub(bytes)).rev() {
+            let places = check(at, None).places();
             let mut kinds = beside[places.clone()].iter();
             if kinds.all(|kind| kind.constant().is_some()) {
                 continue;
@@ -76,24 +92,25 @@ pub(crate) fn find(
                 *tried.entry((index, asked)).or_insert_with(|| {
                     holds(spans, |span| {
                         let cells_end = span.len() - length;
-                        let sent = checksum.sent(&span[from..cells_end + end]);
-                        let is_right =
-                            span[cells_end..][places.clone()] == sent[..checksum.bytes()];
+                        let covered = &span[from..cells_end + end];
+                        let sent = checksum
+                            .map_or_else(|| adler32(covered), |checksum| checksum.sent(covered));
+                        let is_right = span[cells_end..][places.clone()] == sent[..bytes];
                         (sent, is_right)
                     })
                 })
             };
             if holds(length, 0) {
-                return Some(check(None));
+                return Some(check(at, None));
             }
             // One of two bytes or more holds by chance nowhere. Others begin with the mark, behind it, or with the cells.
             let is_constant = |kind: &Kind| kind.constant().is_some();
             let mut begins = (places.end..=length).filter(|&begin| {
                 let around = &beside[begin - 1..length.min(begin + 1)];
-                checksum.bytes() > 1 || begin == length || around.iter().any(is_constant)
+                bytes > 1 || begin == length || around.iter().any(is_constant)
             });
             if let Some(begin) = begins.find(|&begin| holds(begin, at)) {
-                return Some(check(Some(begin)));
+                return Some(check(at, Some(begin)));
             }
         }
     }

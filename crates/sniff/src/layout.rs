@@ -226,6 +226,7 @@ impl Parts<'_> {
     /// The settings for a frame that begins at `split` within the mark. Places are counted from the end of the
     /// cells. No key is left to its default.
     fn of_split(&self, mark: &Range<usize>, split: usize, check: Option<Check>) -> Settings {
+        let read = check.and_then(|check| Some((check.checksum?, check)));
         let values = |range: Range<usize>| -> Vec<u8> {
             range.filter_map(|at| self.place.constant(at)).collect()
         };
@@ -250,7 +251,7 @@ impl Parts<'_> {
         // The other numbers of the first taxel and of the last one are skipped too.
         let number = self.cell.bytes();
         let header = self.place.beside.len() - mark.end + self.channel * number;
-        let footer = check.map_or(mark.start, |check| check.at)
+        let footer = read.map_or(mark.start, |(_, check)| check.at)
             + (self.channels - 1 - self.channel) * number;
         Settings {
             sync: Some(HexBytes(sync)),
@@ -260,8 +261,8 @@ impl Parts<'_> {
             cell: Some(self.cell),
             stride_bytes: (self.channels > 1).then_some(self.channels * number),
             footer_bytes: (footer > 0).then_some(footer),
-            checksum: Some(check.map_or(Checksum::None, |check| check.checksum)),
-            checksum_over: check.and_then(|check| match check.begin {
+            checksum: Some(read.map_or(Checksum::None, |(checksum, _)| checksum)),
+            checksum_over: read.and_then(|(_, check)| match check.begin {
                 None => Some(ChecksumOver::Cells),
                 Some(begin) => self
                     .place

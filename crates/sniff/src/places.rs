@@ -148,8 +148,8 @@ impl Place {
     /// to its high byte are no cells then.
     pub(crate) fn with(mut self, check: Option<Check>) -> Self {
         let of_sum = check.map_or(0..0, |check| match check.checksum {
-            Checksum::Sum16 => check.at + 2..check.at + 4,
-            Checksum::Sum16Be => check.at.saturating_sub(2)..check.at,
+            Some(Checksum::Sum16) => check.at + 2..check.at + 4,
+            Some(Checksum::Sum16Be) => check.at.saturating_sub(2)..check.at,
             _ => 0..0,
         });
         for beside in self.beside.iter_mut().take(of_sum.end).skip(of_sum.start) {

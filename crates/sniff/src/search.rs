@@ -190,10 +190,10 @@ pub(crate) fn in_frames(
         .collect();
     places.sort_by(|a, b| a.bits(columns).total_cmp(&b.bits(columns)));
     places.truncate(most);
-    // A checksum holds in all frames by no chance.
-    if places.iter().any(|place| place.check.is_some()) {
-        places.retain(|place| place.check.is_some());
-    }
+    // A checksum holds in all frames by no chance, and a part of it may look like a shorter one.
+    let bytes = |place: &Place| place.check.map(|check| check.bytes());
+    let most = places.iter().map(bytes).max().flatten();
+    places.retain(|place| bytes(place) == most);
     let candidates = search.candidates(places, known);
     search.rank(&candidates, begin, &capture.bytes, known)
 }
