@@ -12,7 +12,7 @@ use hardnessd_core::wire::{
 
 use crate::checks::Check;
 use crate::columns::{Columns, Number};
-use crate::places::Place;
+use crate::places::{LEAST_MARK, Place};
 
 /// A layout, and the outcome of decoding the bytes with it.
 #[derive(Debug, Clone)]
@@ -41,6 +41,8 @@ const DAMAGED: u64 = 20;
 
 /// How many ways to divide a mark into tail and header are tried.
 const MOST_SPLITS: usize = 3;
+/// The most bytes that are looked for, where fewer do. Others beside them may be numbers that change seldom.
+const MOST_MARK: usize = 4;
 
 /// Hands each frame in `bytes` to `take`, as the daemon would decode it. Returns the number of damaged
 /// ones, and the share of the bytes that frames hold. `None` for impossible settings.
@@ -165,6 +167,10 @@ pub(crate) struct Parts<'a> {
     pub(crate) begin: Option<usize>,
 }
 
+/// Constant bytes by which the daemon finds frames, where a frame begins, if that is known, and what the checksum
+/// covers.
+type Mark = (Range<usize>, Option<usize>, Option<ChecksumOver>);
+
 impl Parts<'_> {
     /// The checksum. Of several numbers a taxel, the cells that are read are not all that it covers.
     fn check(&self) -> Option<Check> {
@@ -174,45 +180,83 @@ impl Parts<'_> {
 
     /// The settings for this array, the likeliest first, and whether a board has them.
     fn settings(&self, check: Option<Check>) -> Vec<(Settings, bool)> {
-        let covered = check.and_then(|check| check.begin);
-        let begin = covered.or_else(|| self.beginning());
-        let mark = match check.map(|check| check.places().end) {
-            Some(end) => match covered.filter(|&begin| self.place.constant(begin).is_none()) {
-                Some(begin) => end..begin,
-                None => {
-                    let begin = begin.unwrap_or(end).max(end);
-                    let whole = end..self.place.constant_end(begin);
-                    let shorter = self.place.without_high_bytes(whole.clone()).end;
-                    end..shorter.max(begin + 1).min(whole.end)
-                }
-            },
-            None => match self.place.mark() {
-                Some(mark) => mark,
-                None => return Vec::new(),
-            },
-        };
-        if mark.is_empty() || mark.clone().any(|at| self.place.constant(at).is_none()) {
-            return Vec::new();
-        }
-        // What is not constant follows the mark.
-        let begin = begin.map(|at| match self.place.constant(at) {
-            None if check.is_some() => mark.start,
-            _ => at,
-        });
-        let begin = begin.filter(|at| (mark.start..=mark.end).contains(at));
-        let splits = begin.into_iter().chain(mark.start..=mark.end);
-        let mut tried: Vec<(Settings, bool)> = splits
-            .filter_map(|split| {
-                let settings = self.of_split(&mark, split, check);
+        let marks = self.marks(check);
+        let of = |mark: &Mark| -> Vec<(Settings, bool)> {
+            let (bytes, begin, _) = mark;
+            let begin = begin.filter(|at| (bytes.start..=bytes.end).contains(at));
+            let splits = begin.into_iter().chain(bytes.start..=bytes.end);
+            let settings = splits.filter_map(|split| {
+                let settings = self.of_split(mark, split, check);
                 let layout = Layout::new(&settings).ok()?;
                 Some(board(&layout).map_or((settings, false), |board| (board, true)))
-            })
-            .collect();
-        if begin.is_none() {
-            tried.sort_by_key(|(_, is_board)| !is_board);
-        }
+            });
+            settings.collect()
+        };
+        let short = marks.iter().map(|mark| self.shortened(mark.clone(), check));
+        let mut tried: Vec<_> = short.flat_map(|mark| of(&mark)).collect();
         tried.truncate(MOST_SPLITS);
-        tried
+        let (boards, others): (Vec<_>, Vec<_>) = marks
+            .iter()
+            .flat_map(of)
+            .partition(|(_, is_board)| *is_board);
+        tried.extend(others.into_iter().take(MOST_SPLITS));
+        [boards, tried].concat()
+    }
+
+    /// The marks that there may be, the likeliest first.
+    fn marks(&self, check: Option<Check>) -> Vec<Mark> {
+        let beginning = self.beginning();
+        let Some(check) = check else {
+            let mark = self.place.mark().into_iter();
+            return mark.map(|bytes| (bytes, beginning, None)).collect();
+        };
+        let end = check.places().end;
+        let from = |begin: usize| {
+            let whole = end..self.place.constant_end(begin);
+            let shorter = self.place.without_high_bytes(whole.clone()).end;
+            end..shorter.max(begin + 1).min(whole.end)
+        };
+        let mut marks = match check.begin {
+            None => {
+                let begin = beginning.unwrap_or(end).max(end);
+                vec![(from(begin), Some(begin), Some(ChecksumOver::Cells))]
+            }
+            Some(begin) => {
+                let over = Some(ChecksumOver::AfterSync);
+                let after = (end..begin, beginning.or(Some(end)), over);
+                vec![after, (from(begin), Some(begin), None)]
+            }
+        };
+        // One byte before what is covered may end a frame, where two behind it are likelier a mark than a number.
+        if let Some(begin) = check.begin {
+            let own = self.place.own_mark(&(end..begin));
+            let before = begin - own.map_or(end, |own| own.end);
+            let behind = self.place.constant_end(begin) - begin;
+            if before < LEAST_MARK && (before == 0 || behind >= LEAST_MARK) {
+                marks.reverse();
+            }
+        }
+        marks.retain(|(bytes, ..)| {
+            let is_constant = |at| self.place.constant(at).is_some();
+            !bytes.is_empty() && bytes.clone().all(is_constant)
+        });
+        marks
+    }
+
+    /// The mark with no more bytes than are needed.
+    fn shortened(&self, (bytes, begin, over): Mark, check: Option<Check>) -> Mark {
+        let own = self.place.own_mark(&bytes);
+        let first = match &own {
+            Some(own) if check.is_none() => own.start,
+            _ => bytes.start,
+        };
+        let from = check.and(begin).unwrap_or(first);
+        let from = own.map_or(from, |own| from.max(own.end));
+        let last = match over {
+            Some(ChecksumOver::AfterSync) => bytes.end,
+            _ => bytes.end.min(from + MOST_MARK),
+        };
+        (first..last, begin, over)
     }
 
     /// The place beside the cells at which a frame begins.
@@ -225,8 +269,8 @@ impl Parts<'_> {
 
     /// The settings for a frame that begins at `split` within the mark. Places are counted from the end of the
     /// cells. No key is left to its default.
-    fn of_split(&self, mark: &Range<usize>, split: usize, check: Option<Check>) -> Settings {
-        let read = check.and_then(|check| Some((check.checksum?, check)));
+    fn of_split(&self, (mark, _, over): &Mark, split: usize, check: Option<Check>) -> Settings {
+        let read = check.and_then(|check| Some((check.checksum?, check.at)));
         let values = |range: Range<usize>| -> Vec<u8> {
             range.filter_map(|at| self.place.constant(at)).collect()
         };
@@ -251,8 +295,8 @@ impl Parts<'_> {
         // The other numbers of the first taxel and of the last one are skipped too.
         let number = self.cell.bytes();
         let header = self.place.beside.len() - mark.end + self.channel * number;
-        let footer = read.map_or(mark.start, |(_, check)| check.at)
-            + (self.channels - 1 - self.channel) * number;
+        let footer =
+            read.map_or(mark.start, |(_, at)| at) + (self.channels - 1 - self.channel) * number;
         Settings {
             sync: Some(HexBytes(sync)),
             tail: (!tail.is_empty()).then_some(HexBytes(tail)),
@@ -262,14 +306,7 @@ impl Parts<'_> {
             stride_bytes: (self.channels > 1).then_some(self.channels * number),
             footer_bytes: (footer > 0).then_some(footer),
             checksum: Some(read.map_or(Checksum::None, |(checksum, _)| checksum)),
-            checksum_over: read.and_then(|(_, check)| match check.begin {
-                None => Some(ChecksumOver::Cells),
-                Some(begin) => self
-                    .place
-                    .constant(begin)
-                    .is_none()
-                    .then_some(ChecksumOver::AfterSync),
-            }),
+            checksum_over: read.and(*over),
             rows: Some(self.array.rows),
             cols: Some(self.array.cols),
             order: (self.order != Order::RowMajor).then_some(self.order),

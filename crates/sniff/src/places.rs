@@ -64,7 +64,7 @@ const MOST_OF_LENGTH: usize = 8;
 /// The most bytes of a number that may look constant.
 const MOST_HIGH_BYTES: usize = 3;
 /// The least mark that is left without them.
-const LEAST_MARK: usize = 2;
+pub(crate) const LEAST_MARK: usize = 2;
 /// The fewest bytes of the cells.
 const FEWEST_BYTES: usize = 4;
 
@@ -206,6 +206,14 @@ impl Place {
             .rev()
             .max_by_key(|&(weight, is_whole, _)| (weight, is_whole));
         best.and_then(|(weight, _, mark)| (weight > 0).then_some(mark))
+    }
+
+    /// The mark of packed frames among these constant bytes.
+    pub(crate) fn own_mark(&self, run: &Range<usize>) -> Option<Range<usize>> {
+        let bytes: Vec<Option<u8>> = run.clone().map(|at| self.constant(at)).collect();
+        let mut places = bytes.windows(packed::MARK.len());
+        let at = places.position(|part| part.iter().copied().eq(packed::MARK.map(Some)))?;
+        Some(run.start + at..run.start + at + packed::MARK.len())
     }
 
     /// How many of these constant bytes are not 0.
