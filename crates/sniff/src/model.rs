@@ -306,8 +306,9 @@ pub(crate) fn stack(
     let is_stack = |count: &usize| {
         let bits = sums(&stacked(pictures, cols, channels, rows / count));
         // The three axes of a force are the likeliest stack.
-        let most = if *count == 3 { 0.0 } else { -SURE_BITS };
-        lead(&own, &bits, &pictures.weights) < most
+        let are_axes = *count == 3;
+        let most = if are_axes { 0.0 } else { -SURE_BITS };
+        are_axes && pictures.are_stacked(*count) || lead(&own, &bits, &pictures.weights) < most
     };
     (2..=MOST_STACKED).find(|count| rows.is_multiple_of(*count) && rows > *count && is_stack(count))
 }

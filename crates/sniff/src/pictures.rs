@@ -140,6 +140,18 @@ pub(crate) struct Picture {
     pub(crate) before: Vec<f32>,
 }
 
+/// Whether the sizes of two changes have about the same ratio in all pairs: their correlation.
+fn are_alike(pairs: impl Iterator<Item = [f32; 2]>) -> bool {
+    let (mut both, mut first, mut second) = (0.0_f64, 0.0_f64, 0.0_f64);
+    for pair in pairs {
+        let [a, b] = pair.map(|change| f64::from(change.abs()));
+        both += a * b;
+        first += a * a;
+        second += b * b;
+    }
+    both > ALIKE * (first * second).sqrt()
+}
+
 impl Pictures {
     /// The pictures of presses, if `frame` returns the numbers of a frame. `None` if some are none.
     pub(crate) fn of(presses: &Presses, frame: impl Fn(usize) -> Vec<f32>) -> Option<Self> {
@@ -244,16 +256,16 @@ impl Pictures {
     /// Whether the numbers of a taxel are so much alike that they are taxels beside each other: the
     /// correlation of each with the next, in the strongest picture.
     pub(crate) fn are_alike(&self, channels: usize) -> bool {
-        let (mut both, mut first, mut second) = (0.0_f64, 0.0_f64, 0.0_f64);
-        for taxel in self.strongest().chunks_exact(channels) {
-            for pair in taxel.windows(2) {
-                let [a, b] = [pair[0], pair[1]].map(|change| f64::from(change.abs()));
-                both += a * b;
-                first += a * a;
-                second += b * b;
-            }
-        }
-        both > ALIKE * (first * second).sqrt()
+        let taxels = self.strongest().chunks_exact(channels);
+        are_alike(taxels.flat_map(|taxel| taxel.array_windows().copied()))
+    }
+
+    /// Whether a press is at the same place in each of so many arrays, one behind the other.
+    pub(crate) fn are_stacked(&self, count: usize) -> bool {
+        let change = self.strongest();
+        let arrays: Vec<&[f32]> = change.chunks_exact(change.len() / count).collect();
+        let mut pairs = arrays.array_windows();
+        pairs.all(|[a, b]| are_alike(a.iter().zip(*b).map(|(&a, &b)| [a, b])))
     }
 
     /// The pictures as an array has them whose each second row of `cols` taxels runs the other way.
