@@ -165,7 +165,7 @@ impl Evaluated {
         }
         let unit = cases[0].unit.map(|(unit, _)| unit);
         let drawn: Option<Vec<Drawn>> = cases.iter().map(Case::drawn).collect();
-        let interval = interval_of(drawn);
+        let interval = drawn.and_then(|drawn| interval::of(&drawn, Mean::OfPresses));
         let category_accuracy = category_accuracy(&confusion);
         let there: Vec<f64> = category_accuracy.iter().copied().flatten().collect();
         let calibration = calibration(cases);
@@ -225,18 +225,10 @@ impl Difference {
         let count = |wanted| pairs.iter().filter(|&&pair| pair == wanted).count();
         Self {
             accuracy: pairs.iter().map(|&pair| value(pair)).sum::<f64>() / pairs.len() as f64,
-            interval: interval_of(drawn),
+            interval: drawn.and_then(|drawn| interval::of(&drawn, Mean::OfPresses)),
             only: [count([true, false]), count([false, true])],
         }
     }
-}
-
-/// The interval of the mean over presses. `None` too if the units have the same share of right verdicts: a few that are
-/// alike by chance do not show how much units vary.
-fn interval_of(drawn: Option<Vec<Drawn>>) -> Option<[f64; 2]> {
-    let interval = interval::of(&drawn?, Mean::OfPresses)?;
-    // Rounding makes draws of the same mean differ a little.
-    (interval[1] - interval[0] > 1e-9).then_some(interval)
 }
 
 /// The evaluation of the Shore hardness of verdicts; `None` for a model or data without it.
