@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::verdict::sha256_hex;
+use crate::verdict::{Piece, sha256_hex};
 use crate::wording;
 
 /// Notes of the user by key, for example on the pressed object.
@@ -17,7 +17,7 @@ const MOST_CHARS: usize = 1000;
 /// # Errors
 ///
 /// Returns what is wrong, in words, if the key is empty, a character is hidden, the label is too long, or
-/// the value of `object` or `shore` is not the right kind of number.
+/// the value of `object`, `shore` or `reference` is not what its reader takes.
 ///
 /// # Example
 ///
@@ -56,6 +56,10 @@ pub fn check_label(key: &str, value: &str) -> Result<(), String> {
             let fits = shore.is_ok_and(|shore: f32| (0.0..=100.0).contains(&shore));
             (fits, "a number from 0 to 100")
         }
+        "reference" => (
+            Piece::rigid(value).is_some(),
+            "flat:MM or ball:MM with 0.1 to 1000 mm",
+        ),
         _ => return Ok(()),
     };
     match fits {
@@ -121,6 +125,11 @@ mod tests {
         for (key, value, expected) in [
             ("", "7", "the label has no key: write KEY=VALUE"),
             ("object", "-1", "object: found \"-1\", expected a whole"),
+            (
+                "reference",
+                "flat",
+                "reference: found \"flat\", expected flat:MM",
+            ),
             ("shore", "NaN", "shore: found \"NaN\", expected a number"),
             ("note", "\u{202e}7", "found \"\\u{202e}7\", expected text"),
             ("a\nb", "7", "found \"a\\nb\", expected text"),
