@@ -418,10 +418,21 @@ fn add<W: Write + Seek, T: Element>(
 fn write_moments<W: Write + Seek>(npz: &mut Writer<W>, presses: &Presses) -> io::Result<()> {
     let all = &presses.all;
     let rows = presses.frames.len();
-    // An i16 holds up to 32 N on a taxel, which is beyond the range of most films.
-    let millinewtons = |newtons: f32| (newtons / MILLINEWTON).round() as i16;
-    let frames = (0..rows).flat_map(|row| presses.frames.frame(row).newtons.map(millinewtons));
-    npz.add_each("frames_mn", &[rows, ROWS, COLS], frames)?;
+    let millinewtons = || {
+        let newtons = (0..rows).flat_map(|row| presses.frames.frame(row).newtons);
+        newtons.map(|newtons| newtons / MILLINEWTON)
+    };
+    // An i16 takes half the room, and holds up to 32 N on a taxel.
+    let fits = |mn: f32| mn.abs() <= f32::from(i16::MAX) && (mn - mn.round()).abs() < 0.01;
+    let shape = [rows, ROWS, COLS];
+    match millinewtons().all(fits) {
+        true => npz.add_each(
+            "frames_mn",
+            &shape,
+            millinewtons().map(|mn| mn.round() as i16),
+        )?,
+        false => npz.add_each("frames_mn", &shape, millinewtons())?,
+    }
     let press = all.iter().zip(0..);
     let press = press.flat_map(|(press, number)| press.moments.clone().map(move |_| number));
     npz.add_list("press", &press.collect::<Vec<u32>>())?;

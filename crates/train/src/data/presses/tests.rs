@@ -104,6 +104,14 @@ fn a_file_gives_back_what_was_written() {
     }
 }
 
+#[test]
+fn counts_below_a_millinewton_are_kept() {
+    let mut presses = Presses::default();
+    presses.push(Press::default(), [(0.0, None, [0.0004; TAXELS])]);
+    let read = parse(&bytes_of(&presses, Layout::OverTime, &json!({}))).unwrap();
+    assert!((read.frames.frame(0).newtons[0] - 0.0004).abs() < 1e-9);
+}
+
 /// A press of two frames on an array of its own.
 fn of_grid(array: Array, pitch_mm: f64, press: Press, frames: [[f32; TAXELS]; 2]) -> Presses {
     let mut presses = Presses::default();
