@@ -4,6 +4,7 @@
 //! that ask without end delay other clients, and no sensor.
 
 use std::io;
+use std::sync::Arc;
 use std::thread;
 
 use tokio::runtime::{Builder, Handle};
@@ -25,19 +26,25 @@ impl Clients {
     ///
     /// Fails if the system has no thread or descriptors for it.
     pub(super) fn start() -> io::Result<Self> {
-        let runtime = Builder::new_current_thread().enable_all().build()?;
+        let runtime = Arc::new(Builder::new_current_thread().enable_all().build()?);
         let handle = runtime.handle().clone();
         let (ending, ended) = oneshot::channel::<()>();
-        let thread = thread::Builder::new()
-            .name("clients".to_owned())
-            .spawn(move || {
-                // The wait always ends with an error, because the sender is only dropped.
-                let _ = runtime.block_on(ended);
-            })?;
+        let of_thread = runtime.clone();
+        let thread = thread::Builder::new().name("clients".to_owned());
+        let started = thread.spawn(move || {
+            // The wait always ends with an error, because the sender is only dropped.
+            let _ = of_thread.block_on(ended);
+        });
+        if started.is_err()
+            && let Some(runtime) = Arc::into_inner(runtime)
+        {
+            // Dropped on the sensors' thread, it would wait, and panic.
+            runtime.shutdown_background();
+        }
         Ok(Self {
             runtime: handle,
             ending: Some(ending),
-            thread: Some(thread),
+            thread: Some(started?),
         })
     }
 }
