@@ -36,7 +36,7 @@ pub fn parse(text: &str) -> Result<Vec<Point>, String> {
             shown(names)
         ));
     };
-    let mut points = Vec::new();
+    let mut points: Vec<Point> = Vec::new();
     for (line, text) in lines.filter(|(_, text)| !text.trim().is_empty()) {
         let cells: Vec<&str> = text.split(',').map(str::trim).collect();
         let number = |key, column: usize, most: f64, expected| {
@@ -48,6 +48,11 @@ pub fn parse(text: &str) -> Result<Vec<Point>, String> {
         let time_s = number("time_s", time, LONGEST_S, "seconds")?;
         let mm = number("approach_mm", approach, FURTHEST_MM, "millimetres")?;
         let at_ns = (time_s * 1e9).round() as i64;
+        if points.last().is_some_and(|last| last.at_ns > at_ns) {
+            return Err(format!(
+                "{line}: time_s: found {time_s}, expected no less than on the line before"
+            ));
+        }
         points.push(Point { at_ns, mm });
     }
     Ok(points)
@@ -59,10 +64,10 @@ mod tests {
 
     #[test]
     fn columns_are_found_by_their_names() {
-        let text = "\u{feff}press, approach_mm ,time_s\r\n1,-2.5,0.25\r\n\n1,1e1,-1\n";
+        let text = "\u{feff}press, approach_mm ,time_s\r\n1,-2.5,-1\r\n\n1,1e1,0.25\n";
         let points = parse(text).unwrap();
         let points: Vec<(i64, f64)> = points.into_iter().map(Into::into).collect();
-        assert_eq!(points, [(250_000_000, -2.5), (-1_000_000_000, 10.0)]);
+        assert_eq!(points, [(-1_000_000_000, -2.5), (250_000_000, 10.0)]);
     }
 
     #[test]
@@ -84,5 +89,9 @@ mod tests {
         );
         check(&format!("{names}\n1,nan"), "4: approach_mm: found \"nan\"");
         check(&format!("{names}inf,1"), "3: time_s: found \"inf\"");
+        check(
+            &format!("{names}0,2"),
+            "3: time_s: found 0, expected no less",
+        );
     }
 }
