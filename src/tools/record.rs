@@ -25,7 +25,6 @@ use crate::maybe;
 use hardnessd_core::part;
 use hardnessd_core::recording::{Labels, check_label, misspelt};
 use hardnessd_core::sensor;
-use hardnessd_core::stderr_line;
 use hardnessd_core::wording::{escaped, positive};
 
 /// What `--help` says below the options.
@@ -82,7 +81,10 @@ pub async fn run(
     let mut labels = Labels::new();
     for (key, value) in args.labels {
         if let Some(known) = misspelt(&key) {
-            stderr_line!("warning: --label {key}: did you mean {known}?");
+            say(
+                log,
+                &format!("warning: --label {key}: did you mean {known}?"),
+            );
         }
         if labels.insert(key.clone(), value).is_some() {
             let twice = format!("--label {key}: given twice: give it once");
@@ -119,7 +121,7 @@ pub async fn run(
     let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
     if io::stderr().is_terminal() {
         let pressed = counted_in_words(presses, "press", "es");
-        stderr_line!("recorded {seen}, {pressed}: {shown}");
+        say(log, &format!("recorded {seen}, {pressed}: {shown}"));
     }
     if recorded.is_ok() && presses == 0 {
         let why = if frames > 0 && progress.tared == 0 {
@@ -127,13 +129,23 @@ pub async fn run(
         } else {
             ": was the sensor pressed, is it live, and is press.contact_threshold_n low enough?"
         };
-        stderr_line!("warning: {shown}: no press in {seen}{why}");
+        say(log, &format!("warning: {shown}: no press in {seen}{why}"));
     }
     recorded
 }
 
+/// Writes a line between those of the log. It waits for no terminal.
+fn say(log: &Log, line: &str) {
+    log.lines().say(format!("{}\n", escaped(line)).as_bytes());
+}
+
 /// Makes the file of a recording. A file that exists is left alone.
 fn create(path: &Path) -> Result<File, Failure> {
+    let directory = part::directory_of(path);
+    if !directory.exists() {
+        let missing = format!("{}: the directory does not exist", path.display());
+        return Err(Failure::new(IO, missing));
+    }
     File::create_new(path).of(format!("{}: name a new file", path.display()), IO)
 }
 
@@ -164,7 +176,11 @@ pub(super) async fn record(
             (Err(failure), Progress::default())
         }
         (Ok(()), Some(Gone::Lost(sensor, reason))) => {
-            let lost = format!("sensor {sensor:?} lost: {reason}; the recording ends there");
+            let end = match progress.frames {
+                0 => "nothing was recorded",
+                _ => "the recording ends there",
+            };
+            let lost = format!("sensor {sensor:?} lost: {reason}; {end}");
             (Err(Failure::new(UNAVAILABLE, lost)), progress)
         }
         _ => (recorded, progress),

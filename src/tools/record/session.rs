@@ -4,7 +4,7 @@
 //! press as it comes, keeps the score, and continues with the next object. `hrn-train fit` takes the files as
 //! they are.
 
-use std::fs;
+use std::fs::{self, File};
 use std::future::Future;
 use std::io::{self, BufRead as _, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -170,15 +170,18 @@ pub(super) async fn run(
     let levels = &setup.hrn.card().levels;
     // The verdicts on objects whose level the user named.
     let mut score = Score::default();
-    let (mut number, mut goes_on, mut ended) = (first, true, Ok(()));
+    let (mut number, mut count, mut goes_on, mut ended) = (first, 0, true, Ok(()));
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
-        let recorded = record_object(&mut user, &object, setup, &mut score).await;
+        let (recorded, is_kept) = match create(&object.path) {
+            Ok(file) => record_object(&mut user, &object, &file, setup, &mut score).await,
+            Err(error) => (Err(error), false),
+        };
         goes_on = recorded.as_ref().is_ok_and(|goes_on| *goes_on);
         ended = recorded.map(drop);
-        number += u32::from(object.path.exists());
+        count += u32::from(is_kept);
+        number = number.saturating_add(is_kept.into());
     }
-    let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
     user.say(&format!("\nrecorded {recorded} in this session\n"));
     if score.verdicts > 0 {
@@ -221,29 +224,30 @@ fn hardness<'a>(
     }
 }
 
-/// Records presses of one object. A recording without a press is removed. Returns `false` if the user quits.
+/// Records presses of one object into its file, which is removed if there is none. Returns `false` if the user quits,
+/// and whether the file is kept.
 async fn record_object(
     user: &mut User<'_>,
     object: &Object,
+    file: &File,
     setup: &Setup,
     score: &mut Score,
-) -> Result<bool, Failure> {
+) -> (Result<bool, Failure>, bool) {
     let path = &object.path;
-    let file = create(path)?;
     user.say("do not touch the sensor until the zero is taken\n");
     let mut goes_on = false;
     let levels = &setup.hrn.card().levels;
     let end = async |counted| goes_on = wait_for_user(user, counted, object, levels).await;
     let (setup, labels) = (setup.clone(), object.labels.clone());
-    let (recorded, progress) = record_waiting(setup, path, &file, labels, end).await;
+    let (recorded, progress) = record_waiting(setup, path, file, labels, end).await;
     if progress.presses == 0 {
         // It would stop `hrn-train collect`.
-        part::remove(path, &file);
+        part::remove(path, file);
         user.say("no press was recorded\n");
     } else if object.level > 0 {
         score.add(progress.score);
     }
-    recorded.map(|()| goes_on)
+    (recorded.map(|()| goes_on), progress.presses > 0)
 }
 
 /// Shows the verdict on each press, until the user says what to do next. Returns `false` if the user quits.
