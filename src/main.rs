@@ -65,7 +65,10 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            hardnessd_core::stderr_line!("hardnessd: {}", error.line());
+            let line = error.line();
+            thread::bounded(LAST_LINES, move || {
+                hardnessd_core::stderr_line!("hardnessd: {line}");
+            });
             ExitCode::from(error.code)
         }
     }
@@ -130,12 +133,12 @@ async fn dispatch(command: Command, signals: Signals) -> Result<(), Failure> {
 /// The signal at which a command is to end in order.
 type End<'a> = Pin<&'a mut dyn Future<Output = process::Signal>>;
 
-/// Runs a command that serves a sensor of the configuration at `path`. A signal before its end is a failure.
+/// Runs a command that serves a sensor of the configuration at `path`, and prints what it found. A signal before its end is a failure.
 async fn attend(
     signals: Signals,
     path: &Path,
     read: impl FnOnce(&Path) -> Result<Setup, config::Error> + Send + 'static,
-    command: impl AsyncFnOnce(Setup, End<'_>) -> Result<(), Failure>,
+    command: impl AsyncFnOnce(Setup, End<'_>) -> Result<String, Failure>,
 ) -> Result<(), Failure> {
     let mut end = pin!(signals.end());
     let path = path.to_owned();
@@ -144,7 +147,11 @@ async fn attend(
         signal = &mut end => return Err(Failure::interrupted(signal)),
     };
     let _log = Log::start(setup.config.log, "warn")?;
-    command(setup, end).await
+    let text = command(setup, end.as_mut()).await?;
+    tokio::select! {
+        printed = tools::print_apart(text) => printed.map(drop),
+        signal = end => Err(Failure::interrupted(signal)),
+    }
 }
 
 /// Waits until `work` ends. A signal before its end is a failure.

@@ -65,13 +65,20 @@ pub async fn run<T: Send + 'static>(
 /// Waits until a write to stdout that is under way has ended, but no longer than `patience`. Nothing is written
 /// after it.
 pub fn finish(patience: Duration) {
+    bounded(patience, || mem::forget(io::stdout().lock()));
+}
+
+/// Waits for `work`, but no longer than `patience`. Where the system has no thread for it, it is done here.
+pub fn bounded(patience: Duration, work: impl FnOnce() + Clone + Send + 'static) {
     let (free, waiting) = mpsc::channel();
-    let taken = start("finish", move || {
-        mem::forget(io::stdout().lock());
+    let of_thread = work.clone();
+    let started = start("bounded", move || {
+        of_thread();
         // Perhaps nobody waits any more.
         let _ = free.send(());
     });
-    if taken.is_ok() {
-        let _ = waiting.recv_timeout(patience);
+    match started {
+        Ok(()) => drop(waiting.recv_timeout(patience)),
+        Err(_) => work(),
     }
 }

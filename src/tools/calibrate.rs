@@ -110,7 +110,7 @@ impl Args {
     }
 }
 
-/// Serves the sensor until there are enough presses, or reads recordings, and prints the values. `config` is the path
+/// Serves the sensor until there are enough presses, or reads recordings. Returns the values in words. `config` is the path
 /// of the configuration.
 ///
 /// # Errors
@@ -122,7 +122,7 @@ pub async fn run(
     setup: Setup,
     config: &Path,
     end: impl Future<Output = Signal>,
-) -> Result<(), Failure> {
+) -> Result<String, Failure> {
     args.check().exit(USAGE)?;
     let sensor = setup.sensor_named(args.sensor.as_deref());
     let sensor = sensor.exit(USAGE)?.clone();
@@ -141,13 +141,14 @@ pub async fn run(
     let next = |seen| next(&args, seen);
     let presses = live::gather(setup, name, wanted, &args.from, next, end, read);
     let presses = presses.await?;
-    let text = match out {
-        None if matches!(args.what, What::Arm) => of_arm(&arm::Fit::of(&presses).exit(FAILED)?),
-        None => of_force(&args.newtons, &presses, &sensor)?,
-        Some(part) => of_taxels(presses, &sensor, part, &path, config)?,
-    };
-    super::print_apart(text).await?;
-    Ok(())
+    match out {
+        None if matches!(args.what, What::Arm) => {
+            let fit = arm::Fit::of(&presses).exit(FAILED)?;
+            Ok(of_arm(&fit))
+        }
+        None => of_force(&args.newtons, &presses, &sensor),
+        Some(part) => of_taxels(presses, &sensor, part, &path, config),
+    }
 }
 
 /// What to do next, after `seen` presses.

@@ -18,7 +18,7 @@ use rustix::process::Signal;
 use super::configuration::Configuration;
 use super::exit::{FAILED, Fail, Failure, IO, USAGE};
 use super::played::Played;
-use super::{cannot_read, live, print_apart};
+use super::{cannot_read, live};
 use crate::daemon::config::{self, Config, Setup};
 use hardnessd_core::line::extent;
 use hardnessd_core::part::Part;
@@ -77,7 +77,7 @@ pub fn load(path: &Path) -> Result<Setup, config::Error> {
     Setup::of(config, path)
 }
 
-/// Makes the file from recordings, or from presses that are made now. `config` is the path of the configuration.
+/// Makes the file from recordings, or from presses that are made now, and says what is in it. `config` is the path of the configuration.
 ///
 /// # Errors
 ///
@@ -88,7 +88,7 @@ pub async fn run(
     setup: Setup,
     config: &Path,
     end: impl Future<Output = Signal>,
-) -> Result<(), Failure> {
+) -> Result<String, Failure> {
     let sensor = setup.sensor_named(args.sensor.as_deref());
     let sensor = sensor.exit(USAGE)?.clone();
     // A file that cannot be made or added to shows before anything is pressed.
@@ -152,9 +152,7 @@ pub async fn run(
     } else {
         Tried::default()
     };
-    let text = account(&super::as_in(config, &args.out), &all, tried);
-    print_apart(text).await?;
-    Ok(())
+    Ok(account(&super::as_in(config, &args.out), &all, tried))
 }
 
 /// Begins the file, and reads the presses that it has already. Fails if there is a file that nothing is to

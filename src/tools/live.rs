@@ -12,7 +12,7 @@ use std::time::Duration;
 use rustix::process::Signal;
 use tokio::sync::watch;
 
-use super::exit::{FAILED, Fail, Failure, IO};
+use super::exit::{FAILED, Fail, Failure, IO, UNAVAILABLE};
 use super::record;
 use crate::daemon::config::Setup;
 use crate::daemon::log::Lines;
@@ -105,9 +105,15 @@ async fn record(
             signal = end => stopped = Some(signal),
         }
     };
-    let (recorded, _) = record::record(setup, &path, &file, Labels::new(), enough).await;
+    let recorded = record::record(setup, &path, &file, Labels::new(), enough).await;
     prompts.flush(LAST_PROMPTS);
-    recorded?;
+    match recorded {
+        // After the last press, a sensor may be taken away.
+        (Err(error), progress) if error.code != UNAVAILABLE || progress.presses < wanted => {
+            return Err(error);
+        }
+        _ => {}
+    }
     if let Some(signal) = stopped {
         return Err(Failure::interrupted(signal));
     }
