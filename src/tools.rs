@@ -142,11 +142,11 @@ pub fn print(lines: &[u8]) -> Result<bool, Failure> {
     }
 }
 
-/// Like [`print`], but on a thread of its own, because the reader of stdout may be slow.
+/// Like [`print()`], but on a thread of its own, because the reader of stdout may be slow.
 ///
 /// # Errors
 ///
-/// Fails as [`print`] does, or if the system has no thread to spare.
+/// Fails as [`print()`] does, or if the system has no thread to spare.
 pub async fn print_apart(text: String) -> Result<bool, Failure> {
     thread::run("stdout", move || print(text.as_bytes())).await?
 }
