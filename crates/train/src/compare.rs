@@ -26,7 +26,7 @@ use crate::judge::evaluated::Evaluated;
 use crate::model::verdicts::{self, Given};
 use crate::recipe::{self, Kind, Recipe};
 use crate::run::Run;
-use crate::run::disk::{load, lock, read_earlier, refuse_foreign, write_whole};
+use crate::run::disk::{load, lock, read_if_there, refuse_foreign, write_whole};
 use crate::settings::Profile;
 use hardnessd_core::verdict::Level;
 use hardnessd_simulator::Split;
@@ -306,7 +306,7 @@ fn write_results(out: &Path, sets: &[TestSet]) -> anyhow::Result<()> {
 fn write_tables(out: &Path) -> anyhow::Result<String> {
     let path = out.join("results.json");
     let shown = || path.display().to_string();
-    let bytes = read_earlier(&path)?.unwrap_or(b"[]".to_vec());
+    let bytes = read_if_there(&path)?.unwrap_or(b"[]".to_vec());
     let entries: Vec<tables::Entry> = serde_json::from_slice(&bytes).with_context(shown)?;
     ensure!(
         !entries.is_empty(),

@@ -33,7 +33,7 @@ const CHECKPOINT_EVERY: Duration = Duration::from_secs(10);
 /// The number of epochs between two judgements of the held-out objects.
 const VALIDATED_EVERY_EPOCHS: u32 = 5;
 
-/// A stage of a run: what whatever learns in it has.
+/// What a stage of a run learns from, and with what settings.
 #[derive(Debug, Clone)]
 pub struct Stage<'a> {
     /// The name in checkpoints and in `metrics.csv`.
@@ -67,14 +67,14 @@ impl Stage<'_> {
 /// What learns. A GAN has two sides, everything else one.
 pub trait Learning {
     /// The stage.
-    fn on(&self) -> &Stage<'_>;
+    fn stage(&self) -> &Stage<'_>;
 
     /// The sides before the first step.
     fn sides(&self) -> Vec<Learner>;
 
     /// What an epoch passes over, in an order that is drawn anew for each.
     fn samples(&self) -> Vec<usize> {
-        self.on().parts.train.clone()
+        self.stage().parts.train.clone()
     }
 
     /// Takes a step of each side on these samples, at this learning rate. `step` counts from 0.
@@ -83,7 +83,7 @@ pub trait Learning {
     /// The questions that presses of held-out objects ask where so much is known of their sensors.
     /// `None` if it never is.
     fn questions(&self, knowledge: Knowledge, _stream: &mut Stream) -> Option<Vec<Question>> {
-        let held_out = &self.on().parts.held_out;
+        let held_out = &self.stage().parts.held_out;
         (knowledge == Knowledge::None).then(|| vec![Question::alone(held_out)])
     }
 
@@ -193,28 +193,28 @@ impl Outputs {
 /// Fails if the run's directory cannot be read or written, its checkpoint is of another run, or a loss or
 /// a weight is no longer finite.
 pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Weights>> {
-    let on = learning.on();
-    let (stage, epochs) = (on.name, on.training.epochs);
-    let (mut sides, batch) = (learning.sides(), on.training.batch);
+    let stage = learning.stage();
+    let (name, epochs) = (stage.name, stage.training.epochs);
+    let (mut sides, batch) = (learning.sides(), stage.training.batch);
     let mut done = match run {
-        Some(run) => begin(stage, &mut sides, run)?,
+        Some(run) => begin(name, &mut sides, run)?,
         None => Checkpoint::default(),
     };
     // A GAN names no levels.
-    let is_judged = sides.len() == 1 && !on.parts.held_out.is_empty();
+    let is_judged = sides.len() == 1 && !stage.parts.held_out.is_empty();
     let samples = learning.samples();
     let steps = u64::from(epochs) * samples.len().div_ceil(batch) as u64;
-    let open = |run: &Run| Metrics::open(&run.path("metrics.csv"), stage, done.step);
+    let open = |run: &Run| Metrics::open(&run.path("metrics.csv"), name, done.step);
     let mut metrics = run.map(open).transpose()?;
-    let bar = progress_bar(stage, steps, done.step);
+    let bar = progress_bar(name, steps, done.step);
     let (begun, seconds_before) = (Instant::now(), done.seconds);
     let mut kept = begun;
     while done.epoch < epochs {
         let mut order = samples.clone();
-        { on.stream("order").child(done.epoch.into()) }.shuffle(&mut order);
+        { stage.stream("order").child(done.epoch.into()) }.shuffle(&mut order);
         let (mut mean, mut rate) = (Taken::default(), 0.0);
         for samples in order.chunks(batch) {
-            rate = on.training.rate_at(done.step, steps);
+            rate = stage.training.rate_at(done.step, steps);
             let taken = learning.step(&mut sides, samples, done.step, rate);
             mean.add(&taken, samples.len() as f64 / order.len() as f64);
             done.step += 1;
@@ -222,7 +222,7 @@ pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Wei
         }
         done.epoch += 1;
         for loss in [Some(mean.loss), mean.generator_loss].into_iter().flatten() {
-            ensure_learning(stage, done.epoch, "loss", loss)?;
+            ensure_learning(name, done.epoch, "loss", loss)?;
         }
         let is_last = done.epoch == epochs;
         let is_validated = is_last || done.epoch.is_multiple_of(VALIDATED_EVERY_EPOCHS);
@@ -231,22 +231,22 @@ pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Wei
             validated(learning, &weights)
         });
         if let Some((loss, _)) = validation {
-            ensure_learning(stage, done.epoch, "validation loss", loss)?;
+            ensure_learning(name, done.epoch, "validation loss", loss)?;
         }
         done.seconds = seconds_before + begun.elapsed().as_secs_f64();
         if let Some(metrics) = &mut metrics {
             metrics.add(&done, rate, &mean, validation)?;
         }
-        report(&bar, stage, done.epoch, epochs, message(&mean, validation));
+        report(&bar, name, done.epoch, epochs, message(&mean, validation));
         if is_last || kept.elapsed() > CHECKPOINT_EVERY {
             kept = Instant::now();
             done.numbers = sides.iter().flat_map(Learner::numbers).collect();
             // The loss does not show the last step yet, because a step's loss is that of the weights before it.
             for &number in &done.numbers {
-                ensure_learning(stage, done.epoch, "weights", number.into())?;
+                ensure_learning(name, done.epoch, "weights", number.into())?;
             }
             if let Some(run) = run {
-                done.write(&run.checkpoint(stage))?;
+                done.write(&run.checkpoint(name))?;
             }
         }
     }
@@ -255,10 +255,10 @@ pub fn run(learning: &dyn Learning, run: Option<&Run>) -> anyhow::Result<Vec<Wei
 }
 
 /// The beginning of a stage, or its last checkpoint, whose numbers the sides then have.
-fn begin(stage: &str, sides: &mut [Learner], run: &Run) -> anyhow::Result<Checkpoint> {
+fn begin(name: &str, sides: &mut [Learner], run: &Run) -> anyhow::Result<Checkpoint> {
     let numbers = sides.iter().flat_map(Learner::numbers).collect();
     let first = Checkpoint::first(&run.settings()?, numbers);
-    let path = run.checkpoint(stage);
+    let path = run.checkpoint(name);
     let Some(kept) = Checkpoint::read(&path)? else {
         return Ok(first);
     };
@@ -276,7 +276,7 @@ fn begin(stage: &str, sides: &mut [Learner], run: &Run) -> anyhow::Result<Checkp
 
 /// Mean loss and accuracy on presses of held-out objects, as they are and without references.
 fn validated(learning: &dyn Learning, weights: &[Weights]) -> (f64, f64) {
-    let Stage { presses, parts, .. } = learning.on();
+    let Stage { presses, parts, .. } = learning.stage();
     let outputs = learning.outputs();
     let (mut loss, mut right) = (0.0, 0.0);
     let rows = learning.judge(weights, &[Question::alone(&parts.held_out)], None);

@@ -33,7 +33,7 @@ const KEPT: usize = 24;
 #[derive(Debug, Clone)]
 pub struct Stages<'a> {
     /// The last stage, with the name of the method.
-    pub on: Stage<'a>,
+    pub stage: Stage<'a>,
     /// The model from which a course model starts, in place of random weights.
     pub start: Option<&'a Start>,
     /// The run's directory, to which the stages write. `None` writes nothing.
@@ -50,17 +50,17 @@ pub fn last_stage<'a>(
     recipe: &Recipe,
     stages: &Stages<'a>,
 ) -> anyhow::Result<Box<dyn Learning + 'a>> {
-    let on = &stages.on;
+    let stage = &stages.stage;
     Ok(match recipe.learning {
         Kind::Sgan => Box::new(stages.semi_supervised("sgan", Game::FakeLevel)),
         Kind::Igan => Box::new(stages.semi_supervised("igan", Game::FeatureMatching)),
-        Kind::Features => Box::new(Regression::new(on.clone(), Seen::Features)),
+        Kind::Features => Box::new(Regression::new(stage.clone(), Seen::Features)),
         Kind::Taxels => {
-            let seen = Seen::parts(on.presses).context(NO_GRID)?;
-            Box::new(Regression::new(on.clone(), seen))
+            let seen = Seen::parts(stage.presses).context(NO_GRID)?;
+            Box::new(Regression::new(stage.clone(), seen))
         }
         Kind::Course => {
-            let course = Course::new(stages.named("course", on.training), stages.start);
+            let course = Course::new(stages.named("course", stage.training), stages.start);
             Box::new(course.context("levels of the data")?)
         }
         Kind::Hrn => {
@@ -68,14 +68,14 @@ pub fn last_stage<'a>(
             let ustgan = needs_gan.then(|| stages.ustgan()).transpose()?;
             let start = ustgan.as_ref().filter(|_| recipe.from_ustgan);
             let start = start.map(|[_, discriminator]| discriminator);
-            let means = on.settings.mean_pooling;
-            let mut initial = hrn::initial(start, on.levels(), means, on.seed, &on.device);
+            let means = stage.settings.mean_pooling;
+            let mut initial = hrn::initial(start, stage.levels(), means, stage.seed, &stage.device);
             if let Some(ustgan) = ustgan.as_ref().filter(|_| recipe.pretrained) {
                 initial = stages.pretrained(ustgan, initial)?;
             }
-            let stage = if needs_gan { "fine-tuning" } else { "hrn" };
-            let on = stages.named(stage, on.training);
-            Box::new(Hrn { on, initial })
+            let name = if needs_gan { "fine-tuning" } else { "hrn" };
+            let stage = stages.named(name, stage.training);
+            Box::new(Hrn { stage, initial })
         }
     })
 }
@@ -85,33 +85,33 @@ impl<'a> Stages<'a> {
         Stage {
             name,
             training,
-            ..self.on.clone()
+            ..self.stage.clone()
         }
     }
 
     /// A GAN whose discriminator also learns the levels and becomes the recogniser.
-    fn semi_supervised(&self, stage: &'static str, game: Game) -> Gan<'a> {
-        let on = self.named(stage, self.on.settings.ustgan);
-        let initial = gan::initial(game, on.levels(), on.seed, &on.device);
-        Gan::new(on, game, initial)
+    fn semi_supervised(&self, name: &'static str, game: Game) -> Gan<'a> {
+        let stage = self.named(name, self.stage.settings.ustgan);
+        let initial = gan::initial(game, stage.levels(), stage.seed, &stage.device);
+        Gan::new(stage, game, initial)
     }
 
     /// Trains USTGAN, the GAN without labels.
     fn ustgan(&self) -> anyhow::Result<[Weights; 2]> {
         let mut gan = self.semi_supervised("ustgan", Game::RealOrFake);
-        gan.on.parts.train.clear();
+        gan.stage.parts.train.clear();
         sides(learn::run(&gan, self.run)?)
     }
 
     /// Trains HRN on samples that one STGAN of each level generates.
     fn pretrained(&self, ustgan: &[Weights; 2], initial: Weights) -> anyhow::Result<Weights> {
         let generated = self.generated(ustgan)?;
-        let on = Stage {
+        let stage = Stage {
             presses: &generated,
             parts: Parts::labelled((0..generated.all.len()).collect()),
-            ..self.named("pretraining", self.on.settings.pretraining)
+            ..self.named("pretraining", self.stage.settings.pretraining)
         };
-        let hrn = Hrn { on, initial };
+        let hrn = Hrn { stage, initial };
         let weights = learn::run(&hrn, self.run)?;
         Ok(weights.into_iter().next().expect("HRN has one side"))
     }
@@ -120,29 +120,29 @@ impl<'a> Stages<'a> {
     /// The STGANs start from USTGAN's weights with fresh optimisers. The samples are not stored,
     /// because the STGANs' last checkpoints determine them. Some are kept to look at.
     fn generated(&self, ustgan: &[Weights; 2]) -> anyhow::Result<Presses> {
-        let Stage { presses, seed, .. } = self.on;
+        let Stage { presses, seed, .. } = self.stage;
         let (mut all, mut kept) = (Presses::default(), Presses::default());
         // They are of the levels of the data.
         all.sources.clone_from(&presses.sources);
-        for level in 1..=self.on.levels() as u8 {
-            let stage: &str = format!("stgan{level}").leak();
+        for level in 1..=self.stage.levels() as u8 {
+            let name: &str = format!("stgan{level}").leak();
             let of_level = |press: &&usize| presses.all[**press].level == level;
-            let real = self.on.parts.train.iter().filter(of_level);
+            let real = self.stage.parts.train.iter().filter(of_level);
             let parts = Parts {
                 unlabelled: real.copied().collect(),
                 ..Parts::default()
             };
-            let on = Stage {
+            let stage = Stage {
                 parts,
-                ..self.named(stage, self.on.settings.stgan)
+                ..self.named(name, self.stage.settings.stgan)
             };
-            let gan = Gan::new(on, Game::RealOrFake, ustgan.clone());
+            let gan = Gan::new(stage, Game::RealOrFake, ustgan.clone());
             let [generator, _] = sides(learn::run(&gan, self.run)?)?;
-            let mut stream = gan.on.stream("generated");
+            let mut stream = gan.stage.stream("generated");
             let frames = generator::generate(
                 &generator,
-                (gan.on.scale(), gan.sensor),
-                self.on.settings.generated_a_component as usize,
+                (gan.stage.scale(), gan.sensor),
+                self.stage.settings.generated_a_component as usize,
                 (seed, &mut stream),
             );
             let press = Press {

@@ -19,7 +19,7 @@ use crate::data::source::Source;
 use crate::exit::coded;
 use crate::settings::{Profile, Settings};
 use checkpoint::Checkpoint;
-use disk::{lock, read_earlier, refuse_foreign, write_whole};
+use disk::{lock, read_if_there, refuse_foreign, write_whole};
 use hardnessd_core::exit::CONFIG;
 use hardnessd_core::wording;
 
@@ -94,7 +94,7 @@ impl Run {
     /// Returns an error if `settings.toml` exists but cannot be read.
     pub fn description_at(directory: &Path) -> anyhow::Result<Option<Description>> {
         let path = directory.join("settings.toml");
-        let Some(bytes) = read_earlier(&path)? else {
+        let Some(bytes) = read_if_there(&path)? else {
             return Ok(None);
         };
         let text = String::from_utf8_lossy(&bytes);

@@ -143,7 +143,7 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     }
 
     let stages = Stages {
-        on: Stage {
+        stage: Stage {
             name: &recipe.name,
             presses: &presses,
             parts,
@@ -157,13 +157,13 @@ pub fn train(asked: &Train) -> anyhow::Result<Option<Evaluated>> {
     };
     let learning = &*last_stage(recipe, &stages)?;
     let weights = learn::run(learning, Some(&run))?;
-    let on = learning.on();
+    let stage = learning.stage();
     // Finite weights can still give a logit that is not. One press is enough for this check.
-    let first = learn::Question::alone(&on.parts.train[..1]);
+    let first = learn::Question::alone(&stage.parts.train[..1]);
     for logit in learning.judge(&weights, &[first], None).concat() {
-        ensure_learning(on.name, settings.training.epochs, "logit", logit.into())?;
+        ensure_learning(stage.name, settings.training.epochs, "logit", logit.into())?;
     }
-    let calibration = Calibration::of(learning, &weights, &mut on.stream("calibration"));
+    let calibration = Calibration::of(learning, &weights, &mut stage.stream("calibration"));
     let missing = calibration.missing();
     if let Some(missing) = missing.filter(|_| recipe.learning == Kind::Course) {
         hardnessd_core::stderr_line!("{missing}");

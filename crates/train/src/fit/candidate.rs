@@ -149,7 +149,7 @@ impl Candidate {
         presses: &'a Presses,
         train: &[usize],
     ) -> anyhow::Result<(Box<dyn Learning + 'a>, Vec<Weights>)> {
-        let on = |settings: Settings| Stage {
+        let stage = |settings: Settings| Stage {
             name: "fit",
             presses,
             parts: Parts::labelled(train.to_vec()),
@@ -161,7 +161,7 @@ impl Candidate {
         match self {
             Self::BuiltIn(_) => anyhow::bail!("the built-in model learns nothing"),
             Self::Regression(seen) => {
-                let regression = Regression::new(on(Settings::default()), *seen);
+                let regression = Regression::new(stage(Settings::default()), *seen);
                 let weights = regression.fitted();
                 Ok((Box::new(regression), vec![weights]))
             }
@@ -171,7 +171,7 @@ impl Candidate {
                 let mut settings = recipe.settings(Profile::Quick, train.len(), &none)?;
                 settings.held_out = 0.0;
                 let stages = Stages {
-                    on: on(settings),
+                    stage: stage(settings),
                     start: None,
                     run: None,
                 };

@@ -68,7 +68,7 @@ impl Calibration {
     /// Calibrates on the held-out presses, varied and with references like the training presses. Without
     /// any, it changes nothing and promises nothing.
     pub fn of(learning: &dyn Learning, weights: &[Weights], stream: &mut Stream) -> Self {
-        let Stage { presses, parts, .. } = learning.on();
+        let Stage { presses, parts, .. } = learning.stage();
         let mut judged = BTreeMap::new();
         for knowledge in Knowledge::ALL {
             let questions = learning.questions(knowledge, stream);

@@ -52,7 +52,7 @@ impl Felt {
 /// The network, and what it learns from.
 #[derive(Debug)]
 pub struct Course<'a> {
-    on: Stage<'a>,
+    stage: Stage<'a>,
     /// What each press felt like.
     felt: Vec<Felt>,
     lots: Lots<'a>,
@@ -69,10 +69,10 @@ impl<'a> Course<'a> {
     /// # Errors
     ///
     /// Fails if the levels are no parts of the scale of Shore hardness.
-    pub fn new(mut on: Stage<'a>, start: Option<&Start>) -> Result<Self, ModelError> {
+    pub fn new(mut stage: Stage<'a>, start: Option<&Start>) -> Result<Self, ModelError> {
         // A sample of an epoch is a group of presses.
-        on.training.batch = (on.training.batch / lots::GROUP).max(1);
-        let (presses, train) = (on.presses, &on.parts.train);
+        stage.training.batch = (stage.training.batch / lots::GROUP).max(1);
+        let (presses, train) = (stage.presses, &stage.parts.train);
         let stated = presses.levels();
         let (borders, levels) = (Borders::of(&stated)?, stated.len());
         let felt = (0..presses.all.len()).map(|place| Felt::of(&presses.course(place)));
@@ -84,7 +84,7 @@ impl<'a> Course<'a> {
                 let rows: Vec<[f32; FEATURES]> = rows.collect();
                 let rows = rows.iter().map(<[f32; FEATURES]>::as_slice);
                 let standard = Standard::of(FEATURES, rows);
-                (course::initial(on.seed, &on.device), standard)
+                (course::initial(stage.seed, &stage.device), standard)
             }
         };
         let mut counts = vec![0; levels];
@@ -95,19 +95,19 @@ impl<'a> Course<'a> {
             felt,
             lots: Lots::of(presses, borders.clone(), train),
             standard,
-            parts: bins::parts(&borders, levels, &on.device),
+            parts: bins::parts(&borders, levels, &stage.device),
             outputs: Outputs::Bins {
                 lifts: bins::lifts(&borders, &counts),
                 borders,
             },
             initial,
-            on,
+            stage,
         })
     }
 
     /// The network's inputs for a question.
     fn group(&self, question: &Question, mut vary: Option<&mut Stream>) -> course::Group {
-        let reports = self.on.settings.reports;
+        let reports = self.stage.settings.reports;
         let whole = ArmReports {
             early: 0.0,
             ..reports
@@ -134,12 +134,12 @@ impl<'a> Course<'a> {
 }
 
 impl Learning for Course<'_> {
-    fn on(&self) -> &Stage<'_> {
-        &self.on
+    fn stage(&self) -> &Stage<'_> {
+        &self.stage
     }
 
     fn sides(&self) -> Vec<Learner> {
-        vec![Learner::fresh(self.initial.clone(), self.on.training)]
+        vec![Learner::fresh(self.initial.clone(), self.stage.training)]
     }
 
     fn samples(&self) -> Vec<usize> {
@@ -149,13 +149,13 @@ impl Learning for Course<'_> {
     /// Takes a step on groups of presses.
     fn step(&self, sides: &mut [Learner], tickets: &[usize], step: u64, rate: f64) -> Taken {
         let learner = &mut sides[0];
-        let mut stream = self.on.stream("variation").child(step);
+        let mut stream = self.stage.stream("variation").child(step);
         let mut labels: Vec<bins::Label> = Vec::new();
         let mut groups = Vec::with_capacity(tickets.len());
         for &ticket in tickets {
             let question = self.lots.draw(ticket, &mut stream);
             groups.push(self.group(&question, Some(&mut stream)));
-            let presses = self.on.presses.of(&question.presses);
+            let presses = self.stage.presses.of(&question.presses);
             labels.extend(presses.map(|press| match press.reference {
                 // A rigid piece is harder than any object.
                 Some(_) => (1, None),
@@ -177,7 +177,7 @@ impl Learning for Course<'_> {
     }
 
     fn questions(&self, knowledge: Knowledge, stream: &mut Stream) -> Option<Vec<Question>> {
-        let lots = self.lots.with(&self.on.parts.held_out);
+        let lots = self.lots.with(&self.stage.parts.held_out);
         let is_askable = knowledge == Knowledge::None || lots.have_references();
         is_askable.then(|| lots.all(knowledge, stream))
     }

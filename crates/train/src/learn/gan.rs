@@ -43,7 +43,7 @@ pub fn initial(game: Game, levels: usize, seed: u64, device: &Device) -> [Weight
 #[derive(Debug)]
 pub struct Gan<'a> {
     /// The stage.
-    pub on: Stage<'a>,
+    pub stage: Stage<'a>,
     /// The classes that the discriminator distinguishes, and the losses.
     pub game: Game,
     /// The first weights of generator and discriminator.
@@ -108,12 +108,12 @@ fn judge(discriminator: &Weights, images: Tensor<4>) -> Judged {
 
 impl<'a> Gan<'a> {
     /// A GAN that begins with these weights.
-    pub fn new(on: Stage<'a>, game: Game, initial: [Weights; 2]) -> Self {
-        let real = on.parts.unlabelled.iter();
-        let frames: Vec<ModelFrame> = real.map(|&press| on.presses.frame(press)).collect();
+    pub fn new(stage: Stage<'a>, game: Game, initial: [Weights; 2]) -> Self {
+        let real = stage.parts.unlabelled.iter();
+        let frames: Vec<ModelFrame> = real.map(|&press| stage.presses.frame(press)).collect();
         Self {
             sensor: Sensor::of(&frames.iter().collect::<Vec<_>>()),
-            on,
+            stage,
             game,
             initial,
         }
@@ -122,14 +122,14 @@ impl<'a> Gan<'a> {
     /// The labelled samples of step `step`. They are fewer than the real ones, so they repeat in passes of
     /// their own.
     fn labelled(&self, step: u64) -> Option<(Tensor<4>, Tensor<2>)> {
-        let batch = self.on.training.batch;
-        let labelled = &self.on.parts.train;
+        let batch = self.stage.training.batch;
+        let labelled = &self.stage.parts.train;
         let batches = labelled.len().div_ceil(batch) as u64;
         let pass = step.checked_div(batches)?;
         let mut order = labelled.clone();
-        { self.on.stream("labelled order").child(pass) }.shuffle(&mut order);
+        { self.stage.stream("labelled order").child(pass) }.shuffle(&mut order);
         let places = order.chunks(batch).nth((step % batches) as usize)?;
-        Some((self.on.images(places), self.on.targets(places)))
+        Some((self.stage.images(places), self.stage.targets(places)))
     }
 
     /// The discriminator as a recogniser of the levels. The statistics of its layers are those of all real
@@ -137,25 +137,25 @@ impl<'a> Gan<'a> {
     fn recogniser(&self, weights: &[Weights]) -> Hrn<'_> {
         let Parts {
             unlabelled, train, ..
-        } = &self.on.parts;
-        let on = Stage {
+        } = &self.stage.parts;
+        let stage = Stage {
             parts: Parts::labelled([&unlabelled[..], train].concat()),
             settings: Settings {
                 augmentation: Augmentation::default(),
-                ..self.on.settings
+                ..self.stage.settings
             },
-            ..self.on.clone()
+            ..self.stage.clone()
         };
         Hrn {
-            initial: hrn::of_levels(&weights[1], on.levels()),
-            on,
+            initial: hrn::of_levels(&weights[1], stage.levels()),
+            stage,
         }
     }
 }
 
 impl Learning for Gan<'_> {
-    fn on(&self) -> &Stage<'_> {
-        &self.on
+    fn stage(&self) -> &Stage<'_> {
+        &self.stage
     }
 
     fn sides(&self) -> Vec<Learner> {
@@ -163,25 +163,29 @@ impl Learning for Gan<'_> {
         // The average is of the discriminator alone.
         let of_generator = Training {
             averaging: 0.0,
-            ..self.on.training
+            ..self.stage.training
         };
         vec![
             Learner::fresh(generator, of_generator),
-            Learner::fresh(discriminator, self.on.training),
+            Learner::fresh(discriminator, self.stage.training),
         ]
     }
 
     fn samples(&self) -> Vec<usize> {
-        self.on.parts.unlabelled.clone()
+        self.stage.parts.unlabelled.clone()
     }
 
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
-        let mut stream = self.on.stream("noise").child(step);
+        let mut stream = self.stage.stream("noise").child(step);
         let batch = Batch {
-            real: self.on.images(samples),
+            real: self.stage.images(samples),
             labelled: self.labelled(step),
-            eta: generator::noise(generator::SAMPLES_A_COMPONENT, &mut stream, &self.on.device),
-            sensing: Some((self.sensor, self.on.scale())),
+            eta: generator::noise(
+                generator::SAMPLES_A_COMPONENT,
+                &mut stream,
+                &self.stage.device,
+            ),
+            sensing: Some((self.sensor, self.stage.scale())),
         };
         let [loss, of_generator] = self::step(sides, self.game, &batch, rate);
         Taken {

@@ -50,7 +50,7 @@ impl Stage<'_> {
 #[derive(Debug)]
 pub struct Hrn<'a> {
     /// The stage.
-    pub on: Stage<'a>,
+    pub stage: Stage<'a>,
     /// The first weights.
     pub initial: Weights,
 }
@@ -75,21 +75,22 @@ pub fn step(
 impl Hrn<'_> {
     /// Images of presses, each augmented.
     fn varied(&self, presses: &[usize], stream: &mut Stream) -> Tensor<4> {
-        let vary = |frame: ModelFrame| augment::vary(&frame, self.on.settings.augmentation, stream);
-        self.on.changed(presses, vary)
+        let vary =
+            |frame: ModelFrame| augment::vary(&frame, self.stage.settings.augmentation, stream);
+        self.stage.changed(presses, vary)
     }
 
     /// Statistics of the normalised layers over the training presses, augmented as the settings
     /// say, in batches of their size. A smaller remainder is left out.
     fn statistics(&self, weights: &Weights) -> Statistics {
         let mut statistics = Statistics::default();
-        let mut order = self.on.parts.train.clone();
-        self.on.stream("statistics").shuffle(&mut order);
-        let batch = self.on.training.batch.min(order.len());
+        let mut order = self.stage.parts.train.clone();
+        self.stage.stream("statistics").shuffle(&mut order);
+        let batch = self.stage.training.batch.min(order.len());
         for (presses, number) in order.chunks_exact(batch).zip(0..) {
             // Training steps count from 0 and these batches from the maximum down, so none share a
             // sub-stream.
-            let mut stream = self.on.stream("augmentation").child(u64::MAX - number);
+            let mut stream = self.stage.stream("augmentation").child(u64::MAX - number);
             let images = self.varied(presses, &mut stream);
             let mut normalisation = Normalisation::Collect(&mut statistics);
             hrn::logits(weights, images, &mut normalisation);
@@ -99,23 +100,23 @@ impl Hrn<'_> {
 }
 
 impl Learning for Hrn<'_> {
-    fn on(&self) -> &Stage<'_> {
-        &self.on
+    fn stage(&self) -> &Stage<'_> {
+        &self.stage
     }
 
     fn sides(&self) -> Vec<Learner> {
-        vec![Learner::fresh(self.initial.clone(), self.on.training)]
+        vec![Learner::fresh(self.initial.clone(), self.stage.training)]
     }
 
     fn step(&self, sides: &mut [Learner], samples: &[usize], step: u64, rate: f64) -> Taken {
-        let mut stream = self.on.stream("augmentation").child(step);
+        let mut stream = self.stage.stream("augmentation").child(step);
         let images = self.varied(samples, &mut stream);
-        let targets = self.on.targets(samples);
+        let targets = self.stage.targets(samples);
         let (loss, judged) = self::step(&mut sides[0], images, targets, rate);
-        let levels = self.on.presses.of(samples).map(|press| press.level);
+        let levels = self.stage.presses.of(samples).map(|press| press.level);
         Taken {
             loss,
-            accuracy: Some(share_right(levels, judged.chunks(self.on.levels()))),
+            accuracy: Some(share_right(levels, judged.chunks(self.stage.levels()))),
             ..Taken::default()
         }
     }
@@ -132,17 +133,21 @@ impl Learning for Hrn<'_> {
         for part in presses.chunks(JUDGED_AT_ONCE) {
             let images = match vary.as_deref_mut() {
                 Some(stream) => self.varied(part, stream),
-                None => self.on.images(part),
+                None => self.stage.images(part),
             };
             let mut normalisation = Normalisation::Fixed(&statistics);
             let logits = hrn::logits(&weights[0], images, &mut normalisation);
             let logits = numbers(&logits);
-            rows.extend(logits.chunks(self.on.levels()).map(<[f32]>::to_vec));
+            rows.extend(logits.chunks(self.stage.levels()).map(<[f32]>::to_vec));
         }
         rows
     }
 
     fn graph(&self, weights: &[Weights]) -> Graph {
-        hrn::graph(&weights[0], &self.statistics(&weights[0]), self.on.scale())
+        hrn::graph(
+            &weights[0],
+            &self.statistics(&weights[0]),
+            self.stage.scale(),
+        )
     }
 }

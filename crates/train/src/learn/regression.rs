@@ -77,7 +77,7 @@ impl Seen {
 /// The regression, which learns from labelled presses.
 #[derive(Debug)]
 pub struct Regression<'a> {
-    on: Stage<'a>,
+    stage: Stage<'a>,
     seen: Seen,
     standard: Standard,
 }
@@ -100,7 +100,7 @@ impl<'a> Regression<'a> {
                 standard.deviation[column] = f32::MAX;
             }
         }
-        let on = Stage {
+        let stage = Stage {
             name: match seen {
                 Seen::Features => "features",
                 Seen::Parts(..) => "taxels",
@@ -114,7 +114,11 @@ impl<'a> Regression<'a> {
             },
             ..stage
         };
-        Self { on, seen, standard }
+        Self {
+            stage,
+            seen,
+            standard,
+        }
     }
 
     /// The weights of least loss.
@@ -125,11 +129,11 @@ impl<'a> Regression<'a> {
     fn samples(&self) -> Samples {
         // Each level counts the same, and within it each object, whatever the number of its presses.
         let unit = |place: &usize| {
-            let press = &self.on.presses.all[*place];
+            let press = &self.stage.presses.all[*place];
             (press.level, press.object)
         };
         let mut counts = BTreeMap::new();
-        for place in &self.on.parts.train {
+        for place in &self.stage.parts.train {
             *counts.entry(unit(place)).or_insert(0.0) += 1.0;
         }
         let objects = |level: u8| counts.keys().filter(|unit| unit.0 == level).count() as f64;
@@ -142,33 +146,33 @@ impl<'a> Regression<'a> {
             let columns = self.row(press).into_iter().chain([1.0]);
             columns.map(f64::from).collect()
         };
-        let presses = self.on.presses.of(&self.on.parts.train);
+        let presses = self.stage.presses.of(&self.stage.parts.train);
         Samples {
-            rows: self.on.parts.train.iter().map(row).collect(),
-            shares: self.on.parts.train.iter().map(share).collect(),
+            rows: self.stage.parts.train.iter().map(row).collect(),
+            shares: self.stage.parts.train.iter().map(share).collect(),
             of_level: presses.map(|press| usize::from(press.level) - 1).collect(),
-            levels: self.on.levels(),
+            levels: self.stage.levels(),
             ridge: match self.seen {
                 Seen::Features => RIDGE,
                 // With as many taxels as this, the presses are what limits the fit.
-                Seen::Parts(..) | Seen::Unloaded(_) => 1.0 / self.on.parts.train.len() as f64,
+                Seen::Parts(..) | Seen::Unloaded(_) => 1.0 / self.stage.parts.train.len() as f64,
             },
         }
     }
 
     /// The standardised columns of a press.
     fn row(&self, press: usize) -> Vec<f32> {
-        self.standard.row(&self.seen.of(self.on.presses, press))
+        self.standard.row(&self.seen.of(self.stage.presses, press))
     }
 
     /// The coefficients of each level, those of the columns and the bias, as a layer.
     fn weights(&self, coefficients: &[f64]) -> Weights {
-        let (columns, levels) = (self.seen.columns(), self.on.levels());
+        let (columns, levels) = (self.seen.columns(), self.stage.levels());
         let of = |column: usize| {
             let levels = coefficients.chunks_exact(columns + 1);
             levels.map(move |of_level| of_level[column] as f32)
         };
-        let mut weights = Weights::new(&self.on.device);
+        let mut weights = Weights::new(&self.stage.device);
         let matrix = (0..columns).flat_map(of).collect();
         weights.add("levels.matrix", &[columns, levels], matrix);
         weights.add("levels.bias", &[levels], of(columns).collect());
@@ -177,13 +181,13 @@ impl<'a> Regression<'a> {
 }
 
 impl Learning for Regression<'_> {
-    fn on(&self) -> &Stage<'_> {
-        &self.on
+    fn stage(&self) -> &Stage<'_> {
+        &self.stage
     }
 
     fn sides(&self) -> Vec<Learner> {
-        let nothing = vec![0.0; (self.seen.columns() + 1) * self.on.levels()];
-        vec![Learner::fresh(self.weights(&nothing), self.on.training)]
+        let nothing = vec![0.0; (self.seen.columns() + 1) * self.stage.levels()];
+        vec![Learner::fresh(self.weights(&nothing), self.stage.training)]
     }
 
     /// Fits the coefficients.
@@ -191,7 +195,7 @@ impl Learning for Regression<'_> {
         let samples = self.samples();
         let fitted = samples.fit();
         let weights = self.weights(&fitted);
-        let Stage { presses, parts, .. } = &self.on;
+        let Stage { presses, parts, .. } = &self.stage;
         let question = Question::alone(&parts.train);
         let judged = self.judge(slice::from_ref(&weights), &[question], None);
         let levels = presses.of(&parts.train).map(|press| press.level);
@@ -213,9 +217,9 @@ impl Learning for Regression<'_> {
         let rows: Vec<f32> = presses.flat_map(|&press| self.row(press)).collect();
         let columns = self.seen.columns();
         let shape = [rows.len() / columns, columns];
-        let rows = Tensor::from_data(TensorData::new(rows, shape), &self.on.device);
+        let rows = Tensor::from_data(TensorData::new(rows, shape), &self.stage.device);
         let logits = numbers(&dense(&weights[0], "levels", rows));
-        let rows = logits.chunks(self.on.levels());
+        let rows = logits.chunks(self.stage.levels());
         rows.map(<[f32]>::to_vec).collect()
     }
 

@@ -52,7 +52,7 @@ pub fn finish(
 ) -> anyhow::Result<Option<Evaluated>> {
     let mut card = learnt.card(&description.method, &description.data)?;
     let hrn = Model::load(&learnt.bytes(&card)?)?;
-    let presses = learnt.learning.on().presses;
+    let presses = learnt.learning.stage().presses;
     let test: Vec<usize> = presses.labelled(Split::Test).collect();
     let cases = verdicts::of(&hrn, presses, &test, Given::USUAL)?;
     let evaluation = (!cases.is_empty()).then(|| Evaluated::of(&cases, &card.levels));
@@ -85,7 +85,7 @@ impl Learnt<'_> {
     ///
     /// Fails if the names of the files cannot be written as JSON.
     pub fn card(&self, method: &str, sources: &[Source]) -> anyhow::Result<Card> {
-        let Stage { presses, parts, .. } = self.learning.on();
+        let Stage { presses, parts, .. } = self.learning.stage();
         let graph = self.learning.graph(self.weights);
         let mut metrics = json!({ "temperature": self.calibration.temperature });
         let (format, conformal) = match graph.inputs {
@@ -134,7 +134,7 @@ impl Learnt<'_> {
     /// Two presses of each level, and what the trainer's network says of them. Of a model that takes
     /// references, every second press has some.
     fn checks(&self, graph: &Graph, outputs: &Outputs) -> Checks {
-        let presses = self.learning.on().presses;
+        let presses = self.learning.stage().presses;
         let places = self.checked();
         let references = match graph.inputs {
             Inputs::References => self.check_references(),
@@ -192,7 +192,7 @@ impl Learnt<'_> {
 
     /// The references of the first sensor that has some.
     fn check_references(&self) -> Vec<(usize, Piece)> {
-        let Stage { presses, parts, .. } = self.learning.on();
+        let Stage { presses, parts, .. } = self.learning.stage();
         let sensors = presses.of(&parts.train).map(|press| press.sensor);
         let mut seen = BTreeSet::new();
         let new = sensors.filter(|&sensor| seen.insert(sensor));
@@ -204,7 +204,7 @@ impl Learnt<'_> {
 
     /// Two training presses of each level: those one third and two thirds through its presses.
     fn checked(&self) -> Vec<usize> {
-        let Stage { presses, parts, .. } = self.learning.on();
+        let Stage { presses, parts, .. } = self.learning.stage();
         let mut checked = Vec::new();
         for level in presses.levels() {
             let of_level = |&press: &usize| presses.all[press].level == level.level;

@@ -10,7 +10,7 @@ use anyhow::{Context as _, ensure};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-use super::disk::{read_earlier, write_whole};
+use super::disk::{read_if_there, write_whole};
 use hardnessd_core::verdict::sha256_hex;
 
 /// How far a stage is. The default is its beginning.
@@ -59,7 +59,7 @@ impl Checkpoint {
     ///
     /// Returns an error if the file cannot be read, or is none of a checkpoint.
     pub fn read(path: &Path) -> anyhow::Result<Option<Self>> {
-        let Some(file) = read_earlier(path)? else {
+        let Some(file) = read_if_there(path)? else {
             return Ok(None);
         };
         let head = file.split(|&byte| byte == b'\n').next().unwrap_or_default();

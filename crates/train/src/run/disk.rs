@@ -65,7 +65,7 @@ pub fn read(path: &Path, most: usize) -> anyhow::Result<Vec<u8>> {
 /// # Errors
 ///
 /// Returns an error if the file is there and cannot be read.
-pub fn read_earlier(path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+pub fn read_if_there(path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
     match fs::read(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         read => read.map(Some).with_context(|| path.display().to_string()),

@@ -9,7 +9,7 @@ use std::path::Path;
 use anyhow::Context as _;
 
 use super::checkpoint::Checkpoint;
-use super::disk::{read_earlier, write_whole};
+use super::disk::{read_if_there, write_whole};
 
 /// The columns of the file.
 const COLUMNS: &str = "stage,step,epoch,loss,learning_rate,accuracy,validation_loss,validation_accuracy,\
@@ -53,7 +53,7 @@ impl Metrics {
     /// Returns the errors of reading and writing.
     pub fn open(path: &Path, stage: &str, step: u64) -> anyhow::Result<Self> {
         let context = || path.display().to_string();
-        let before = read_earlier(path)?.unwrap_or_default();
+        let before = read_if_there(path)?.unwrap_or_default();
         let before = String::from_utf8(before).with_context(context)?;
         let is_kept = |row: &&str| {
             let cells: Vec<&str> = row.split(',').collect();
