@@ -78,7 +78,7 @@ const FAREWELL: Duration = Duration::from_millis(300);
 /// The most commands that wait for a sensor.
 const QUESTIONS: usize = 64;
 
-/// The reason the daemon cannot start, or has stopped by itself. Nobody tells reasons apart but by the exit code.
+/// The reason the daemon cannot start, or has stopped by itself, in words. Only the exit code tells reasons apart.
 #[derive(Debug, thiserror::Error)]
 #[error("{message}")]
 pub struct Error {

@@ -81,10 +81,8 @@ pub async fn run(
     let mut labels = Labels::new();
     for (key, value) in args.labels {
         if let Some(known) = misspelt(&key) {
-            say(
-                log,
-                &format!("warning: --label {key}: did you mean {known}?"),
-            );
+            let meant = format!("warning: --label {key}: did you mean {known}?");
+            say(log, &meant);
         }
         if labels.insert(key.clone(), value).is_some() {
             let twice = format!("--label {key}: given twice: give it once");
@@ -118,7 +116,7 @@ pub async fn run(
         part::remove(&path, &file);
         return recorded;
     }
-    let (seen, shown) = (counted_in_words(frames, "frame", "s"), shown(&path));
+    let (seen, shown) = (counted_in_words(frames, "frame", "s"), path.display());
     if io::stderr().is_terminal() {
         let pressed = counted_in_words(presses, "press", "es");
         say(log, &format!("recorded {seen}, {pressed}: {shown}"));
@@ -134,19 +132,15 @@ pub async fn run(
     recorded
 }
 
-/// Writes a line between those of the log. It waits for no terminal.
+/// Writes a line between those of the log, with hidden characters escaped. It waits for no terminal.
 fn say(log: &Log, line: &str) {
     log.lines().say(format!("{}\n", escaped(line)).as_bytes());
 }
 
 /// Makes the file of a recording. A file that exists is left alone.
 fn create(path: &Path) -> Result<File, Failure> {
-    let directory = part::directory_of(path);
-    if !directory.exists() {
-        let missing = format!("{}: the directory does not exist", path.display());
-        return Err(Failure::new(IO, missing));
-    }
-    File::create_new(path).of(format!("{}: name a new file", path.display()), IO)
+    let made = part::directory_for(path).and_then(|_| File::create_new(path));
+    made.of(format!("{}: name a new file", path.display()), IO)
 }
 
 /// Records into `file`, which is at `path`, until `end` is over, or until no sensor is left. Returns what the file holds
@@ -224,10 +218,6 @@ fn unavailable(sensor: &sensor::Settings, reason: String) -> Failure {
     let (name, port) = (&sensor.name, &sensor.port);
     let obstacle = doctor::obstacle(port).unwrap_or(reason);
     Failure::new(UNAVAILABLE, format!("sensor {name:?}: {port}: {obstacle}"))
-}
-
-fn shown(path: &Path) -> String {
-    escaped(&path.display().to_string())
 }
 
 fn counted_in_words(count: u64, what: &str, plural: &str) -> String {

@@ -154,13 +154,23 @@ pub fn directory_of(file: &Path) -> &Path {
 /// The descriptors of this process, by which a file without a name gets one.
 const DESCRIPTORS: &str = "/proc/self/fd";
 
+/// The directory of a file that is to be made.
+///
+/// # Errors
+///
+/// Fails, and names the directory, if it does not exist.
+pub fn directory_for(file: &Path) -> io::Result<&Path> {
+    let directory = directory_of(file);
+    if directory.exists() {
+        return Ok(directory);
+    }
+    let text = format!("the directory {} does not exist", directory.display());
+    Err(io::Error::new(ErrorKind::NotFound, text))
+}
+
 /// A file in the directory of `path`, without a name where the file system can do that.
 fn beside(path: &Path) -> io::Result<(File, Option<TempPath>)> {
-    let directory = directory_of(path);
-    if !directory.exists() {
-        let text = format!("the directory {} does not exist", directory.display());
-        return Err(io::Error::new(ErrorKind::NotFound, text));
-    }
+    let directory = directory_for(path)?;
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     if Path::new(DESCRIPTORS).exists()
         && let Ok(file) = rustix::fs::open(directory, flags, Mode::from_raw_mode(0o666))

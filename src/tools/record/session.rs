@@ -170,7 +170,7 @@ pub(super) async fn run(
     let levels = &setup.hrn.card().levels;
     // The verdicts on objects whose level the user named.
     let mut score = Score::default();
-    let (mut number, mut count, mut goes_on, mut ended) = (first, 0, true, Ok(()));
+    let (mut number, mut goes_on, mut ended) = (first, true, Ok(()));
     while goes_on && let Some(mut object) = user.name_object(directory, number, levels).await {
         object.labels.extend(labels.clone());
         let (recorded, is_kept) = match create(&object.path) {
@@ -179,9 +179,9 @@ pub(super) async fn run(
         };
         goes_on = recorded.as_ref().is_ok_and(|goes_on| *goes_on);
         ended = recorded.map(drop);
-        count += u32::from(is_kept);
         number = number.saturating_add(is_kept.into());
     }
+    let count = number - first;
     let recorded = counted_in_words(count.into(), "object", "s");
     user.say(&format!("\nrecorded {recorded} in this session\n"));
     if score.verdicts > 0 {
