@@ -156,11 +156,11 @@ impl Plan {
     }
 }
 
-/// What makes presses, on whatever thread: those of an object, or of a cover if each sensor is another one. A press
+/// Makes the presses of an object, or of a cover if each sensor is another one. It may run on any thread. A press
 /// is `None` if no sensor sees it, however hard it is made, or if it lasts too long.
 type Work<'a> = Box<dyn FnOnce() -> Vec<Option<LabelledCourse>> + Send + 'a>;
 
-/// The data set, as what makes its presses, in the order of [`super::dataset`].
+/// The work that makes the data set, in the order of [`super::dataset`].
 pub fn courses(settings: &CourseSettings) -> Vec<Work<'_>> {
     if let Some(sensors) = &settings.sensors {
         return world::courses(settings, sensors);

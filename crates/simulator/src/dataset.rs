@@ -30,7 +30,7 @@ const FORCES: usize = 8;
 const ROUND: usize = POSTURES * FORCES;
 const FORCE_JITTER: f64 = 0.08;
 
-/// The data set, as what makes the samples of each object, on whatever thread. The objects are in the order of
+/// The work that makes the data set, one piece for each object, on any thread. The objects are in the order of
 /// materials (as in [`super::Material::ALL`]) or of split and group, and their samples in that of posture and
 /// press.
 pub fn dataset(

@@ -41,7 +41,8 @@ const DAMAGED: u64 = 20;
 
 /// How many ways to divide a mark into tail and header are tried.
 const MOST_SPLITS: usize = 3;
-/// The most bytes that are looked for, where fewer do. Others beside them may be numbers that change seldom.
+/// A mark has at most so many bytes, if these find all frames. Constant bytes beside them may be numbers that change
+/// seldom.
 const MOST_MARK: usize = 4;
 
 /// Hands each frame in `bytes` to `take`, as the daemon would decode it. Returns the number of damaged
@@ -227,7 +228,8 @@ impl Parts<'_> {
                 vec![after, (from(begin), Some(begin), None)]
             }
         };
-        // One byte before what is covered may end a frame, where two behind it are likelier a mark than a number.
+        // A single constant byte before the covered ones may end the frame before. If two constant bytes begin the
+        // covered ones, these are likelier the mark.
         if let Some(begin) = check.begin {
             let own = self.place.own_mark(&(end..begin));
             let before = begin - own.map_or(end, |own| own.end);

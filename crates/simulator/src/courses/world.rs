@@ -41,7 +41,7 @@ impl CourseSettings {
     }
 }
 
-/// What makes the presses on each cover; see [`super::courses()`].
+/// The work that makes the presses on each cover; see [`super::courses()`].
 pub(super) fn courses<'a>(
     settings: &'a CourseSettings,
     sensors: &'a BroadSensors,
